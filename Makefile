@@ -1,0 +1,76 @@
+# Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
+.DEFAULT_GOAL := help
+.PHONY: help setup archive train calibrate replay evaluate test lint clean
+
+PYTHON ?= python3
+ROBOT ?= anymal
+BIN := .venv/bin
+STAMP := .venv/.setup-done
+
+# The flags of the variables that are set, of those named: $(call flags,DEVICE SEED) -> --device cpu
+flags = $(foreach name,$(1),$(if $($(name)),--$(FLAG_$(name)) '$($(name))'))
+FLAG_PRESET := preset
+FLAG_DEVICE := device
+FLAG_ITERATIONS := iterations
+FLAG_POLICY := policy
+FLAG_SEED := seed
+FLAG_RESUME := resume
+FLAG_RUN := run
+FLAG_ELITE := elite
+
+help: ## This list
+	@echo 'faultline: find the terrains that break a legged robot. Targets:'
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo
+	@echo 'Variables (left out: the default of the command):'
+	@echo '  ROBOT=anymal     which robot'
+	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive train calibrate replay evaluate'
+	@echo '  PRESET=small     size of the search: paper, small  archive'
+	@echo '  ITERATIONS=N     stop after N iterations           archive train'
+	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, or'
+	@echo '                   module:callable                   archive calibrate replay evaluate'
+	@echo '  SEED=N           seed of everything drawn          archive train calibrate evaluate'
+	@echo '  RESUME=DIR       go on with this run               archive train'
+	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
+	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
+	@echo '  TORCH=SPEC       torch other than the pinned one, e.g. a build for your GPU driver: a requirement or a wheel'
+	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.replay, train.base, ...)'
+
+setup: $(STAMP) ## Make .venv with the pinned packages, unless it is up to date
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "make setup: PYTHON=$(PYTHON) must be Python 3.11 or newer, got: $$($(PYTHON) --version 2>&1)." >&2; \
+	  echo 'Name another one: make setup PYTHON=python3.12' >&2; exit 1; }
+	@echo 'Installing the pinned packages into .venv: some minutes the first time.'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	grep -v $(if $(TORCH),'^torch==','^$$') constraints.txt > .venv/constraints.txt
+	$(if $(TORCH),$(BIN)/python -m pip install '$(TORCH)')
+	$(BIN)/python -m pip install --quiet -e '.[dev]' -c .venv/constraints.txt
+	@touch $@
+
+archive: setup ## Search the terrains on which the controller of ROBOT fails; writes a run under runs/
+	$(BIN)/python -m qd.search --robot '$(ROBOT)' $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME)
+
+train: setup ## Train the base controller of ROBOT from scratch
+	$(BIN)/python -m train.base --robot '$(ROBOT)' $(call flags,DEVICE ITERATIONS SEED RESUME)
+
+calibrate: setup ## Measure the penalty scales of ROBOT
+	$(BIN)/python -m qd.calibrate --robot '$(ROBOT)' $(call flags,DEVICE POLICY SEED)
+
+replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
+	$(BIN)/python -m qd.replay --robot '$(ROBOT)' $(call flags,RUN ELITE DEVICE POLICY)
+
+evaluate: setup ## Success and goal rates of the controller of ROBOT
+	$(BIN)/python -m train.evaluate --robot '$(ROBOT)' $(call flags,DEVICE POLICY SEED)
+
+test: setup ## Run the tests
+	$(BIN)/python -m pytest
+
+lint: setup ## Check style, documentation and types
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+clean: ## Remove caches and build leftovers; keeps .venv and runs/
+	rm -rf .pytest_cache .ruff_cache build *.egg-info
+	find kernels sim qd train tests -name __pycache__ -type d -prune -exec rm -rf {} +
