@@ -1,0 +1,109 @@
+"""The shape of the house: which room may import what, and how long a file may be."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = ("kernels", "sim", "qd", "train")  # a room may import itself and the rooms before it
+QD_DOORS_FOR_TRAIN = ("archive", "space", "workers")
+LIBRARY_DOORS = {
+    "warp": ("kernels", "sim"),
+    "newton": ("sim",),
+    "mujoco": ("sim",),
+    "mujoco_warp": ("sim",),
+    "ribs": ("qd",),
+    "rsl_rl": ("train",),
+    "torch": ("sim", "train"),
+}
+MAX_LINES = 299
+FILES = [path.relative_to(ROOT) for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+
+
+def imported_names(path: Path, tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and absolute dotted name of everything imported anywhere in a file, inside functions and by name too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            package = path.parent.parts[: len(path.parent.parts) - node.level + 1] if node.level else ()
+            module = ".".join((*package, *filter(None, [node.module])))
+            yield from ((node.lineno, f"{module}.{alias.name}") for alias in node.names)
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            function = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", None)
+            if function in ("import_module", "__import__"):
+                yield node.lineno, str(node.args[0].value)
+
+
+def offences(path: Path, source: str) -> list[str]:
+    """What a file of a room does that the house forbids, one line each."""
+    room = path.parts[0]
+    found = []
+    for line, name in imported_names(path, ast.parse(source)):
+        top, _, rest = name.partition(".")
+        if top in ROOMS and ROOMS.index(top) > ROOMS.index(room):
+            found.append(f"{path}:{line}: {room} may not import {name}: imports point {' <- '.join(ROOMS)}")
+        elif room == "train" and top == "qd" and rest.partition(".")[0] not in QD_DOORS_FOR_TRAIN:
+            found.append(f"{path}:{line}: of qd, train may import only {', '.join(QD_DOORS_FOR_TRAIN)}, not {name}")
+        elif top == "tests":
+            found.append(f"{path}:{line}: {room} may not import {name}: tests are not shipped")
+        elif room not in LIBRARY_DOORS.get(top, ROOMS):
+            found.append(f"{path}:{line}: {room} may not import {name}: only {' and '.join(LIBRARY_DOORS[top])} may")
+    lines = len(source.splitlines())
+    if lines > MAX_LINES:
+        found.append(f"{path}: {lines} lines, at most {MAX_LINES}: give one of its responsibilities a file of its own")
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=str)
+def test_file_keeps_to_its_room(path):
+    assert offences(path, (ROOT / path).read_text(encoding="utf-8")) == []
+
+
+def test_every_room_is_walked():
+    assert {path.parts[0] for path in FILES} == set(ROOMS)
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("kernels/a.py", "import sim"),
+        ("kernels/a.py", "from sim import robot"),
+        ("sim/a.py", "def f():\n    from qd.archive import read"),
+        ("qd/a.py", "import train.base as base"),
+        ("qd/a.py", "import importlib\nimportlib.import_module('train.base')"),
+        ("qd/a.py", "__import__('torch')"),
+        ("qd/a.py", "import numpy, warp"),
+        ("qd/a.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch"),
+        ("kernels/a.py", "import torch"),
+        ("train/a.py", "import warp as wp"),
+        ("train/a.py", "from newton.solvers import SolverMuJoCo"),
+        ("qd/a.py", "import mujoco"),
+        ("train/a.py", "from ribs.archives import GridArchive"),
+        ("sim/a.py", "from rsl_rl.runners import OnPolicyRunner"),
+        ("train/a.py", "from qd import archive, search"),
+        ("train/a.py", "import qd"),
+        ("train/a.py", "from qd.descriptors import ratios"),
+        ("train/a.py", "from ..qd.fitness import fitness"),
+        ("sim/a.py", "from tests.oracles import height"),
+        ("sim/a.py", "x = 1\n" * 300),
+    ],
+)
+def test_an_offender_is_caught(path, source):
+    assert len(offences(Path(path), source)) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("kernels/a.py", "import numpy as np\nimport warp as wp\nfrom kernels.contact import collide"),
+        ("sim/a.py", "import newton\nimport torch\nimport warp\nfrom . import robot\nfrom kernels import contact"),
+        ("qd/a.py", "from ribs.archives import GridArchive\nfrom sim.rollout import Rollout\nfrom .space import Space"),
+        ("train/a.py", "import torch\nfrom qd import archive, space\nfrom qd.workers import evaluate\nimport rsl_rl"),
+        ("sim/a.py", "x = 1\n" * 299),
+    ],
+)
+def test_what_is_allowed_passes(path, source):
+    assert offences(Path(path), source) == []
