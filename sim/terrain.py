@@ -1,0 +1,242 @@
+"""Terrains as height grids: hand-crafted crossings, random genes, and the tiles of the training curriculum.
+
+Every grid is 16 m x 8 m at 0.05 m: heights [m] of shape ``(NUM_ROWS, NUM_COLS)``, row along y (0..8 m), column along x
+(0..16 m). A feature fills the 8 m x 8 m square 4 <= x <= 12 in the middle. A crossing starts at (2, 4) on flat ground
+before it; a training tile starts at (8, 4), in the tile's centre.
+
+Level l in 0..9 sets the difficulty d = l / 10 (after Rudin et al. 2022, the paper's reference for its hand-crafted
+terrains): gradient 0.4 d, step height 0.05 + 0.18 d m (tread 0.31 m), obstacle height 0.05 + 0.2 d m, roughness
++-0.05 m; crossings add noise of +-(0.02 + 0.08 d) m. Heights are sampled at the nodes: a riser is one cell wide.
+
+Every random terrain has its own generator, spawned from the seed: terrain i does not depend on how many are drawn.
+"""
+
+import numpy as np
+
+from kernels.super_gaussian import GENES_PER_BUMP, PARAMETERS
+
+Seed = int | np.random.Generator
+"""What the generators draw from. A Generator gives other terrains on each call, an int the same ones."""
+
+SPACING = 0.05
+"""Distance of neighbouring nodes [m]."""
+NUM_ROWS = 161
+NUM_COLS = 321
+NUM_LEVELS = 10
+
+CROSSING_TYPES = ("slope", "rough_slope", "stairs_up_down", "stairs_down_up", "boxes", "noise")
+TILE_TYPES = ("slope", "rough_slope", "stairs_up", "stairs_down", "obstacles")
+
+_SIDE = NUM_ROWS  # nodes along one side of the feature square
+_FIRST_COL = (NUM_COLS - _SIDE) // 2  # column at x = 4 m
+_TILE_SHARES_PERCENT = np.array([10, 10, 35, 25, 20])
+
+# Centimetres as integers: 0.31 m treads fall on nodes exactly, with no rounding at a riser.
+_NODES_CM = 5 * np.arange(_SIDE)
+_EDGE_DISTANCE_CM = np.minimum(_NODES_CM, _NODES_CM[-1] - _NODES_CM)
+_INSET_CROSSING_CM = np.broadcast_to(_EDGE_DISTANCE_CM, (_SIDE, _SIDE))  # the feature is the same at every y
+_INSET_TILE_CM = np.minimum(_EDGE_DISTANCE_CM[:, None], _EDGE_DISTANCE_CM)  # a pyramid
+_FLANK_CM = 250  # from the edge to the 3 m platform
+_TREAD_CM = 31
+
+_PATCH_NODES = 4  # 0.2 m: roughness is drawn at this distance and interpolated; noise is drawn a patch
+_ROUGHNESS = 0.05
+_NUM_BOXES = 20
+_BOX_CELLS = (20, 40)  # 1 m to 2 m
+
+
+def _slope(inset_cm: np.ndarray, gradient: float) -> np.ndarray:
+    """Heights [m] of a flank of constant gradient up to the platform."""
+    return gradient * 0.01 * np.minimum(inset_cm, _FLANK_CM)
+
+
+def _stairs(inset_cm: np.ndarray, step_height: float) -> np.ndarray:
+    """Heights [m] of stairs up to the platform; the first riser stands one tread inside the edge."""
+    return step_height * np.minimum(inset_cm // _TREAD_CM, _FLANK_CM // _TREAD_CM)
+
+
+def _roughness(rng: np.random.Generator) -> np.ndarray:
+    """Uniform heights of +-0.05 m drawn every 0.2 m, bilinearly interpolated; 0 at x = 4 and x = 12."""
+    coarse = np.arange(0, _SIDE, _PATCH_NODES)
+    drawn = rng.uniform(-_ROUGHNESS, _ROUGHNESS, (len(coarse), len(coarse)))
+    drawn[:, [0, -1]] = 0.0
+    weights = np.maximum(0.0, 1.0 - np.abs(np.arange(_SIDE)[:, None] - coarse) / _PATCH_NODES)
+    return weights @ drawn @ weights.T
+
+
+def _noise(rng: np.random.Generator, amplitude: float) -> np.ndarray:
+    """Uniform heights of +-``amplitude`` [m], constant on patches of 0.2 m."""
+    patches = -(-_SIDE // _PATCH_NODES)
+    drawn = rng.uniform(-amplitude, amplitude, (patches, patches))
+    return drawn.repeat(_PATCH_NODES, axis=0).repeat(_PATCH_NODES, axis=1)[:_SIDE, :_SIDE]
+
+
+def _boxes(rng: np.random.Generator, height: float) -> np.ndarray:
+    """20 boxes of 1-2 m sides, each ``height`` or half of it [m] above or below the ground; a later one overwrites.
+
+    None reaches the square's edge: beyond a tile its edge heights continue, and a box there would become a ridge.
+    """
+    heights = np.zeros((_SIDE, _SIDE))
+    for _ in range(_NUM_BOXES):
+        size_y, size_x = rng.integers(*_BOX_CELLS, size=2, endpoint=True)
+        row = rng.integers(1, _SIDE - 1 - size_y)
+        col = rng.integers(1, _SIDE - 1 - size_x)
+        heights[row : row + size_y + 1, col : col + size_x + 1] = height * rng.choice([-1.0, -0.5, 0.5, 1.0])
+    return heights
+
+
+def _difficulty(kind: str, kinds: tuple[str, ...], level: int) -> float:
+    if kind not in kinds:
+        raise ValueError(f"terrain type must be one of {', '.join(kinds)}, got {kind!r}")
+    if not 0 <= level < NUM_LEVELS:
+        raise ValueError(f"level must be in 0..{NUM_LEVELS - 1}, got {level}: difficulty is level / {NUM_LEVELS}")
+    return level / NUM_LEVELS
+
+
+def _check_positive(**counts: int) -> None:
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
+
+
+def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
+    """One hand-crafted crossing: the feature over the full width, flat at height 0 for x <= 4 and x >= 12.
+
+    Args:
+        kind: One of :data:`CROSSING_TYPES`.
+        level: 0 (nearly flat) to 9.
+        seed: For the random types.
+
+    Returns:
+        Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
+
+    Raises:
+        ValueError: If ``kind`` is unknown or ``level`` out of range.
+    """
+    d = _difficulty(kind, CROSSING_TYPES, level)
+    rng = np.random.default_rng(seed)
+    feature = {
+        "slope": lambda: _slope(_INSET_CROSSING_CM, 0.4 * d),
+        "rough_slope": lambda: _slope(_INSET_CROSSING_CM, 0.4 * d) + _roughness(rng),
+        "stairs_up_down": lambda: _stairs(_INSET_CROSSING_CM, 0.05 + 0.18 * d),
+        "stairs_down_up": lambda: _stairs(_INSET_CROSSING_CM, -0.05 - 0.18 * d),
+        "boxes": lambda: _boxes(rng, 0.05 + 0.2 * d),
+        "noise": lambda: _noise(rng, 0.02 + 0.08 * d),
+    }[kind]()
+    heights = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    inside = slice(1, -1)  # the nodes at x = 4 and x = 12 belong to the run-in and run-out
+    heights[:, _FIRST_COL : _FIRST_COL + _SIDE][:, inside] = feature[:, inside]
+    return heights
+
+
+def hand_crafted_crossings(count: int, seed: Seed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Hand-crafted crossings: the types of :data:`CROSSING_TYPES` in turn (equal shares), levels uniform in 0..9.
+
+    Args:
+        count: Number of terrains.
+        seed: Int or Generator.
+
+    Returns:
+        Heights [m] float32 of shape (count, NUM_ROWS, NUM_COLS), types (count,) and levels (count,), both int;
+        a type is an index into :data:`CROSSING_TYPES`.
+
+    Raises:
+        ValueError: If ``count`` is not positive.
+    """
+    _check_positive(count=count)
+    types = np.arange(count) % len(CROSSING_TYPES)
+    levels = np.empty(count, int)
+    heights = np.empty((count, NUM_ROWS, NUM_COLS), np.float32)
+    for i, rng in enumerate(np.random.default_rng(seed).spawn(count)):
+        levels[i] = rng.integers(NUM_LEVELS)
+        heights[i] = crossing_terrain(CROSSING_TYPES[types[i]], levels[i], rng)
+    return heights, types, levels
+
+
+def uniform_random_genes(count: int, seed: Seed, num_bumps: int = 8) -> np.ndarray:
+    """Genes drawn uniformly from [-1, 1].
+
+    Args:
+        count: Number of terrains.
+        seed: Int or Generator.
+        num_bumps: Super-Gaussians a terrain.
+
+    Returns:
+        Genes, float32, shape (count, 8 * num_bumps), bump after bump.
+
+    Raises:
+        ValueError: If ``count`` or ``num_bumps`` is not positive.
+    """
+    _check_positive(count=count, num_bumps=num_bumps)
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1.0, 1.0, (count, GENES_PER_BUMP * num_bumps)).astype(np.float32)
+
+
+def hard_random_genes(count: int, seed: Seed, num_bumps: int = 8) -> np.ndarray:
+    """Genes drawn uniformly, but each bump's height gene w at -1 or 1: the paper's hard-random terrains.
+
+    Arguments, result and errors are those of :func:`uniform_random_genes`.
+    """
+    genes = uniform_random_genes(count, seed, num_bumps)
+    height_genes = genes[:, PARAMETERS.index("w") :: GENES_PER_BUMP]
+    height_genes[:] = np.where(height_genes < 0.0, -1.0, 1.0)
+    return genes
+
+
+def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) -> np.ndarray:
+    """One 8 m x 8 m tile of the training curriculum in the middle of the grid; beyond it the edge heights continue.
+
+    The robot starts in the centre, on the platform: it walks down from a slope, up from ``stairs_up`` (a pit) and down
+    from ``stairs_down``. The pyramids' faces are planes, so the gradient is the same everywhere on a flank.
+
+    Args:
+        kind: One of :data:`TILE_TYPES`.
+        level: 0 (nearly flat) to 9.
+        seed: For the random types.
+        inverted: Turn a slope into a pit; other types ignore it.
+
+    Returns:
+        Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
+
+    Raises:
+        ValueError: If ``kind`` is unknown or ``level`` out of range.
+    """
+    d = _difficulty(kind, TILE_TYPES, level)
+    rng = np.random.default_rng(seed)
+    tile = {
+        "slope": lambda: _slope(_INSET_TILE_CM, -0.4 * d if inverted else 0.4 * d),
+        "rough_slope": lambda: _slope(_INSET_TILE_CM, 0.4 * d) + _roughness(rng),
+        "stairs_up": lambda: _stairs(_INSET_TILE_CM, -0.05 - 0.18 * d),
+        "stairs_down": lambda: _stairs(_INSET_TILE_CM, 0.05 + 0.18 * d),
+        "obstacles": lambda: np.where(_INSET_TILE_CM < _FLANK_CM, _boxes(rng, 0.05 + 0.2 * d), 0.0),
+    }[kind]()
+    return np.pad(tile, ((0, 0), (_FIRST_COL, _FIRST_COL)), mode="edge").astype(np.float32)
+
+
+def training_tiles(num_levels: int, num_columns: int, seed: Seed) -> tuple[np.ndarray, np.ndarray]:
+    """The tiles of the training curriculum: a row a level from 0 up, a column a type.
+
+    Columns go to :data:`TILE_TYPES` in order, in shares .1, .1, .35, .25, .2; every other smooth slope is inverted.
+
+    Args:
+        num_levels: Number of levels, 1 to 10; level l has difficulty l / 10 whatever their number.
+        num_columns: Number of columns; 20 and its multiples give the shares exactly.
+        seed: Int or Generator.
+
+    Returns:
+        Heights [m] float32 of shape (num_levels * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
+        index level * num_columns + column, and types (num_columns,) int, indices into :data:`TILE_TYPES`.
+
+    Raises:
+        ValueError: If ``num_levels`` is not in 1..10 or ``num_columns`` not positive.
+    """
+    _check_positive(num_levels=num_levels, num_columns=num_columns)
+    if num_levels > NUM_LEVELS:
+        raise ValueError(f"num_levels must be at most {NUM_LEVELS}, got {num_levels}: levels are 0..{NUM_LEVELS - 1}")
+    ends = np.cumsum(_TILE_SHARES_PERCENT) * num_columns
+    types = np.searchsorted(ends, 100 * np.arange(num_columns), side="right")
+    heights = np.empty((num_levels * num_columns, NUM_ROWS, NUM_COLS), np.float32)
+    for i, rng in enumerate(np.random.default_rng(seed).spawn(len(heights))):
+        level, column = divmod(i, num_columns)
+        heights[i] = training_tile(TILE_TYPES[types[column]], level, rng, inverted=column % 2 == 1)
+    return heights, types
