@@ -1,1 +1,1 @@
-"""The search: genes, descriptors, fitness and the archive of terrains on which a controller fails."""
+"""The quality-diversity search: genes, failure ratios and cells, fitness, archive, and the loop over them."""

@@ -1,0 +1,145 @@
+from fractions import Fraction
+from itertools import product
+
+import numpy as np
+import pytest
+
+from qd.descriptors import Cells, episode_ratios, terrain_ratios
+
+
+def test_ratios_of_an_episode():
+    # 1 + 3 + 0 + 4 = 8
+    assert episode_ratios([1.0, 3.0, 0.0, 4.0]).tolist() == [0.125, 0.375, 0.0, 0.5]
+
+
+def test_an_episode_without_penalties_counts_one_nth_each():
+    assert episode_ratios(np.zeros((2, 5))).tolist() == [[0.2] * 5] * 2
+
+
+def test_terrain_ratio_is_the_mean_of_ratios_not_the_ratio_of_means():
+    # episodes (1, 3) -> (1/4, 3/4) and (10, 0) -> (1, 0): mean (5/8, 3/8); the ratio of means would be (11/14, 3/14)
+    ratios = terrain_ratios([[[1.0, 3.0], [10.0, 0.0]]], [[True, True]])
+    assert ratios.tolist() == [[0.625, 0.375]]
+
+
+def test_invalid_episodes_are_left_out_even_when_they_hold_nan():
+    penalties = [[[1.0, 3.0], [np.nan, np.inf], [10.0, 0.0]], [[np.nan, 1.0]] * 3]
+    ratios = terrain_ratios(penalties, [[True, False, True], [False] * 3])
+    assert ratios.tolist() == [[0.625, 0.375], [0.5, 0.5]]
+
+
+def test_ratios_sum_to_one():
+    rng = np.random.default_rng(0)
+    penalties = (
+        rng.exponential(size=(200, 20, 6)) * (rng.random((200, 20, 6)) < 0.5) * 10.0 ** rng.integers(-8, 8, (200, 1, 1))
+    )
+    assert np.abs(terrain_ratios(penalties, np.ones((200, 20), bool)).sum(axis=1) - 1.0).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("num_ratios", "bit", "count"), [(5, False, 1750), (5, True, 3500), (6, False, 4795), (2, False, 10), (2, True, 20)]
+)
+def test_number_of_reachable_cells(num_ratios, bit, count):
+    assert Cells(num_ratios, collision_bit=bit).num_cells == count
+
+
+@pytest.mark.parametrize(
+    ("num_ratios", "intervals"), [(2, 1), (2, 7), (3, 1), (3, 2), (3, 4), (3, 10), (4, 3), (4, 6), (6, 3)]
+)
+def test_reachable_are_the_boxes_with_a_strictly_inner_point_on_the_plane(num_ratios, intervals):
+    # Exact oracle: walk from the lower to the upper corner of a box; the sum grows linearly, so the plane sum = 1 is
+    # crossed strictly inside exactly if the walk's parameter lies strictly between 0 and 1.
+    expected = [
+        box
+        for box in product(range(intervals), repeat=num_ratios)
+        if 0 < (1 - Fraction(sum(box), intervals)) / Fraction(num_ratios, intervals) < 1
+    ]
+    assert [tuple(row) for row in Cells(num_ratios, intervals).tuples.tolist()] == expected
+
+
+@pytest.mark.parametrize(("num_ratios", "intervals"), [(5, 10), (6, 10), (3, 7), (2, 49)])
+def test_every_reachable_cell_is_hit_by_a_point_in_its_middle(num_ratios, intervals):
+    cells = Cells(num_ratios, intervals)
+    lower = cells.tuples / intervals
+    inside = lower + (1.0 - lower.sum(axis=1, keepdims=True)) / num_ratios
+    assert cells.cell_of(inside).tolist() == list(range(cells.num_cells))
+
+
+def test_random_ratios_fall_into_the_box_that_holds_them():
+    cells = Cells(6)
+    ratios = np.random.default_rng(1).dirichlet(np.full(6, 0.5), size=5000)
+    tuples = cells.tuples[cells.cell_of(ratios)]
+    assert (tuples == np.minimum(np.floor(ratios * 10), 9)).all()
+
+
+@pytest.mark.parametrize(
+    ("ratios", "expected"),
+    [
+        # all on a lower edge, indices sum to 10: down on the largest, the first of equal ones
+        ([0.2, 0.2, 0.2, 0.2, 0.2], [1, 2, 2, 2, 2]),
+        ([0.1, 0.5, 0.4, 0.0, 0.0], [1, 4, 4, 0, 0]),
+        # 1.0 is in the last interval, so this one is reachable as it is
+        ([0.0, 0.0, 1.0, 0.0, 0.0], [0, 0, 9, 0, 0]),
+        # every ratio one rounding step below its upper edge, indices sum to 5: up on the ratio nearest its edge
+        (
+            [np.nextafter(0.2, 0), np.nextafter(0.2, 0) - 1e-12, 0.2 - 1e-12, 0.2 - 1e-12, 0.2 - 1e-12],
+            [2, 1, 1, 1, 1],
+        ),
+        # a knife edge inside the set stays where it is: .3 opens its interval
+        ([0.3, 0.25, 0.15, 0.15, 0.15], [3, 2, 1, 1, 1]),
+    ],
+)
+def test_knife_edges(ratios, expected):
+    cells = Cells(5)
+    assert cells.tuples[cells.cell_of([ratios])[0]].tolist() == expected
+
+
+def test_every_point_of_the_edge_lattice_finds_a_reachable_neighbour():
+    # All ratio vectors in steps of 1/10, computed the way a program does, each off by up to one rounding step.
+    cells = Cells(4)
+    lattice = np.array([box for box in product(range(11), repeat=4) if sum(box) == 10]) / 10
+    for ratios in (lattice, np.nextafter(lattice, 0), np.nextafter(lattice, 1)):
+        tuples = cells.tuples[cells.cell_of(ratios)]
+        assert (np.abs(tuples - lattice * 10) <= 1 + 1e-9).all()
+
+
+def test_edges_of_other_intervals_are_exact():
+    # floor(1/49 * 49) = 0 in float64; the edge belongs to interval 1
+    cells = Cells(2, 49)
+    assert cells.tuples[cells.cell_of([[1 / 49, 48 / 49]])[0]].tolist() == [1, 47]
+
+
+def test_collision_bit_selects_the_upper_half():
+    cells = Cells(5, collision_bit=True)
+    ratios = [[0.25, 0.25, 0.25, 0.15, 0.1]] * 2
+    without, with_collision = cells.cell_of(ratios, [False, True])
+    assert with_collision == without + 1750
+    assert cells.describe(int(with_collision)).endswith("with collision")
+    assert not cells.are_neighbours([without], [with_collision])[0]
+    with pytest.raises(ValueError, match="collided must be given"):
+        cells.cell_of(ratios)
+
+
+def test_neighbours():
+    cells = Cells(3)
+
+    def cell(*ratios: float) -> int:
+        return int(cells.cell_of([ratios])[0])
+
+    here = cell(0.35, 0.35, 0.30)
+    assert cells.are_neighbours([here], [here])[0]
+    assert cells.are_neighbours([here], [cell(0.45, 0.30, 0.25)])[0]
+    assert not cells.are_neighbours([here], [cell(0.55, 0.25, 0.20)])[0]
+
+
+@pytest.mark.parametrize("ratios", [[[0.5, 0.6]], [[-0.1, 1.1]], [[np.nan, 1.0]], [[0.5, 0.25, 0.25]], [0.5, 0.5]])
+def test_ratios_that_are_none_are_refused(ratios):
+    with pytest.raises(ValueError, match="ratios must"):
+        Cells(2).cell_of(ratios)
+
+
+def test_descriptors_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="num_ratios must be at least 2, got 1"):
+        Cells(1)
+    with pytest.raises(ValueError, match="intervals must be at least 1, got 0"):
+        Cells(5, 0)
