@@ -1,0 +1,143 @@
+"""Fitness: how hard, and how reliably hard, a terrain is for the controller (the paper's fitness equation)."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.descriptors import Cells, terrain_ratios
+
+if TYPE_CHECKING:
+    from sim.rollout import RolloutResult
+
+FITNESS_FLOOR = -20.0
+"""Fitness an invalid terrain is told with; an elite's is above it, so that every elite adds to the QD score."""
+MAX_INVALID_SHARE = 0.25
+"""A terrain with more than this share of invalid episodes is invalid."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitnessCfg:
+    """Weights of the fitness, and the penalties that count."""
+
+    penalties: tuple[str, ...]
+    """Names of the penalties, in the order of the ratios."""
+    scales: tuple[float, ...]
+    """Scale of each penalty: raw sums are divided by it."""
+    alpha: float = 1.0
+    """Weight of the standard deviations."""
+    lam: float = 2.0
+    """Weight of the share of episodes without a base collision."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What a search knows of T evaluated terrains; statistics are over valid episodes, penalties are scaled."""
+
+    fitness: NDArray[np.float64]
+    """Shape (T,)."""
+    ratios: NDArray[np.float64]
+    """Shape (T, P); each row sums to 1."""
+    cell: NDArray[np.int64]
+    """Reachable cell of the ratios, shape (T,)."""
+    penalty_mean: NDArray[np.float64]
+    """Shape (T, P)."""
+    penalty_std: NDArray[np.float64]
+    """Shape (T, P), ddof 0."""
+    collision_rate: NDArray[np.float64]
+    """Share of episodes with a base collision, shape (T,)."""
+    goal_rate: NDArray[np.float64]
+    """Share of episodes that reached the goal, shape (T,)."""
+    fallen_rate: NDArray[np.float64]
+    """Share of episodes that ended tilted by more than 60 degrees, shape (T,)."""
+    invalid_episodes: NDArray[np.int64]
+    """Episodes left out, shape (T,)."""
+    episodes: NDArray[np.int64]
+    """Episodes run, the invalid ones included, shape (T,)."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether a terrain's numbers mean anything, shape (T,)."""
+        return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes
+
+
+def paper_fitness(
+    mean: NDArray[np.float64], std: NDArray[np.float64], collision_rate: NDArray[np.float64], cfg: FitnessCfg
+) -> NDArray[np.float64]:
+    """The paper's fitness: sum of means - alpha * sum of standard deviations - lambda * u.
+
+    u is the share of episodes without a base collision, and 0 where no episode has one.
+
+    Args:
+        mean: Mean of each scaled penalty, shape (T, P).
+        std: Standard deviation of each, shape (T, P).
+        collision_rate: Share of episodes with a base collision, shape (T,).
+        cfg: alpha and lambda.
+
+    Returns:
+        Fitness, shape (T,).
+    """
+    inconsistency = np.where(collision_rate > 0.0, 1.0 - collision_rate, 0.0)
+    return mean.sum(axis=1) - cfg.alpha * std.sum(axis=1) - cfg.lam * inconsistency
+
+
+def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Evaluation:
+    """Fitness, ratios, cells and rates of the terrains of a rollout.
+
+    Args:
+        result: Episodes of T terrains x R replicas.
+        cells: The archive's cells; one ratio a penalty of ``cfg``.
+        cfg: Penalties, their scales and the weights.
+
+    Returns:
+        The evaluation. An invalid terrain has fitness -20, equal ratios and otherwise zeros, never NaN.
+
+    Raises:
+        ValueError: If the rollout lacks a penalty of ``cfg``, or scales are not positive, one a penalty.
+    """
+    penalties = _scaled_penalties(result, cfg)
+    episode_valid = ~np.asarray(result.invalid, dtype=bool) & np.isfinite(penalties).all(axis=2)
+    num_terrains, num_replicas = episode_valid.shape
+    invalid_episodes = num_replicas - episode_valid.sum(axis=1)
+    terrain_valid = invalid_episodes <= MAX_INVALID_SHARE * num_replicas
+    episode_valid &= terrain_valid[:, None]
+
+    mean = _mean(penalties, episode_valid)
+    std = np.sqrt(_mean((penalties - mean[:, None]) ** 2, episode_valid))
+    collision_rate = _rate(result.base_collision, episode_valid)
+    ratios = terrain_ratios(penalties, episode_valid)
+    return Evaluation(
+        fitness=np.where(terrain_valid, paper_fitness(mean, std, collision_rate, cfg), FITNESS_FLOOR),
+        ratios=ratios,
+        cell=cells.cell_of(ratios, collision_rate > 0.0),
+        penalty_mean=mean,
+        penalty_std=std,
+        collision_rate=collision_rate,
+        goal_rate=_rate(result.reached_goal, episode_valid),
+        fallen_rate=_rate(result.fallen, episode_valid),
+        invalid_episodes=invalid_episodes,
+        episodes=np.full(num_terrains, num_replicas),
+    )
+
+
+def _scaled_penalties(result: "RolloutResult", cfg: FitnessCfg) -> NDArray[np.float64]:
+    """Penalties of ``cfg`` divided by their scales, shape (T, R, P)."""
+    missing = [name for name in cfg.penalties if name not in result.penalty_names]
+    if missing:
+        raise ValueError(f"no penalty named {', '.join(missing)}: the rollout has {', '.join(result.penalty_names)}")
+    if len(cfg.scales) != len(cfg.penalties) or not all(0.0 < scale < np.inf for scale in cfg.scales):
+        raise ValueError(f"scales must be one positive number a penalty {cfg.penalties}, got {cfg.scales}")
+    columns = [result.penalty_names.index(name) for name in cfg.penalties]
+    return np.asarray(result.penalties, dtype=np.float64)[:, :, columns] / np.asarray(cfg.scales)
+
+
+def _mean(values: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Mean over the valid episodes of values of shape (T, R, P); zeros where there are none."""
+    kept = np.where(valid[:, :, None], values, 0.0)
+    return kept.sum(axis=1) / np.maximum(valid.sum(axis=1), 1)[:, None]
+
+
+def _rate(flags: NDArray[np.bool_], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Share of the valid episodes, shape (T, R), that have a flag; zeros where there are none."""
+    return (np.asarray(flags, dtype=bool) & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)

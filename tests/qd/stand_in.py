@@ -1,0 +1,54 @@
+"""A cheap, deterministic stand-in for the simulation: genes and seeds in, a result shaped like a rollout's out."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
+SCALES = (1.0, 2.0, 1.0, 4.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Result:
+    """The fields of a rollout's result that the search reads; leading axes (terrain, replica)."""
+
+    penalties: np.ndarray
+    penalty_names: tuple[str, ...]
+    base_collision: np.ndarray
+    reached_goal: np.ndarray
+    fallen: np.ndarray
+    invalid: np.ndarray
+    physics_steps: int = 4000
+    wall_s: float = 0.5
+
+
+def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES) -> Result:
+    """A result with given penalties, shape (T, R, P); nothing else happened unless said."""
+    penalties = np.asarray(penalties, dtype=np.float64)
+    never = np.zeros(penalties.shape[:2], dtype=bool)
+    return Result(
+        penalties=penalties,
+        penalty_names=tuple(names[: penalties.shape[2]]),
+        base_collision=never if base_collision is None else np.asarray(base_collision, dtype=bool),
+        reached_goal=~never,
+        fallen=never,
+        invalid=never if invalid is None else np.asarray(invalid, dtype=bool),
+    )
+
+
+def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> Result:
+    """Penalties that differ between terrains by their genes and between replicas by their seed."""
+    genes = np.asarray(genes, dtype=np.float64)
+    hardness = np.stack([np.abs(genes[:, k::6]).mean(axis=1) for k in range(6)], axis=1)
+    noise = np.stack([np.random.default_rng(int(seed)).uniform(0.9, 1.1, size=(num_replicas, 6)) for seed in seeds])
+    penalties = 4.0 * hardness[:, None] ** 3 * noise * SCALES
+    collides = (genes[:, 7] > 0.3)[:, None] & (noise[:, :, 0] > 0.95)
+    return make_result(penalties, base_collision=collides)
+
+
+@contextmanager
+def open_stand_in(*, num_replicas: int = 4, **_: object) -> Iterator:
+    """Opened like the real evaluator."""
+    yield lambda genes, seeds: evaluate(genes, seeds, num_replicas)

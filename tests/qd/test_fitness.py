@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+
+from qd.descriptors import Cells
+from qd.fitness import FitnessCfg, evaluation_of
+from tests.qd.stand_in import make_result
+
+CFG = FitnessCfg(penalties=("yaw_rate", "vel_x"), scales=(1.0, 10.0))
+CELLS = Cells(2)
+
+
+def test_fitness_by_hand():
+    # scaled penalties of four episodes: (1, 2), (3, 2), (1, 6), (3, 2); the second episode collides
+    # means 2 and 3; standard deviations (ddof 0): 1, and sqrt(((-1)^2 + (-1)^2 + 3^2 + (-1)^2) / 4) = sqrt(3)
+    # u = 3 of 4 without collision: f = (2 + 3) - 1 * (1 + sqrt(3)) - 2 * .75
+    result = make_result([[[1, 20], [3, 20], [1, 60], [3, 20]]], base_collision=[[False, True, False, False]])
+    evaluation = evaluation_of(result, CELLS, CFG)
+    assert evaluation.fitness[0] == pytest.approx(5.0 - (1.0 + 3.0**0.5) - 1.5)
+    assert evaluation.penalty_mean.tolist() == [[2.0, 3.0]]
+    assert evaluation.penalty_std[0] == pytest.approx([1.0, 3.0**0.5])
+    assert evaluation.collision_rate.tolist() == [0.25]
+    # ratios (1/3, 2/3), (3/5, 2/5), (1/7, 6/7), (3/5, 2/5)
+    assert evaluation.ratios[0, 0] == pytest.approx((1 / 3 + 3 / 5 + 1 / 7 + 3 / 5) / 4)
+    assert CELLS.tuples[evaluation.cell[0]].tolist() == [4, 5]
+
+
+def test_weights_are_settings():
+    result = make_result([[[1, 20], [3, 20]]], base_collision=[[False, True]])
+    cfg = FitnessCfg(penalties=CFG.penalties, scales=CFG.scales, alpha=0.5, lam=4.0)
+    assert evaluation_of(result, CELLS, cfg).fitness[0] == pytest.approx(4.0 - 0.5 * 1.0 - 4.0 * 0.5)
+
+
+@pytest.mark.parametrize(("collided", "inconsistency"), [(0, 0.0), (1, 0.75), (3, 0.25), (4, 0.0)])
+def test_consistent_terrains_are_not_punished(collided, inconsistency):
+    # identical episodes: no spread, so the fitness is 1 + 1 - 2 u; u is 0 if none collides and if all do
+    collides = [[k < collided for k in range(4)]]
+    result = make_result([[[1, 10]] * 4], base_collision=collides)
+    assert evaluation_of(result, CELLS, CFG).fitness[0] == pytest.approx(2.0 - 2.0 * inconsistency)
+
+
+def test_an_invalid_episode_counts_nowhere():
+    nan = float("nan")
+    result = make_result(
+        [[[1, 20], [3, 20], [nan, nan], [3, 20]]],
+        base_collision=[[False, True, True, False]],
+        invalid=[[False, False, True, False]],
+    )
+    evaluation = evaluation_of(result, CELLS, CFG)
+    without = evaluation_of(make_result([[[1, 20], [3, 20], [3, 20]]], base_collision=[[0, 1, 0]]), CELLS, CFG)
+    assert evaluation.fitness == without.fitness
+    assert evaluation.ratios.tolist() == without.ratios.tolist()
+    assert evaluation.collision_rate.tolist() == [1 / 3]
+    assert (evaluation.invalid_episodes.tolist(), evaluation.episodes.tolist()) == ([1], [4])
+
+
+def test_a_penalty_that_is_not_finite_makes_its_episode_invalid():
+    result = make_result([[[1, 20], [np.inf, 20], [3, 20], [3, 20]]])
+    evaluation = evaluation_of(result, CELLS, CFG)
+    assert evaluation.invalid_episodes.tolist() == [1]
+    assert np.isfinite(evaluation.fitness).all()
+
+
+@pytest.mark.parametrize(("num_invalid", "valid"), [(5, True), (6, False), (20, False)])
+def test_more_than_a_quarter_of_invalid_episodes_make_a_terrain_invalid(num_invalid, valid):
+    invalid = np.arange(20)[None] < num_invalid
+    penalties = np.where(invalid[..., None], np.nan, 1.0) * [1.0, 30.0]
+    evaluation = evaluation_of(make_result(penalties, base_collision=~invalid, invalid=invalid), CELLS, CFG)
+    assert evaluation.valid.tolist() == [valid]
+    assert evaluation.fitness[0] == pytest.approx(4.0 if valid else -20.0)
+    assert evaluation.ratios[0] == pytest.approx([0.25, 0.75] if valid else [0.5, 0.5])
+    assert evaluation.collision_rate.tolist() == [1.0 if valid else 0.0]
+    assert evaluation.invalid_episodes.tolist() == [num_invalid]
+    assert all(np.isfinite(value).all() for value in vars(evaluation).values())
+
+
+def test_collision_bit_needs_one_collision_in_a_valid_episode():
+    cells = Cells(2, collision_bit=True)
+    invalid = [[True, False, False, False]] * 2
+    collides = [[True, False, False, False], [False, False, True, False]]
+    result = make_result([[[1, 10]] * 4] * 2, base_collision=collides, invalid=invalid)
+    assert (evaluation_of(result, cells, CFG).cell >= len(cells.tuples)).tolist() == [False, True]
+
+
+def test_penalties_are_found_by_name():
+    result = make_result([[[7, 10, 1]] * 4], names=("stumble", "vel_x", "yaw_rate"))
+    assert evaluation_of(result, CELLS, CFG).penalty_mean.tolist() == [[1.0, 1.0]]
+    with pytest.raises(ValueError, match=r"no penalty named yaw_rate: the rollout has stumble, vel_x"):
+        evaluation_of(make_result([[[7, 10]] * 4], names=("stumble", "vel_x")), CELLS, CFG)
+
+
+@pytest.mark.parametrize("scales", [(1.0,), (1.0, 0.0), (1.0, float("nan"))])
+def test_scales_must_be_positive_one_a_penalty(scales):
+    cfg = FitnessCfg(penalties=CFG.penalties, scales=scales)
+    with pytest.raises(ValueError, match="scales must be one positive number a penalty"):
+        evaluation_of(make_result([[[1, 10]] * 4]), CELLS, cfg)
