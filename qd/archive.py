@@ -1,0 +1,153 @@
+"""The archive of a search as data: terrains that break the controller, one a cell, and the file that holds them.
+
+Reading an archive needs NumPy alone, so that training and figures do not depend on the search's libraries.
+"""
+
+import io
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.descriptors import Cells
+from qd.files import write_atomically
+from qd.fitness import FITNESS_FLOOR
+from qd.space import NUM_GENES
+
+ARCHIVE_FILE = "archive.npz"
+"""Name of the archive in a run directory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Archive:
+    """Elites in order of descending fitness: elite 0 is the worst terrain for the robot.
+
+    Statistics are over the valid episodes of the evaluation that found the elite; penalties are scaled.
+    """
+
+    robot: str
+    penalties: tuple[str, ...]
+    """Names of the P penalties, in the order of the ratios."""
+    scales: tuple[float, ...]
+    """What raw penalty sums were divided by."""
+    intervals: int
+    """Intervals of each ratio."""
+    collision_bit: bool
+    """Whether base collision is a descriptor too."""
+    iterations: int
+    """Iterations the search had done."""
+    genes: NDArray[np.float32]
+    """Clipped genes, shape (N, 64)."""
+    ratios: NDArray[np.float64]
+    """Shape (N, P)."""
+    cell: NDArray[np.int64]
+    """Reachable cell, shape (N,)."""
+    fitness: NDArray[np.float64]
+    """Shape (N,)."""
+    penalty_mean: NDArray[np.float64]
+    """Shape (N, P)."""
+    penalty_std: NDArray[np.float64]
+    """Shape (N, P), ddof 0."""
+    collision_rate: NDArray[np.float64]
+    """Share of episodes with a base collision, shape (N,)."""
+    goal_rate: NDArray[np.float64]
+    """Share of episodes that reached the goal, shape (N,)."""
+    fallen_rate: NDArray[np.float64]
+    """Share of episodes that ended tilted by more than 60 degrees, shape (N,)."""
+    invalid_episodes: NDArray[np.int64]
+    """Episodes left out, shape (N,)."""
+    episodes: NDArray[np.int64]
+    """Episodes run, the invalid ones included, shape (N,)."""
+    iteration: NDArray[np.int64]
+    """Iteration that found the elite, from 1, shape (N,)."""
+
+    def __len__(self) -> int:
+        """Number of elites."""
+        return len(self.fitness)
+
+    @property
+    def cells(self) -> Cells:
+        """The cells that ``cell`` counts in."""
+        return Cells(len(self.penalties), self.intervals, collision_bit=self.collision_bit)
+
+    @property
+    def reachable_coverage(self) -> float:
+        """Filled share of the reachable cells."""
+        return len(self) / self.cells.num_cells
+
+    @property
+    def qd_score(self) -> float:
+        """Sum over the elites of their fitness above the floor of -20."""
+        return float((self.fitness - FITNESS_FLOOR).sum())
+
+    @property
+    def mean_fitness(self) -> float:
+        """Mean fitness of the elites; 0 without any."""
+        return float(self.fitness.mean()) if len(self) else 0.0
+
+
+_SETTINGS = ("robot", "penalties", "scales", "intervals", "collision_bit", "iterations")
+PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in _SETTINGS)
+"""Names of the arrays that have one row an elite."""
+
+
+def write_archive(path: Path, archive: Archive) -> None:
+    """Writes an archive as a compressed npz; equal archives give equal bytes.
+
+    Args:
+        path: File to write, atomically.
+        archive: What to write.
+    """
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **{field.name: np.asarray(getattr(archive, field.name)) for field in fields(Archive)})
+    write_atomically(path, buffer.getvalue())
+
+
+def read_archive(path: str | Path) -> Archive:
+    """Reads an archive; data only, nothing in the file can run.
+
+    Args:
+        path: ``archive.npz``, or the run directory that holds it.
+
+    Returns:
+        The archive.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        ValueError: If the file is damaged or no archive.
+    """
+    path = Path(path)
+    file = path / ARCHIVE_FILE if path.is_dir() else path
+    if not file.exists():
+        raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            content = {field.name: data[field.name] for field in fields(Archive)}
+    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"{file} must be the archive of a search, but it is damaged or another file: {error}"
+        ) from None
+    archive = Archive(**{name: _from_array(name, value) for name, value in content.items()})
+    _check(archive, file)
+    return archive
+
+
+def _from_array(name: str, value: NDArray) -> object:
+    """A field as the dataclass wants it: settings as Python values, arrays as they are."""
+    if name not in _SETTINGS:
+        return value
+    return tuple(value.tolist()) if value.ndim else value.item()
+
+
+def _check(archive: Archive, file: Path) -> None:
+    num_elites, num_penalties = len(archive.genes), len(archive.penalties)
+    columns = {"genes": NUM_GENES, "ratios": num_penalties, "penalty_mean": num_penalties, "penalty_std": num_penalties}
+    for name in PER_ELITE:
+        expected = (num_elites, columns[name]) if name in columns else (num_elites,)
+        actual = getattr(archive, name).shape
+        if actual != expected:
+            raise ValueError(
+                f"{file}: {name} must have shape {expected}, got {actual}: the file is no archive of a search"
+            )
