@@ -1,0 +1,73 @@
+"""Base pose and velocity of a robot, from the joint coordinates Newton keeps.
+
+Row layout of ``joint_q``: base position (3), base quaternion xyzw (4), joints; of ``joint_qd``: velocity of the base's
+centre of mass (3) and angular velocity (3), both in the world frame, joints.
+"""
+
+import warp as wp
+
+
+@wp.func
+def base_position(joint_q: wp.array2d[float], env: int) -> wp.vec3:
+    """Position of the base link's origin, world-local frame [m]."""
+    return wp.vec3(joint_q[env, 0], joint_q[env, 1], joint_q[env, 2])
+
+
+@wp.func
+def base_rotation(joint_q: wp.array2d[float], env: int) -> wp.quat:
+    """Rotation of the base link, base to world frame."""
+    return wp.quat(joint_q[env, 3], joint_q[env, 4], joint_q[env, 5], joint_q[env, 6])
+
+
+@wp.func
+def base_yaw(joint_q: wp.array2d[float], env: int) -> float:
+    """Heading of the base's x axis in the world's horizontal plane [rad]."""
+    x = joint_q[env, 3]
+    y = joint_q[env, 4]
+    z = joint_q[env, 5]
+    w = joint_q[env, 6]
+    return wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+@wp.func
+def base_ang_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], env: int) -> wp.vec3:
+    """Angular velocity of the base in its own frame [rad/s]."""
+    return wp.quat_rotate_inv(
+        base_rotation(joint_q, env), wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
+    )
+
+
+@wp.func
+def base_lin_vel_b(
+    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_com: wp.vec3, env: int
+) -> wp.vec3:
+    """Velocity of the base link's origin in the base frame [m/s]; ``base_com`` is the mass centre in that frame [m]."""
+    of_com = wp.quat_rotate_inv(
+        base_rotation(joint_q, env), wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
+    )
+    return of_com - wp.cross(base_ang_vel_b(joint_q, joint_qd, env), base_com)
+
+
+@wp.func
+def projected_gravity(joint_q: wp.array2d[float], env: int) -> wp.vec3:
+    """Unit vector of gravity in the base frame: (0, 0, -1) when upright."""
+    return wp.quat_rotate_inv(base_rotation(joint_q, env), wp.vec3(0.0, 0.0, -1.0))
+
+
+@wp.func
+def wrap_angle(angle: float) -> float:
+    """The angle in [-pi, pi] [rad]."""
+    return wp.atan2(wp.sin(angle), wp.cos(angle))
+
+
+@wp.func
+def state_is_invalid(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], env: int, max_speed: float) -> bool:
+    """True where a coordinate is not finite or any velocity exceeds ``max_speed`` [m/s or rad/s]."""
+    invalid = bool(False)
+    for k in range(joint_q.shape[1]):
+        if not wp.isfinite(joint_q[env, k]):
+            invalid = True
+    for k in range(joint_qd.shape[1]):
+        if not (wp.abs(joint_qd[env, k]) <= max_speed):
+            invalid = True
+    return invalid

@@ -1,0 +1,292 @@
+"""A crossing on the device: randomised start, goal command, and the latch that ends an episode once and for all."""
+
+from enum import IntEnum
+from typing import Any
+
+import warp as wp
+
+from kernels.base_state import base_position, base_yaw, state_is_invalid, wrap_angle
+from kernels.heightfield import Terrain, node_height
+from kernels.penalties import max_base_force
+
+
+class Outcome(IntEnum):
+    """How an episode ended."""
+
+    RUNNING = 0
+    GOAL = 1
+    BASE_COLLISION = 2
+    TIME_OUT = 3
+    OUT = 4
+    INVALID = 5
+
+
+_RUNNING = wp.constant(int(Outcome.RUNNING))
+_GOAL = wp.constant(int(Outcome.GOAL))
+_BASE_COLLISION = wp.constant(int(Outcome.BASE_COLLISION))
+_TIME_OUT = wp.constant(int(Outcome.TIME_OUT))
+_OUT = wp.constant(int(Outcome.OUT))
+_INVALID = wp.constant(int(Outcome.INVALID))
+
+
+@wp.struct
+class StartRanges:
+    """Randomised start of an episode: half widths round the nominal start, uniform."""
+
+    position: wp.vec2
+    """Nominal start, world-local x, y [m]."""
+    position_range: float
+    yaw_range: float
+    joint_scale_range: float
+    """Joint angles are the default pose times 1 +- this."""
+    velocity_range: float
+    """Each component of the base's linear [m/s] and angular [rad/s] velocity, world frame."""
+    base_height: float
+    """Base height over the highest ground under the robot [m]."""
+    footprint: wp.vec2
+    """Half length and half width of the ground looked at [m]."""
+
+
+@wp.struct
+class Task:
+    """Goal, speed and limits of a crossing."""
+
+    goal: wp.vec2
+    goal_radius: float
+    speed: float
+    """Commanded speed [m/s]."""
+    yaw_gain: float
+    max_yaw_rate: float
+    lower: wp.vec2
+    """World-local corner of the allowed area [m]; leaving it ends the episode as OUT."""
+    upper: wp.vec2
+    max_steps: int
+    """Physics steps of the longest episode."""
+    first_counted_step: int
+    """Penalties count from this physics step on."""
+    base_force: float
+    """Contact force on the base that counts as a collision [N]."""
+    max_speed: float
+    """Any velocity beyond is invalid [m/s or rad/s]."""
+    overflow_mask: int
+    """Solver overflow bits that make an episode invalid."""
+
+
+@wp.struct
+class EpisodeState:
+    """Progress of each environment's episode, shape (num_envs,) each."""
+
+    outcome: wp.array[int]
+    steps: wp.array[int]
+    """Physics steps made up to the end."""
+    counted: wp.array[int]
+    """1 if the step just made counts for the penalties."""
+    final_pose: wp.array[wp.transform]
+    """Base pose at the end, world-local frame."""
+    num_running: wp.array[int]
+    """Episodes not yet ended, shape (1,)."""
+
+
+@wp.func
+def _highest_ground(terrain: Terrain, t: int, centre: wp.vec2, half: wp.vec2) -> float:
+    col0 = int(wp.floor((centre[0] - half[0]) / terrain.spacing))
+    col1 = int(wp.ceil((centre[0] + half[0]) / terrain.spacing))
+    row0 = int(wp.floor((centre[1] - half[1]) / terrain.spacing))
+    row1 = int(wp.ceil((centre[1] + half[1]) / terrain.spacing))
+    highest = node_height(terrain, t, row0, col0)
+    for row in range(row0, row1 + 1):
+        for col in range(col0, col1 + 1):
+            highest = wp.max(highest, node_height(terrain, t, row, col))
+    return highest
+
+
+@wp.kernel
+def _start_episodes_kernel(
+    seed_of_terrain: wp.array[wp.uint32],
+    terrain_of_env: wp.array[int],
+    num_replicas: int,
+    terrain: Terrain,
+    ranges: StartRanges,
+    base_com: wp.vec3,
+    default_joint_pos: wp.array[float],
+    joint_q_out: wp.array2d[float],
+    joint_qd_out: wp.array2d[float],
+    episode_out: EpisodeState,
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    t = terrain_of_env[env]
+    # The stream depends on the terrain's seed and the replica alone: sharding terrains changes no episode.
+    rng = wp.rand_init(int(seed_of_terrain[t]), env % num_replicas)
+    x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
+    ground = _highest_ground(terrain, t, wp.vec2(x, y), ranges.footprint)
+    joint_q_out[env, 0] = x
+    joint_q_out[env, 1] = y
+    joint_q_out[env, 2] = ranges.base_height + ground
+    joint_q_out[env, 3] = 0.0
+    joint_q_out[env, 4] = 0.0
+    joint_q_out[env, 5] = wp.sin(half_yaw)
+    joint_q_out[env, 6] = wp.cos(half_yaw)
+    for j in range(default_joint_pos.shape[0]):
+        joint_q_out[env, 7 + j] = default_joint_pos[j] * (1.0 + ranges.joint_scale_range * wp.randf(rng, -1.0, 1.0))
+        joint_qd_out[env, 6 + j] = 0.0
+    v = ranges.velocity_range
+    lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))
+    of_com = lin_vel + wp.cross(ang_vel, wp.quat_rotate(rotation, base_com))
+    for k in range(3):
+        joint_qd_out[env, k] = of_com[k]
+        joint_qd_out[env, 3 + k] = ang_vel[k]
+    episode_out.outcome[env] = _RUNNING
+    episode_out.steps[env] = 0
+    episode_out.counted[env] = 0
+    episode_out.final_pose[env] = wp.transform_identity()
+    wp.atomic_add(episode_out.num_running, 0, 1)
+
+
+def start_episodes(
+    seed_of_terrain: Any, terrain_of_env: Any, num_replicas: int, terrain: Terrain, ranges: StartRanges,
+    base_com: wp.vec3, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, episode_out: EpisodeState,
+) -> None:  # fmt: skip
+    """Put every robot at its randomised start; replica r of terrain t draws from the stream (seed of t, r).
+
+    Args:
+        seed_of_terrain: uint32 seeds, shape (num_terrains,).
+        terrain_of_env: Terrain of each environment, shape (num_envs,).
+        num_replicas: Episodes a terrain; the replica of an environment is ``env % num_replicas``.
+        terrain: Height grids.
+        ranges: Nominal start and ranges.
+        base_com: Mass centre of the base in its frame [m].
+        default_joint_pos: Default pose [rad], shape (num_joints,).
+        joint_q_out: Shape (num_envs, 7 + num_joints).
+        joint_qd_out: Shape (num_envs, 6 + num_joints).
+        episode_out: Set to running, zero steps.
+    """
+    episode_out.num_running.zero_()
+    wp.launch(
+        _start_episodes_kernel,
+        dim=terrain_of_env.shape[0],
+        inputs=[seed_of_terrain, terrain_of_env, num_replicas, terrain, ranges, base_com, default_joint_pos],
+        outputs=[joint_q_out, joint_qd_out, episode_out],
+        device=joint_q_out.device,
+    )
+
+
+@wp.func
+def goal_command(position: wp.vec2, yaw: float, task: Task) -> wp.vec3:
+    """Velocity toward the goal in the yaw frame [m/s] and the yaw rate that turns the robot to it [rad/s]."""
+    to_goal = task.goal - position
+    error = wrap_angle(wp.atan2(to_goal[1], to_goal[0]) - yaw)
+    return wp.vec3(
+        task.speed * wp.cos(error),
+        task.speed * wp.sin(error),
+        wp.clamp(task.yaw_gain * error, -task.max_yaw_rate, task.max_yaw_rate),
+    )
+
+
+@wp.kernel
+def _command_goal_kernel(
+    joint_q: wp.array2d[float], outcome: wp.array[int], task: Task, command_out: wp.array2d[float]
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    command = wp.vec3(0.0)
+    if outcome[env] == _RUNNING:
+        command = goal_command(wp.vec2(joint_q[env, 0], joint_q[env, 1]), base_yaw(joint_q, env), task)
+    for k in range(3):
+        command_out[env, k] = command[k]
+
+
+def command_goal(joint_q: Any, outcome: Any, task: Task, command_out: Any) -> None:
+    """Write each environment's command, zero once its episode has ended; shape (num_envs, 3)."""
+    wp.launch(
+        _command_goal_kernel,
+        dim=outcome.shape[0],
+        inputs=[joint_q, outcome, task],
+        outputs=[command_out],
+        device=joint_q.device,
+    )
+
+
+@wp.func
+def judge_step(
+    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_force: float, overflow: int, steps: int,
+    task: Task, env: int,
+) -> int:  # fmt: skip
+    """Outcome of an episode after its ``steps``-th physics step; the gravest of several wins."""
+    if (overflow & task.overflow_mask) != 0 or state_is_invalid(joint_q, joint_qd, env, task.max_speed):
+        return _INVALID
+    if base_force > task.base_force:
+        return _BASE_COLLISION
+    position = base_position(joint_q, env)
+    if wp.length(task.goal - wp.vec2(position[0], position[1])) < task.goal_radius:
+        return _GOAL
+    if position[0] < task.lower[0] or position[0] > task.upper[0]:
+        return _OUT
+    if position[1] < task.lower[1] or position[1] > task.upper[1]:
+        return _OUT
+    if steps >= task.max_steps:
+        return _TIME_OUT
+    return _RUNNING
+
+
+@wp.kernel
+def _latch_outcomes_kernel(
+    joint_q: wp.array2d[float],
+    joint_qd: wp.array2d[float],
+    geom_force: wp.array2d[wp.vec3],
+    geom_role: wp.array[int],
+    overflow: wp.array[int],
+    contact_count: wp.array[int],
+    contact_capacity: int,
+    task: Task,
+    episode_out: EpisodeState,
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    episode_out.counted[env] = 0
+    if episode_out.outcome[env] != _RUNNING:
+        return
+    steps = episode_out.steps[env] + 1
+    bits = overflow[env]
+    if contact_count[0] > contact_capacity:
+        bits = task.overflow_mask  # nobody knows whose contacts were dropped, so nobody's episode is trusted
+    outcome = judge_step(joint_q, joint_qd, max_base_force(geom_force, geom_role, env), bits, steps, task, env)
+    episode_out.steps[env] = steps
+    if outcome != _INVALID and steps >= task.first_counted_step:
+        episode_out.counted[env] = 1
+    if outcome != _RUNNING:
+        episode_out.outcome[env] = outcome
+        episode_out.final_pose[env] = wp.transform(
+            base_position(joint_q, env), wp.quat(joint_q[env, 3], joint_q[env, 4], joint_q[env, 5], joint_q[env, 6])
+        )
+        wp.atomic_sub(episode_out.num_running, 0, 1)
+
+
+def latch_outcomes(
+    joint_q: Any, joint_qd: Any, geom_force: Any, geom_role: Any, overflow: Any, contact_count: Any,
+    contact_capacity: int, task: Task, episode_out: EpisodeState,
+) -> None:  # fmt: skip
+    """Judge every running episode after a physics step and latch its end.
+
+    Args:
+        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
+        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
+        geom_force: Contact forces, world frame [N], shape (num_envs, num_geoms).
+        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
+        overflow: Solver overflow bits of the step, shape (num_envs,).
+        contact_count: Terrain contacts found in the step, shape (1,).
+        contact_capacity: Contacts that fit.
+        task: Goal and limits.
+        episode_out: Updated in place.
+    """
+    wp.launch(
+        _latch_outcomes_kernel,
+        dim=overflow.shape[0],
+        inputs=[joint_q, joint_qd, geom_force, geom_role, overflow, contact_count, contact_capacity, task],
+        outputs=[episode_out],
+        device=joint_q.device,
+    )

@@ -1,0 +1,197 @@
+"""The observation row of the target controller (legged_gym's layout) and its action, on the device.
+
+Columns, for J joints and S scan points: base linear velocity (3, base frame, x 2), base angular velocity (3, base frame,
+x 0.25), projected gravity (3), command vx, vy, yaw rate (3, x 2, 2, 0.25), joint positions minus default (J), joint
+rates (J, x 0.05), last action (J), height scan (S): clip(base height - 0.5 m - ground height, -1, 1) x 5.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from kernels.base_state import base_ang_vel_b, base_lin_vel_b, base_yaw, projected_gravity
+from kernels.heightfield import Terrain, height_at
+
+NUM_BASE_COLUMNS = 12
+LIN_VEL_SCALE = wp.constant(2.0)
+ANG_VEL_SCALE = wp.constant(0.25)
+JOINT_VEL_SCALE = wp.constant(0.05)
+SCAN_SCALE = wp.constant(5.0)
+SCAN_OFFSET = wp.constant(0.5)
+ACTION_LIMIT = wp.constant(100.0)
+OBSERVATION_LIMIT = wp.constant(100.0)
+
+
+@wp.struct
+class Sensors:
+    """What the observation of one robot type is made of."""
+
+    default_joint_pos: wp.array[float]
+    """Joint angles of the default pose [rad], shape (num_joints,)."""
+    scan_x: wp.array[float]
+    """Scan points ahead of the base in its yaw frame [m], shape (num_scan_points,)."""
+    scan_y: wp.array[float]
+    """Scan points left of the base in its yaw frame [m], shape (num_scan_points,)."""
+    base_com: wp.vec3
+    """Mass centre of the base in its own frame [m]."""
+
+
+@wp.struct
+class Noise:
+    """Half widths of uniform observation noise, in the units of the measured quantity; all zero for none."""
+
+    lin_vel: float
+    ang_vel: float
+    gravity: float
+    joint_pos: float
+    joint_vel: float
+    scan: float
+
+
+@wp.func
+def _base_column(
+    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], command: wp.array2d[float], sensors: Sensors, env: int, k: int
+) -> float:  # fmt: skip
+    if k < 3:
+        return base_lin_vel_b(joint_q, joint_qd, sensors.base_com, env)[k] * LIN_VEL_SCALE
+    if k < 6:
+        return base_ang_vel_b(joint_q, joint_qd, env)[k - 3] * ANG_VEL_SCALE
+    if k < 9:
+        return projected_gravity(joint_q, env)[k - 6]
+    if k < 11:
+        return command[env, k - 9] * LIN_VEL_SCALE
+    return command[env, 2] * ANG_VEL_SCALE
+
+
+@wp.func
+def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: Sensors, env: int, k: int) -> float:
+    yaw = base_yaw(joint_q, env)
+    x = joint_q[env, 0] + wp.cos(yaw) * sensors.scan_x[k] - wp.sin(yaw) * sensors.scan_y[k]
+    y = joint_q[env, 1] + wp.sin(yaw) * sensors.scan_x[k] + wp.cos(yaw) * sensors.scan_y[k]
+    return wp.clamp(joint_q[env, 2] - SCAN_OFFSET - height_at(terrain, t, x, y), -1.0, 1.0) * SCAN_SCALE
+
+
+@wp.func
+def _noise_width(noise: Noise, k: int, num_joints: int) -> float:
+    if k < 3:
+        return noise.lin_vel * LIN_VEL_SCALE
+    if k < 6:
+        return noise.ang_vel * ANG_VEL_SCALE
+    if k < 9:
+        return noise.gravity
+    if k < NUM_BASE_COLUMNS:
+        return 0.0
+    if k < NUM_BASE_COLUMNS + num_joints:
+        return noise.joint_pos
+    if k < NUM_BASE_COLUMNS + 2 * num_joints:
+        return noise.joint_vel * JOINT_VEL_SCALE
+    if k < NUM_BASE_COLUMNS + 3 * num_joints:
+        return 0.0
+    return noise.scan * SCAN_SCALE
+
+
+@wp.kernel
+def _write_observation_kernel(
+    joint_q: wp.array2d[float],
+    joint_qd: wp.array2d[float],
+    command: wp.array2d[float],
+    last_action: wp.array2d[float],
+    terrain_of_env: wp.array[int],
+    terrain: Terrain,
+    sensors: Sensors,
+    noise: Noise,
+    noise_seed: wp.array[int],
+    observation_out: wp.array2d[float],
+):
+    """Grid (num_envs, num_columns)."""
+    env, k = wp.tid()
+    num_joints = last_action.shape[1]
+    column = float(0.0)
+    joint = k - NUM_BASE_COLUMNS
+    if joint < 0:
+        column = _base_column(joint_q, joint_qd, command, sensors, env, k)
+    elif joint < num_joints:
+        column = joint_q[env, 7 + joint] - sensors.default_joint_pos[joint]
+    elif joint < 2 * num_joints:
+        column = joint_qd[env, 6 + joint - num_joints] * JOINT_VEL_SCALE
+    elif joint < 3 * num_joints:
+        column = last_action[env, joint - 2 * num_joints]
+    else:
+        column = _scan_column(joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
+    width = _noise_width(noise, k, num_joints)
+    if width > 0.0:
+        state = wp.rand_init(noise_seed[0], env * observation_out.shape[1] + k)
+        column += width * wp.randf(state, -1.0, 1.0)
+    observation_out[env, k] = wp.clamp(column, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
+def write_observation(
+    joint_q: Any, joint_qd: Any, command: Any, last_action: Any, terrain_of_env: Any, terrain: Terrain,
+    sensors: Sensors, noise: Noise, noise_seed: Any, observation_out: Any,
+) -> None:  # fmt: skip
+    """Write one observation row an environment (columns: module docstring).
+
+    Args:
+        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
+        joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
+        command: Commanded vx, vy [m/s] in the base's yaw frame and yaw rate [rad/s], shape (num_envs, 3).
+        last_action: Action of the step before, shape (num_envs, num_joints).
+        terrain_of_env: Terrain of each environment, shape (num_envs,).
+        terrain: Height grids.
+        sensors: Default pose, scan points, mass centre.
+        noise: Noise widths.
+        noise_seed: One integer on the device, to be advanced by the caller; shape (1,).
+        observation_out: Shape (num_envs, 12 + 3 * num_joints + num_scan_points).
+
+    Raises:
+        ValueError: If ``observation_out`` has another shape.
+    """
+    num_envs, num_joints = last_action.shape
+    expected = (num_envs, NUM_BASE_COLUMNS + 3 * num_joints + sensors.scan_x.shape[0])
+    if tuple(observation_out.shape) != expected:
+        raise ValueError(f"observation_out must have shape {expected}, got {tuple(observation_out.shape)}")
+    wp.launch(
+        _write_observation_kernel,
+        dim=expected,
+        inputs=[
+            joint_q, joint_qd, command, last_action, terrain_of_env, terrain, sensors, noise, noise_seed,
+        ],
+        outputs=[observation_out],
+        device=joint_q.device,
+    )  # fmt: skip
+
+
+@wp.kernel
+def _apply_action_kernel(
+    action: wp.array2d[float], default_joint_pos: wp.array[float], scale: float,
+    last_action_out: wp.array2d[float], targets_out: wp.array2d[float],
+):  # fmt: skip
+    """Grid (num_envs, num_joints)."""
+    env, joint = wp.tid()
+    clipped = wp.clamp(action[env, joint], -ACTION_LIMIT, ACTION_LIMIT)
+    last_action_out[env, joint] = clipped
+    targets_out[env, 7 + joint] = default_joint_pos[joint] + scale * clipped
+
+
+def apply_action(action: Any, sensors: Sensors, scale: float, last_action_out: Any, targets_out: Any) -> None:
+    """Turn actions into joint position targets [rad]: default pose + ``scale`` * clip(action, -100, 100).
+
+    Args:
+        action: Policy output, shape (num_envs, num_joints).
+        sensors: Holds the default pose.
+        scale: Radians per unit of action.
+        last_action_out: The clipped action, shape (num_envs, num_joints).
+        targets_out: Targets in columns 7 and up, shape (num_envs, 7 + num_joints).
+
+    Raises:
+        ValueError: If ``action`` has another shape than ``last_action_out``.
+    """
+    if tuple(action.shape) != tuple(last_action_out.shape):
+        raise ValueError(f"action must have shape {tuple(last_action_out.shape)}, got {tuple(action.shape)}")
+    wp.launch(
+        _apply_action_kernel,
+        dim=action.shape,
+        inputs=[action, sensors.default_joint_pos, scale],
+        outputs=[last_action_out, targets_out],
+        device=action.device,
+    )

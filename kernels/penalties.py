@@ -1,0 +1,207 @@
+"""Contact force of every geom, and the raw penalties of one physics step (the paper's section III-B), on the device."""
+
+from typing import Any
+
+import warp as wp
+
+from kernels.base_state import base_ang_vel_b, base_lin_vel_b
+
+PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
+"""Columns of the penalty sums."""
+
+BASE = 1
+FOOT = 2
+LIMB = 4
+"""Role bits of a geom: its touch ends the episode; it walks; its touch is penalised."""
+
+STUMBLE_RATIO = wp.constant(5.0)
+COLLISION_FORCE = wp.constant(0.1)
+
+
+@wp.struct
+class SolverContacts:
+    """Contacts and constraint forces of the last solver step, as mujoco_warp keeps them for pyramidal friction cones."""
+
+    count: wp.array[int]
+    capacity: int
+    world: wp.array[int]
+    geom: wp.array[wp.vec2i]
+    frame: wp.array[wp.mat33]
+    """Rows: normal (toward the second geom) and two tangents, world frame."""
+    friction: wp.array[wp.types.vector(5, float)]
+    efc_address: wp.array2d[int]
+    """Constraint rows of each contact; negative where the contact is inactive."""
+    efc_force: wp.array2d[float]
+
+
+@wp.func
+def pyramid_force(contacts: SolverContacts, c: int) -> wp.vec3:
+    """Force of a contact on its second geom, world frame [N].
+
+    A pyramidal cone of two tangents has four rows, one an edge ``normal +- mu * tangent``: the normal force is their
+    sum, a tangential force mu times the difference of its pair (MuJoCo, Computation, "Friction cones").
+    """
+    row = contacts.efc_address[c, 0]
+    if row < 0:
+        return wp.vec3(0.0)
+    world = contacts.world[c]
+    edge0 = contacts.efc_force[world, row]
+    edge1 = contacts.efc_force[world, row + 1]
+    edge2 = contacts.efc_force[world, row + 2]
+    edge3 = contacts.efc_force[world, row + 3]
+    local = wp.vec3(
+        edge0 + edge1 + edge2 + edge3,
+        (edge0 - edge1) * contacts.friction[c][0],
+        (edge2 - edge3) * contacts.friction[c][1],
+    )
+    return wp.transpose(contacts.frame[c]) * local
+
+
+@wp.kernel
+def _sum_geom_forces_kernel(
+    contacts: SolverContacts, column_of_geom: wp.array[int], geom_force_out: wp.array2d[wp.vec3]
+):
+    """Grid (contact capacity,)."""
+    c = wp.tid()
+    if c >= wp.min(contacts.count[0], contacts.capacity):
+        return
+    # The robot's geom is second in every contact that kernels.contact writes.
+    column = column_of_geom[contacts.geom[c][1]]
+    if column >= 0:
+        wp.atomic_add(geom_force_out, contacts.world[c], column, pyramid_force(contacts, c))
+
+
+def sum_geom_forces(contacts: SolverContacts, column_of_geom: Any, geom_force_out: Any) -> None:
+    """Sum the contact forces on each robot geom, world frame [N].
+
+    Args:
+        contacts: The solver's contacts and forces of the step just made.
+        column_of_geom: Column of each solver geom, -1 for others, shape (num_solver_geoms,).
+        geom_force_out: Vectors, shape (num_envs, num_geoms); overwritten.
+    """
+    geom_force_out.zero_()
+    wp.launch(
+        _sum_geom_forces_kernel,
+        dim=contacts.capacity,
+        inputs=[contacts, column_of_geom],
+        outputs=[geom_force_out],
+        device=geom_force_out.device,
+    )
+
+
+@wp.func
+def yaw_rate_error(ang_vel_b: wp.vec3, command: wp.vec3) -> float:
+    """Absolute error of the yaw rate [rad/s], base frame."""
+    return wp.abs(ang_vel_b[2] - command[2])
+
+
+@wp.func
+def velocity_error(lin_vel_b: wp.vec3, command: wp.vec3, axis: int) -> float:
+    """Absolute velocity error along an axis of the base frame [m/s]."""
+    return wp.abs(lin_vel_b[axis] - command[axis])
+
+
+@wp.func
+def excess_contact_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], limit: float, env: int) -> float:
+    """Sum over the feet of the contact force beyond ``limit`` [N]."""
+    excess = float(0.0)
+    for g in range(geom_role.shape[0]):
+        if (geom_role[g] & FOOT) != 0:
+            excess += wp.max(0.0, wp.length(geom_force[env, g]) - limit)
+    return excess
+
+
+@wp.func
+def is_stumbling(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env: int) -> float:
+    """1 if the contact force of any foot is more horizontal than 5 to 1 (it hits a vertical surface), else 0."""
+    stumbling = float(0.0)
+    for g in range(geom_role.shape[0]):
+        force = geom_force[env, g]
+        if (geom_role[g] & FOOT) != 0 and wp.length(wp.vec2(force[0], force[1])) > STUMBLE_RATIO * wp.abs(force[2]):
+            stumbling = 1.0
+    return stumbling
+
+
+@wp.func
+def count_collisions(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env: int) -> float:
+    """Number of base and limb geoms touched with more than 0.1 N."""
+    count = float(0.0)
+    for g in range(geom_role.shape[0]):
+        if (geom_role[g] & (BASE | LIMB)) != 0 and wp.length(geom_force[env, g]) > COLLISION_FORCE:
+            count += 1.0
+    return count
+
+
+@wp.func
+def max_base_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env: int) -> float:
+    """Largest contact force on a base geom [N]."""
+    largest = float(0.0)
+    for g in range(geom_role.shape[0]):
+        if (geom_role[g] & BASE) != 0:
+            largest = wp.max(largest, wp.length(geom_force[env, g]))
+    return largest
+
+
+@wp.kernel
+def _add_penalties_kernel(
+    joint_q: wp.array2d[float],
+    joint_qd: wp.array2d[float],
+    base_com: wp.vec3,
+    command: wp.array2d[float],
+    geom_force: wp.array2d[wp.vec3],
+    geom_role: wp.array[int],
+    force_limit: float,
+    dt: float,
+    counted: wp.array[int],
+    sums_out: wp.array2d[float],
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    if counted[env] == 0:
+        return
+    wanted = wp.vec3(command[env, 0], command[env, 1], command[env, 2])
+    lin_vel = base_lin_vel_b(joint_q, joint_qd, base_com, env)
+    ang_vel = base_ang_vel_b(joint_q, joint_qd, env)
+    sums_out[env, 0] += dt * yaw_rate_error(ang_vel, wanted)
+    sums_out[env, 1] += dt * velocity_error(lin_vel, wanted, 0)
+    sums_out[env, 2] += dt * velocity_error(lin_vel, wanted, 1)
+    sums_out[env, 3] += dt * excess_contact_force(geom_force, geom_role, force_limit, env)
+    sums_out[env, 4] += dt * is_stumbling(geom_force, geom_role, env)
+    sums_out[env, 5] += dt * count_collisions(geom_force, geom_role, env)
+
+
+def add_penalties(
+    joint_q: Any, joint_qd: Any, base_com: wp.vec3, command: Any, geom_force: Any, geom_role: Any,
+    force_limit: float, dt: float, counted: Any, sums_out: Any,
+) -> None:  # fmt: skip
+    """Add one physics step's raw penalties times ``dt`` to the sums, columns :data:`PENALTIES`.
+
+    Args:
+        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
+        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
+        base_com: Mass centre of the base in its frame [m].
+        command: Command held over the control step: vx, vy [m/s], yaw rate [rad/s]; shape (num_envs, 3).
+        geom_force: Contact forces, world frame [N], shape (num_envs, num_geoms).
+        geom_role: Role bits, shape (num_geoms,).
+        force_limit: Highest foot contact force that costs nothing [N].
+        dt: Physics step [s].
+        counted: 0 where the step does not count, shape (num_envs,).
+        sums_out: Sums so far, shape (num_envs, 6).
+
+    Raises:
+        ValueError: If ``sums_out`` has not one column a penalty.
+    """
+    if tuple(sums_out.shape) != (counted.shape[0], len(PENALTIES)):
+        raise ValueError(
+            f"sums_out must have shape ({counted.shape[0]}, {len(PENALTIES)}), got {tuple(sums_out.shape)}: "
+            f"one column for each of {', '.join(PENALTIES)}"
+        )
+    wp.launch(
+        _add_penalties_kernel,
+        dim=counted.shape[0],
+        inputs=[
+            joint_q, joint_qd, base_com, command, geom_force, geom_role, force_limit, dt, counted,
+        ],
+        outputs=[sums_out],
+        device=sums_out.device,
+    )  # fmt: skip

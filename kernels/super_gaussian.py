@@ -1,0 +1,93 @@
+"""Genes to heights: mixtures of rotated Super-Gaussians rasterised on the device (the paper's equation 1 and Table I)."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+PARAMETERS = ("mu_x", "mu_y", "sigma_x", "sigma_y", "p_x", "p_y", "theta", "w")
+"""Parameters of one bump in gene order: centre [m], half widths [m], exponents, rotation [rad], height [m]."""
+GENES_PER_BUMP = len(PARAMETERS)
+LOWER = np.array([6.0, 2.0, 0.5, 0.5, 1.0, 1.0, -np.pi, -0.25])
+"""Table I, minimum of each parameter: the value of a gene of -1."""
+UPPER = np.array([10.0, 6.0, 3.0, 3.0, 4.0, 4.0, np.pi, 0.25])
+"""Table I, maximum of each parameter: the value of a gene of 1."""
+
+_bump = wp.types.vector(GENES_PER_BUMP, float)
+
+
+@wp.func
+def _decode_gene(gene: float, lower: float, upper: float) -> float:
+    return lower + (wp.clamp(gene, -1.0, 1.0) + 1.0) * 0.5 * (upper - lower)
+
+
+@wp.func
+def super_gaussian(bump: _bump, x: float, y: float) -> float:
+    """Height [m] one bump adds at (x, y) [m] (equation 1)."""
+    cos_theta = wp.cos(bump[6])
+    sin_theta = wp.sin(bump[6])
+    x_rot = cos_theta * (x - bump[0]) - sin_theta * (y - bump[1])
+    y_rot = sin_theta * (x - bump[0]) + cos_theta * (y - bump[1])
+    across = wp.pow(wp.abs(x_rot) / bump[2], 2.0 * bump[4])
+    along = wp.pow(wp.abs(y_rot) / bump[3], 2.0 * bump[5])
+    return bump[7] * wp.exp(-across - along)
+
+
+@wp.kernel
+def _decode_genes_kernel(genes: wp.array2d[float], lower: _bump, upper: _bump, bumps_out: wp.array2d[_bump]):
+    """Grid (num_terrains, num_bumps)."""
+    t, b = wp.tid()
+    bump = _bump()
+    for k in range(GENES_PER_BUMP):
+        bump[k] = _decode_gene(genes[t, b * GENES_PER_BUMP + k], lower[k], upper[k])
+    bumps_out[t, b] = bump
+
+
+@wp.kernel
+def _rasterise_bumps_kernel(bumps: wp.array2d[_bump], spacing: float, heights_out: wp.array3d[float]):
+    """Grid (num_terrains, nrow, ncol)."""
+    t, row, col = wp.tid()
+    x = float(col) * spacing
+    y = float(row) * spacing
+    height = float(0.0)
+    for b in range(bumps.shape[1]):
+        height += super_gaussian(bumps[t, b], x, y)
+    heights_out[t, row, col] = height
+
+
+def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
+    """Rasterise one Super-Gaussian mixture a terrain (equation 1; genes clipped to [-1, 1], rescaled by Table I).
+
+    Args:
+        genes: Warp array, shape (num_terrains, 8 * num_bumps); per bump in the order of :data:`PARAMETERS`.
+        spacing: Distance of neighbouring grid nodes [m].
+        heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
+
+    Raises:
+        ValueError: If the shapes do not fit each other.
+    """
+    if genes.ndim != 2 or genes.shape[1] == 0 or genes.shape[1] % GENES_PER_BUMP != 0:
+        raise ValueError(
+            f"genes must have shape (batch, 8 * num_bumps), got {tuple(genes.shape)}: one row is num_bumps x 8"
+        )
+    if heights_out.ndim != 3 or heights_out.shape[0] != genes.shape[0]:
+        raise ValueError(
+            f"heights_out must have shape ({genes.shape[0]}, nrow, ncol), got {tuple(heights_out.shape)}: "
+            "one grid per row of genes"
+        )
+    num_bumps = genes.shape[1] // GENES_PER_BUMP
+    bumps = wp.empty((genes.shape[0], num_bumps), dtype=_bump, device=genes.device)
+    wp.launch(
+        _decode_genes_kernel,
+        dim=bumps.shape,
+        inputs=[genes, _bump(*LOWER), _bump(*UPPER)],
+        outputs=[bumps],
+        device=genes.device,
+    )
+    wp.launch(
+        _rasterise_bumps_kernel,
+        dim=heights_out.shape,
+        inputs=[bumps, spacing],
+        outputs=[heights_out],
+        device=genes.device,
+    )

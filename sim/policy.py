@@ -1,0 +1,201 @@
+"""Controllers as black boxes: a batch of observation rows to a batch of actions."""
+
+import importlib
+import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+import warp as wp
+
+from sim.robot import RobotCfg
+
+_FORMATS = (
+    "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), or module:callable (a function on device tensors, "
+    "or a class or factory marked by `faultline_factory = True` that is called with (robot, device))"
+)
+
+
+class Policy(Protocol):
+    """Anything that maps observations to actions."""
+
+    def __call__(self, observation: torch.Tensor) -> torch.Tensor:
+        """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size)."""
+        ...
+
+
+class MlpPolicy(torch.nn.Module):
+    """Multilayer perceptron with ELU between its layers: rsl_rl's ``MLPModel`` without its distribution."""
+
+    def __init__(self, state: dict[str, torch.Tensor]) -> None:
+        """Build from rsl_rl's keys ``mlp.<k>.weight`` / ``.bias`` and, if any, ``obs_normalizer._mean`` / ``._std``."""
+        super().__init__()
+        indices = sorted(int(m.group(1)) for key in state if (m := re.fullmatch(r"mlp\.(\d+)\.weight", key)))
+        layers: list[torch.nn.Module] = []
+        for index in indices:
+            weight = state[f"mlp.{index}.weight"]
+            layer = torch.nn.Linear(weight.shape[1], weight.shape[0])
+            layer.weight.data.copy_(weight)
+            layer.bias.data.copy_(state[f"mlp.{index}.bias"])
+            layers += [layer, torch.nn.ELU()]
+        self.layers = torch.nn.Sequential(*layers[:-1])
+        self.register_buffer("mean", state.get("obs_normalizer._mean", torch.zeros(1)).float())
+        self.register_buffer("std", state.get("obs_normalizer._std", torch.ones(1)).float())
+        self.normalised = "obs_normalizer._mean" in state
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Observation and action size."""
+        linear = [layer for layer in self.layers if isinstance(layer, torch.nn.Linear)]
+        return linear[0].in_features, linear[-1].out_features
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions, shape (num_envs, num_joints)."""
+        if self.normalised:
+            observation = (observation - self.mean) / (self.std + 1e-2)
+        return self.layers(observation)
+
+
+def share_stream(device: str) -> None:
+    """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting."""
+    if device.startswith("cuda"):
+        torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
+
+
+def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
+    """Load a controller and try it on one batch of zeros.
+
+    Files are loaded as data only (``weights_only``; TorchScript holds no Python); code runs only from
+    ``module:callable``.
+
+    Args:
+        spec: An rsl_rl checkpoint, a TorchScript file, or ``module:callable``.
+        robot: The robot it is to walk: fixes observation and action size.
+        device: Warp device name.
+
+    Raises:
+        ValueError: If the controller cannot be loaded, or its actions have the wrong shape or are not finite.
+    """
+    where = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
+    match = re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_][\w.]*)", str(spec))
+    if match and not Path(spec).exists():
+        policy = _import_callable(str(spec), *match.groups(), robot=robot, device=where)
+    else:
+        policy = _load_file(Path(spec), robot, where)
+    _try_policy(policy, robot, where, str(spec))
+    return policy
+
+
+def _import_callable(spec: str, module: str, name: str, *, robot: RobotCfg, device: str) -> Policy:
+    try:
+        target: Any = importlib.import_module(module)
+        for part in name.split("."):
+            target = getattr(target, part)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"policy '{spec}' cannot be imported: {error}; expected {_FORMATS}") from error
+    if not callable(target):
+        raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
+    if getattr(target, "faultline_factory", False):
+        target = target(robot, device)
+    return target
+
+
+def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
+    if not path.is_file():
+        raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError) as error:
+        return _load_script(path, device, error)
+    state = content.get("actor_state_dict") if isinstance(content, dict) else None
+    if not isinstance(state, dict) or "mlp.0.weight" not in state:
+        found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(
+            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', found {found}"
+        )
+    policy = MlpPolicy(state)
+    expected = (robot.observation_size, robot.num_joints)
+    if policy.sizes != expected:
+        raise ValueError(
+            f"policy '{path}' maps {policy.sizes[0]} observations to {policy.sizes[1]} actions, but robot "
+            f"'{robot.name}' has {expected[0]} observations and {expected[1]} joints: use a controller of this robot"
+        )
+    return policy.to(device).eval()
+
+
+def _load_script(path: Path, device: str, reason: Exception) -> Policy:
+    try:
+        return torch.jit.load(str(path), map_location=device).eval()
+    except (RuntimeError, ValueError, OSError) as error:
+        first = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
+        raise ValueError(
+            f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, or "
+            f"holding code): {first}; expected {_FORMATS}"
+        ) from error
+
+
+def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None:
+    observation = torch.zeros((4, robot.observation_size), device=device)
+    expected = (4, robot.num_joints)
+    try:
+        with torch.inference_mode():
+            action = policy(observation)
+    except (RuntimeError, TypeError, ValueError, IndexError) as error:
+        raise ValueError(
+            f"policy '{spec}' failed on observations of shape {tuple(observation.shape)}, which robot '{robot.name}' "
+            f"gives: {str(error).splitlines()[0]}"
+        ) from error
+    if not isinstance(action, torch.Tensor) or tuple(action.shape) != expected:
+        got = tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__
+        raise ValueError(
+            f"policy '{spec}' must return actions of shape (num_envs, {robot.num_joints}) for robot '{robot.name}', "
+            f"got {got} for 4 environments"
+        )
+    if not torch.isfinite(action).all():
+        raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
+
+
+class PolicyRunner:
+    """Runs a policy between two Warp buffers: captured as a CUDA graph where it is a torch module, else called."""
+
+    def __init__(self, policy: Policy, observation: Any, action: Any) -> None:
+        """Bind the buffers.
+
+        Args:
+            policy: The controller.
+            observation: Warp array, shape (num_envs, observation_size).
+            action: Warp array the actions are written to, shape (num_envs, num_joints).
+        """
+        self._policy = policy
+        self._observation = wp.to_torch(observation)
+        self._action = wp.to_torch(action)
+        self._graph: torch.cuda.CUDAGraph | None = None
+        if self._observation.is_cuda and isinstance(policy, torch.nn.Module):
+            self._graph = self._capture()
+
+    def _call(self) -> None:
+        self._action.copy_(self._policy(self._observation))
+
+    @torch.inference_mode()
+    def _capture(self) -> torch.cuda.CUDAGraph:
+        for _ in range(3):
+            self._call()
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=torch.cuda.current_stream()):
+            self._call()
+        return graph
+
+    @torch.inference_mode()
+    def __call__(self) -> None:
+        """Write the actions of the present observations."""
+        if self._graph is not None:
+            self._graph.replay()
+        else:
+            self._call()
+
+
+PolicySpec = str | Path | Callable[[torch.Tensor], torch.Tensor]
+"""A controller by file, by ``module:callable``, or as a callable."""

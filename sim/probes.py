@@ -1,0 +1,103 @@
+"""Collision shapes to strips of sphere probes, close enough that no terrain edge slips between two of them."""
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+
+MAX_SAG = 0.005
+"""Deepest that a sharp ridge may sink between two neighbouring probes [m]."""
+MAX_EDGE_RADIUS = 0.02
+"""Largest probe radius on boxes and cylinders, whose edges the probes round off [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strip:
+    """A straight row of equal spheres on one shape."""
+
+    centres: np.ndarray
+    """Centres in the shape's frame [m], shape (num_probes, 3), in order along the strip."""
+    radius: float
+    """Probe radius [m]."""
+
+
+def max_spacing(radius: float, sag: float = MAX_SAG) -> float:
+    """Largest distance of neighbouring probes between which a sharp ridge sinks at most ``sag`` [m].
+
+    Two spheres of radius r at distance s leave a dent of depth ``r - sqrt(r^2 - s^2 / 4)`` between them.
+    """
+    sag = min(sag, radius)
+    return 2.0 * float(np.sqrt(2.0 * radius * sag - sag * sag))
+
+
+def _line(low: float, high: float, spacing: float) -> np.ndarray:
+    length = high - low
+    if length <= 1e-9:
+        return np.array([0.5 * (low + high)])
+    return np.linspace(low, high, int(np.ceil(length / spacing - 1e-9)) + 1)
+
+
+def _along_z(x: float, y: float, z: np.ndarray) -> np.ndarray:
+    return np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=1)
+
+
+def capsule_strips(radius: float, half_height: float) -> list[Strip]:
+    """One strip along the axis (z); exact at the caps."""
+    return [Strip(centres=_along_z(0.0, 0.0, _line(-half_height, half_height, max_spacing(radius))), radius=radius)]
+
+
+def box_strips(half: tuple[float, float, float]) -> list[Strip]:
+    """Parallel strips under the whole surface of a box, along z.
+
+    Edges and corners are rounded by at most :data:`MAX_EDGE_RADIUS`; faces are exact at every probe.
+    """
+    radius = min(MAX_EDGE_RADIUS, *half)
+    spacing = max_spacing(radius)
+    x, y, z = (_line(-h + radius, h - radius, spacing) for h in half)
+    strips = []
+    for i, px in enumerate(x):
+        for j, py in enumerate(y):
+            rim = i in (0, len(x) - 1) or j in (0, len(y) - 1)
+            # Inside the cross-section only the two end faces have a surface.
+            for part in [z] if rim else [z[:1], z[-1:]]:
+                strips.append(Strip(centres=_along_z(float(px), float(py), part), radius=radius))
+    return strips
+
+
+def cylinder_strips(radius: float, half_height: float) -> list[Strip]:
+    """Strips along the axis (z) round the mantle, and rings of single probes on the two end faces."""
+    probe = min(MAX_EDGE_RADIUS, radius, half_height)
+    spacing = max_spacing(probe)
+    z = _line(-half_height + probe, half_height - probe, spacing)
+    strips = []
+    for ring, ring_radius in enumerate(_line(0.0, radius - probe, spacing)[::-1]):
+        count = max(1, int(np.ceil(2.0 * np.pi * ring_radius / spacing)))
+        for angle in np.arange(count) * 2.0 * np.pi / count:
+            x, y = ring_radius * np.cos(angle), ring_radius * np.sin(angle)
+            for part in [z] if ring == 0 else [z[:1], z[-1:]]:
+                strips.append(Strip(centres=_along_z(float(x), float(y), part), radius=probe))
+    return strips
+
+
+def shape_strips(shape_type: newton.GeoType, scale: np.ndarray) -> list[Strip]:
+    """Strips of one collision shape, in the shape's frame.
+
+    Args:
+        shape_type: Sphere, capsule, box or cylinder.
+        scale: Newton's shape scale [m]: (radius,), (radius, half height) or (half x, half y, half z).
+
+    Raises:
+        ValueError: For any other shape.
+    """
+    if shape_type == newton.GeoType.SPHERE:
+        return [Strip(centres=np.zeros((1, 3)), radius=float(scale[0]))]
+    if shape_type == newton.GeoType.CAPSULE:
+        return capsule_strips(float(scale[0]), float(scale[1]))
+    if shape_type == newton.GeoType.BOX:
+        return box_strips((float(scale[0]), float(scale[1]), float(scale[2])))
+    if shape_type == newton.GeoType.CYLINDER:
+        return cylinder_strips(float(scale[0]), float(scale[1]))
+    raise ValueError(
+        f"no probes for a {newton.GeoType(shape_type).name} collision shape: "
+        "expected SPHERE, CAPSULE, BOX or CYLINDER; replace it in the robot's file"
+    )

@@ -1,0 +1,312 @@
+"""The crossing task: robots cross terrains toward a goal, and what it cost them comes back."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels.episode import (
+    EpisodeState,
+    Outcome,
+    StartRanges,
+    Task,
+    command_goal,
+    latch_outcomes,
+    start_episodes,
+)
+from kernels.observation import Noise, apply_action, write_observation
+from kernels.penalties import PENALTIES, add_penalties
+from sim.bank import TerrainBank
+from sim.policy import PolicyRunner, PolicySpec, load_policy, share_stream
+from sim.robot import RobotCfg
+from sim.simulation import Simulation, SolverCfg
+
+_CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)  # all of mujoco_warp's bits but its two iteration caps
+_FALLEN_TILT_DEG = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrossingCfg:
+    """A crossing: start, goal, command and ends (the paper's task; the rest in the terms of the field)."""
+
+    start: tuple[float, float] = (2.0, 4.0)
+    start_position_range: float = 0.1
+    start_yaw_range: float = 0.2
+    start_joint_range: float = 0.2
+    start_velocity_range: float = 0.2
+    goal: tuple[float, float] = (14.0, 4.0)
+    goal_radius: float = 0.5
+    speed: float = 0.75
+    """Commanded speed toward the goal [m/s]."""
+    yaw_gain: float = 0.5
+    max_yaw_rate: float = 1.0
+    lower: tuple[float, float] = (-2.0, -2.0)
+    upper: tuple[float, float] = (18.0, 10.0)
+    max_duration_s: float = 20.0
+    penalties_from_s: float = 0.0
+    """Penalties are summed from this time on."""
+    base_force: float = 1.0
+    """Contact force on the base that counts as a collision [N]."""
+    max_speed: float = 100.0
+    """Any velocity beyond makes the episode invalid [m/s or rad/s]."""
+    poll_every_s: float = 1.0
+    """How often the host asks whether any episode still runs, in simulated time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutResult:
+    """What came of every episode; arrays lead with (num_terrains, num_replicas)."""
+
+    penalties: np.ndarray
+    """Raw penalty sums times the physics step, unscaled; (T, R, P) float64, NaN where invalid."""
+    penalty_names: tuple[str, ...]
+    outcome: np.ndarray
+    """:class:`kernels.episode.Outcome` of each episode, uint8."""
+    fallen: np.ndarray
+    """Tilt above 60 degrees at the end, bool."""
+    duration_s: np.ndarray
+    """Simulated time up to the end [s], float32."""
+    final_position: np.ndarray
+    """Base position at the end, world-local [m], (T, R, 3) float32."""
+    physics_steps: int
+    """Physics steps run until the last episode ended."""
+    wall_s: float
+    paths: np.ndarray | None = None
+    """Base position at every control step [m], NaN after the end; (T, R, steps, 3) float32, or None."""
+
+    @property
+    def base_collision(self) -> np.ndarray:
+        """Ended by base collision, bool."""
+        return self.outcome == Outcome.BASE_COLLISION
+
+    @property
+    def reached_goal(self) -> np.ndarray:
+        """Ended at the goal, bool."""
+        return self.outcome == Outcome.GOAL
+
+    @property
+    def invalid(self) -> np.ndarray:
+        """Non-finite, too fast or overflowed, bool."""
+        return self.outcome == Outcome.INVALID
+
+
+class Rollout:
+    """Crossings of ``num_terrains`` x ``num_replicas`` robots at once; built once, used again and again."""
+
+    def __init__(
+        self,
+        robot: RobotCfg,
+        policy: PolicySpec,
+        *,
+        num_terrains: int,
+        num_replicas: int,
+        device: str,
+        cfg: CrossingCfg | None = None,
+        solver: SolverCfg | None = None,
+    ) -> None:
+        """Load the policy, build the simulation and capture the control step.
+
+        Args:
+            robot: Robot settings.
+            policy: The controller, by file, ``module:callable`` or as a callable on device tensors.
+            num_terrains: Terrains of one evaluation.
+            num_replicas: Episodes on each.
+            device: Warp device name.
+            cfg: The crossing.
+            solver: Solver options.
+
+        Raises:
+            ValueError: If the policy does not fit the robot, or a number is not positive.
+        """
+        if num_terrains < 1 or num_replicas < 1:
+            raise ValueError(f"num_terrains and num_replicas must be positive, got {num_terrains} and {num_replicas}")
+        self.robot = robot
+        self.cfg = cfg or CrossingCfg()
+        self.num_terrains = num_terrains
+        self.num_replicas = num_replicas
+        share_stream(device)
+        loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
+        bank = TerrainBank(num_terrains, device=device)
+        terrain_of_env = np.repeat(np.arange(num_terrains), num_replicas)
+        self.sim = Simulation(robot, bank, terrain_of_env, cfg=solver)
+        with wp.ScopedDevice(device):
+            self._allocate()
+            self._start(np.zeros(num_terrains, dtype=np.uint32))
+            self._policy = PolicyRunner(loaded, self._observation, self._action)
+            self._graph = self.sim.capture(self._control_step)
+
+    def _allocate(self) -> None:
+        num_envs, robot = self.sim.num_envs, self.robot
+        self._task = _make_task(self.cfg, robot)
+        self._ranges = _make_start_ranges(self.cfg, robot)
+        self._command = wp.zeros((num_envs, 3), dtype=float)
+        self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
+        self._last_action = wp.zeros_like(self._action)
+        self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
+        self._noise_seed = wp.zeros(1, dtype=int)
+        self._sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
+        self._everyone = wp.ones(num_envs, dtype=int)
+        self._seeds = wp.zeros(self.num_terrains, dtype=wp.uint32)
+        self._episode = EpisodeState()
+        for field in ("outcome", "steps", "counted"):
+            setattr(self._episode, field, wp.zeros(num_envs, dtype=int))
+        self._episode.final_pose = wp.zeros(num_envs, dtype=wp.transform)
+        self._episode.num_running = wp.zeros(1, dtype=int)
+
+    def _start(self, seeds: np.ndarray) -> None:
+        self._seeds.assign(seeds)
+        start_episodes(
+            self._seeds, self.sim.terrain_of_env, self.num_replicas, self.sim.bank.terrain, self._ranges,
+            self.sim.sensors.base_com, self.sim.sensors.default_joint_pos, self.sim.joint_q, self.sim.joint_qd,
+            self._episode,
+        )  # fmt: skip
+        self.sim.clear_solver(self._everyone)
+        self._sums.zero_()
+        self._last_action.zero_()
+        self.sim.refresh()
+        self._observe()
+
+    def _observe(self) -> None:
+        command_goal(self.sim.joint_q, self._episode.outcome, self._task, self._command)
+        write_observation(
+            self.sim.joint_q, self.sim.joint_qd, self._command, self._last_action, self.sim.terrain_of_env,
+            self.sim.bank.terrain, self.sim.sensors, Noise(), self._noise_seed, self._observation,
+        )  # fmt: skip
+
+    def _control_step(self) -> None:
+        sim, robot = self.sim, self.robot
+        apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
+        for _ in range(robot.decimation):
+            sim.physics_step()
+            sim.read_geom_forces()
+            latch_outcomes(
+                sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, sim.overflow, sim.contact_count,
+                sim.contact_capacity, self._task, self._episode,
+            )  # fmt: skip
+            add_penalties(
+                sim.joint_q, sim.joint_qd, sim.sensors.base_com, self._command, sim.geom_force, sim.geom_role,
+                robot.contact_force_limit, robot.physics_dt, self._episode.counted, self._sums,
+            )  # fmt: skip
+        self._observe()
+
+    def evaluate(
+        self,
+        terrains: np.ndarray,
+        seeds: np.ndarray,
+        *,
+        record_paths: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> RolloutResult:
+        """Run one crossing of every replica on every terrain.
+
+        An episode depends on its terrain, the terrain's seed and its replica alone.
+
+        Args:
+            terrains: Genes, shape (num_terrains, 64), or heights [m], shape (num_terrains, nrow, ncol).
+            seeds: One seed a terrain, shape (num_terrains,), uint32.
+            record_paths: Keep the base's position at every control step.
+            progress: Called with (control steps done, most control steps) at every poll.
+
+        Raises:
+            ValueError: If a shape does not fit or a value is not finite.
+        """
+        if seeds.shape != (self.num_terrains,):
+            raise ValueError(f"seeds must have shape ({self.num_terrains},), one a terrain, got {seeds.shape}")
+        began = time.perf_counter()
+        with wp.ScopedDevice(self.sim.device):
+            if terrains.ndim == 3:
+                self.sim.bank.set_heights(terrains)
+            else:
+                self.sim.bank.set_genes(terrains)
+            self._start(seeds.astype(np.uint32))
+            paths: list[np.ndarray] | None = [] if record_paths else None
+            control_steps = self._run(progress, paths)
+        return self._collect(control_steps, began, paths)
+
+    def _run(self, progress: Callable[[int, int], None] | None, paths: list[np.ndarray] | None) -> int:
+        most = round(self.cfg.max_duration_s / self.robot.control_dt)
+        poll = max(1, round(self.cfg.poll_every_s / self.robot.control_dt))
+        for step in range(1, most + 1):
+            if paths is not None:
+                running = self._episode.outcome.numpy() == Outcome.RUNNING
+                paths.append(np.where(running[:, None], self.sim.joint_q.numpy()[:, :3], np.nan))
+            self._policy()
+            wp.capture_launch(self._graph)
+            if step % poll == 0 or step == most:
+                running_count = int(self._episode.num_running.numpy()[0])
+                if progress is not None:
+                    progress(step, most)
+                if running_count == 0:
+                    return step
+        return most
+
+    def _collect(self, control_steps: int, began: float, paths: list[np.ndarray] | None) -> RolloutResult:
+        shape = (self.num_terrains, self.num_replicas)
+        outcome = self._episode.outcome.numpy().astype(np.uint8).reshape(shape)
+        pose = self._episode.final_pose.numpy().reshape(*shape, 7)
+        columns = [PENALTIES.index(name) for name in self.robot.penalties]
+        penalties = self._sums.numpy().astype(np.float64)[:, columns].reshape(*shape, len(columns))
+        penalties[outcome == Outcome.INVALID] = np.nan
+        with np.errstate(invalid="ignore"):
+            upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)
+        return RolloutResult(
+            penalties=penalties,
+            penalty_names=self.robot.penalties,
+            outcome=outcome,
+            fallen=upright < np.cos(np.deg2rad(_FALLEN_TILT_DEG)),
+            duration_s=(self._episode.steps.numpy() * self.robot.physics_dt).astype(np.float32).reshape(shape),
+            final_position=pose[..., :3],
+            physics_steps=control_steps * self.robot.decimation,
+            wall_s=time.perf_counter() - began,
+            paths=None if paths is None else np.stack(paths, axis=1).reshape(*shape, -1, 3).astype(np.float32),
+        )
+
+
+def evaluate(
+    robot: RobotCfg, policy: PolicySpec, terrains: np.ndarray, replicas: int, *, seed: int = 0, device: str = "cpu"
+) -> RolloutResult:
+    """Cross each terrain ``replicas`` times with one controller (:class:`Rollout` for repeated use).
+
+    Args:
+        robot: Robot settings.
+        policy: The controller.
+        terrains: Genes (num_terrains, 64) or heights (num_terrains, nrow, ncol).
+        replicas: Episodes a terrain.
+        seed: Seeds the terrains' streams.
+        device: Warp device name.
+    """
+    rollout = Rollout(robot, policy, num_terrains=len(terrains), num_replicas=replicas, device=device)
+    return rollout.evaluate(terrains, np.random.SeedSequence(seed).generate_state(len(terrains), np.uint32))
+
+
+def _make_task(cfg: CrossingCfg, robot: RobotCfg) -> Any:
+    task = Task()
+    task.goal = wp.vec2(*cfg.goal)
+    task.goal_radius = cfg.goal_radius
+    task.speed = cfg.speed
+    task.yaw_gain = cfg.yaw_gain
+    task.max_yaw_rate = cfg.max_yaw_rate
+    task.lower = wp.vec2(*cfg.lower)
+    task.upper = wp.vec2(*cfg.upper)
+    task.max_steps = round(cfg.max_duration_s / robot.physics_dt)
+    task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
+    task.base_force = cfg.base_force
+    task.max_speed = cfg.max_speed
+    task.overflow_mask = _CAPACITY_OVERFLOWS
+    return task
+
+
+def _make_start_ranges(cfg: CrossingCfg, robot: RobotCfg) -> Any:
+    ranges = StartRanges()
+    ranges.position = wp.vec2(*cfg.start)
+    ranges.position_range = cfg.start_position_range
+    ranges.yaw_range = cfg.start_yaw_range
+    ranges.joint_scale_range = cfg.start_joint_range
+    ranges.velocity_range = cfg.start_velocity_range
+    ranges.base_height = robot.default_base_height
+    ranges.footprint = wp.vec2(*robot.footprint)
+    return ranges

@@ -1,0 +1,265 @@
+"""Parallel robots on height grids: one world each, terrain contact of our own, Newton's MuJoCo solver."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
+from kernels.observation import Sensors
+from kernels.penalties import SolverContacts, sum_geom_forces
+from kernels.reset import clear_rows
+from sim.bank import TerrainBank
+from sim.probes import shape_strips
+from sim.robot import RobotCfg, build_robot, leaf_name
+
+GROUND_FRICTION = 0.3
+"""Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverCfg:
+    """Options of the physics solver, chosen by measurement (results/*/speed.json).
+
+    The contact time constant, 0.02 s at critical damping (MuJoCo's own), stands in the robot's file: half of it lets
+    feet sink less on edges but doubles the peak forces.
+    """
+
+    iterations: int = 10
+    ls_iterations: int = 20
+
+
+def resolve_device(name: str | None) -> str:
+    """Warp device name for what a user asked for: ``None`` is CUDA where there is one, else the CPU.
+
+    Raises:
+        ValueError: If the device is unknown or absent.
+    """
+    wp.init()
+    if name is None:
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    if name.startswith("cuda") and not wp.is_cuda_available():
+        raise ValueError(f"device '{name}' asked for, but no CUDA device was found here: use --device cpu")
+    try:
+        return str(wp.get_device("cuda:0" if name == "cuda" else name))
+    except (RuntimeError, ValueError) as error:
+        present = ", ".join(str(device) for device in wp.get_devices())
+        raise ValueError(f"unknown device '{name}': expected one of {present}") from error
+
+
+class Simulation:
+    """``num_envs`` robots, each alone in a world of its own, in world-local coordinates on its terrain's grid.
+
+    Attributes:
+        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints); layout in :mod:`kernels.base_state`.
+        joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
+        targets: Joint position targets [rad] in columns 7 and up, shape (num_envs, 7 + num_joints).
+        geom_force: Contact force on each geom with a role in the last step, world frame [N], vectors of shape
+            (num_envs, num_geoms) in the order of ``robot.geom_names``.
+        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
+        joint_torque: Actuator torques of the last step [N m] in columns 6 and up, shape (num_envs, 6 + num_joints).
+        overflow: mujoco_warp's overflow bits of the last step, shape (num_envs,).
+        contact_count: Terrain contacts found in the last step over all environments, shape (1,).
+        contact_capacity: Contacts that fit.
+    """
+
+    def __init__(
+        self,
+        robot: RobotCfg,
+        bank: TerrainBank,
+        terrain_of_env: np.ndarray,
+        *,
+        friction: np.ndarray | None = None,
+        added_base_mass: np.ndarray | None = None,
+        cfg: SolverCfg | None = None,
+    ) -> None:
+        """Build the model on the bank's device.
+
+        Args:
+            robot: Robot settings.
+            bank: Terrains.
+            terrain_of_env: Terrain of each environment, integers of shape (num_envs,).
+            friction: Coulomb friction of each robot, shape (num_envs,); the file's where None.
+            added_base_mass: Mass added to each base [kg], shape (num_envs,).
+            cfg: Solver options.
+
+        Raises:
+            ValueError: If a terrain index is out of range or the robot's file and settings disagree.
+        """
+        if terrain_of_env.min() < 0 or terrain_of_env.max() >= bank.num_terrains:
+            raise ValueError(
+                f"terrain_of_env must lie in 0..{bank.num_terrains - 1}, "
+                f"got {terrain_of_env.min()}..{terrain_of_env.max()}"
+            )
+        self.robot = robot
+        self.bank = bank
+        self.device = bank.device
+        self.num_envs = len(terrain_of_env)
+        builder = build_robot(robot)
+        with wp.ScopedDevice(self.device):
+            self.terrain_of_env = wp.array(terrain_of_env, dtype=int)
+            self._build_model(builder)
+            self._randomise_model(friction, added_base_mass)
+            self._build_solver(cfg or SolverCfg())
+            self._build_contact(builder)
+            self._build_views()
+
+    def _build_model(self, builder: newton.ModelBuilder) -> None:
+        scene = newton.ModelBuilder()
+        newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
+        scene.rigid_gap = 0.0
+        scene.default_shape_cfg.mu = GROUND_FRICTION
+        # The plane only carries the ground's material: kernels.contact is the only collider.
+        scene.add_ground_plane()
+        scene.replicate(builder, self.num_envs)
+        self.model = scene.finalize()
+
+    def _randomise_model(self, friction: np.ndarray | None, added_base_mass: np.ndarray | None) -> None:
+        model, bodies = self.model, self.model.body_count // self.num_envs
+        if friction is not None:
+            mu = model.shape_material_mu.numpy()
+            on_robot = model.shape_body.numpy() >= 0
+            mu[on_robot] = np.repeat(friction, on_robot.sum() // self.num_envs)
+            model.shape_material_mu.assign(mu)
+        if added_base_mass is not None:
+            mass = model.body_mass.numpy()
+            mass[::bodies] += added_base_mass
+            model.body_mass.assign(mass)
+            model.body_inv_mass.assign(1.0 / mass)
+
+    def _build_solver(self, cfg: SolverCfg) -> None:
+        self.solver = newton.solvers.SolverMuJoCo(
+            self.model,
+            njmax=self.robot.njmax,
+            nconmax=self.robot.nconmax,
+            iterations=cfg.iterations,
+            ls_iterations=cfg.ls_iterations,
+            cone="pyramidal",
+            integrator="implicitfast",
+            use_mujoco_contacts=False,
+            kinematic_switchable_roots=False,
+        )
+        self.solver.mjw_model.opt.warn_overflow = 0
+        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+    def _build_contact(self, builder: newton.ModelBuilder) -> None:
+        shape_body = self.model.shape_body.numpy()
+        first_shape = int(np.flatnonzero(shape_body >= 0)[0])
+        self.layout = Layout()
+        self.layout.bodies_per_env = builder.body_count
+        self.layout.shapes_per_env = builder.shape_count
+        self.layout.first_shape = first_shape
+        self.layout.ground_shape = int(np.flatnonzero(shape_body < 0)[0])
+        self.probes = make_probes(builder)
+        self.contact_capacity = self.num_envs * self.robot.nconmax
+        self._contacts = newton.Contacts(
+            rigid_contact_max=self.contact_capacity, soft_contact_max=0, device=self.device
+        )
+        self.contact_count = self._contacts.rigid_contact_count
+        self._buffer = ContactBuffer()
+        for field in ("count", "shape0", "shape1", "point0", "point1", "normal", "offset0", "offset1", "margin0", "margin1"):
+            setattr(self._buffer, field, getattr(self._contacts, f"rigid_contact_{field}"))
+        geom_of_shape = self.solver.newton_shape_to_mjc_geom.numpy()
+        names = [leaf_name(label) for label in builder.shape_label]
+        column_of_geom = np.full(self.solver.mjw_model.ngeom, -1)
+        for column, name in enumerate(self.robot.geom_names):
+            column_of_geom[geom_of_shape[first_shape + names.index(name)]] = column
+        self._column_of_geom = wp.array(column_of_geom, dtype=int)
+        self.geom_role = wp.array([self.robot.role_of(name) for name in self.robot.geom_names], dtype=int)
+
+    def _build_views(self) -> None:
+        model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
+        self._state = model.state()
+        self._control = model.control()
+        self.joint_q = self._state.joint_q.reshape((self.num_envs, 7 + num_joints))
+        self.joint_qd = self._state.joint_qd.reshape((self.num_envs, 6 + num_joints))
+        self.targets = self._control.joint_target_q.reshape((self.num_envs, 7 + num_joints))
+        self.geom_force = wp.zeros((self.num_envs, len(self.robot.geom_names)), dtype=wp.vec3)
+        self.joint_torque = data.qfrc_actuator
+        self.overflow = data.overflow
+        self.geom_names = self.robot.geom_names
+        self._solver_contacts = view_solver_contacts(data)
+        self.sensors = Sensors()
+        self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
+        scan_x, scan_y = self.robot.scan_points()
+        self.sensors.scan_x = wp.array(scan_x, dtype=float)
+        self.sensors.scan_y = wp.array(scan_y, dtype=float)
+        self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
+
+    def refresh(self) -> None:
+        """Recompute body poses from the joint coordinates; due after anyone but the solver wrote them."""
+        newton.eval_fk(self.model, self._state.joint_q, self._state.joint_qd, self._state)
+
+    def collide(self) -> None:
+        """Find the terrain contacts of the present poses."""
+        self._contacts.clear()
+        collide_strips(
+            self._state.body_q, self.terrain_of_env, self.bank.terrain, self.probes, self.layout, self._buffer
+        )
+
+    def physics_step(self) -> None:
+        """Terrain contacts, then one solver step of ``robot.physics_dt``, in place."""
+        self.collide()
+        self.solver.step(self._state, self._state, self._control, self._contacts, self.robot.physics_dt)
+
+    def read_geom_forces(self) -> None:
+        """Sum the last step's contact forces into ``geom_force``."""
+        sum_geom_forces(self._solver_contacts, self._column_of_geom, self.geom_force)
+
+    def clear_solver(self, mask: Any) -> None:
+        """Forget the solver's warm start in the environments where ``mask`` (num_envs,) is not 0."""
+        clear_rows(mask, self.solver.mjw_data.qacc_warmstart)
+
+    def capture(self, launch_all: Callable[[], None]) -> Any:
+        """Record the launches of ``launch_all`` once as a graph for :meth:`launch`, on CUDA and CPU alike.
+
+        It is run eagerly first, so that no kernel is loaded while recording.
+        """
+        with wp.ScopedDevice(self.device):
+            launch_all()
+            with wp.ScopedCapture() as capture:
+                launch_all()
+        return capture.graph
+
+    def launch(self, graph: Any) -> None:
+        """Run a captured graph once."""
+        with wp.ScopedDevice(self.device):
+            wp.capture_launch(graph)
+
+
+def make_probes(builder: newton.ModelBuilder) -> Probes:
+    """Sphere probes of all collision shapes of one robot, on the current device."""
+    centres, radius, body, shape = [], [], [], []
+    for k in range(builder.shape_count):
+        if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
+            continue
+        pose = builder.shape_transform[k]
+        for strip in shape_strips(builder.shape_type[k], np.asarray(builder.shape_scale[k])):
+            centres.append([wp.transform_point(pose, wp.vec3(*centre)) for centre in strip.centres])
+            radius.append(strip.radius)
+            body.append(builder.shape_body[k])
+            shape.append(k)
+    probes = Probes()
+    probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
+    probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)
+    probes.strip_radius = wp.array(radius, dtype=float)
+    probes.strip_body = wp.array(body, dtype=int)
+    probes.strip_shape = wp.array(shape, dtype=int)
+    return probes
+
+
+def view_solver_contacts(data: Any) -> SolverContacts:
+    """The contact arrays of a mujoco_warp ``Data`` as a kernel argument."""
+    contacts = SolverContacts()
+    contacts.count = data.nacon
+    contacts.capacity = data.naconmax
+    contacts.world = data.contact.worldid
+    contacts.geom = data.contact.geom
+    contacts.frame = data.contact.frame
+    contacts.friction = data.contact.friction
+    contacts.efc_address = data.contact.efc_address
+    contacts.efc_force = data.efc.force
+    return contacts
