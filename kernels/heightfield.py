@@ -1,8 +1,8 @@
 """Height grids on the device: sampling, block maxima, and the exact nearest surface point of a sphere.
 
 A terrain is a triangulated grid: node ``(row, col)`` stands at ``x = col * spacing``, ``y = row * spacing``, and every
-cell is cut along the diagonal from its (low x, high y) to its (high x, low y) corner, as MuJoCo's heightfield is. Beyond
-the grid the height of the nearest edge node continues.
+cell is cut along the diagonal from its (low x, high y) to its (high x, low y) corner, as MuJoCo's heightfield is.
+Beyond the grid the height of the nearest edge node continues.
 """
 
 from typing import Any
@@ -131,7 +131,9 @@ def nearest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.ve
 
 
 @wp.func
-def nearest_in_cell(terrain: Terrain, t: int, row: int, col: int, p: wp.vec3, reach: float, nearest: wp.vec3) -> wp.vec3:
+def nearest_in_cell(
+    terrain: Terrain, t: int, row: int, col: int, p: wp.vec3, reach: float, nearest: wp.vec3
+) -> wp.vec3:
     """The nearer to ``p`` of ``nearest`` and the cell's two triangles; a cell lower than ``p.z - reach`` is skipped."""
     h00 = node_height(terrain, t, row, col)
     h10 = node_height(terrain, t, row, col + 1)
@@ -188,7 +190,7 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
 def _max_blocks_kernel(heights: wp.array3d[float], ceilings_out: wp.array3d[float]):
     """Grid (num_terrains, block rows, block cols)."""
     t, block_row, block_col = wp.tid()
-    highest = heights[t, wp.min(block_row * BLOCK, heights.shape[1] - 1), wp.min(block_col * BLOCK, heights.shape[2] - 1)]
+    highest = float(-1.0e6)
     for i in range(BLOCK + 1):
         for j in range(BLOCK + 1):
             row = wp.min(block_row * BLOCK + i, heights.shape[1] - 1)

@@ -1,8 +1,8 @@
 """The observation row of the target controller (legged_gym's layout) and its action, on the device.
 
-Columns, for J joints and S scan points: base linear velocity (3, base frame, x 2), base angular velocity (3, base frame,
-x 0.25), projected gravity (3), command vx, vy, yaw rate (3, x 2, 2, 0.25), joint positions minus default (J), joint
-rates (J, x 0.05), last action (J), height scan (S): clip(base height - 0.5 m - ground height, -1, 1) x 5.
+Columns, for J joints and S scan points: base linear velocity (3, base frame, x 2), base angular velocity (3, base
+frame, x 0.25), projected gravity (3), command vx, vy, yaw rate (3, x 2, 2, 0.25), joint positions minus default (J),
+joint rates (J, x 0.05), last action (J), height scan (S): clip(base height - 0.5 m - ground height, -1, 1) x 5.
 """
 
 from typing import Any
@@ -50,7 +50,8 @@ class Noise:
 
 @wp.func
 def _base_column(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], command: wp.array2d[float], sensors: Sensors, env: int, k: int
+    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], command: wp.array2d[float], sensors: Sensors, env: int,
+    k: int,
 ) -> float:  # fmt: skip
     if k < 3:
         return base_lin_vel_b(joint_q, joint_qd, sensors.base_com, env)[k] * LIN_VEL_SCALE

@@ -20,7 +20,7 @@ COLLISION_FORCE = wp.constant(0.1)
 
 @wp.struct
 class SolverContacts:
-    """Contacts and constraint forces of the last solver step, as mujoco_warp keeps them for pyramidal friction cones."""
+    """Contacts and constraint forces of the last solver step, as mujoco_warp keeps them for pyramidal cones."""
 
     count: wp.array[int]
     capacity: int

@@ -1,4 +1,4 @@
-"""Genes to heights: mixtures of rotated Super-Gaussians rasterised on the device (the paper's equation 1 and Table I)."""
+"""Genes to heights: mixtures of rotated Super-Gaussians rasterised on the device (the paper's eq. 1 and Table I)."""
 
 from typing import Any
 

@@ -21,7 +21,7 @@ _FORMATS = (
 class Policy(Protocol):
     """Anything that maps observations to actions."""
 
-    def __call__(self, observation: torch.Tensor) -> torch.Tensor:
+    def __call__(self, observation: torch.Tensor, /) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size)."""
         ...
 
@@ -41,8 +41,8 @@ class MlpPolicy(torch.nn.Module):
             layer.bias.data.copy_(state[f"mlp.{index}.bias"])
             layers += [layer, torch.nn.ELU()]
         self.layers = torch.nn.Sequential(*layers[:-1])
-        self.register_buffer("mean", state.get("obs_normalizer._mean", torch.zeros(1)).float())
-        self.register_buffer("std", state.get("obs_normalizer._std", torch.ones(1)).float())
+        self.mean = torch.nn.Buffer(state.get("obs_normalizer._mean", torch.zeros(1)).float())
+        self.std = torch.nn.Buffer(state.get("obs_normalizer._std", torch.ones(1)).float())
         self.normalised = "obs_normalizer._mean" in state
 
     @property
@@ -88,7 +88,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     return policy
 
 
-def _import_callable(spec: str, module: str, name: str, *, robot: RobotCfg, device: str) -> Policy:
+def _import_callable(spec: str, module: str, name: str, *, robot: RobotCfg, device: str) -> Any:
     try:
         target: Any = importlib.import_module(module)
         for part in name.split("."):
@@ -131,8 +131,8 @@ def _load_script(path: Path, device: str, reason: Exception) -> Policy:
     except (RuntimeError, ValueError, OSError) as error:
         first = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
         raise ValueError(
-            f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, or "
-            f"holding code): {first}; expected {_FORMATS}"
+            f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
+            f"or holding code): {first}; expected {_FORMATS}"
         ) from error
 
 

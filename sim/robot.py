@@ -108,7 +108,7 @@ class RobotCfg:
         """
         remedy = f"run `make calibrate ROBOT={self.name}`"
         if not self.scales_file.exists():
-            raise ValueError(f"penalty scales of robot '{self.name}' expected in {self.scales_file}, no such file: {remedy}")
+            raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
         scales = json.loads(self.scales_file.read_text())["scales"]
         missing = [name for name in self.penalties if not scales.get(name, 0.0) > 0.0]
         if missing:
@@ -187,7 +187,7 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
         )
     if len(robot.default_joint_pos) != len(joints):
         raise ValueError(
-            f"robot '{robot.name}': default_joint_pos must have {len(joints)} angles, got {len(robot.default_joint_pos)}"
+            f"robot '{robot.name}': default_joint_pos needs {len(joints)} angles, got {len(robot.default_joint_pos)}"
         )
     _require("geom", robot.geom_names, [leaf_name(label) for label in builder.shape_label], robot)
     return builder

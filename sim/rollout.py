@@ -4,57 +4,20 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from kernels.episode import (
-    EpisodeState,
-    Outcome,
-    StartRanges,
-    Task,
-    command_goal,
-    latch_outcomes,
-    start_episodes,
-)
+from kernels.episode import EpisodeState, Outcome, command_goal, latch_outcomes, start_episodes
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
 from sim.bank import TerrainBank
+from sim.crossing import CrossingCfg, make_start_ranges, make_task
 from sim.policy import PolicyRunner, PolicySpec, load_policy, share_stream
 from sim.robot import RobotCfg
 from sim.simulation import Simulation, SolverCfg
 
-_CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)  # all of mujoco_warp's bits but its two iteration caps
 _FALLEN_TILT_DEG = 60.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class CrossingCfg:
-    """A crossing: start, goal, command and ends (the paper's task; the rest in the terms of the field)."""
-
-    start: tuple[float, float] = (2.0, 4.0)
-    start_position_range: float = 0.1
-    start_yaw_range: float = 0.2
-    start_joint_range: float = 0.2
-    start_velocity_range: float = 0.2
-    goal: tuple[float, float] = (14.0, 4.0)
-    goal_radius: float = 0.5
-    speed: float = 0.75
-    """Commanded speed toward the goal [m/s]."""
-    yaw_gain: float = 0.5
-    max_yaw_rate: float = 1.0
-    lower: tuple[float, float] = (-2.0, -2.0)
-    upper: tuple[float, float] = (18.0, 10.0)
-    max_duration_s: float = 20.0
-    penalties_from_s: float = 0.0
-    """Penalties are summed from this time on."""
-    base_force: float = 1.0
-    """Contact force on the base that counts as a collision [N]."""
-    max_speed: float = 100.0
-    """Any velocity beyond makes the episode invalid [m/s or rad/s]."""
-    poll_every_s: float = 1.0
-    """How often the host asks whether any episode still runs, in simulated time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,8 +104,8 @@ class Rollout:
 
     def _allocate(self) -> None:
         num_envs, robot = self.sim.num_envs, self.robot
-        self._task = _make_task(self.cfg, robot)
-        self._ranges = _make_start_ranges(self.cfg, robot)
+        self._task = make_task(self.cfg, robot)
+        self._ranges = make_start_ranges(self.cfg, robot)
         self._command = wp.zeros((num_envs, 3), dtype=float)
         self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
         self._last_action = wp.zeros_like(self._action)
@@ -281,32 +244,3 @@ def evaluate(
     """
     rollout = Rollout(robot, policy, num_terrains=len(terrains), num_replicas=replicas, device=device)
     return rollout.evaluate(terrains, np.random.SeedSequence(seed).generate_state(len(terrains), np.uint32))
-
-
-def _make_task(cfg: CrossingCfg, robot: RobotCfg) -> Any:
-    task = Task()
-    task.goal = wp.vec2(*cfg.goal)
-    task.goal_radius = cfg.goal_radius
-    task.speed = cfg.speed
-    task.yaw_gain = cfg.yaw_gain
-    task.max_yaw_rate = cfg.max_yaw_rate
-    task.lower = wp.vec2(*cfg.lower)
-    task.upper = wp.vec2(*cfg.upper)
-    task.max_steps = round(cfg.max_duration_s / robot.physics_dt)
-    task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
-    task.base_force = cfg.base_force
-    task.max_speed = cfg.max_speed
-    task.overflow_mask = _CAPACITY_OVERFLOWS
-    return task
-
-
-def _make_start_ranges(cfg: CrossingCfg, robot: RobotCfg) -> Any:
-    ranges = StartRanges()
-    ranges.position = wp.vec2(*cfg.start)
-    ranges.position_range = cfg.start_position_range
-    ranges.yaw_range = cfg.start_yaw_range
-    ranges.joint_scale_range = cfg.start_joint_range
-    ranges.velocity_range = cfg.start_velocity_range
-    ranges.base_height = robot.default_base_height
-    ranges.footprint = wp.vec2(*robot.footprint)
-    return ranges

@@ -160,7 +160,7 @@ class Simulation:
         )
         self.contact_count = self._contacts.rigid_contact_count
         self._buffer = ContactBuffer()
-        for field in ("count", "shape0", "shape1", "point0", "point1", "normal", "offset0", "offset1", "margin0", "margin1"):
+        for field in ContactBuffer.vars:
             setattr(self._buffer, field, getattr(self._contacts, f"rigid_contact_{field}"))
         geom_of_shape = self.solver.newton_shape_to_mjc_geom.numpy()
         names = [leaf_name(label) for label in builder.shape_label]
@@ -191,7 +191,8 @@ class Simulation:
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates; due after anyone but the solver wrote them."""
-        newton.eval_fk(self.model, self._state.joint_q, self._state.joint_qd, self._state)
+        state: Any = self._state
+        newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
 
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""
@@ -230,15 +231,20 @@ class Simulation:
             wp.capture_launch(graph)
 
 
+def _place(pose: Any, point: np.ndarray) -> Any:
+    local: Any = wp.vec3(*point)
+    return wp.transform_point(pose, local)
+
+
 def make_probes(builder: newton.ModelBuilder) -> Probes:
     """Sphere probes of all collision shapes of one robot, on the current device."""
     centres, radius, body, shape = [], [], [], []
     for k in range(builder.shape_count):
         if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
             continue
-        pose = builder.shape_transform[k]
-        for strip in shape_strips(builder.shape_type[k], np.asarray(builder.shape_scale[k])):
-            centres.append([wp.transform_point(pose, wp.vec3(*centre)) for centre in strip.centres])
+        pose: Any = builder.shape_transform[k]
+        for strip in shape_strips(newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k])):
+            centres.append([_place(pose, centre) for centre in strip.centres])
             radius.append(strip.radius)
             body.append(builder.shape_body[k])
             shape.append(k)

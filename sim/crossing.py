@@ -1,0 +1,69 @@
+"""Settings of the crossing task, and what the kernels take of them."""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from kernels.episode import StartRanges, Task
+from sim.robot import RobotCfg
+
+_CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)  # all of mujoco_warp's bits but its two iteration caps
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrossingCfg:
+    """A crossing: start, goal, command and ends (the paper's task; the rest in the terms of the field)."""
+
+    start: tuple[float, float] = (2.0, 4.0)
+    start_position_range: float = 0.1
+    start_yaw_range: float = 0.2
+    start_joint_range: float = 0.2
+    start_velocity_range: float = 0.2
+    goal: tuple[float, float] = (14.0, 4.0)
+    goal_radius: float = 0.5
+    speed: float = 0.75
+    """Commanded speed toward the goal [m/s]."""
+    yaw_gain: float = 0.5
+    max_yaw_rate: float = 1.0
+    lower: tuple[float, float] = (-2.0, -2.0)
+    upper: tuple[float, float] = (18.0, 10.0)
+    max_duration_s: float = 20.0
+    penalties_from_s: float = 0.0
+    """Penalties are summed from this time on."""
+    base_force: float = 1.0
+    """Contact force on the base that counts as a collision [N]."""
+    max_speed: float = 100.0
+    """Any velocity beyond makes the episode invalid [m/s or rad/s]."""
+    poll_every_s: float = 1.0
+    """How often the host asks whether any episode still runs, in simulated time."""
+
+
+def make_task(cfg: CrossingCfg, robot: RobotCfg) -> Task:
+    """The goal, command and ends of a crossing as a kernel argument."""
+    task = Task()
+    task.goal = wp.vec2(*cfg.goal)
+    task.goal_radius = cfg.goal_radius
+    task.speed = cfg.speed
+    task.yaw_gain = cfg.yaw_gain
+    task.max_yaw_rate = cfg.max_yaw_rate
+    task.lower = wp.vec2(*cfg.lower)
+    task.upper = wp.vec2(*cfg.upper)
+    task.max_steps = round(cfg.max_duration_s / robot.physics_dt)
+    task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
+    task.base_force = cfg.base_force
+    task.max_speed = cfg.max_speed
+    task.overflow_mask = _CAPACITY_OVERFLOWS
+    return task
+
+
+def make_start_ranges(cfg: CrossingCfg, robot: RobotCfg) -> StartRanges:
+    """The randomised start of a crossing as a kernel argument."""
+    ranges = StartRanges()
+    ranges.position = wp.vec2(*cfg.start)
+    ranges.position_range = cfg.start_position_range
+    ranges.yaw_range = cfg.start_yaw_range
+    ranges.joint_scale_range = cfg.start_joint_range
+    ranges.velocity_range = cfg.start_velocity_range
+    ranges.base_height = robot.default_base_height
+    ranges.footprint = wp.vec2(*robot.footprint)
+    return ranges
