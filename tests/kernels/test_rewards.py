@@ -1,0 +1,228 @@
+"""Reward terms against a float64 oracle and hand-computed numbers."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.penalties import BASE, FOOT, LIMB
+from kernels.rewards import REWARDS, Feet, Motion, RewardWeights, make_feet, reward_steps
+
+NUM_JOINTS = 3
+ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
+DT = 0.02
+FORCE_LIMIT = 500.0
+BASE_COM = (0.05, -0.02, 0.1)
+STANDING = (0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 1.0)
+
+
+class Step:
+    """A batch of control steps as plain arrays; what is not given is at rest."""
+
+    def __init__(self, num_envs: int = 1, **given: np.ndarray) -> None:
+        geoms = len(ROLES)
+        self.arrays = {
+            "joint_q": np.tile(np.float32(STANDING + (0.0,) * NUM_JOINTS), (num_envs, 1)),
+            "joint_qd": np.zeros((num_envs, 6 + NUM_JOINTS), np.float32),
+            "joint_torque": np.zeros((num_envs, 6 + NUM_JOINTS), np.float32),
+            "geom_force": np.zeros((num_envs, geoms, 3), np.float32),
+            "command": np.zeros((num_envs, 3), np.float32),
+            "action": np.zeros((num_envs, NUM_JOINTS), np.float32),
+            "previous_action": np.zeros((num_envs, NUM_JOINTS), np.float32),
+            "previous_joint_vel": np.zeros((num_envs, NUM_JOINTS), np.float32),
+        }
+        for name, value in given.items():
+            assert self.arrays[name].shape == np.shape(value)
+            self.arrays[name] = np.float32(value)
+        self.num_envs = num_envs
+        self.feet = make_feet(num_envs, geoms, "cpu")
+        self.base_com = BASE_COM
+        self.valid = np.ones(num_envs, np.int32)
+
+    def reward(self, *, only_positive: bool = False, **weights: float) -> tuple[np.ndarray, np.ndarray]:
+        """Reward (num_envs,) and the terms per second (num_envs, len(REWARDS))."""
+        motion = Motion()
+        for name, value in self.arrays.items():
+            setattr(motion, name, wp.array(value, dtype=wp.vec3 if name == "geom_force" else float))
+        motion.geom_role = wp.array(ROLES, dtype=int)
+        motion.base_com = self.base_com
+        motion.force_limit = FORCE_LIMIT
+        motion.dt = DT
+        packed = RewardWeights()
+        for name, value in weights.items():
+            setattr(packed, name, value)
+        reward = wp.full(self.num_envs, -7.0, dtype=float)
+        terms = wp.zeros((self.num_envs, len(REWARDS)), dtype=float)
+        valid = wp.array(self.valid, dtype=int)
+        reward_steps(
+            motion,
+            packed,
+            only_positive=only_positive,
+            valid=valid,
+            feet_out=self.feet,
+            reward_out=reward,
+            terms_out=terms,
+        )
+        return reward.numpy(), terms.numpy() / DT
+
+    def term(self, name: str) -> float:
+        """One unweighted term of the first environment."""
+        return float(self.reward(**{name: 1.0})[1][0, REWARDS.index(name)])
+
+
+def rotate_inverse(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors of the world frame in the body frame, quaternions xyzw."""
+    axis, w = -quaternion[:, :3], quaternion[:, 3:]
+    across = 2.0 * np.cross(axis, vector)
+    return vector + w * across + np.cross(axis, across)
+
+
+def oracle(step: Step) -> dict[str, np.ndarray]:
+    """Every term but the air time in float64, after the formulas of legged_gym and the paper."""
+    a = {name: value.astype(np.float64) for name, value in step.arrays.items()}
+    rotation = a["joint_q"][:, 3:7]
+    w = rotate_inverse(rotation, a["joint_qd"][:, 3:6])
+    v = rotate_inverse(rotation, a["joint_qd"][:, :3]) - np.cross(w, BASE_COM)
+    force = np.linalg.norm(a["geom_force"], axis=2)
+    limb, foot = np.equal(ROLES, LIMB), np.equal(ROLES, FOOT)
+    foot_force = a["geom_force"][:, foot]
+    return {
+        "tracking_lin_vel": np.exp(-((v[:, :2] - a["command"][:, :2]) ** 2).sum(1) / 0.25),
+        "tracking_ang_vel": np.exp(-((w[:, 2] - a["command"][:, 2]) ** 2) / 0.25),
+        "lin_vel_z": v[:, 2] ** 2,
+        "ang_vel_xy": (w[:, :2] ** 2).sum(1),
+        "torques": (a["joint_torque"][:, 6:] ** 2).sum(1),
+        "dof_acc": (((a["joint_qd"][:, 6:] - a["previous_joint_vel"]) / DT) ** 2).sum(1),
+        "collision": (force[:, limb] > 0.1).sum(1),
+        "action_rate": ((a["action"] - a["previous_action"]) ** 2).sum(1),
+        "stumble": (np.linalg.norm(foot_force[..., :2], axis=2) > 5 * np.abs(foot_force[..., 2])).any(1),
+        "feet_contact_forces": np.maximum(0.0, force[:, foot] - FORCE_LIMIT).sum(1),
+    }
+
+
+def random_step(num_envs: int) -> Step:
+    rng = np.random.default_rng(0)
+    joint_q = rng.normal(size=(num_envs, 7 + NUM_JOINTS))
+    joint_q[:, 3:7] /= np.linalg.norm(joint_q[:, 3:7], axis=1, keepdims=True)
+    force = rng.normal(size=(num_envs, len(ROLES), 3)) * rng.choice([0.01, 1.0, 400.0], (num_envs, len(ROLES), 1))
+    force[::3, :, 2] *= 0.05  # every third environment stumbles now and then
+    return Step(
+        num_envs,
+        joint_q=joint_q,
+        joint_qd=rng.normal(size=(num_envs, 6 + NUM_JOINTS)),
+        joint_torque=rng.normal(size=(num_envs, 6 + NUM_JOINTS)) * 20.0,
+        geom_force=force,
+        command=rng.uniform(-1, 1, (num_envs, 3)),
+        action=rng.normal(size=(num_envs, NUM_JOINTS)),
+        previous_action=rng.normal(size=(num_envs, NUM_JOINTS)),
+        previous_joint_vel=rng.normal(size=(num_envs, NUM_JOINTS)),
+    )
+
+
+def test_terms_equal_the_oracle():
+    step = random_step(200)
+    expected = oracle(step)
+    _, terms = step.reward(**dict.fromkeys(REWARDS, 1.0))
+    for name, values in expected.items():
+        np.testing.assert_allclose(terms[:, REWARDS.index(name)], values, rtol=2e-5, atol=1e-6, err_msg=name)
+    assert 0 < expected["stumble"].sum() < 200
+    assert set(expected["collision"]) == {0, 1, 2}
+    assert set(expected) | {"feet_air_time"} == set(REWARDS)
+
+
+def test_reward_is_the_weighted_sum_times_the_step():
+    step = random_step(50)
+    weights = {name: 0.1 * (k - 5) for k, name in enumerate(REWARDS) if name not in ("dof_acc", "feet_air_time")}
+    expected = DT * sum(weight * oracle(step)[name] for name, weight in weights.items())
+    np.testing.assert_allclose(step.reward(**weights)[0], expected, rtol=2e-5, atol=1e-6)
+
+
+def test_clipping_at_zero():
+    step = random_step(50)
+    weights = {"tracking_lin_vel": 1.0, "lin_vel_z": -1.0}
+    plain = step.reward(**weights)[0]
+    assert (plain < 0).any() and (plain > 0).any()
+    np.testing.assert_array_equal(step.reward(only_positive=True, **weights)[0], np.maximum(plain, 0.0))
+
+
+def test_hand_computed_numbers():
+    standing = Step(command=[[0.3, 0.4, 0.5]])
+    assert standing.term("tracking_lin_vel") == pytest.approx(np.exp(-1.0))  # (.3^2 + .4^2) / .25 = 1
+    assert standing.term("tracking_ang_vel") == pytest.approx(np.exp(-1.0))  # .5^2 / .25 = 1
+    joints = Step(
+        joint_torque=[[9, 9, 9, 9, 9, 9, 1, 2, 3]],
+        joint_qd=[[0, 0, 0, 0, 0, 0, 0.1, 0, 0]],
+        action=[[1, 0, 0]],
+        previous_action=[[0, 2, 0]],
+    )
+    assert joints.term("torques") == pytest.approx(14.0)  # 1 + 4 + 9; the base's six columns are no torques
+    assert joints.term("dof_acc") == pytest.approx(25.0, rel=1e-5)  # (.1 / .02)^2
+    assert joints.term("action_rate") == pytest.approx(5.0)  # 1 + 4
+    turning = Step(joint_qd=[[0, 0, 0, 0, 0, 2.0, 0, 0, 0]])
+    # The mass centre stands still and the base turns round it at 2 rad/s: its origin moves at -2 z x (.05, -.02).
+    assert turning.term("tracking_lin_vel") == pytest.approx(np.exp(-(0.04**2 + 0.1**2) / 0.25), rel=1e-5)
+
+
+def test_velocity_is_that_of_the_base_frame():
+    quarter_turn = [*STANDING[:3], 0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4), 0, 0, 0]
+    step = Step(joint_q=[quarter_turn], joint_qd=[[0, 0.8, 0, 0, 0, 0, 0, 0, 0]], command=[[0.8, 0, 0]])
+    assert step.term("tracking_lin_vel") == pytest.approx(1.0, abs=1e-5)
+
+
+def forces(**of_geom: tuple[float, float, float]) -> np.ndarray:
+    force = np.zeros((1, len(ROLES), 3), np.float32)
+    for name, value in of_geom.items():
+        force[0, int(name[1:])] = value
+    return force
+
+
+def test_contacts_count_by_role():
+    base_only = Step(geom_force=forces(g0=(0, 0, 50)))
+    assert base_only.term("collision") == 0.0
+    limbs = Step(geom_force=forces(g1=(0, 0, 0.2), g2=(0, 0, 0.05), g3=(0, 0, 600), g4=(0, 0, 700)))
+    assert limbs.term("collision") == 1.0
+    assert limbs.term("feet_contact_forces") == pytest.approx(300.0)  # 100 + 200 over the limit
+    assert limbs.term("stumble") == 0.0
+    assert Step(geom_force=forces(g3=(51, 0, 10))).term("stumble") == 1.0
+    assert Step(geom_force=forces(g1=(51, 0, 10))).term("stumble") == 0.0
+
+
+def air_times(pattern: list[bool], command: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> list[float]:
+    """The air-time term of each step of one foot that touches as told."""
+    step = Step(command=[command])
+    found = []
+    for touching in pattern:
+        step.arrays["geom_force"] = forces(g3=(0, 0, 100.0 if touching else 0.0))
+        found.append(step.term("feet_air_time"))
+    return found
+
+
+def test_air_time_counts_from_take_off_to_landing():
+    # One step of slack after the last touch, 30 steps in the air, then the landing step: 31 * .02 - .5 = .12.
+    found = air_times([True] * 3 + [False] * 31 + [True] * 2)
+    assert found[:-2] == [0.0] * 34
+    assert found[-2] == pytest.approx(0.12, abs=1e-5)
+    assert found[-1] == 0.0
+
+
+def test_one_missed_contact_is_no_take_off():
+    assert air_times([True, False, True, False, True]) == [0.0] * 5
+
+
+def test_air_time_does_not_count_when_told_to_stand():
+    assert air_times([False] * 40 + [True], command=(0.05, 0.05, 1.0)) == [0.0] * 41
+
+
+def test_invalid_environments_get_nothing():
+    step = Step(2, joint_qd=np.full((2, 9), np.nan))
+    step.valid = np.array([0, 1], np.int32)
+    reward, terms = step.reward(tracking_lin_vel=1.0)
+    assert reward[0] == 0.0 and (terms[0] == 0.0).all()
+    assert np.isnan(reward[1])
+
+
+def test_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match="one column for each of tracking_lin_vel"):
+        reward_steps(
+            Motion(), RewardWeights(), only_positive=True, valid=wp.zeros(2, dtype=int), feet_out=Feet(),
+            reward_out=wp.zeros(2, dtype=float), terms_out=wp.zeros((2, 3), dtype=float),
+        )  # fmt: skip

@@ -1,0 +1,173 @@
+"""Train a base controller from scratch on rough terrain: ``python -m train.base --robot anymal``.
+
+Ctrl-C or ``--max-seconds`` saves and stops; ``--resume RUN_DIR`` goes on where it stopped.
+"""
+
+import io
+import signal
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from sim.robot import get_robot
+from sim.simulation import resolve_device
+from train.learner import Iteration, Learner, read_checkpoint
+from train.ppo import PpoCfg
+from train.progress import Progress
+from train.record import provenance, write_json, write_whole
+from train.task import CommandTask, TaskCfg
+from train.vec_env import CommandVecEnv
+
+CHECKPOINT = "checkpoint.pt"
+POLICY = "policy.pt"
+_RESERVE_S = 10.0  # kept back of --max-seconds for the last save
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseCfg:
+    """Train a base controller from scratch: PPO on legged_gym's rough-terrain task."""
+
+    robot: str = "anymal"
+    """Which robot."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    num_envs: int | None = None
+    """Robots trained at once; 4096 on CUDA, 32 on the CPU."""
+    iterations: int | None = None
+    """Iterations in all, those before a resume included; 2000 on CUDA, 20 on the CPU."""
+    max_seconds: float | None = None
+    """Save and stop in time to be done this many seconds after the start."""
+    run_dir: Path | None = None
+    """Where to write; runs/<robot>-base-<date>, or the resumed run."""
+    resume: Path | None = None
+    """Run directory to go on from."""
+    export: Path | None = None
+    """Also write the controller to this file and its training record beside it (sim/robots/<robot>.pt ships it)."""
+    seed: int = 0
+    """Seed of everything drawn."""
+    save_every_s: float = 60.0
+    """A checkpoint every so often [s]."""
+    rows: int = 100
+    """Progress rows over the whole training."""
+    task: TaskCfg = field(default_factory=TaskCfg)
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+
+
+class StopRequest:
+    """Set by Ctrl-C or SIGTERM: the iteration at hand is finished, then everything is saved. A second one kills."""
+
+    def __init__(self) -> None:
+        """Listen from now on."""
+        self.requested = False
+        for kind in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(kind, self._handle)
+
+    def _handle(self, kind: int, _frame: object) -> None:
+        self.requested = True
+        signal.signal(kind, signal.SIG_DFL)
+
+
+def _resolve(cfg: BaseCfg) -> tuple[str, int, int, Path]:
+    """Device, number of environments, iterations and run directory; checks what can be checked without long work."""
+    device = resolve_device(cfg.device)
+    on_cuda = device.startswith("cuda")
+    if on_cuda and not torch.cuda.is_available():
+        raise ValueError(
+            f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build "
+            "or use --device cpu"
+        )
+    num_envs = cfg.num_envs or (4096 if on_cuda else 32)
+    iterations = cfg.iterations or (2000 if on_cuda else 20)
+    if not on_cuda and cfg.num_envs is None and cfg.iterations is None:
+        print(
+            f"No GPU: a small training of {num_envs} robots and {iterations} iterations, enough to see that it runs. "
+            "A controller that walks takes about 10 minutes on one GPU."
+        )
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    run_dir = cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-base-{stamp}"
+    if cfg.resume is None and (run_dir / CHECKPOINT).exists():
+        raise ValueError(
+            f"{run_dir} already holds a training run: go on with --resume {run_dir}, or name another --run-dir"
+        )
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        write_json(run_dir / "config.json", {"device": device, **_plain(asdict(cfg))})
+        if cfg.export is not None:
+            cfg.export.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"cannot write to {run_dir}: {error.strerror}; name another --run-dir") from error
+    return device, num_envs, iterations, run_dir
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return str(value) if isinstance(value, Path) else value
+
+
+def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
+    """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
+    buffer = io.BytesIO()
+    torch.save({"actor_state_dict": learner.actor_state(), "iter": learner.iteration}, buffer)
+    write_whole(path, buffer.getvalue())
+    write_json(path.with_suffix(".train.json"), record)
+
+
+def train(cfg: BaseCfg) -> int:
+    """Train as told; returns the exit status: 0, or 130 after Ctrl-C.
+
+    Raises:
+        ValueError: If something asked for cannot be had; raised before any long work.
+    """
+    began = time.monotonic()
+    robot = get_robot(cfg.robot)
+    device, num_envs, iterations, run_dir = _resolve(cfg)
+    saved = read_checkpoint(cfg.resume / CHECKPOINT, cfg.robot, device=device) if cfg.resume else None
+    print(f"Training '{robot.name}': {num_envs} robots on {device}, {iterations} iterations, in {run_dir}", flush=True)
+    stop = StopRequest()
+    env = CommandVecEnv(CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=cfg.seed))
+    learner = Learner(env, cfg.ppo, seed=cfg.seed)
+    if saved is not None:
+        learner.resume(saved)
+    origin = provenance(device, cfg.seed)
+    progress = Progress(run_dir, learner, iterations, rows=cfg.rows, origin=origin, saved=saved and saved["extra"])
+    deadline = began + cfg.max_seconds - _RESERVE_S if cfg.max_seconds else float("inf")
+    slowest = 0.0
+    last_save = time.monotonic()
+    while learner.iteration < iterations and not stop.requested and time.monotonic() + 2.0 * slowest < deadline:
+        step: Iteration = learner.iterate()
+        slowest = max(slowest, step.collection_s + step.learning_s) if progress.warm else 0.0
+        progress.add(step)
+        if time.monotonic() - last_save > cfg.save_every_s:
+            learner.save(run_dir / CHECKPOINT, progress.state())
+            last_save = time.monotonic()
+    progress.close()
+    learner.save(run_dir / CHECKPOINT, progress.state())
+    record = progress.record(asdict(cfg.task), asdict(cfg.ppo))
+    for path in (run_dir / POLICY, cfg.export):
+        if path is not None:
+            export_policy(path, learner, record)
+            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+    if learner.iteration < iterations:
+        print(f"Stopped after {learner.iteration} of {iterations} iterations. Go on with: --resume {run_dir}")
+    return 130 if stop.requested else 0
+
+
+def main() -> int:
+    """Command line; returns the exit status."""
+    cfg = tyro.cli(BaseCfg, description=__doc__)
+    try:
+        return train(cfg)
+    except (ValueError, FloatingPointError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""Which terrain an environment is trained on: a grid of tiles, harder level by level, one type a column."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, TILE_TYPES, crossing_terrain, training_tiles
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumCfg:
+    """Shares of the terrain types and where robots begin.
+
+    legged_gym's tiles have no rough ground on a level plane, which one in six hand-crafted crossings is made of:
+    columns of ``noise`` tiles are added beside them.
+    """
+
+    num_columns: int = 20
+    """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
+    noise_columns: int = 2
+    """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
+    max_first_level: int = 5
+    """Robots begin on levels 0 to this, drawn uniformly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tiles:
+    """Training terrains; the tile of a level and a column is number ``level * num_columns + column``."""
+
+    heights: np.ndarray
+    """Heights [m] float32, shape (num_levels * num_columns, NUM_ROWS, NUM_COLS); the robot starts at (8, 4)."""
+    type_of_column: tuple[str, ...]
+    """Terrain type of each column."""
+
+    @property
+    def num_columns(self) -> int:
+        """Columns of the grid."""
+        return len(self.type_of_column)
+
+    @property
+    def num_levels(self) -> int:
+        """Levels of the grid."""
+        return len(self.heights) // self.num_columns
+
+    def columns_of(self, num_envs: int) -> np.ndarray:
+        """Column of each environment, int32 of shape (num_envs,): equal runs, so that every type gets its share."""
+        return (np.arange(num_envs) * self.num_columns // num_envs).astype(np.int32)
+
+
+def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
+    """Generate the tiles of a training run.
+
+    Raises:
+        ValueError: If there is no column or a count is negative.
+    """
+    if cfg.num_columns < 0 or cfg.noise_columns < 0 or cfg.num_columns + cfg.noise_columns < 1:
+        raise ValueError(
+            f"the curriculum needs at least one column, got num_columns {cfg.num_columns} and noise_columns "
+            f"{cfg.noise_columns}"
+        )
+    tile_rng, noise_rng = np.random.default_rng(seed).spawn(2)
+    noise = np.empty((NUM_LEVELS, cfg.noise_columns, NUM_ROWS, NUM_COLS), np.float32)
+    for level in range(NUM_LEVELS):
+        for column in range(cfg.noise_columns):
+            noise[level, column] = crossing_terrain("noise", level, noise_rng)
+    types = ("noise",) * cfg.noise_columns
+    if cfg.num_columns:
+        tiles, type_index = training_tiles(NUM_LEVELS, cfg.num_columns, tile_rng)
+        noise = np.concatenate([tiles.reshape(NUM_LEVELS, cfg.num_columns, NUM_ROWS, NUM_COLS), noise], axis=1)
+        types = (*(TILE_TYPES[k] for k in type_index), *types)
+    return Tiles(heights=noise.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)
+
+
+def first_levels(num_envs: int, cfg: CurriculumCfg, rng: np.random.Generator) -> np.ndarray:
+    """Levels robots begin on, int32 of shape (num_envs,).
+
+    Raises:
+        ValueError: If ``max_first_level`` is no level.
+    """
+    if not 0 <= cfg.max_first_level < NUM_LEVELS:
+        raise ValueError(f"max_first_level must be in 0..{NUM_LEVELS - 1}, got {cfg.max_first_level}")
+    return rng.integers(cfg.max_first_level, size=num_envs, endpoint=True, dtype=np.int32)

@@ -1,0 +1,199 @@
+"""PPO settings as a fresh dict per call, and rsl_rl's PPO with its minibatch step captured as one CUDA graph."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from torch import nn
+
+_EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoCfg:
+    """Settings of the learner; the defaults are legged_gym's."""
+
+    hidden_dims: tuple[int, ...] = (512, 256, 128)
+    """Hidden layers (ELU) of actor and critic."""
+    steps_per_env: int = 24
+    """Control steps an iteration, per environment."""
+    epochs: int = 5
+    """Passes over the data of an iteration."""
+    mini_batches: int = 4
+    """Minibatches a pass."""
+    learning_rate: float = 1e-3
+    """Learning rate at the start; adapted to the KL divergence from then on."""
+    desired_kl: float = 0.01
+    """KL divergence an update aims at."""
+    gamma: float = 0.99
+    """Discount per control step."""
+    lam: float = 0.95
+    """Lambda of generalised advantage estimation."""
+    clip: float = 0.2
+    """Clip range of the probability ratio and of the value."""
+    entropy: float = 0.01
+    """Weight of the entropy bonus."""
+    init_noise_std: float = 1.0
+    """Standard deviation of the actions before the first update."""
+
+
+def runner_settings(cfg: PpoCfg) -> dict[str, Any]:
+    """Settings for ``OnPolicyRunner``; a new dict each call because rsl_rl writes into the one it is given."""
+    network = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": False}
+    noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_noise_std, "std_type": "scalar"}
+    return {
+        "num_steps_per_env": cfg.steps_per_env,
+        "save_interval": 10**9,
+        "check_for_nan": False,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "algorithm": {
+            "class_name": CapturedPPO,
+            "num_learning_epochs": cfg.epochs,
+            "num_mini_batches": cfg.mini_batches,
+            "learning_rate": cfg.learning_rate,
+            "desired_kl": cfg.desired_kl,
+            "schedule": "adaptive",
+            "gamma": cfg.gamma,
+            "lam": cfg.lam,
+            "clip_param": cfg.clip,
+            "entropy_coef": cfg.entropy,
+            "value_loss_coef": 1.0,
+            "use_clipped_value_loss": True,
+            "max_grad_norm": 1.0,
+        },
+        "actor": {**network, "hidden_dims": list(cfg.hidden_dims), "distribution_cfg": noise},
+        "critic": {**network, "hidden_dims": list(cfg.hidden_dims)},
+    }
+
+
+class CapturedPPO(PPO):
+    """rsl_rl's PPO for feed-forward actors, without a host synchronisation inside an update.
+
+    The arithmetic is rsl_rl's own. What differs is where it runs: learning rate and losses stay on the device, so that
+    on CUDA one minibatch step (gather, both networks, backward, clip, Adam) is one graph launch instead of hundreds of
+    launches and five synchronisations. On the CPU the same function runs eagerly.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Construct rsl_rl's PPO and move its learning rate to the device.
+
+        Raises:
+            ValueError: If a feature of rsl_rl's PPO is asked for that this update does not compute.
+        """
+        super().__init__(*args, **kwargs)
+        if self.rnd or self.symmetry or self.is_multi_gpu or self.actor.is_recurrent or self.use_mixed_precision:
+            raise ValueError(
+                "CapturedPPO computes the plain feed-forward update, got RND, symmetry, several GPUs, a recurrent "
+                'actor or mixed precision: use rsl_rl\'s own ("class_name": "PPO") for these'
+            )
+        if self.schedule != "adaptive" or self.normalize_advantage_per_mini_batch or not self.use_clipped_value_loss:
+            raise ValueError(
+                "CapturedPPO computes the adaptive schedule with rollout-wide advantages and a clipped value loss: "
+                "leave these three settings of rsl_rl's PPO at their defaults"
+            )
+        on_cuda = torch.device(self.device).type == "cuda"
+        self._lr = torch.tensor(float(self.learning_rate), device=self.device)
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(parameters, lr=self._lr, fused=on_cuda or None, capturable=on_cuda)
+        count = self.storage.num_envs * self.storage.num_transitions_per_env
+        self._index = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=self.device)
+        self._advantages = torch.zeros(count, 1, device=self.device)
+        self._losses = torch.zeros(3, device=self.device)
+        self._stream = torch.cuda.Stream(self.device) if on_cuda else None
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._eager_steps = 0
+
+    def update(self) -> dict[str, float]:
+        """Run all epochs over the stored rollout; returns the mean value, surrogate and entropy losses."""
+        self._advantages.copy_(self.storage.advantages.flatten(0, 1))
+        self._losses.zero_()
+        size = self._index.shape[0]
+        order = torch.randperm(self.num_mini_batches * size, device=self.device)
+        if self._stream is None:
+            self._run_epochs(order)
+        else:
+            # One stream of our own for every backward pass: autograd remembers the stream of a parameter's first use,
+            # and a capture must not meet another one.
+            self._stream.wait_stream(torch.cuda.current_stream(self.device))
+            with torch.cuda.stream(self._stream):
+                self._run_epochs(order)
+            torch.cuda.current_stream(self.device).wait_stream(self._stream)
+        self.storage.clear()
+        value, surrogate, entropy = (self._losses / (self.num_learning_epochs * self.num_mini_batches)).tolist()
+        self.learning_rate = self._lr.item()
+        return {"value": value, "surrogate": surrogate, "entropy": entropy}
+
+    def save(self) -> dict[str, Any]:
+        """Rsl_rl's state dicts, with the learning rate as a plain number."""
+        state = super().save()
+        for group in state["optimizer_state_dict"]["param_groups"]:
+            group["lr"] = float(group["lr"])
+        return state
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Load rsl_rl's state dicts; the captured graph is dropped because it holds the old optimiser's tensors."""
+        again = super().load(loaded_dict, load_cfg, strict)
+        self._lr.fill_(float(self.learning_rate))
+        for group in self.optimizer.param_groups:
+            group.update(lr=self._lr, capturable=self._stream is not None, fused=self._stream is not None or None)
+        for state in self.optimizer.state.values():  # a checkpoint of the other kind of device keeps its step elsewhere
+            state["step"] = state["step"].to(self._lr.device)
+        self._graph = None
+        self._eager_steps = 0
+        return again
+
+    def _run_epochs(self, order: torch.Tensor) -> None:
+        for _ in range(self.num_learning_epochs):
+            for index in order.view(self.num_mini_batches, -1):
+                self._index.copy_(index)
+                self._run_minibatch()
+
+    def _run_minibatch(self) -> None:
+        if self._stream is None or self._eager_steps < _EAGER_STEPS:
+            self._learn_minibatch()
+            self._eager_steps += 1
+            return
+        if self._graph is None:
+            self.optimizer.zero_grad(set_to_none=True)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph, stream=self._stream):
+                self._learn_minibatch()
+        self._graph.replay()
+
+    def _learn_minibatch(self) -> None:
+        """One optimiser step on the transitions of ``_index``; reads and writes fixed memory only."""
+        stored, index = self.storage, self._index
+        observations: Any = {key: value.flatten(0, 1)[index] for key, value in stored.observations.items()}
+        old_mean_std = tuple(value.flatten(0, 1)[index] for value in stored.distribution_params or ())
+        distribution: Any = self.actor.distribution
+        distribution.update(self.actor.mlp(self.actor.get_latent(observations)))
+        log_prob = self.actor.get_output_log_prob(stored.actions.flatten(0, 1)[index])
+        entropy = self.actor.output_entropy.mean()
+        self._adapt_learning_rate(old_mean_std)
+        advantages = self._advantages[index].squeeze(1)
+        ratio = torch.exp(log_prob - stored.actions_log_prob.flatten(0, 1)[index].squeeze(1))
+        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+        value_loss = self._value_loss(observations)
+        loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._losses.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
+
+    def _value_loss(self, observations: Any) -> torch.Tensor:
+        values = self.critic(observations)
+        old_values = self.storage.values.flatten(0, 1)[self._index]
+        returns = self.storage.returns.flatten(0, 1)[self._index]
+        clipped = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+        return torch.max((values - returns).pow(2), (clipped - returns).pow(2)).mean()
+
+    @torch.no_grad()
+    def _adapt_learning_rate(self, old_mean_std: tuple[torch.Tensor, ...]) -> None:
+        kl = self.actor.get_kl_divergence(old_mean_std, self.actor.output_distribution_params).mean()
+        lower = torch.where(kl > 2.0 * self.desired_kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
+        higher = (self._lr * 1.5).clamp(max=1e-2)
+        self._lr.copy_(torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), higher, lower))

@@ -1,0 +1,312 @@
+"""The command-following task: a robot on rough terrain told a velocity and a heading, rewarded for keeping to them.
+
+One control step is one captured graph: action, physics, end of episodes, rewards, curriculum, restart, commands,
+pushes, observation. The host copies actions in and results out, and draws no random number.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from kernels.episode import StartRanges
+from kernels.observation import Noise, apply_action, write_observation
+from kernels.restart import command_episodes, promote_episodes, remember_steps, restart_episodes
+from kernels.rewards import REWARDS, Motion, RewardWeights, make_feet, reward_steps
+from kernels.training import STATISTICS, End, Rules, judge_steps, make_episodes, record_steps
+from sim.bank import TerrainBank
+from sim.policy import share_stream
+from sim.robot import RobotCfg
+from sim.simulation import Simulation
+from train.curriculum import CurriculumCfg, first_levels, make_tiles
+
+ITERATION_CAP_BITS = 512 | 1024  # solver bits that say "stopped at the iteration cap", which is no fault
+_TILE_SIDE = 8.0
+_TILE_CENTRE = (8.0, 4.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardCfg:
+    """Weight of each reward term per second: legged_gym's for ANYmal, and the paper's two."""
+
+    tracking_lin_vel: float = 1.0
+    tracking_ang_vel: float = 0.5
+    lin_vel_z: float = -2.0
+    ang_vel_xy: float = -0.05
+    torques: float = -1e-5
+    dof_acc: float = -2.5e-7
+    feet_air_time: float = 1.0
+    collision: float = -1.0
+    action_rate: float = -0.01
+    stumble: float = -0.1
+    feet_contact_forces: float = -1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseCfg:
+    """Half widths of the uniform observation noise, in the units of the measured quantity."""
+
+    lin_vel: float = 0.1
+    ang_vel: float = 0.2
+    gravity: float = 0.05
+    joint_pos: float = 0.01
+    joint_vel: float = 1.5
+    scan: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskCfg:
+    """The task; the defaults are legged_gym's but for the start's yaw, which it leaves at 0."""
+
+    rewards: RewardCfg = field(default_factory=RewardCfg)
+    noise: NoiseCfg = field(default_factory=NoiseCfg)
+    curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
+    only_positive: bool = True
+    """Clip the reward of a step at 0, so that ending early never pays."""
+    episode_s: float = 20.0
+    command_interval_s: float = 10.0
+    """A new command every so often."""
+    lin_vel_x: tuple[float, float] = (-1.0, 1.0)
+    """Range of the commanded forward velocity [m/s]."""
+    lin_vel_y: tuple[float, float] = (-1.0, 1.0)
+    """Range of the commanded sideward velocity [m/s]."""
+    min_speed: float = 0.2
+    """Slower commands become 0 [m/s]."""
+    yaw_gain: float = 0.5
+    """Commanded yaw rate per heading error [1/s]."""
+    max_yaw_rate: float = 1.0
+    """Largest commanded yaw rate [rad/s]."""
+    push_interval_s: float = 15.0
+    """A push every so often; 0 for none."""
+    push_speed: float = 1.0
+    """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
+    friction: tuple[float, float] = (0.5, 1.25)
+    """Range of the robots' friction coefficients."""
+    added_base_mass: tuple[float, float] = (-5.0, 5.0)
+    """Range of the mass added to the bases [kg]."""
+    start_position_range: float = 1.0
+    """Starts lie within this of the tile's centre along x and y [m]."""
+    start_yaw_range: float = np.pi
+    """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
+    start_joint_range: float = 0.5
+    """Joints start at the default pose times 1 +- this."""
+    start_velocity_range: float = 0.5
+    """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
+    base_force: float = 1.0
+    """Contact force on the base that ends an episode [N]."""
+    max_gravity_z: float = -0.1
+    """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
+    max_speed: float = 100.0
+    """Any velocity beyond makes the state invalid [m/s or rad/s]."""
+
+
+def _fill(struct: Any, **values: Any) -> Any:
+    for name, value in values.items():
+        setattr(struct, name, value)
+    return struct
+
+
+def _make_rules(cfg: TaskCfg, control_dt: float, num_levels: int, num_columns: int) -> Any:
+    return _fill(
+        Rules(),
+        max_steps=round(cfg.episode_s / control_dt),
+        base_force=cfg.base_force,
+        max_gravity_z=cfg.max_gravity_z,
+        max_speed=cfg.max_speed,
+        overflow_mask=~ITERATION_CAP_BITS,
+        num_levels=num_levels,
+        num_columns=num_columns,
+        promotion_distance=0.5 * _TILE_SIDE,
+        demotion_time_s=0.5 * cfg.episode_s,
+        command_steps=round(cfg.command_interval_s / control_dt),
+        lin_vel_x=cfg.lin_vel_x,
+        lin_vel_y=cfg.lin_vel_y,
+        min_speed=cfg.min_speed,
+        yaw_gain=cfg.yaw_gain,
+        max_yaw_rate=cfg.max_yaw_rate,
+        push_steps=round(cfg.push_interval_s / control_dt),
+        push_speed=cfg.push_speed,
+    )
+
+
+class CommandTask:
+    """``num_envs`` robots following commands on the tiles of the curriculum.
+
+    Torch tensors below are views of the memory the graph works in: the next step overwrites them.
+
+    Attributes:
+        observation: Observation row of each environment, shape (num_envs, observation_size).
+        reward: Reward of the step just made, shape (num_envs,).
+        end: How the episode ended with it (:class:`kernels.training.End`), int32, shape (num_envs,).
+        episode_steps: Control steps of the episode so far, int32, shape (num_envs,).
+        levels: Terrain level, int32, shape (num_envs,).
+        counter: Control steps since the seed's first number: the state of all random numbers, int32, shape (1,).
+        max_episode_steps: Control steps of the longest episode.
+    """
+
+    def __init__(self, robot: RobotCfg, cfg: TaskCfg, *, num_envs: int, device: str, seed: int) -> None:
+        """Build the terrain, the robots and the graph; every episode begins.
+
+        Args:
+            robot: Robot settings.
+            cfg: Task settings.
+            num_envs: Number of robots.
+            device: Warp device name.
+            seed: Of everything drawn.
+
+        Raises:
+            ValueError: If a count or range is not usable.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        share_stream(device)
+        self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
+        tile_seed, model_seed, start_seed, first_count = np.random.SeedSequence(seed).generate_state(4)
+        self.tiles = make_tiles(cfg.curriculum, int(tile_seed))
+        bank = TerrainBank(len(self.tiles.heights), device=device)
+        bank.set_heights(self.tiles.heights)
+        columns = self.tiles.columns_of(num_envs)
+        levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(start_seed))
+        rng = np.random.default_rng(model_seed)
+        self.sim = Simulation(
+            robot,
+            bank,
+            levels * self.tiles.num_columns + columns,
+            friction=rng.uniform(*cfg.friction, num_envs).astype(np.float32),
+            added_base_mass=rng.uniform(*cfg.added_base_mass, num_envs).astype(np.float32),
+        )
+        self._rules = _make_rules(cfg, robot.control_dt, self.tiles.num_levels, self.tiles.num_columns)
+        self.max_episode_steps: int = self._rules.max_steps
+        self._episodes = make_episodes(
+            columns,
+            levels,
+            num_joints=robot.num_joints,
+            observation_size=robot.observation_size,
+            first_count=int(first_count) % 2**30,
+            device=device,
+        )
+        self._make_structs()
+        self._make_views()
+        self._graph = self.sim.capture(self._control_step)  # makes one step, which is undone here
+        self.counter.fill_(int(first_count) % 2**30)
+        self.restart_all(torch.from_numpy(levels))
+
+    def _make_structs(self) -> None:
+        sim, robot, cfg = self.sim, self.robot, self.cfg
+        self._noise = _fill(Noise(), **asdict(cfg.noise))
+        self._weights = _fill(RewardWeights(), **asdict(cfg.rewards))
+        self._feet = make_feet(self.num_envs, len(robot.geom_names), self.device)
+        self._ranges = _fill(
+            StartRanges(),
+            position=_TILE_CENTRE,
+            position_range=cfg.start_position_range,
+            yaw_range=cfg.start_yaw_range,
+            joint_scale_range=cfg.start_joint_range,
+            velocity_range=cfg.start_velocity_range,
+            base_height=robot.default_base_height,
+            footprint=(max(robot.footprint), max(robot.footprint)),  # whatever the heading
+        )
+        self._motion = _fill(
+            Motion(),
+            joint_q=sim.joint_q,
+            joint_qd=sim.joint_qd,
+            joint_torque=sim.joint_torque,
+            geom_force=sim.geom_force,
+            geom_role=sim.geom_role,
+            command=self._episodes.command,
+            action=self._episodes.last_action,
+            previous_action=self._episodes.previous_action,
+            previous_joint_vel=self._episodes.previous_joint_vel,
+            base_com=sim.sensors.base_com,
+            force_limit=robot.contact_force_limit,
+            dt=robot.control_dt,
+        )
+
+    def _make_views(self) -> None:
+        episodes = self._episodes
+        self._action = torch.from_dlpack(episodes.action)
+        self.observation = torch.from_dlpack(episodes.observation)
+        self.reward = torch.from_dlpack(episodes.reward)
+        self.end = torch.from_dlpack(episodes.end)
+        self.episode_steps = torch.from_dlpack(episodes.steps)
+        self.levels = torch.from_dlpack(episodes.level)
+        self.counter = torch.from_dlpack(episodes.counter)
+        self._column = torch.from_dlpack(episodes.column)
+        self._terrain_of_env = torch.from_dlpack(self.sim.terrain_of_env)
+        self._statistics = torch.from_dlpack(episodes.statistics)
+        self._reward_terms = torch.from_dlpack(episodes.reward_terms)
+
+    def step(self, action: torch.Tensor) -> None:
+        """Make one control step; an episode that ends restarts within it.
+
+        Args:
+            action: Policy output, shape (num_envs, num_joints).
+
+        Raises:
+            ValueError: If ``action`` has another shape.
+        """
+        if action.shape != self._action.shape:
+            raise ValueError(f"action must have shape {tuple(self._action.shape)}, got {tuple(action.shape)}")
+        self._action.copy_(action)
+        self.sim.launch(self._graph)
+
+    def restart_all(self, levels: torch.Tensor) -> None:
+        """Begin every episode anew on the given terrain levels, shape (num_envs,)."""
+        self.levels.copy_(levels)
+        self._terrain_of_env.copy_(self.levels * self.tiles.num_columns + self._column)
+        self.end.fill_(int(End.TIME_OUT))
+        self._begin_episodes()
+        self.read_statistics()
+
+    def read_statistics(self) -> dict[str, float]:
+        """Sums over all environments since the last call: :data:`STATISTICS`, then each weighted reward term.
+
+        Synchronises with the device.
+        """
+        sums = torch.cat((self._statistics.sum(0), self._reward_terms.sum(0))).tolist()
+        self._statistics.zero_()
+        self._reward_terms.zero_()
+        return dict(zip((*STATISTICS, *REWARDS), sums, strict=True))
+
+    def level_by_type(self) -> dict[str, float]:
+        """Mean terrain level of the environments of each type. Synchronises with the device."""
+        levels = self.levels.cpu().numpy()
+        types = np.array(self.tiles.type_of_column)[self._column.cpu().numpy()]
+        return {str(name): float(levels[types == name].mean()) for name in dict.fromkeys(types)}
+
+    def _control_step(self) -> None:
+        sim, episodes = self.sim, self._episodes
+        apply_action(episodes.action, sim.sensors, self.robot.action_scale, episodes.last_action, sim.targets)
+        sim.refresh()
+        for _ in range(self.robot.decimation):
+            sim.physics_step()
+        sim.read_geom_forces()
+        judge_steps(sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, self._rules, episodes)
+        reward_steps(
+            self._motion,
+            self._weights,
+            only_positive=self.cfg.only_positive,
+            valid=episodes.valid,
+            feet_out=self._feet,
+            reward_out=episodes.reward,
+            terms_out=episodes.reward_terms,
+        )
+        record_steps(sim.joint_q, sim.joint_qd, sim.sensors.base_com, sim.overflow, self._rules, episodes)
+        promote_episodes(sim.joint_q, self._rules, sim.terrain_of_env, episodes)
+        self._begin_episodes()
+
+    def _begin_episodes(self) -> None:
+        sim, episodes, terrain = self.sim, self._episodes, self.sim.bank.terrain
+        base_com, default_pose = sim.sensors.base_com, sim.sensors.default_joint_pos
+        restart_episodes(
+            sim.terrain_of_env, terrain, self._ranges, base_com, default_pose,
+            sim.joint_q, sim.joint_qd, self._feet, episodes,
+        )  # fmt: skip
+        sim.clear_solver(episodes.end)
+        command_episodes(self._rules, sim.joint_q, sim.joint_qd, episodes)
+        write_observation(
+            sim.joint_q, sim.joint_qd, episodes.command, episodes.last_action, sim.terrain_of_env, terrain,
+            sim.sensors, self._noise, episodes.counter, episodes.observation,
+        )  # fmt: skip
+        remember_steps(sim.joint_qd, episodes)
