@@ -101,7 +101,8 @@ def write_archive(path: Path, archive: Archive) -> None:
         archive: What to write.
     """
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{field.name: np.asarray(getattr(archive, field.name)) for field in fields(Archive)})
+    content: dict[str, Any] = {field.name: np.asarray(getattr(archive, field.name)) for field in fields(Archive)}
+    np.savez_compressed(buffer, **content)
     write_atomically(path, buffer.getvalue())
 
 

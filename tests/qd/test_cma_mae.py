@@ -1,0 +1,132 @@
+import pickle
+
+import numpy as np
+import pytest
+
+from qd.cma_mae import CmaMae, CmaMaeCfg
+from qd.descriptors import Cells
+from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
+from tests.qd import stand_in
+
+CELLS = Cells(6)
+FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
+SMALL = CmaMaeCfg(emitters=2, batch_size=6, restart_rule="4")
+
+
+def make_search(cfg: CmaMaeCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> CmaMae:
+    return CmaMae(cfg, num_cells=cells.num_cells, num_ratios=6, seed=seed)
+
+
+def advance(search: CmaMae, first: int, last: int, cells: Cells = CELLS) -> None:
+    for iteration in range(first, last + 1):
+        genes = search.ask()
+        seeds = np.random.SeedSequence([0, iteration]).generate_state(len(genes))
+        search.tell(evaluation_of(stand_in.evaluate(genes, seeds), cells, FITNESS), iteration)
+
+
+def told(cell, fitness, invalid=None) -> Evaluation:
+    """An evaluation of 12 terrains with the given cells and fitness."""
+    cell = np.asarray(cell)
+    rates = np.zeros(len(cell))
+    columns = np.full((len(cell), 6), 1 / 6)
+    return Evaluation(
+        fitness=np.asarray(fitness, dtype=float), ratios=columns, cell=cell, penalty_mean=columns, penalty_std=columns,
+        collision_rate=rates, goal_rate=rates, fallen_rate=rates,
+        invalid_episodes=np.zeros(len(cell), int) if invalid is None else np.asarray(invalid),
+        episodes=np.full(len(cell), 4),
+    )  # fmt: skip
+
+
+def test_asks_for_clipped_genes_of_every_emitter():
+    genes = make_search(CmaMaeCfg(emitters=3, batch_size=5, sigma0=2.0)).ask()
+    assert genes.shape == (15, 64)
+    assert genes.min() == -1.0
+    assert genes.max() == 1.0
+    assert len(np.unique(genes[:, 0])) > 3  # emitters do not share a stream
+
+
+def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
+    search = make_search()
+    genes = search.ask()
+    search.tell(told([7, 7] + [9] * 10, [5.0, 1.0] + [0.0] * 10), 1)
+    # A threshold of 3, the mean of 5 and 1, would let 4 in.
+    search.ask()
+    search.tell(told([7] * 12, [4.0] * 12), 2)
+    elites = search.elites()
+    assert elites["cell"].tolist() == [7, 9]
+    assert elites["fitness"].tolist() == [5.0, 0.0]
+    assert elites["iteration"].tolist() == [1, 1]
+    assert np.array_equal(elites["genes"][0], genes[0])
+
+
+def test_an_invalid_terrain_is_never_an_elite():
+    search = make_search()
+    search.ask()
+    search.tell(told(np.arange(12), [FITNESS_FLOOR] * 6 + [1.0] * 6, invalid=[4] * 6 + [0] * 6), 1)
+    assert sorted(search.elites()["cell"].tolist()) == [6, 7, 8, 9, 10, 11]
+
+
+def test_iterations_without_a_valid_terrain_are_survived():
+    search = make_search(CmaMaeCfg(emitters=2, batch_size=6, restart_rule="1"))
+    for iteration in (1, 2):
+        search.ask()
+        search.tell(told([0] * 12, [FITNESS_FLOOR] * 12, invalid=[4] * 12), iteration)
+    assert len(search.elites()["fitness"]) == 0
+    advance(search, 3, 5)
+    assert len(search.elites()["fitness"]) > 0
+
+
+def test_cell_of_an_elite_is_the_cell_of_its_ratios():
+    search = make_search()
+    advance(search, 1, 10)
+    elites = search.elites()
+    assert len(elites["cell"]) > 5
+    assert np.array_equal(CELLS.cell_of(elites["ratios"]), elites["cell"])
+    assert (np.diff(elites["fitness"]) <= 0).all()
+    assert np.abs(elites["genes"]).max() <= 1.0
+
+
+@pytest.mark.parametrize("es", ["cma_es", "sep_cma_es"])
+def test_a_pickled_search_goes_on_bit_for_bit(es):
+    # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut
+    cfg = CmaMaeCfg(emitters=2, batch_size=6, restart_rule="5", es=es)
+    straight, cut = make_search(cfg), make_search(cfg)
+    advance(straight, 1, 16)
+    advance(cut, 1, 7)
+    cut = CmaMae.from_state(pickle.loads(pickle.dumps(cut.state())))
+    advance(cut, 8, 16)
+    for name, rows in straight.elites().items():
+        assert np.array_equal(rows, cut.elites()[name]), name
+    assert np.array_equal(straight.ask(), cut.ask())
+
+
+def test_seeds_make_the_difference():
+    assert np.array_equal(make_search(seed=1).ask(), make_search(seed=1).ask())
+    assert not np.array_equal(make_search(seed=1).ask(), make_search(seed=2).ask())
+
+
+def test_tell_answers_ask():
+    search = make_search()
+    with pytest.raises(RuntimeError, match="must follow ask"):
+        search.tell(told([0] * 12, [0.0] * 12), 1)
+    search.ask()
+    with pytest.raises(ValueError, match="evaluation must have 12 rows, got 3"):
+        search.tell(told([0] * 3, [0.0] * 3), 1)
+
+
+@pytest.mark.parametrize("state", [{}, {"archive": 1, "result": 2, "emitters": []}])
+def test_a_state_of_something_else_is_refused(state):
+    with pytest.raises(ValueError, match="two archives and a list of emitters"):
+        CmaMae.from_state(state)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("emitters", 0), ("batch_size", 1), ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
+        ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
+    ],
+)  # fmt: skip
+def test_bad_settings_are_named(setting, value):
+    with pytest.raises(ValueError, match=f"{setting} must|{setting} at least"):
+        CmaMaeCfg(**{setting: value})
