@@ -1,0 +1,61 @@
+"""Where a result comes from: the keys that every results file carries."""
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+_PACKAGES = ("faultline", "newton", "mujoco-warp", "warp-lang", "torch", "ribs", "numpy")
+
+
+def provenance(device: str, seed: int) -> dict[str, Any]:
+    """Command, commit, device, versions, seed and date of the running program.
+
+    Args:
+        device: Warp device name.
+        seed: Seed of the run.
+    """
+    return {
+        "command": shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
+        "commit": os.environ.get("FAULTLINE_COMMIT") or _output(["git", "rev-parse", "HEAD"]),
+        "device": _device_name(device),
+        "versions": {name: _version(name) for name in _PACKAGES},
+        "seed": seed,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _module() -> str:
+    """Name of the module that runs, as after ``python -m``."""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    return spec.name if spec else Path(sys.argv[0]).stem
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except ModuleNotFoundError:  # a checkout on the path without being installed
+        return None
+
+
+def _device_name(device: str) -> str:
+    if not device.startswith("cuda"):
+        return f"CPU ({platform.machine()}, {os.cpu_count()} cores)"
+    index = device.partition(":")[2] or "0"
+    return _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader", f"--id={index}"]) or device
+
+
+def _output(command: list[str]) -> str | None:
+    """What a program prints, run in the checkout; None where it is missing or fails."""
+    try:
+        done = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=20, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None

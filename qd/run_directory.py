@@ -1,0 +1,196 @@
+"""The directory of a search's run: what it was asked to do, how far it is, and what it found.
+
+The checkpoint is the one truth and is written first; metrics and archive are made from it and made again on resume, so
+that a kill between any two writes leaves a run that goes on as if nothing had been.
+"""
+
+import dataclasses
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qd.archive import ARCHIVE_FILE, Archive, write_archive
+from qd.checkpoint import load_checkpoint, save_checkpoint
+from qd.files import read_json, to_json, write_atomically
+
+if TYPE_CHECKING:
+    from qd.cma_mae import CmaMae
+
+CONFIG_FILE = "config.json"
+CHECKPOINT_FILE = "checkpoint.bin"
+METRICS_FILE = "metrics.jsonl"
+
+Settings = dict[str, Any]
+"""The settings that make a run what it is, as JSON values."""
+Metrics = list[dict[str, Any]]
+"""One row an iteration."""
+
+
+def new_path(root: Path, name: str) -> Path:
+    """A directory that does not exist yet: ``name``, else ``name-2``, ``name-3`` and so on."""
+    path, number = root / name, 1
+    while path.exists():
+        number += 1
+        path = root / f"{name}-{number}"
+    return path
+
+
+def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:
+    """Settings that differ, each as ``cma.sigma0 (0.5 there, 0.2 wanted)``."""
+    found = []
+    for key in sorted(there.keys() | wanted.keys()):
+        a, b = there.get(key), wanted.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += differences(a, b, f"{prefix}{key}.")
+        elif a != b:
+            found.append(f"{prefix}{key} ({_short(a)} there, {_short(b)} wanted)")
+    return found
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[None]:
+    """Makes a run directory if need be and keeps other searches out of it.
+
+    Args:
+        path: The directory; if it was made here and is still empty at the end, it is removed again.
+
+    Raises:
+        ValueError: If it cannot be made or written to, or another search works in it.
+    """
+    made = not path.exists()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".write-test"
+        probe.touch()
+        probe.unlink()
+        handle = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise ValueError(
+            f"run directory {path} cannot be written to: {error.strerror}: give another --run-dir"
+        ) from None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise ValueError(f"another search works in {path}: let it end, or give another --run-dir") from None
+    try:
+        yield
+    finally:
+        os.close(handle)
+        if made and not any(path.iterdir()):
+            path.rmdir()
+
+
+class RunDirectory:
+    """Files of one run.
+
+    Args:
+        path: The directory, claimed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def read_config(self) -> dict[str, Any]:
+        """What the run was asked to do: ``settings``, ``iterations`` and where it comes from.
+
+        Raises:
+            FileNotFoundError: If there is no run here.
+            ValueError: If the file is damaged.
+        """
+        file = self.path / CONFIG_FILE
+        if not file.exists():
+            raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}")
+        config = read_json(file)
+        if not isinstance(config.get("settings"), dict) or not isinstance(config.get("iterations"), int):
+            raise ValueError(f"{file} must hold settings and iterations of a search, got {', '.join(config)}")
+        return config
+
+    def write_config(self, settings: Settings, iterations: int, origin: dict[str, Any]) -> None:
+        """Writes what the run is asked to do.
+
+        Args:
+            settings: Everything that must not change on resume.
+            iterations: Iterations to reach; may grow.
+            origin: Provenance.
+        """
+        content = {"settings": settings, "iterations": iterations, **origin}
+        write_atomically(self.path / CONFIG_FILE, to_json(content))
+
+    def save(self, settings: Settings, search: "CmaMae", metrics: Metrics) -> None:
+        """Saves an iteration; killed anywhere in here, the run is either before or after it.
+
+        Args:
+            settings: The run's settings, so that a checkpoint that strayed here is noticed.
+            search: The search after ``tell``.
+            metrics: All rows up to this iteration.
+        """
+        state = {"settings": settings, "metrics": metrics, **search.state()}
+        save_checkpoint(self.path / CHECKPOINT_FILE, state)
+        self.write_derived(settings, search, metrics)
+
+    def write_derived(self, settings: Settings, search: "CmaMae", metrics: Metrics) -> None:
+        """Writes the files that follow from a checkpoint: metrics and archive."""
+        rows = "".join(json.dumps(row, allow_nan=False) + "\n" for row in metrics)
+        write_atomically(self.path / METRICS_FILE, rows.encode())
+        write_archive(self.path / ARCHIVE_FILE, archive_of(settings, search, len(metrics)))
+
+    def load(self, settings: Settings) -> tuple["CmaMae", Metrics] | None:
+        """The search as its checkpoint has it.
+
+        Args:
+            settings: The settings that the run's config has.
+
+        Returns:
+            The search and its metrics, or None if the run was killed before its first checkpoint.
+
+        Raises:
+            ValueError: If the checkpoint is damaged, or belongs to a run of other settings.
+        """
+        file = self.path / CHECKPOINT_FILE
+        if not file.exists():
+            return None
+        from qd.cma_mae import CmaMae  # pyribs takes two seconds to import: not for `--help`
+
+        state = load_checkpoint(file)
+        different = differences(state.get("settings") or {}, settings)
+        if different:
+            raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}")
+        try:
+            return CmaMae.from_state(state), list(state["metrics"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{file} is no checkpoint of a search: {error}") from None
+
+
+def archive_of(settings: Settings, search: "CmaMae", iterations: int) -> Archive:
+    """What a search has found so far.
+
+    Args:
+        settings: Settings of the run.
+        search: The search.
+        iterations: Iterations done.
+    """
+    return Archive(
+        robot=settings["robot"],
+        penalties=tuple(settings["fitness"]["penalties"]),
+        scales=tuple(settings["fitness"]["scales"]),
+        intervals=settings["intervals"],
+        collision_bit=settings["collision_bit"],
+        iterations=iterations,
+        **search.elites(),
+    )
+
+
+def as_settings(cfg: Any, *, leave_out: tuple[str, ...] = ()) -> Settings:
+    """A configuration dataclass as JSON values, without the named fields."""
+    values = {name: value for name, value in dataclasses.asdict(cfg).items() if name not in leave_out}
+    return json.loads(json.dumps(values))

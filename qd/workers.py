@@ -1,0 +1,232 @@
+"""Evaluation of many terrains: in this process on a GPU, over several processes on a CPU.
+
+Whole terrains are handed out, and an episode depends on its terrain, seed and replica alone, so that how terrains are
+spread changes nothing in the result.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.worker_process import Crosser, EvaluatorError, WorkerProcess
+
+if TYPE_CHECKING:
+    from sim.rollout import RolloutResult
+
+__all__ = ["Crosser", "Evaluate", "EvaluatorCfg", "EvaluatorError", "open_evaluator"]
+
+_MIN_ROWS = 4  # torch's linear layers give the same bits for batches of 4 rows and more, other ones for fewer
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluatorCfg:
+    """What an evaluator crosses, with what, and where."""
+
+    robot: str
+    """Name of the robot."""
+    policy: str
+    """Controller: a file or ``module:callable``."""
+    num_terrains: int
+    """Terrains at once; more are taken in turns."""
+    num_replicas: int
+    """Episodes a terrain."""
+    device: str = "cpu"
+    """Warp device name."""
+    num_workers: int | None = None
+    """Processes on the CPU; None: one a core."""
+
+    @property
+    def processes(self) -> int:
+        """Processes that evaluate: this one on a GPU; on the CPU no more than there is work for."""
+        if self.device.startswith("cuda"):
+            return 1
+        by_rows = self.num_terrains * self.num_replicas // _MIN_ROWS
+        return max(1, min(self.num_workers or available_cores(), self.num_terrains, by_rows))
+
+
+class Evaluate(Protocol):
+    """Evaluates any number of terrains."""
+
+    def __call__(
+        self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
+    ) -> "RolloutResult":
+        """Cross each terrain once a replica.
+
+        Args:
+            terrains: Genes, shape (num_terrains, 64), or heights [m], shape (num_terrains, nrow, ncol).
+            seeds: One a terrain, uint32.
+            progress: Called now and then with the share that is done.
+        """
+        ...
+
+
+def available_cores() -> int:
+    """Processor cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def resolve_device(name: str | None) -> str:
+    """Warp device name; None means CUDA where it is there, else the CPU.
+
+    Raises:
+        ValueError: If the device is unknown or absent.
+    """
+    from sim.simulation import resolve_device as resolve
+
+    return resolve(name)
+
+
+def check_policy(policy: str, robot: str, device: str) -> None:
+    """Loads a controller and tries it, so that a bad one is found before any long work.
+
+    Raises:
+        ValueError: If it cannot be loaded or does not fit the robot.
+    """
+    from sim.policy import load_policy
+    from sim.robot import get_robot
+
+    load_policy(policy, get_robot(robot), device)
+
+
+def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
+    """The simulation of an evaluator, for a share of its terrains."""
+    from sim.robot import get_robot
+    from sim.rollout import Rollout
+
+    return Rollout(
+        get_robot(cfg.robot),
+        cfg.policy,
+        num_terrains=num_terrains,
+        num_replicas=cfg.num_replicas,
+        device=cfg.device,
+    )
+
+
+Build = Callable[[EvaluatorCfg, int], Crosser]
+
+
+@contextmanager
+def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterator[Evaluate]:
+    """Builds the simulation, in as many processes as pay, and keeps it until the end.
+
+    Args:
+        cfg: What, with what, where.
+        build: Makes the simulation; a module-level function, since processes import it by name.
+
+    Yields:
+        A function of terrains and seeds.
+
+    Raises:
+        ValueError: If the simulation cannot be built as asked for.
+        EvaluatorError: If a process dies.
+    """
+    if cfg.device.startswith("cuda"):
+        crosser = build(cfg, cfg.num_terrains)
+        yield _in_turns(_in_process(crosser), cfg.num_terrains)
+        return
+    workers: list[WorkerProcess] = []
+    try:
+        per_worker = -(-cfg.num_terrains // cfg.processes)
+        for first in range(0, cfg.num_terrains, per_worker):
+            num_terrains = min(per_worker, cfg.num_terrains - first)
+            workers.append(WorkerProcess(num_terrains, build, cfg))
+            if first == 0:
+                workers[0].receive()  # it compiles the kernels; the others then find them compiled
+        for worker in workers[1:]:
+            worker.receive()
+        yield _in_turns(_over_workers(workers), cfg.num_terrains)
+    finally:
+        for worker in workers:
+            worker.stop()
+
+
+def _in_process(crosser: Crosser) -> Evaluate:
+    def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        report = None if progress is None else lambda done, most: progress(done / most)
+        return crosser.evaluate(terrains, seeds, progress=report)
+
+    return evaluate
+
+
+def _over_workers(workers: list["WorkerProcess"]) -> Evaluate:
+    """Shards of whole terrains, one a worker, put together again in order."""
+
+    def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        first = 0
+        for worker in workers:
+            own = slice(first, first + worker.num_terrains)
+            worker.send(terrains[own], seeds[own])
+            first = own.stop
+        results: dict[int, Any] = {}
+        shares = np.zeros(len(workers))
+        while len(results) < len(workers):
+            for index in _ready(workers, results):
+                message, value = workers[index].receive()
+                if message == "result":
+                    results[index] = value
+                shares[index] = value if message == "progress" else 1.0
+            if progress is not None:
+                progress(float(shares.mean()))
+        return _merge([results[index] for index in range(len(workers))], join=0)
+
+    return evaluate
+
+
+def _ready(workers: list["WorkerProcess"], results: dict[int, Any]) -> list[int]:
+    """Workers still at it that have something to say, or died."""
+    waiting = {workers[k].connection: k for k in range(len(workers)) if k not in results}
+    return [waiting[connection] for connection in wait(list(waiting)) if isinstance(connection, Connection)]
+
+
+def _in_turns(evaluate: Evaluate, at_once: int) -> Evaluate:
+    """Any number of terrains, ``at_once`` at a time; the last turn is filled up and what fills it is dropped."""
+
+    def in_turns(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        count = len(terrains)
+        if seeds.shape != (count,) or count == 0:
+            raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
+        parts = []
+        for first in range(0, count, at_once):
+            turn = np.arange(first, first + at_once) % count
+            report = None if progress is None else _share_of(progress, first / count, at_once / count)
+            result = evaluate(terrains[turn], seeds[turn], report)
+            parts.append(_take(result, min(at_once, count - first)))
+        return _merge(parts, join=1)
+
+    return in_turns
+
+
+def _share_of(progress: Callable[[float], None], start: float, share: float) -> Callable[[float], None]:
+    return lambda done: progress(min(1.0, start + share * done))
+
+
+def _take(result: Any, count: int) -> Any:
+    """The first terrains of a result."""
+    arrays = {name: value[:count] for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
+    return dataclasses.replace(result, **arrays)
+
+
+def _merge(results: list[Any], *, join: int) -> Any:
+    """Results side by side (``join`` 0: they ran at the same time) or one after the other (1)."""
+    if len(results) == 1:
+        return results[0]
+    combine = (max, sum)[join]
+    merged: dict[str, Any] = {
+        name: np.concatenate([getattr(result, name) for result in results])
+        for name, value in _fields(results[0]).items()
+        if isinstance(value, np.ndarray)
+    }
+    for name in ("physics_steps", "wall_s"):
+        merged[name] = combine(getattr(result, name) for result in results)
+    return dataclasses.replace(results[0], **merged)
+
+
+def _fields(result: Any) -> dict[str, Any]:
+    return {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
