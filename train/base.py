@@ -17,11 +17,12 @@ import tyro
 
 from sim.robot import get_robot
 from sim.simulation import resolve_device
-from train.learner import Iteration, Learner, read_checkpoint
+from train.learner import Learner, read_checkpoint
 from train.ppo import PpoCfg
 from train.progress import Progress
 from train.record import provenance, write_json, write_whole
-from train.task import CommandTask, TaskCfg
+from train.task import CommandTask
+from train.task_cfg import TaskCfg
 from train.vec_env import CommandVecEnv
 
 CHECKPOINT = "checkpoint.pt"
@@ -63,18 +64,24 @@ class StopRequest:
     """Set by Ctrl-C or SIGTERM: the iteration at hand is finished, then everything is saved. A second one kills."""
 
     def __init__(self) -> None:
-        """Listen from now on."""
+        """Not asked yet; listens inside a ``with`` block."""
         self.requested = False
-        for kind in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(kind, self._handle)
+
+    def __enter__(self) -> "StopRequest":
+        self._before = {kind: signal.signal(kind, self._handle) for kind in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for kind, handler in self._before.items():
+            signal.signal(kind, handler)
 
     def _handle(self, kind: int, _frame: object) -> None:
         self.requested = True
         signal.signal(kind, signal.SIG_DFL)
 
 
-def _resolve(cfg: BaseCfg) -> tuple[str, int, int, Path]:
-    """Device, number of environments, iterations and run directory; checks what can be checked without long work."""
+def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
+    """Device, number of environments and iterations."""
     device = resolve_device(cfg.device)
     on_cuda = device.startswith("cuda")
     if on_cuda and not torch.cuda.is_available():
@@ -89,9 +96,14 @@ def _resolve(cfg: BaseCfg) -> tuple[str, int, int, Path]:
             f"No GPU: a small training of {num_envs} robots and {iterations} iterations, enough to see that it runs. "
             "A controller that walks takes about 10 minutes on one GPU."
         )
+    return device, num_envs, iterations
+
+
+def _prepare_run_dir(cfg: BaseCfg, device: str) -> Path:
+    """The run directory, made and written to."""
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     run_dir = cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-base-{stamp}"
-    if cfg.resume is None and (run_dir / CHECKPOINT).exists():
+    if (run_dir / CHECKPOINT).exists() and (cfg.resume is None or run_dir.resolve() != cfg.resume.resolve()):
         raise ValueError(
             f"{run_dir} already holds a training run: go on with --resume {run_dir}, or name another --run-dir"
         )
@@ -101,14 +113,26 @@ def _resolve(cfg: BaseCfg) -> tuple[str, int, int, Path]:
         if cfg.export is not None:
             cfg.export.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"cannot write to {run_dir}: {error.strerror}; name another --run-dir") from error
-    return device, num_envs, iterations, run_dir
+        raise ValueError(f"cannot write to {error.filename}: {error.strerror}; name another place") from error
+    return run_dir
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     return str(value) if isinstance(value, Path) else value
+
+
+def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
+    """What differs between two nested settings, one line each."""
+    found = []
+    for key in sorted(before.keys() | after.keys()):
+        old, new = before.get(key), after.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += changes(old, new, f"{prefix}{key}.")
+        elif old != new:
+            found.append(f"{prefix}{key} {old} -> {new}")
+    return found
 
 
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
@@ -127,36 +151,49 @@ def train(cfg: BaseCfg) -> int:
     """
     began = time.monotonic()
     robot = get_robot(cfg.robot)
-    device, num_envs, iterations, run_dir = _resolve(cfg)
-    saved = read_checkpoint(cfg.resume / CHECKPOINT, cfg.robot, device=device) if cfg.resume else None
+    device, num_envs, iterations = _resolve_size(cfg)
+    saved = read_checkpoint(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
+    run_dir = _prepare_run_dir(cfg, device)
+    settings = {"seed": cfg.seed, "num_envs": num_envs, "task": asdict(cfg.task), "ppo": asdict(cfg.ppo)}
+    for change in changes(saved["extra"]["settings"], settings) if saved else []:
+        print(f"Changed since the checkpoint: {change}")
     print(f"Training '{robot.name}': {num_envs} robots on {device}, {iterations} iterations, in {run_dir}", flush=True)
-    stop = StopRequest()
-    env = CommandVecEnv(CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=cfg.seed))
-    learner = Learner(env, cfg.ppo, seed=cfg.seed)
-    if saved is not None:
-        learner.resume(saved)
-    origin = provenance(device, cfg.seed)
-    progress = Progress(run_dir, learner, iterations, rows=cfg.rows, origin=origin, saved=saved and saved["extra"])
-    deadline = began + cfg.max_seconds - _RESERVE_S if cfg.max_seconds else float("inf")
-    slowest = 0.0
-    last_save = time.monotonic()
-    while learner.iteration < iterations and not stop.requested and time.monotonic() + 2.0 * slowest < deadline:
-        step: Iteration = learner.iterate()
-        slowest = max(slowest, step.collection_s + step.learning_s) if progress.warm else 0.0
-        progress.add(step)
-        if time.monotonic() - last_save > cfg.save_every_s:
-            learner.save(run_dir / CHECKPOINT, progress.state())
-            last_save = time.monotonic()
-    progress.close()
-    learner.save(run_dir / CHECKPOINT, progress.state())
-    record = progress.record(asdict(cfg.task), asdict(cfg.ppo))
-    for path in (run_dir / POLICY, cfg.export):
-        if path is not None:
-            export_policy(path, learner, record)
-            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+    with StopRequest() as stop:
+        env = CommandVecEnv(CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=cfg.seed))
+        learner = Learner(env, cfg.ppo, seed=cfg.seed)
+        if saved is not None:
+            learner.resume(saved)
+        about = {**provenance(device, cfg.seed), "settings": settings}
+        progress = Progress(run_dir, learner, iterations, rows=cfg.rows, about=about, saved=saved and saved["extra"])
+        deadline = began + cfg.max_seconds - _RESERVE_S if cfg.max_seconds else float("inf")
+        _iterate(learner, progress, cfg, run_dir / CHECKPOINT, stop, deadline)
+        progress.close()
+        learner.save(run_dir / CHECKPOINT, progress.state())
+        record = progress.record()
+        for path in (run_dir / POLICY, cfg.export):
+            if path is not None:
+                export_policy(path, learner, record)
+                print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
     if learner.iteration < iterations:
         print(f"Stopped after {learner.iteration} of {iterations} iterations. Go on with: --resume {run_dir}")
     return 130 if stop.requested else 0
+
+
+def _iterate(
+    learner: Learner, progress: Progress, cfg: BaseCfg, checkpoint: Path, stop: StopRequest, deadline: float
+) -> None:
+    """Iterate until all is done, a stop is requested, or another iteration might end past the deadline."""
+    iterations = progress.iterations
+    slowest = 0.0
+    last_save = time.monotonic()
+    while learner.iteration < iterations and not stop.requested and time.monotonic() + slowest < deadline:
+        step = learner.iterate()
+        if progress.warm:  # the first iteration compiles and is no measure
+            slowest = max(slowest, step.collection_s + step.learning_s)
+        progress.add(step)
+        if time.monotonic() - last_save > cfg.save_every_s:
+            learner.save(checkpoint, progress.state())
+            last_save = time.monotonic()
 
 
 def main() -> int:

@@ -51,7 +51,7 @@ class EvaluateCfg:
     """Where to write the numbers; with 300 x 20 results/<robot>/base.json, else nowhere."""
 
 
-def test_rng(number: int, seed: int) -> np.random.Generator:
+def set_rng(number: int, seed: int) -> np.random.Generator:
     """Random numbers of a test set, shared with no other use of ``seed`` in the project."""
     return np.random.default_rng([_TEST_KEY, number, seed])
 
@@ -143,7 +143,7 @@ def evaluate_sets(rollout: Rollout, seed: int) -> dict[str, Any]:
         seed: Draws the test sets.
     """
     count = rollout.num_terrains
-    rngs = [test_rng(number, seed) for number in range(3)]
+    rngs = [set_rng(number, seed) for number in range(3)]
     crossings, types, levels = hand_crafted_crossings(count, rngs[0])
     sets = {
         "hand_crafted": crossings,

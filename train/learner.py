@@ -138,13 +138,15 @@ class Learner:
         self._begin()
 
 
-def read_checkpoint(path: Path, robot: str, *, device: str) -> dict[str, Any]:
+def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
     """Read a checkpoint as data only (no code in it is run).
 
     Args:
         path: File written by :meth:`Learner.save`.
         robot: Name of the robot it must be of.
-        device: Torch device its tensors go to.
+
+    Returns:
+        Its content, tensors on the CPU.
 
     Raises:
         ValueError: If the file is absent, truncated, foreign or of another robot.
@@ -163,6 +165,4 @@ def read_checkpoint(path: Path, robot: str, *, device: str) -> dict[str, Any]:
         raise ValueError(f"{path} must be a '{CHECKPOINT_FORMAT}', got another kind of file: {remedy}")
     if content["robot"] != robot:
         raise ValueError(f"{path} is of robot '{content['robot']}', expected '{robot}': {remedy} of '{robot}'")
-    for part in ("actor_state_dict", "critic_state_dict"):
-        content[part] = {key: value.to(device) for key, value in content[part].items()}
     return content

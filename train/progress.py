@@ -29,6 +29,7 @@ class Progress:
     """Collects iterations into rows; a row is printed, written to TensorBoard and kept for the record.
 
     Attributes:
+        iterations: Iterations in all.
         warm: False until the first iteration, which compiles and captures, is over.
     """
 
@@ -39,7 +40,7 @@ class Progress:
         iterations: int,
         *,
         rows: int,
-        origin: dict[str, Any],
+        about: dict[str, Any],
         saved: dict[str, Any] | None = None,
     ) -> None:
         """Begin a piece of training.
@@ -49,18 +50,18 @@ class Progress:
             learner: What is trained.
             iterations: Iterations in all.
             rows: Rows over all iterations.
-            origin: Provenance of this piece.
+            about: Provenance and ``settings`` of this piece.
             saved: :meth:`state` of the pieces before.
         """
         self._learner = learner
-        self._iterations = iterations
+        self.iterations = iterations
         self._every = max(1, iterations // rows)
         self._curve: list[dict[str, Any]] = list(saved["curve"]) if saved else []
         self._pieces: list[dict[str, Any]] = list(saved["pieces"]) if saved else []
         self._env_steps = int(saved["env_steps"]) if saved else 0
         self._wall_s = float(saved["wall_s"]) if saved else 0.0
-        self._pieces.append({**origin, "from_iteration": learner.iteration})
-        self._origin = origin
+        self._pieces.append({**about, "from_iteration": learner.iteration})
+        self._about = about
         self._writer = SummaryWriter(log_dir=str(run_dir), flush_secs=10)
         self._window: list[Iteration] = []
         self._piece_began = time.monotonic()
@@ -86,20 +87,24 @@ class Progress:
     def state(self) -> dict[str, Any]:
         """What the next piece needs, plain data."""
         wall_s = self._wall_s + time.monotonic() - self._piece_began
-        return {"curve": self._curve, "pieces": self._pieces, "env_steps": self._env_steps, "wall_s": wall_s}
-
-    def record(self, task: dict[str, Any], ppo: dict[str, Any]) -> dict[str, Any]:
-        """The training record: provenance, totals, settings, and the curve."""
         return {
-            **self._origin,
+            "settings": self._about["settings"],
+            "curve": self._curve,
+            "pieces": self._pieces,
+            "env_steps": self._env_steps,
+            "wall_s": wall_s,
+        }
+
+    def record(self) -> dict[str, Any]:
+        """The training record: provenance, settings, totals, the pieces it was trained in, and the curve."""
+        return {
+            **self._about,
             "robot": self._learner.env.task.robot.name,
             "iterations": self._learner.iteration,
             "num_envs": self._learner.env.num_envs,
             "env_steps": self._env_steps,
             "wall_s": round(self.state()["wall_s"], 1),
             "pieces": self._pieces,
-            "task": task,
-            "ppo": ppo,
             "curve": self._curve,
         }
 
@@ -138,9 +143,9 @@ class Progress:
         self._write_scalars(row)
 
     def _print(self, row: dict[str, Any]) -> None:
-        left = (self._iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
+        left = (self.iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
         print(
-            f"{row['iteration']:>6}/{self._iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
+            f"{row['iteration']:>6}/{self.iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
             f"{row['env_steps_per_s']:>9,.0f} "
             f"{row['collection_s'] * 1e3:>6.0f}ms {row['learning_s'] * 1e3:>6.0f}ms {_number(row['reward'], '.2f'):>7} "
             f"{_number(row['length_s'], '.1f'):>6}s {_number(row['fall_rate'], '.3f'):>6} {row['lin_vel_error']:>6.3f} "

@@ -4,130 +4,21 @@ One control step is one captured graph: action, physics, end of episodes, reward
 pushes, observation. The host copies actions in and results out, and draws no random number.
 """
 
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict
 
 import numpy as np
 import torch
 
-from kernels.episode import StartRanges
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.restart import command_episodes, promote_episodes, remember_steps, restart_episodes
 from kernels.rewards import REWARDS, Motion, RewardWeights, make_feet, reward_steps
-from kernels.training import STATISTICS, End, Rules, judge_steps, make_episodes, record_steps
+from kernels.training import STATISTICS, End, judge_steps, make_episodes, record_steps
 from sim.bank import TerrainBank
 from sim.policy import share_stream
 from sim.robot import RobotCfg
 from sim.simulation import Simulation
-from train.curriculum import CurriculumCfg, first_levels, make_tiles
-
-ITERATION_CAP_BITS = 512 | 1024  # solver bits that say "stopped at the iteration cap", which is no fault
-_TILE_SIDE = 8.0
-_TILE_CENTRE = (8.0, 4.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RewardCfg:
-    """Weight of each reward term per second: legged_gym's for ANYmal, and the paper's two."""
-
-    tracking_lin_vel: float = 1.0
-    tracking_ang_vel: float = 0.5
-    lin_vel_z: float = -2.0
-    ang_vel_xy: float = -0.05
-    torques: float = -1e-5
-    dof_acc: float = -2.5e-7
-    feet_air_time: float = 1.0
-    collision: float = -1.0
-    action_rate: float = -0.01
-    stumble: float = -0.1
-    feet_contact_forces: float = -1e-3
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoiseCfg:
-    """Half widths of the uniform observation noise, in the units of the measured quantity."""
-
-    lin_vel: float = 0.1
-    ang_vel: float = 0.2
-    gravity: float = 0.05
-    joint_pos: float = 0.01
-    joint_vel: float = 1.5
-    scan: float = 0.1
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaskCfg:
-    """The task; the defaults are legged_gym's but for the start's yaw, which it leaves at 0."""
-
-    rewards: RewardCfg = field(default_factory=RewardCfg)
-    noise: NoiseCfg = field(default_factory=NoiseCfg)
-    curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
-    only_positive: bool = True
-    """Clip the reward of a step at 0, so that ending early never pays."""
-    episode_s: float = 20.0
-    command_interval_s: float = 10.0
-    """A new command every so often."""
-    lin_vel_x: tuple[float, float] = (-1.0, 1.0)
-    """Range of the commanded forward velocity [m/s]."""
-    lin_vel_y: tuple[float, float] = (-1.0, 1.0)
-    """Range of the commanded sideward velocity [m/s]."""
-    min_speed: float = 0.2
-    """Slower commands become 0 [m/s]."""
-    yaw_gain: float = 0.5
-    """Commanded yaw rate per heading error [1/s]."""
-    max_yaw_rate: float = 1.0
-    """Largest commanded yaw rate [rad/s]."""
-    push_interval_s: float = 15.0
-    """A push every so often; 0 for none."""
-    push_speed: float = 1.0
-    """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
-    friction: tuple[float, float] = (0.5, 1.25)
-    """Range of the robots' friction coefficients."""
-    added_base_mass: tuple[float, float] = (-5.0, 5.0)
-    """Range of the mass added to the bases [kg]."""
-    start_position_range: float = 1.0
-    """Starts lie within this of the tile's centre along x and y [m]."""
-    start_yaw_range: float = np.pi
-    """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
-    start_joint_range: float = 0.5
-    """Joints start at the default pose times 1 +- this."""
-    start_velocity_range: float = 0.5
-    """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
-    base_force: float = 1.0
-    """Contact force on the base that ends an episode [N]."""
-    max_gravity_z: float = -0.1
-    """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
-    max_speed: float = 100.0
-    """Any velocity beyond makes the state invalid [m/s or rad/s]."""
-
-
-def _fill(struct: Any, **values: Any) -> Any:
-    for name, value in values.items():
-        setattr(struct, name, value)
-    return struct
-
-
-def _make_rules(cfg: TaskCfg, control_dt: float, num_levels: int, num_columns: int) -> Any:
-    return _fill(
-        Rules(),
-        max_steps=round(cfg.episode_s / control_dt),
-        base_force=cfg.base_force,
-        max_gravity_z=cfg.max_gravity_z,
-        max_speed=cfg.max_speed,
-        overflow_mask=~ITERATION_CAP_BITS,
-        num_levels=num_levels,
-        num_columns=num_columns,
-        promotion_distance=0.5 * _TILE_SIDE,
-        demotion_time_s=0.5 * cfg.episode_s,
-        command_steps=round(cfg.command_interval_s / control_dt),
-        lin_vel_x=cfg.lin_vel_x,
-        lin_vel_y=cfg.lin_vel_y,
-        min_speed=cfg.min_speed,
-        yaw_gain=cfg.yaw_gain,
-        max_yaw_rate=cfg.max_yaw_rate,
-        push_steps=round(cfg.push_interval_s / control_dt),
-        push_speed=cfg.push_speed,
-    )
+from train.curriculum import first_levels, make_tiles
+from train.task_cfg import TaskCfg, fill, make_rules, make_start_ranges
 
 
 class CommandTask:
@@ -162,52 +53,46 @@ class CommandTask:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         share_stream(device)
         self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
-        tile_seed, model_seed, start_seed, first_count = np.random.SeedSequence(seed).generate_state(4)
+        tile_seed, level_seed, model_seed, count_seed = np.random.SeedSequence(seed).generate_state(4)
+        first_count = int(count_seed) % 2**30  # far from where a 32-bit counter wraps
         self.tiles = make_tiles(cfg.curriculum, int(tile_seed))
-        bank = TerrainBank(len(self.tiles.heights), device=device)
-        bank.set_heights(self.tiles.heights)
         columns = self.tiles.columns_of(num_envs)
-        levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(start_seed))
-        rng = np.random.default_rng(model_seed)
-        self.sim = Simulation(
-            robot,
-            bank,
-            levels * self.tiles.num_columns + columns,
-            friction=rng.uniform(*cfg.friction, num_envs).astype(np.float32),
-            added_base_mass=rng.uniform(*cfg.added_base_mass, num_envs).astype(np.float32),
-        )
-        self._rules = _make_rules(cfg, robot.control_dt, self.tiles.num_levels, self.tiles.num_columns)
+        levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(level_seed))
+        self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
+        self._rules = make_rules(cfg, robot.control_dt, self.tiles.num_levels, self.tiles.num_columns)
         self.max_episode_steps: int = self._rules.max_steps
         self._episodes = make_episodes(
             columns,
             levels,
             num_joints=robot.num_joints,
             observation_size=robot.observation_size,
-            first_count=int(first_count) % 2**30,
+            first_count=first_count,
             device=device,
         )
         self._make_structs()
         self._make_views()
         self._graph = self.sim.capture(self._control_step)  # makes one step, which is undone here
-        self.counter.fill_(int(first_count) % 2**30)
+        self.counter.fill_(first_count)
         self.restart_all(torch.from_numpy(levels))
+
+    def _build_simulation(self, terrain_of_env: np.ndarray, rng: np.random.Generator) -> Simulation:
+        bank = TerrainBank(len(self.tiles.heights), device=self.device)
+        bank.set_heights(self.tiles.heights)
+        return Simulation(
+            self.robot,
+            bank,
+            terrain_of_env,
+            friction=rng.uniform(*self.cfg.friction, self.num_envs).astype(np.float32),
+            added_base_mass=rng.uniform(*self.cfg.added_base_mass, self.num_envs).astype(np.float32),
+        )
 
     def _make_structs(self) -> None:
         sim, robot, cfg = self.sim, self.robot, self.cfg
-        self._noise = _fill(Noise(), **asdict(cfg.noise))
-        self._weights = _fill(RewardWeights(), **asdict(cfg.rewards))
+        self._noise = fill(Noise(), **asdict(cfg.noise))
+        self._weights = fill(RewardWeights(), **asdict(cfg.rewards))
         self._feet = make_feet(self.num_envs, len(robot.geom_names), self.device)
-        self._ranges = _fill(
-            StartRanges(),
-            position=_TILE_CENTRE,
-            position_range=cfg.start_position_range,
-            yaw_range=cfg.start_yaw_range,
-            joint_scale_range=cfg.start_joint_range,
-            velocity_range=cfg.start_velocity_range,
-            base_height=robot.default_base_height,
-            footprint=(max(robot.footprint), max(robot.footprint)),  # whatever the heading
-        )
-        self._motion = _fill(
+        self._ranges = make_start_ranges(cfg, robot)
+        self._motion = fill(
             Motion(),
             joint_q=sim.joint_q,
             joint_qd=sim.joint_qd,

@@ -61,7 +61,7 @@ def test_ends_at_their_thresholds():
 
 
 def test_non_finite_states_are_invalid():
-    broken = [UPRIGHT[:7] + (value,) for value in (np.nan, np.inf, -np.inf)]
+    broken = [(*UPRIGHT[:7], value) for value in (np.nan, np.inf, -np.inf)]
     assert ends(broken) == [End.INVALID] * 3
     assert ends([UPRIGHT], velocity=np.nan) == [End.INVALID]
 
@@ -85,7 +85,7 @@ def test_statistics_add_up():
     episodes.reward.assign(np.float32([1, 2, 3, 4]))
     episodes.total_reward.assign(np.float32([10, 20, 30, 40]))
     episodes.command.assign(np.float32([[0.3, 0.4, 0.2]] * 4))
-    joint_q = wp.array(np.float32([UPRIGHT] * 3 + [UPRIGHT[:7] + (np.nan,)]), dtype=float)
+    joint_q = wp.array(np.float32([UPRIGHT] * 3 + [(*UPRIGHT[:7], np.nan)]), dtype=float)
     joint_qd = wp.zeros((4, 7), dtype=float)
     overflow = wp.array([1, 512 | 1024, 0, 2 | 512], dtype=int)
     record_steps(joint_q, joint_qd, wp.vec3(0.0), overflow, make_rules(), episodes)

@@ -1,0 +1,34 @@
+"""One small task for all tests of the room: what is compiled for one serves the others."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from sim.robot import get_robot
+from train.curriculum import CurriculumCfg
+from train.task import CommandTask
+from train.task_cfg import TaskCfg
+
+NUM_ENVS = 6
+CURRICULUM = CurriculumCfg(num_columns=2, noise_columns=1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def make_task() -> Callable[..., CommandTask]:
+    def make(seed: int = 0, num_envs: int = NUM_ENVS, **changes: object) -> CommandTask:
+        cfg = TaskCfg(curriculum=CURRICULUM, **changes)  # type: ignore[arg-type]
+        return CommandTask(get_robot("anymal"), cfg, num_envs=num_envs, device="cpu", seed=seed)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def shared_task() -> CommandTask:
+    """A task that tests may step and change, but not count on finding at its beginning."""
+    return CommandTask(get_robot("anymal"), TaskCfg(curriculum=CURRICULUM), num_envs=NUM_ENVS, device="cpu", seed=1)

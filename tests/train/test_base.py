@@ -1,0 +1,130 @@
+"""The training command: what a run leaves behind, resuming, stopping, and errors."""
+
+import json
+import signal
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sim.policy import load_policy
+from sim.robot import get_robot
+from tests.train.conftest import CURRICULUM
+from train.base import BaseCfg, StopRequest, main, train
+from train.ppo import PpoCfg
+from train.task_cfg import TaskCfg
+
+PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
+
+
+def config(run_dir, **changes):
+    values = {"num_envs": 6, "iterations": 2, "rows": 2, "device": "cpu", "ppo": PPO, **changes}
+    return BaseCfg(run_dir=run_dir, task=TaskCfg(curriculum=CURRICULUM), **values)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("run") / "first"
+    assert train(config(run_dir, export=run_dir.parent / "out" / "robot.pt")) == 0
+    return run_dir
+
+
+def test_a_run_leaves_a_controller_and_its_record(finished):
+    robot = get_robot("anymal")
+    exported = finished.parent / "out" / "robot.pt"
+    content = torch.load(exported, weights_only=True)
+    assert content["actor_state_dict"]["mlp.0.weight"].shape == (16, 235)
+    policy = load_policy(exported, robot, "cpu")
+    observation = torch.randn(3, 235)
+    assert policy(observation).shape == (3, 12)
+    record = json.loads(exported.with_suffix(".train.json").read_text())
+    for key in ("command", "commit", "device", "versions", "seed", "date", "wall_s", "settings", "pieces"):
+        assert key in record, key
+    assert (record["robot"], record["iterations"], record["num_envs"], record["env_steps"]) == ("anymal", 2, 6, 48)
+    assert [row["iteration"] for row in record["curve"]] == [1, 2]
+    assert record["settings"]["ppo"]["hidden_dims"] == [16, 8]
+
+
+def test_a_run_leaves_tensorboard_scalars(finished):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(finished))
+    events.Reload()
+    assert {"train/level", "terms/stumble", "losses/value", "train/env_steps_per_s"} <= set(events.Tags()["scalars"])
+
+
+def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
+    before = (finished / "checkpoint.pt").read_bytes()
+    assert train(config(tmp_path / "second", resume=finished, iterations=3)) == 0
+    assert (finished / "checkpoint.pt").read_bytes() == before
+    record = json.loads((tmp_path / "second" / "policy.train.json").read_text())
+    assert record["iterations"] == 3 and record["env_steps"] == 72
+    assert [row["iteration"] for row in record["curve"]] == [1, 2, 3]
+    assert [piece["from_iteration"] for piece in record["pieces"]] == [0, 2]
+    assert train(config(None, resume=tmp_path / "second", iterations=4)) == 0
+    assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
+
+
+def test_changed_settings_are_named(finished, tmp_path, capsys):
+    ppo = replace(PPO, entropy=0.5)
+    train(config(tmp_path / "changed", resume=finished, iterations=2, ppo=ppo))
+    assert "Changed since the checkpoint: ppo.entropy 0.01 -> 0.5\n" in capsys.readouterr().out
+
+
+def test_out_of_time_saves_and_says_how_to_go_on(finished, tmp_path, capsys):
+    assert train(config(tmp_path / "late", resume=finished, iterations=50, max_seconds=1.0)) == 0
+    assert (tmp_path / "late" / "checkpoint.pt").exists()
+    assert f"Stopped after 2 of 50 iterations. Go on with: --resume {tmp_path / 'late'}" in capsys.readouterr().out
+
+
+def test_an_interrupt_saves_and_says_how_to_go_on(finished, tmp_path, capsys, monkeypatch):
+    from train.learner import Learner
+
+    iterate = Learner.iterate
+
+    def interrupted(learner):
+        signal.raise_signal(signal.SIGINT)
+        return iterate(learner)
+
+    monkeypatch.setattr(Learner, "iterate", interrupted)
+    assert train(config(tmp_path / "cut", resume=finished, iterations=50)) == 130
+    assert torch.load(tmp_path / "cut" / "checkpoint.pt", weights_only=True)["iter"] == 3
+    assert "Go on with: --resume" in capsys.readouterr().out
+
+
+def test_handlers_are_put_back():
+    before = signal.getsignal(signal.SIGINT)
+    with StopRequest() as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.requested
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--robot", "spot"], "unknown robot 'spot': expected one of anymal"),
+        (["--device", "cuda"], "no CUDA device was found"),
+        (["--device", "cpu", "--run-dir", "/proc/nowhere"], "cannot write to /proc/nowhere"),
+        (["--device", "cpu", "--resume", "{empty}"], "no checkpoint at"),
+    ],
+)
+@pytest.mark.skipif(torch.cuda.is_available(), reason="one of the errors is the absence of CUDA")
+def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("train.base.CommandTask", None)  # building anything would fail with another error
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.base", *(flag.format(empty=tmp_path) for flag in flags)])
+    assert main() == 2
+    error = capsys.readouterr().err
+    assert message in error and error.startswith("error: ") and error.count("\n") == 1
+
+
+def test_a_run_is_not_overwritten(finished, tmp_path):
+    before = (finished / "checkpoint.pt").read_bytes()
+    for resume in (None, tmp_path / "other"):
+        if resume is not None:
+            assert train(config(resume, resume=finished)) == 0
+        with pytest.raises(ValueError, match="already holds a training run"):
+            train(config(finished, resume=resume))
+    assert (finished / "checkpoint.pt").read_bytes() == before

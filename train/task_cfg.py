@@ -1,0 +1,135 @@
+"""Settings of the command-following task, and what the kernels take of them."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kernels.episode import StartRanges
+from kernels.training import Rules
+from sim.robot import RobotCfg
+from train.curriculum import CurriculumCfg
+
+ITERATION_CAP_BITS = 512 | 1024  # solver bits that say "stopped at the iteration cap", which is no fault
+_TILE_SIDE = 8.0
+_TILE_CENTRE = (8.0, 4.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardCfg:
+    """Weight of each reward term per second: legged_gym's for ANYmal, and the paper's two."""
+
+    tracking_lin_vel: float = 1.0
+    tracking_ang_vel: float = 0.5
+    lin_vel_z: float = -2.0
+    ang_vel_xy: float = -0.05
+    torques: float = -1e-5
+    dof_acc: float = -2.5e-7
+    feet_air_time: float = 1.0
+    collision: float = -1.0
+    action_rate: float = -0.01
+    stumble: float = -0.1
+    feet_contact_forces: float = -1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseCfg:
+    """Half widths of the uniform observation noise, in the units of the measured quantity."""
+
+    lin_vel: float = 0.1
+    ang_vel: float = 0.2
+    gravity: float = 0.05
+    joint_pos: float = 0.01
+    joint_vel: float = 1.5
+    scan: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskCfg:
+    """The task; the defaults are legged_gym's but for the start's yaw, which it leaves at 0."""
+
+    rewards: RewardCfg = field(default_factory=RewardCfg)
+    noise: NoiseCfg = field(default_factory=NoiseCfg)
+    curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
+    only_positive: bool = True
+    """Clip the reward of a step at 0, so that ending early never pays."""
+    episode_s: float = 20.0
+    command_interval_s: float = 10.0
+    """A new command every so often."""
+    lin_vel_x: tuple[float, float] = (-1.0, 1.0)
+    """Range of the commanded forward velocity [m/s]."""
+    lin_vel_y: tuple[float, float] = (-1.0, 1.0)
+    """Range of the commanded sideward velocity [m/s]."""
+    min_speed: float = 0.2
+    """Slower commands become 0 [m/s]."""
+    yaw_gain: float = 0.5
+    """Commanded yaw rate per heading error [1/s]."""
+    max_yaw_rate: float = 1.0
+    """Largest commanded yaw rate [rad/s]."""
+    push_interval_s: float = 15.0
+    """A push every so often; 0 for none."""
+    push_speed: float = 1.0
+    """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
+    friction: tuple[float, float] = (0.5, 1.25)
+    """Range of the robots' friction coefficients."""
+    added_base_mass: tuple[float, float] = (-5.0, 5.0)
+    """Range of the mass added to the bases [kg]."""
+    start_position_range: float = 1.0
+    """Starts lie within this of the tile's centre along x and y [m]."""
+    start_yaw_range: float = np.pi
+    """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
+    start_joint_range: float = 0.5
+    """Joints start at the default pose times 1 +- this."""
+    start_velocity_range: float = 0.5
+    """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
+    base_force: float = 1.0
+    """Contact force on the base that ends an episode [N]."""
+    max_gravity_z: float = -0.1
+    """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
+    max_speed: float = 100.0
+    """Any velocity beyond makes the state invalid [m/s or rad/s]."""
+
+
+def fill(struct: Any, **values: Any) -> Any:
+    """Set the fields of a kernel argument; returns it."""
+    for name, value in values.items():
+        setattr(struct, name, value)
+    return struct
+
+
+def make_rules(cfg: TaskCfg, control_dt: float, num_levels: int, num_columns: int) -> Any:
+    """Limits, ranges and intervals of the task as a kernel argument."""
+    return fill(
+        Rules(),
+        max_steps=round(cfg.episode_s / control_dt),
+        base_force=cfg.base_force,
+        max_gravity_z=cfg.max_gravity_z,
+        max_speed=cfg.max_speed,
+        overflow_mask=~ITERATION_CAP_BITS,
+        num_levels=num_levels,
+        num_columns=num_columns,
+        promotion_distance=0.5 * _TILE_SIDE,
+        demotion_time_s=0.5 * cfg.episode_s,
+        command_steps=round(cfg.command_interval_s / control_dt),
+        lin_vel_x=cfg.lin_vel_x,
+        lin_vel_y=cfg.lin_vel_y,
+        min_speed=cfg.min_speed,
+        yaw_gain=cfg.yaw_gain,
+        max_yaw_rate=cfg.max_yaw_rate,
+        push_steps=round(cfg.push_interval_s / control_dt),
+        push_speed=cfg.push_speed,
+    )
+
+
+def make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
+    """The randomised start of an episode as a kernel argument."""
+    return fill(
+        StartRanges(),
+        position=_TILE_CENTRE,
+        position_range=cfg.start_position_range,
+        yaw_range=cfg.start_yaw_range,
+        joint_scale_range=cfg.start_joint_range,
+        velocity_range=cfg.start_velocity_range,
+        base_height=robot.default_base_height,
+        footprint=(max(robot.footprint), max(robot.footprint)),  # whatever the heading
+    )
