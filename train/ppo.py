@@ -36,6 +36,8 @@ class PpoCfg:
     """Weight of the entropy bonus."""
     init_noise_std: float = 1.0
     """Standard deviation of the actions before the first update."""
+    captured: bool = True
+    """Update with :class:`CapturedPPO`; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
 
 
 def runner_settings(cfg: PpoCfg) -> dict[str, Any]:
@@ -48,7 +50,7 @@ def runner_settings(cfg: PpoCfg) -> dict[str, Any]:
         "check_for_nan": False,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "algorithm": {
-            "class_name": CapturedPPO,
+            "class_name": CapturedPPO if cfg.captured else "PPO",
             "num_learning_epochs": cfg.epochs,
             "num_mini_batches": cfg.mini_batches,
             "learning_rate": cfg.learning_rate,

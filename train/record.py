@@ -7,7 +7,7 @@ import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
         "command": shlex.join(["python", "-m", *_module_and_arguments()]),
         "commit": _commit(),
         "device": _device_name(device),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
         "seed": seed,
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
     }
@@ -36,6 +36,13 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
 def _module_and_arguments() -> list[str]:
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     return [spec.name if spec is not None else Path(sys.argv[0]).name, *sys.argv[1:]]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:  # on the path, but not installed
+        return None
 
 
 def _commit() -> str | None:

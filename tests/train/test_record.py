@@ -1,0 +1,35 @@
+"""Provenance, and files that are whole or absent."""
+
+import json
+import re
+
+import pytest
+
+from train.record import provenance, write_json, write_whole
+
+
+def test_provenance_has_its_keys(monkeypatch):
+    monkeypatch.setenv("FAULTLINE_COMMIT", "abc123")
+    origin = provenance("cpu", 7)
+    assert list(origin) == ["command", "commit", "device", "versions", "seed", "date"]
+    assert origin["commit"] == "abc123" and origin["seed"] == 7
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", origin["date"])
+    assert all(re.match(r"\d+\.", number) for number in origin["versions"].values())
+    json.dumps(origin, allow_nan=False)
+
+
+def test_commit_comes_from_git_otherwise(monkeypatch):
+    monkeypatch.delenv("FAULTLINE_COMMIT", raising=False)
+    commit = provenance("cpu", 0)["commit"]
+    assert commit is None or re.fullmatch(r"[0-9a-f]{40}", commit)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"x": 1})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(path, {"x": float("nan")})
+    assert json.loads(path.read_text()) == {"x": 1}
+    with pytest.raises(OSError, match="absent"):
+        write_whole(tmp_path / "absent" / "a", b"")
+    assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
