@@ -1,0 +1,223 @@
+"""Terrain contact of sphere probes: nothing invented, nothing missed, and records as the solver reads them."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
+from sim.terrain import SPACING, crossing_terrain, hard_random_genes
+from tests.kernels import oracle
+from tests.kernels.test_heightfield import make_terrain
+
+RADII = (0.0175, 0.03, 0.06, 0.1)
+UNDECIDED = 1e-4  # a sphere this close to touching may go either way in float32
+FIRST_SHAPE, GROUND_SHAPE = 5, 2
+
+
+def make_probes(strips, device):
+    """Strips as (centres (n, 3), radius), each on a body and a shape of its own."""
+    probes = Probes()
+    centres = np.concatenate([np.reshape(centres, (-1, 3)) for centres, _ in strips])
+    probes.position = wp.array(np.float32(centres), dtype=wp.vec3, device=device)
+    starts = np.cumsum([0] + [len(np.reshape(centres, (-1, 3))) for centres, _ in strips])
+    probes.strip_start = wp.array(starts, dtype=int, device=device)
+    probes.strip_radius = wp.array([radius for _, radius in strips], dtype=float, device=device)
+    probes.strip_body = wp.array(np.arange(len(strips)), dtype=int, device=device)
+    probes.strip_shape = wp.array(np.arange(len(strips)), dtype=int, device=device)
+    return probes
+
+
+def make_buffer(capacity, device):
+    buffer = ContactBuffer()
+    buffer.count = wp.zeros(1, dtype=int, device=device)
+    for name in ("shape0", "shape1"):
+        setattr(buffer, name, wp.full(capacity, -1, dtype=int, device=device))
+    for name in ("point0", "point1", "normal", "offset0", "offset1"):
+        setattr(buffer, name, wp.zeros(capacity, dtype=wp.vec3, device=device))
+    for name in ("margin0", "margin1"):
+        setattr(buffer, name, wp.full(capacity, -1.0, dtype=float, device=device))
+    return buffer
+
+
+def collide(poses, terrain_of_env, grids, strips, device, capacity=None):
+    """Contact records as a dict of arrays, plus ``env``, ``strip`` and the world ``centre`` and ``distance``."""
+    num_envs = len(terrain_of_env)
+    layout = Layout()
+    layout.bodies_per_env = layout.shapes_per_env = len(strips)
+    layout.first_shape, layout.ground_shape = FIRST_SHAPE, GROUND_SHAPE
+    probes = make_probes(strips, device)
+    buffer = make_buffer(capacity or 3 * num_envs * len(strips), device)
+    poses = np.float32(poses).reshape(-1, 7)
+    collide_strips(
+        wp.array(poses, dtype=wp.transform, device=device),
+        wp.array(terrain_of_env, dtype=int, device=device),
+        make_terrain(grids, device),
+        probes,
+        layout,
+        buffer,
+    )
+    count = int(buffer.count.numpy()[0])
+    found = {name: getattr(buffer, name).numpy()[:count] for name in ContactBuffer.vars if name != "count"}
+    found["count"] = count
+    found["env"], found["strip"] = np.divmod(found["shape1"] - FIRST_SHAPE, len(strips))
+    found["rotation"] = np.array([oracle.rotation_matrix(poses[k, 3:]) for k in found["shape1"] - FIRST_SHAPE])
+    origin = np.float64(poses)[found["shape1"] - FIRST_SHAPE, :3]
+    found["centre"] = origin + np.einsum("nij,nj->ni", found["rotation"].reshape(-1, 3, 3), found["point1"])
+    found["distance"] = ((found["centre"] - found["point0"]) * found["normal"]).sum(1)
+    return found
+
+
+def random_rotations(rng, count):
+    quaternion = rng.normal(size=(count, 4))
+    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+
+def hard_terrain(kind):
+    if kind == "genes":
+        x, y = np.arange(321)[None, :] * SPACING, np.arange(161)[:, None] * SPACING
+        return np.float32(oracle.mixture_height(hard_random_genes(1, 3)[0], x, y))
+    return crossing_terrain(kind, 9, 4)
+
+
+def sphere_poses(rng, grid, count):
+    """Spheres about the surface (half of them between the lowest and highest node near), also beyond the grid."""
+    poses = np.zeros((count, len(RADII), 7))
+    poses[..., :2] = rng.uniform([3.0, -0.2], [13.0, 8.2], (count, len(RADII), 2))
+    poses[: count // 10, :, 0] = rng.uniform(-0.3, 16.3, (count // 10, len(RADII)))
+    for pose in poses.reshape(-1, 7):
+        near = oracle.triangles(grid, SPACING, pose[0], pose[1], max(RADII))[..., 2]
+        ground = oracle.surface_height(grid, SPACING, pose[0], pose[1])
+        low, high = (near.min(), near.max()) if rng.random() < 0.5 else (ground, ground)
+        pose[2] = rng.uniform(low - 0.05, high + 0.12)
+    poses[..., 3:] = random_rotations(rng, poses.size // 7).reshape(count, len(RADII), 4)
+    return np.float32(poses)
+
+
+@pytest.mark.parametrize("kind", ["genes", "stairs_up_down", "boxes", "noise"])
+def test_random_spheres_against_the_oracle(device, kind):
+    rng = np.random.default_rng(7)
+    grid = hard_terrain(kind)
+    poses = sphere_poses(rng, grid, 500)
+    found = collide(poses, np.zeros(500, int), grid[None], [(np.zeros(3), radius) for radius in RADII], device)
+    distance_of = {
+        (env, strip): d for env, strip, d in zip(found["env"], found["strip"], found["distance"], strict=True)
+    }
+    assert len(distance_of) == found["count"], "one sphere gave two contacts"
+    invented, missed, touching, sidelong = [], [], 0, 0
+    for env, strip in np.ndindex(poses.shape[:2]):
+        centre, radius = poses[env, strip, :3], RADII[strip]
+        expected, nearest = oracle.nearest_on_surface(grid, SPACING, centre, radius + UNDECIDED)
+        got = distance_of.get((env, strip))
+        if expected < radius - UNDECIDED and got is None:
+            missed.append((centre, radius, expected))
+        if expected > radius + UNDECIDED and got is not None:
+            invented.append((centre, radius, expected, got))
+        if got is not None and abs(expected) < radius - UNDECIDED:
+            touching += 1
+            sidelong += abs(nearest[2] - centre[2]) < 0.5 * abs(expected)
+            assert got == pytest.approx(expected, abs=1e-4)
+    assert (missed, invented) == ([], [])
+    assert touching > 300
+    assert sidelong > 10 or kind == "genes"  # the case that approximate nearest points get wrong
+
+
+def test_strips_report_first_deepest_and_last(device):
+    rng = np.random.default_rng(8)
+    grid = hard_terrain("boxes")
+    centres, radius = np.linspace([0, 0, -0.2], [0, 0, 0.2], 15), 0.04
+    poses = sphere_poses(rng, grid, 150)[:, :1]
+    found = collide(poses, np.zeros(150, int), grid[None], [(centres, radius)], device)
+    touched = 0
+    for env, pose in enumerate(np.float64(poses[:, 0])):
+        world = pose[:3] + centres @ oracle.rotation_matrix(pose[3:]).T
+        distance = np.array([oracle.nearest_on_surface(grid, SPACING, p, radius + UNDECIDED)[0] for p in world])
+        if (np.abs(distance - radius) < UNDECIDED).any() or (np.sort(distance)[:2] == -np.inf).any():
+            continue  # too close to call, or so deep that the depth is another definition
+        expected = np.flatnonzero(distance < radius)
+        mine = found["env"] == env
+        if len(expected) == 0:
+            assert not mine.any()
+            continue
+        touched += 1
+        wanted = {expected[0], expected[-1], np.argmin(distance)}
+        got = {int(np.argmin(np.abs(centres - point).sum(1))) for point in found["point1"][mine]}
+        tied = np.flatnonzero(distance < distance.min() + 2e-5)
+        assert got in [{expected[0], expected[-1], k} for k in tied], (wanted, got)
+        assert mine.sum() == len(got)
+    assert touched > 30
+
+
+def test_records_are_what_the_solver_reads(device):
+    rng = np.random.default_rng(9)
+    grid = hard_terrain("genes")
+    poses = sphere_poses(rng, grid, 100)
+    found = collide(
+        poses, np.zeros(100, int), grid[None], [(rng.normal(0, 0.02, 3), radius) for radius in RADII], device
+    )
+    assert found["count"] > 50
+    radius = np.array(RADII)[found["strip"]]
+    assert (found["shape0"] == GROUND_SHAPE).all()
+    assert (found["margin0"] == 0).all()
+    assert not found["offset0"].any()
+    np.testing.assert_array_equal(found["margin1"], np.float32(radius))
+    np.testing.assert_allclose(np.linalg.norm(found["normal"], axis=1), 1, atol=1e-5)
+    # offset1, turned into the world, leads from the centre to the sphere's lowest point against the normal.
+    offset_w = np.einsum("nij,nj->ni", found["rotation"], found["offset1"])
+    np.testing.assert_allclose(offset_w, -found["normal"] * radius[:, None], atol=1e-6)
+    for point in found["point0"][np.abs(found["distance"]) < radius]:
+        assert abs(oracle.nearest_on_surface(grid, SPACING, point, 0.05)[0]) < 1e-5
+
+
+def test_permuting_environments_permutes_contacts(device):
+    rng = np.random.default_rng(10)
+    grids = np.stack([hard_terrain(kind) for kind in ("genes", "boxes")])
+    terrain_of_env, order = rng.integers(0, 2, 60), rng.permutation(60)
+    poses = sphere_poses(rng, grids[1], 60)
+    strips = [(np.zeros(3), radius) for radius in RADII]
+    one = collide(poses, terrain_of_env, grids, strips, device)
+    other = collide(poses[order], terrain_of_env[order], grids, strips, device)
+    records = [
+        sorted((env, strip, *point) for env, strip, point in zip(envs, found["strip"], found["point0"], strict=True))
+        for envs, found in ((one["env"], one), (order[other["env"]], other))
+    ]
+    assert records[0] == records[1]
+
+
+def test_depth_by_hand(device):
+    # A sphere of radius 0.1 whose centre is 0.06 m over flat ground at 0.25: distance 0.06, normal up; 0.11 m over it:
+    # no contact; 0.04 m under it: distance -0.04, still pushed up.
+    poses = [[5, 4, 0.31, 0, 0, 0, 1], [5, 4, 0.36, 0, 0, 0, 1], [5, 4, 0.21, 0, 0, 0, 1]]
+    found = collide(poses, np.zeros(3, int), np.full((1, 161, 321), 0.25), [(np.zeros(3), 0.1)], device)
+    order = np.argsort(found["env"])
+    assert found["env"][order].tolist() == [0, 2]
+    np.testing.assert_allclose(found["distance"][order], [0.06, -0.04], atol=1e-6)
+    np.testing.assert_allclose(found["normal"], [[0, 0, 1]] * 2, atol=1e-6)
+
+
+def test_contacts_past_the_capacity_are_counted_but_not_written(device):
+    poses = np.tile([5, 4, 0.05, 0, 0, 0, 1], (6, 1))
+    found = collide(poses, np.zeros(6, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device, capacity=4)
+    assert found["count"] == 6
+    assert (found["shape1"] >= FIRST_SHAPE).sum() == 4
+
+
+def test_a_state_that_is_not_finite_touches_nothing(device):
+    poses = np.full((2, 7), np.nan)
+    found = collide(poses, np.zeros(2, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device)
+    assert found["count"] == 0
+
+
+def test_wrong_number_of_poses_is_named(device):
+    poses = np.zeros((3, 7))
+    with pytest.raises(ValueError, match=r"4 x 1 poses, got 3"):
+        collide(poses, np.zeros(4, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device)
+
+
+def test_cpu_is_deterministic():
+    rng = np.random.default_rng(11)
+    grid = hard_terrain("boxes")
+    poses = sphere_poses(rng, grid, 50)
+    strips = [(np.zeros(3), radius) for radius in RADII]
+    one, other = (collide(poses, np.zeros(50, int), grid[None], strips, "cpu") for _ in range(2))
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])

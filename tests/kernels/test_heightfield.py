@@ -1,0 +1,201 @@
+"""Height, normal, ceiling and nearest point of the triangulated surface against the float64 oracle."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.heightfield import (
+    BLOCK,
+    Terrain,
+    ceiling_over,
+    ceiling_shape,
+    height_at,
+    max_blocks,
+    nearest_surface_point,
+    normal_at,
+)
+from tests.kernels import oracle
+
+SPACING = 0.05
+RNG_SEED = 5
+
+
+@wp.kernel
+def _sample_kernel(
+    terrain: Terrain,
+    t: int,
+    points: wp.array[wp.vec3],
+    reach: float,
+    height_out: wp.array[float],
+    normal_out: wp.array[wp.vec3],
+    distance_out: wp.array[float],
+    direction_out: wp.array[wp.vec3],
+):
+    k = wp.tid()
+    p = points[k]
+    height_out[k] = height_at(terrain, t, p[0], p[1])
+    normal_out[k] = normal_at(terrain, t, p[0], p[1])
+    nearest = nearest_surface_point(terrain, t, p, reach)
+    distance_out[k] = nearest.distance
+    direction_out[k] = nearest.normal
+
+
+@wp.kernel
+def _ceiling_kernel(terrain: Terrain, lower: wp.array[wp.vec2], upper: wp.array[wp.vec2], out: wp.array[float]):
+    k = wp.tid()
+    out[k] = ceiling_over(terrain, 0, lower[k], upper[k])
+
+
+def make_terrain(grids, device, spacing=SPACING):
+    terrain = Terrain()
+    terrain.heights = wp.array(np.float32(grids), device=device)
+    terrain.ceilings = wp.zeros(ceiling_shape(*np.shape(grids)), dtype=float, device=device)
+    terrain.spacing = spacing
+    max_blocks(terrain.heights, terrain.ceilings)
+    return terrain
+
+
+def sample(terrain, points, reach, device, t=0):
+    out = [wp.zeros(len(points), dtype=kind, device=device) for kind in (float, wp.vec3, float, wp.vec3)]
+    inputs = [terrain, t, wp.array(np.float32(points), dtype=wp.vec3, device=device), reach]
+    wp.launch(_sample_kernel, dim=len(points), inputs=inputs, outputs=out, device=device)
+    return [array.numpy() for array in out]
+
+
+def rough(nrow, ncol, size=0.2, seed=RNG_SEED):
+    """A grid with no two nodes alike: cells as steep as 76 degrees."""
+    return np.random.default_rng(seed).uniform(-size, size, (nrow, ncol)).astype(np.float32)
+
+
+def scatter(nrow, ncol, count, spacing=SPACING, seed=RNG_SEED):
+    """Points over and up to 0.3 m beyond the grid, none closer than 1e-3 cells to an edge where the normal jumps."""
+    rng = np.random.default_rng(seed)
+    low, high = [-0.3, -0.3, -0.4], [(ncol - 1) * spacing + 0.3, (nrow - 1) * spacing + 0.3, 0.4]
+    points = np.float32(rng.uniform(low, high, (4 * count, 3)))
+    fraction = (points[:, :2] / spacing) % 1
+    edges = np.column_stack([fraction, 1 - fraction, np.abs(1 - fraction.sum(1))])
+    return points[(edges > 1e-3).all(1)][:count]
+
+
+@pytest.mark.parametrize(("nrow", "ncol", "spacing"), [(33, 49, 0.05), (2, 2, 0.05), (5, 12, 0.1)])
+def test_height_and_normal(device, nrow, ncol, spacing):
+    grid = rough(nrow, ncol)
+    points = scatter(nrow, ncol, 500, spacing)
+    height, normal, _, _ = sample(make_terrain(grid[None], device, spacing), points, 0.03, device)
+    # x / spacing in float32 is off by 1e-5 cells, times 0.4 m from node to node.
+    np.testing.assert_allclose(
+        height, [oracle.surface_height(grid, spacing, *p[:2]) for p in np.float64(points)], atol=1e-5
+    )
+    np.testing.assert_allclose(
+        normal, [oracle.surface_normal(grid, spacing, *p[:2]) for p in np.float64(points)], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("reach", [0.0175, 0.03, 0.1])
+def test_nearest_point(device, reach):
+    grid = rough(33, 49)
+    points = scatter(33, 49, 1500)
+    _, _, distance, direction = sample(make_terrain(grid[None], device), points, reach, device)
+    near = 0
+    for p, got, normal in zip(np.float64(points), distance, np.float64(direction), strict=True):
+        expected, _ = oracle.nearest_on_surface(grid, SPACING, p, reach)
+        if abs(expected) < reach - 1e-4:
+            near += 1
+            assert got == pytest.approx(expected, abs=1e-5)
+            landed, _ = oracle.nearest_on_surface(grid, SPACING, p - got * normal, reach)
+            assert abs(landed) < 1e-5
+            assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-5)
+        elif expected == np.inf:
+            assert got > reach - 1e-4
+        elif expected == -np.inf:  # deep inside: the plane of the triangle straight above
+            plane = oracle.surface_normal(grid, SPACING, *p[:2])
+            depth = (p[2] - oracle.surface_height(grid, SPACING, *p[:2])) * plane[2]
+            assert got == pytest.approx(depth, abs=1e-5)
+            np.testing.assert_allclose(normal, plane, atol=1e-5)
+    assert near > 30
+
+
+def test_terrains_do_not_mix(device):
+    grids = np.stack([rough(17, 17, seed=k) for k in range(3)])
+    points = scatter(17, 17, 100)
+    terrain = make_terrain(grids, device)
+    for t in range(3):
+        alone = sample(make_terrain(grids[t : t + 1], device), points, 0.05, device)
+        for got, expected in zip(sample(terrain, points, 0.05, device, t), alone, strict=True):
+            np.testing.assert_array_equal(got, expected)
+
+
+def test_the_cut_of_a_cell_by_hand(device):
+    # One cell of 0.05 m, only its (high x, high y) corner raised to 0.1: the cut runs between the two other corners, so
+    # the low triangle is flat, and at (0.04, 0.04) the high one stands at 0.1 * (0.8 + 0.8 - 1) = 0.06.
+    terrain = make_terrain([[[0, 0], [0, 0.1]]], device)
+    height, normal, _, _ = sample(terrain, [[0.02, 0.02, 0], [0.04, 0.04, 0]], 0.01, device)
+    np.testing.assert_allclose(height, [0, 0.06], atol=1e-6)
+    # Its gradient is 0.1 / 0.05 = 2 along x and y: normal (-2, -2, 1) / 3.
+    np.testing.assert_allclose(normal, [[0, 0, 1], [-2 / 3, -2 / 3, 1 / 3]], atol=1e-6)
+
+
+def test_nearest_point_by_hand(device):
+    # A riser of 0.2 m in the cell between x = 0.2 and x = 0.25 (a 76 degree ramp): upward normal (-4, 0, 1) / sqrt(17).
+    grid = np.zeros((9, 9), np.float32)
+    grid[:, 5:] = 0.2
+    # The foot of the perpendicular from (0.2, 0.2, 0.1), half way up, is (0.1 / 4) * 4 / sqrt(17) = 0.0242536 away; the
+    # ground straight below is 0.1 m away.
+    # Over the upper edge: (0.24, 0.2, 0.23) is nearest to the edge (0.25, 0.2, 0.2): sqrt(0.01^2 + 0.03^2) = 0.0316228.
+    # Inside the riser by the same 0.0242536: (0.25, 0.2, 0.1).
+    points = [[0.2, 0.2, 0.1], [0.24, 0.2, 0.23], [0.25, 0.2, 0.1]]
+    _, _, distance, normal = sample(make_terrain(grid[None], device), points, 0.06, device)
+    np.testing.assert_allclose(distance, [0.0242536, 0.0316228, -0.0242536], atol=1e-6)
+    riser = np.array([-4, 0, 1]) / np.sqrt(17)
+    np.testing.assert_allclose(normal, [riser, np.array([-1, 0, 3]) / np.sqrt(10), riser], atol=1e-5)
+
+
+@pytest.mark.parametrize(("nrow", "ncol"), [(161, 321), (2, 2), (10, 18), (9, 33)])
+def test_ceiling_is_an_upper_bound(device, nrow, ncol):
+    grid = rough(nrow, ncol)
+    rng = np.random.default_rng(0)
+    size = np.array([ncol - 1, nrow - 1]) * SPACING
+    lower = np.float32(rng.uniform(-1, size + 1, (300, 2)))
+    upper = np.float32(lower + rng.uniform(0, 0.9, (300, 2)))
+    out = wp.zeros(300, dtype=float, device=device)
+    corners = [wp.array(corner, dtype=wp.vec2, device=device) for corner in (lower, upper)]
+    wp.launch(
+        _ceiling_kernel, dim=300, inputs=[make_terrain(grid[None], device), *corners], outputs=[out], device=device
+    )
+    for low, high, ceiling in zip(np.float64(lower), np.float64(upper), out.numpy(), strict=True):
+        # The highest surface point over a rectangle is bounded by the nodes of the cells it overlaps ...
+        first, last = np.floor(low / SPACING).astype(int), np.ceil(high / SPACING).astype(int)
+        cols = np.clip(np.arange(first[0], last[0] + 1), 0, ncol - 1)
+        rows = np.clip(np.arange(first[1], last[1] + 1), 0, nrow - 1)
+        assert ceiling >= grid[np.ix_(rows, cols)].max() - 1e-6
+        # ... and the bound is no looser than a block on every side.
+        rows = np.arange(max(rows.min() - BLOCK - 1, 0), min(rows.max() + BLOCK + 2, nrow))
+        cols = np.arange(max(cols.min() - BLOCK - 1, 0), min(cols.max() + BLOCK + 2, ncol))
+        assert ceiling <= grid[np.ix_(rows, cols)].max()
+
+
+def test_block_maxima_share_the_border_nodes(device):
+    # 17 x 17 nodes are 2 x 2 blocks of 8 cells. A spike on their common corner lifts all four ceilings, one on node
+    # (3, 12) only that of block row 0, block column 1.
+    grid = np.zeros((1, 17, 17), np.float32)
+    grid[0, 3, 12] = 1
+    ceilings = make_terrain(grid, device).ceilings.numpy()
+    np.testing.assert_array_equal(ceilings, [[[0, 1], [0, 0]]])
+    grid[0, 8, 8] = 2
+    np.testing.assert_array_equal(make_terrain(grid, device).ceilings.numpy(), [[[2, 2], [2, 2]]])
+
+
+def test_ceilings_below_zero_stay_below(device):
+    np.testing.assert_array_equal(make_terrain(np.full((1, 9, 17), -3.0), device).ceilings.numpy(), [[[-3, -3]]])
+
+
+def test_wrong_ceiling_shape_is_named(device):
+    heights = wp.zeros((2, 17, 33), dtype=float, device=device)
+    with pytest.raises(ValueError, match=r"\(2, 2, 4\).*got \(2, 2, 5\).*ceiling_shape"):
+        max_blocks(heights, wp.zeros((2, 2, 5), dtype=float, device=device))
+
+
+def test_cpu_is_deterministic():
+    terrain, points = make_terrain(rough(33, 49)[None], "cpu"), scatter(33, 49, 300)
+    for one, other in zip(sample(terrain, points, 0.05, "cpu"), sample(terrain, points, 0.05, "cpu"), strict=True):
+        np.testing.assert_array_equal(one, other)
