@@ -6,8 +6,9 @@ from typing import Any
 import warp as wp
 
 from kernels.base_state import base_position, base_yaw, state_is_invalid, wrap_angle
-from kernels.heightfield import Terrain, node_height
+from kernels.heightfield import Terrain
 from kernels.penalties import max_base_force
+from kernels.start import StartRanges, place_robot
 
 
 class Outcome(IntEnum):
@@ -27,24 +28,6 @@ _BASE_COLLISION = wp.constant(int(Outcome.BASE_COLLISION))
 _TIME_OUT = wp.constant(int(Outcome.TIME_OUT))
 _OUT = wp.constant(int(Outcome.OUT))
 _INVALID = wp.constant(int(Outcome.INVALID))
-
-
-@wp.struct
-class StartRanges:
-    """Randomised start of an episode: half widths round the nominal start, uniform."""
-
-    position: wp.vec2
-    """Nominal start, world-local x, y [m]."""
-    position_range: float
-    yaw_range: float
-    joint_scale_range: float
-    """Joint angles are the default pose times 1 +- this."""
-    velocity_range: float
-    """Each component of the base's linear [m/s] and angular [rad/s] velocity, world frame."""
-    base_height: float
-    """Base height over the highest ground under the robot [m]."""
-    footprint: wp.vec2
-    """Half length and half width of the ground looked at [m]."""
 
 
 @wp.struct
@@ -87,19 +70,6 @@ class EpisodeState:
     """Episodes not yet ended, shape (1,)."""
 
 
-@wp.func
-def _highest_ground(terrain: Terrain, t: int, centre: wp.vec2, half: wp.vec2) -> float:
-    col0 = int(wp.floor((centre[0] - half[0]) / terrain.spacing))
-    col1 = int(wp.ceil((centre[0] + half[0]) / terrain.spacing))
-    row0 = int(wp.floor((centre[1] - half[1]) / terrain.spacing))
-    row1 = int(wp.ceil((centre[1] + half[1]) / terrain.spacing))
-    highest = node_height(terrain, t, row0, col0)
-    for row in range(row0, row1 + 1):
-        for col in range(col0, col1 + 1):
-            highest = wp.max(highest, node_height(terrain, t, row, col))
-    return highest
-
-
 @wp.kernel
 def _start_episodes_kernel(
     seed_of_terrain: wp.array[wp.uint32],
@@ -118,28 +88,7 @@ def _start_episodes_kernel(
     t = terrain_of_env[env]
     # The stream depends on the terrain's seed and the replica alone: sharding terrains changes no episode.
     rng = wp.rand_init(int(seed_of_terrain[t]), env % num_replicas)
-    x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
-    y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
-    half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
-    ground = _highest_ground(terrain, t, wp.vec2(x, y), ranges.footprint)
-    joint_q_out[env, 0] = x
-    joint_q_out[env, 1] = y
-    joint_q_out[env, 2] = ranges.base_height + ground
-    joint_q_out[env, 3] = 0.0
-    joint_q_out[env, 4] = 0.0
-    joint_q_out[env, 5] = wp.sin(half_yaw)
-    joint_q_out[env, 6] = wp.cos(half_yaw)
-    for j in range(default_joint_pos.shape[0]):
-        joint_q_out[env, 7 + j] = default_joint_pos[j] * (1.0 + ranges.joint_scale_range * wp.randf(rng, -1.0, 1.0))
-        joint_qd_out[env, 6 + j] = 0.0
-    v = ranges.velocity_range
-    lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))
-    of_com = lin_vel + wp.cross(ang_vel, wp.quat_rotate(rotation, base_com))
-    for k in range(3):
-        joint_qd_out[env, k] = of_com[k]
-        joint_qd_out[env, 3 + k] = ang_vel[k]
+    place_robot(rng, terrain, t, ranges, base_com, default_joint_pos, env, joint_q_out, joint_qd_out)
     episode_out.outcome[env] = _RUNNING
     episode_out.steps[env] = 0
     episode_out.counted[env] = 0

@@ -9,9 +9,9 @@ from typing import Any
 import warp as wp
 
 from kernels.base_state import base_yaw, wrap_angle
-from kernels.episode import StartRanges, _highest_ground
 from kernels.heightfield import Terrain
 from kernels.rewards import Feet
+from kernels.start import StartRanges, place_robot
 from kernels.training import End, Episodes, Rules
 
 _RUNNING = wp.constant(int(End.RUNNING))
@@ -78,32 +78,6 @@ def promote_episodes(joint_q: Any, rules: Rules, terrain_of_env_out: Any, episod
     )
 
 
-@wp.func
-def _place_robot(
-    rng: wp.uint32, terrain: Terrain, t: int, ranges: StartRanges, base_com: wp.vec3,
-    default_joint_pos: wp.array[float], env: int, joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float],
-):  # fmt: skip
-    x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
-    y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
-    half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
-    rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))
-    joint_q_out[env, 0] = x
-    joint_q_out[env, 1] = y
-    joint_q_out[env, 2] = ranges.base_height + _highest_ground(terrain, t, wp.vec2(x, y), ranges.footprint)
-    for k in range(4):
-        joint_q_out[env, 3 + k] = rotation[k]
-    for j in range(default_joint_pos.shape[0]):
-        joint_q_out[env, 7 + j] = default_joint_pos[j] * (1.0 + ranges.joint_scale_range * wp.randf(rng, -1.0, 1.0))
-        joint_qd_out[env, 6 + j] = 0.0
-    v = ranges.velocity_range
-    lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    of_com = lin_vel + wp.cross(ang_vel, wp.quat_rotate(rotation, base_com))
-    for k in range(3):
-        joint_qd_out[env, k] = of_com[k]
-        joint_qd_out[env, 3 + k] = ang_vel[k]
-
-
 @wp.kernel
 def _restart_episodes_kernel(
     terrain_of_env: wp.array[int],
@@ -122,7 +96,7 @@ def _restart_episodes_kernel(
         return
     rng = _random_stream(episodes_out.counter[0], _STREAM_START, terrain_of_env.shape[0], env)
     t = terrain_of_env[env]
-    _place_robot(rng, terrain, t, ranges, base_com, default_joint_pos, env, joint_q_out, joint_qd_out)
+    place_robot(rng, terrain, t, ranges, base_com, default_joint_pos, env, joint_q_out, joint_qd_out)
     episodes_out.start[env] = wp.vec2(joint_q_out[env, 0], joint_q_out[env, 1])
     episodes_out.steps[env] = 0
     episodes_out.total_reward[env] = 0.0

@@ -64,7 +64,7 @@ def measure_bare_physics(
 def stand_on_terrain(sim: Simulation, x: float = 2.0, y: float = 4.0) -> None:
     """Put every robot in its default pose at world-local (x, y) [m] over its terrain, and hold that pose."""
     robot, spacing = sim.robot, sim.bank.terrain.spacing
-    heights = np.take(sim.bank.heights.numpy(), sim.terrain_of_env.numpy(), axis=0)
+    heights = sim.bank.heights.numpy()[np.array(sim.terrain_of_env.numpy(), dtype=np.intp)]
     row, col = round(y / spacing), round(x / spacing)
     length, width = (round(half / spacing) for half in robot.footprint)
     ground = heights[:, row - width : row + width + 1, col - length : col + length + 1].max(axis=(1, 2))

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from kernels.episode import StartRanges, Task
+from kernels.episode import Task
+from kernels.start import StartRanges
 from sim.robot import RobotCfg
 
 _CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)  # all of mujoco_warp's bits but its two iteration caps

@@ -7,7 +7,7 @@ import io
 import signal
 import sys
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -50,8 +50,8 @@ class BaseCfg:
     """Run directory to go on from."""
     export: Path | None = None
     """Also write the controller to this file and its training record beside it (sim/robots/<robot>.pt ships it)."""
-    seed: int = 0
-    """Seed of everything drawn."""
+    seed: int | None = None
+    """Seed of everything drawn; 0, or that of the resumed run."""
     save_every_s: float = 60.0
     """A checkpoint every so often [s]."""
     rows: int = 100
@@ -153,17 +153,19 @@ def train(cfg: BaseCfg) -> int:
     robot = get_robot(cfg.robot)
     device, num_envs, iterations = _resolve_size(cfg)
     saved = read_checkpoint(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
+    seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
+    cfg = replace(cfg, seed=seed)
     run_dir = _prepare_run_dir(cfg, device)
-    settings = {"seed": cfg.seed, "num_envs": num_envs, "task": asdict(cfg.task), "ppo": asdict(cfg.ppo)}
+    settings = {"seed": seed, "num_envs": num_envs, "task": asdict(cfg.task), "ppo": asdict(cfg.ppo)}
     for change in changes(saved["extra"]["settings"], settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     print(f"Training '{robot.name}': {num_envs} robots on {device}, {iterations} iterations, in {run_dir}", flush=True)
     with StopRequest() as stop:
-        env = CommandVecEnv(CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=cfg.seed))
-        learner = Learner(env, cfg.ppo, seed=cfg.seed)
+        env = CommandVecEnv(CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=seed))
+        learner = Learner(env, cfg.ppo, seed=seed)
         if saved is not None:
             learner.resume(saved)
-        about = {**provenance(device, cfg.seed), "settings": settings}
+        about = {**provenance(device, seed), "settings": settings}
         progress = Progress(run_dir, learner, iterations, rows=cfg.rows, about=about, saved=saved and saved["extra"])
         deadline = began + cfg.max_seconds - _RESERVE_S if cfg.max_seconds else float("inf")
         _iterate(learner, progress, cfg, run_dir / CHECKPOINT, stop, deadline)

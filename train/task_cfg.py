@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from kernels.episode import StartRanges
+from kernels.start import StartRanges
 from kernels.training import Rules
 from sim.robot import RobotCfg
 from train.curriculum import CurriculumCfg

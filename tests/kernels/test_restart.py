@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.episode import StartRanges
 from kernels.heightfield import Terrain, ceiling_shape
 from kernels.restart import command_episodes, promote_episodes, remember_steps, restart_episodes
 from kernels.rewards import make_feet
+from kernels.start import StartRanges
 from kernels.training import End, Rules, make_episodes
 
 NUM_JOINTS = 2
