@@ -1,0 +1,22 @@
+"""Random robot states for kernel tests."""
+
+import numpy as np
+
+
+def random_states(num_envs, num_joints, seed=0, speed=2.0):
+    """Joint coordinates and velocities of tumbling robots somewhere over a crossing, float32."""
+    rng = np.random.default_rng(seed)
+    joint_q = rng.uniform(-1, 1, (num_envs, 7 + num_joints))
+    joint_q[:, :3] = rng.uniform([0, 0, 0.2], [16, 8, 1.0], (num_envs, 3))
+    quaternion = rng.normal(size=(num_envs, 4))
+    joint_q[:, 3:7] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    joint_qd = rng.uniform(-speed, speed, (num_envs, 6 + num_joints))
+    return np.float32(joint_q), np.float32(joint_qd)
+
+
+def upright(num_envs, num_joints, x=2.0, y=4.0, z=0.6):
+    """Robots at rest with level base, all joints 0, float32."""
+    joint_q = np.zeros((num_envs, 7 + num_joints), np.float32)
+    joint_q[:, :3] = x, y, z
+    joint_q[:, 6] = 1
+    return joint_q, np.zeros((num_envs, 6 + num_joints), np.float32)

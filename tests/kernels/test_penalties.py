@@ -1,0 +1,181 @@
+"""Raw penalties and contact forces: float64 oracle, hand-computed steps, contracts."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, SolverContacts, add_penalties, sum_geom_forces
+from tests.kernels import oracle
+from tests.kernels.states import random_states, upright
+
+ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
+FEET, BASE_AND_LIMBS = [3, 4], [0, 1, 2]
+BASE_COM = (0.05, -0.02, 0.1)
+LIMIT = 500.0
+DT = 0.005
+
+
+def sums_after(states, command, forces, device, *, counted=None, steps=1, roles=ROLES, sums=None):
+    """Penalty sums after adding the same physics step ``steps`` times."""
+    num_envs = len(command)
+    out = wp.array(np.zeros((num_envs, 6), np.float32) if sums is None else sums, device=device)
+    arrays = [wp.array(np.float32(array), device=device) for array in (*states, command)]
+    for _ in range(steps):
+        add_penalties(
+            *arrays[:2],
+            wp.vec3(*BASE_COM),
+            arrays[2],
+            wp.array(np.float32(forces), dtype=wp.vec3, device=device),
+            wp.array(roles, dtype=int, device=device),
+            LIMIT,
+            DT,
+            wp.array(np.ones(num_envs, int) if counted is None else counted, dtype=int, device=device),
+            out,
+        )
+    return out.numpy()
+
+
+def random_forces(num_envs, num_geoms, seed=0):
+    """Forces from none through 0.1 N touches to beyond the limit, some nearly horizontal."""
+    rng = np.random.default_rng(seed)
+    forces = rng.normal(size=(num_envs, num_geoms, 3)) * 10 ** rng.uniform(-2, 3, (num_envs, num_geoms, 1))
+    forces[..., 2] *= rng.choice([1.0, 0.05], (num_envs, num_geoms))
+    return np.float32(forces * rng.choice([0.0, 1.0], (num_envs, num_geoms, 1)))
+
+
+@pytest.mark.parametrize("num_envs", [1, 200])
+def test_parity_with_the_oracle(device, num_envs):
+    states = random_states(num_envs, 3)
+    command = np.float32(np.random.default_rng(1).uniform(-1, 1, (num_envs, 3)))
+    forces = random_forces(num_envs, 5)
+    expected = [
+        oracle.penalties(q, qd, BASE_COM, c, f, FEET, BASE_AND_LIMBS, LIMIT)
+        for q, qd, c, f in zip(*states, np.float64(command), forces, strict=True)
+    ]
+    np.testing.assert_allclose(
+        sums_after(states, command, forces, device), DT * np.array(expected), rtol=1e-5, atol=1e-7
+    )
+
+
+def test_permuting_environments(device):
+    states, forces = random_states(20, 3), random_forces(20, 5)
+    command, order = np.zeros((20, 3)), np.random.default_rng(0).permutation(20)
+    permuted = sums_after([array[order] for array in states], command, forces[order], device)
+    np.testing.assert_array_equal(permuted, sums_after(states, command, forces, device)[order])
+
+
+def test_velocity_errors_by_hand(device):
+    # Level base turned by 90 degrees: it looks along world y. A world velocity of the mass centre of (-0.2, 1, 0) m/s is (1, 0.2) in the base frame. Commanded (0.75, 0, 0.1), turning at 0: errors 0.25, 0.2, yaw rate 0.1.
+    # Two steps of 0.005 s: 0.0025, 0.002, 0.001.
+    q, qd = upright(1, 3)
+    q[0, 3:7] = 0, 0, np.sqrt(0.5), np.sqrt(0.5)
+    qd[0, :3] = -0.2, 1, 0
+    sums = sums_after((q, qd), [[0.75, 0, 0.1]], np.zeros((1, 5, 3)), device, steps=2)
+    np.testing.assert_allclose(sums[0], [0.001, 0.0025, 0.002, 0, 0, 0], atol=1e-8)
+
+
+def test_velocity_is_taken_at_the_base_origin(device):
+    # Turning at 2 rad/s on the spot, the origin at rest: the mass centre at (0.05, -0.02) moves with w x r =
+    # 2 * (0.02, 0.05) = (0.04, 0.1) m/s. With command 0 only the yaw rate is an error: 2 * 0.005 = 0.01.
+    q, qd = upright(1, 3)
+    qd[0, :6] = 0.04, 0.1, 0, 0, 0, 2
+    np.testing.assert_allclose(
+        sums_after((q, qd), [[0, 0, 0]], np.zeros((1, 5, 3)), device)[0], [0.01, 0, 0, 0, 0, 0], atol=1e-8
+    )
+
+
+@pytest.mark.parametrize(
+    ("forces", "contact_force", "stumble", "collision"),
+    [
+        # Feet of 600 N and 500.5 N against a limit of 500: (100 + 0.5) * 0.005 = 0.5025. Norms, in any direction.
+        ({3: (0, 0, 600), 4: (300.3, 0, 400.4)}, 0.5025, 0, 0),
+        # Sideways 5.1 to 1: stumble, once for both feet. 5 to 1 exactly and below is none.
+        ({3: (51, 0, 10), 4: (0, -51, -10)}, 0, 0.005, 0),
+        ({3: (50, 0, 10), 4: (30, 39.9, 10)}, 0, 0, 0),
+        # 30.6, 40.8: length 51.
+        ({3: (30.6, 40.8, 10)}, 0, 0.005, 0),
+        # Base and one limb touch harder than 0.1 N, the other limb with 0.09 N: 2 * 0.005.
+        ({0: (0, 0, 0.2), 1: (0.11, 0, 0), 2: (0, 0, 0.09)}, 0, 0, 0.01),
+        # A foot never collides; base and limbs have no force limit and do not stumble.
+        ({0: (900, 0, 0), 3: (0, 0, 400)}, 0, 0, 0.005),
+        ({}, 0, 0, 0),
+    ],
+)
+def test_contact_penalties_by_hand(device, forces, contact_force, stumble, collision):
+    on_geoms = np.zeros((1, 5, 3))
+    for geom, force in forces.items():
+        on_geoms[0, geom] = force
+    sums = sums_after(upright(1, 3), [[0, 0, 0]], on_geoms, device)
+    np.testing.assert_allclose(sums[0, 3:], [contact_force, stumble, collision], atol=1e-6)
+
+
+def test_steps_that_do_not_count_add_nothing(device):
+    states, forces = random_states(4, 3), random_forces(4, 5)
+    before = np.random.default_rng(0).random((4, 6)).astype(np.float32)
+    after = sums_after(states, np.zeros((4, 3)), forces, device, counted=[0, 1, 0, 1], sums=before)
+    np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+    assert (after[[1, 3], :3] > before[[1, 3], :3]).all()
+
+
+def test_a_robot_without_feet_or_joints(device):
+    sums = sums_after(upright(2, 0), np.zeros((2, 3)), np.ones((2, 1, 3)), device, roles=[LIMB])
+    np.testing.assert_allclose(sums, [[0, 0, 0, 0, 0, DT]] * 2, atol=1e-9)
+
+
+def test_wrong_number_of_columns_is_named(device):
+    with pytest.raises(ValueError, match=r"\(2, 6\), got \(2, 5\).*yaw_rate.*collision"):
+        sums_after(upright(2, 3), np.zeros((2, 3)), np.zeros((2, 5, 3)), device, sums=np.zeros((2, 5), np.float32))
+    assert len(PENALTIES) == 6
+
+
+def geom_forces(device, *, count, capacity, column_of_geom, num_geoms):
+    """Two worlds; contact k is on geom k of world k % 2, with edge forces k + (1, 2, 3, 4) and friction 0.5, 0.25."""
+    contacts = SolverContacts()
+    total = 4
+    contacts.count = wp.array([count], dtype=int, device=device)
+    contacts.capacity = capacity
+    contacts.world = wp.array(np.arange(total) % 2, dtype=int, device=device)
+    contacts.geom = wp.array([[9, k] for k in range(total)], dtype=wp.vec2i, device=device)
+    # Normal along world y, tangents along z and x.
+    frame = np.tile([[0, 1, 0], [0, 0, 1], [1, 0, 0]], (total, 1, 1)).astype(np.float32)
+    contacts.frame = wp.array(frame, dtype=wp.mat33, device=device)
+    friction = np.tile(np.float32([0.5, 0.25, 9, 9, 9]), (total, 1))
+    contacts.friction = wp.array(friction, dtype=wp.types.vector(5, float), device=device)
+    # World 0 has contacts 0 and 2 in rows 0.. and 4..; world 1 contact 1 in rows 0.., and contact 3 is inactive.
+    contacts.efc_address = wp.array([[0, 1, 2, 3], [0, 1, 2, 3], [4, 5, 6, 7], [-1] * 4], dtype=int, device=device)
+    efc_force = np.float32([[1, 2, 3, 4, 3, 4, 5, 6], [2, 3, 4, 5, 0, 0, 0, 0]])
+    contacts.efc_force = wp.array(efc_force, device=device)
+    out = wp.full((2, num_geoms), wp.vec3(7.0), dtype=wp.vec3, device=device)
+    sum_geom_forces(contacts, wp.array(column_of_geom, dtype=int, device=device), out)
+    return out.numpy()
+
+
+def test_contact_force_by_hand(device):
+    # Contact 0: normal 1 + 2 + 3 + 4 = 10 along y, (1 - 2) * 0.5 = -0.5 along z, (3 - 4) * 0.25 = -0.25 along x.
+    # Contact 2 (edges 3, 4, 5, 6): 18, -0.5, -0.25. Contact 1 (2, 3, 4, 5): 14, -0.5, -0.25. Contact 3: inactive.
+    forces = geom_forces(device, count=4, capacity=4, column_of_geom=[0, 1, 2, 3] + [-1] * 6, num_geoms=4)
+    expected = np.zeros((2, 4, 3))
+    expected[0, 0] = -0.25, 10, -0.5
+    expected[0, 2] = -0.25, 18, -0.5
+    expected[1, 1] = -0.25, 14, -0.5
+    np.testing.assert_allclose(forces, expected, atol=1e-6)
+
+
+def test_contacts_of_one_geom_add_up_and_others_are_left_out(device):
+    # Geoms 0 and 2 share column 1 (10 + 18 N along y), geom 1 has none.
+    forces = geom_forces(device, count=4, capacity=4, column_of_geom=[1, -1, 1, 0] + [-1] * 6, num_geoms=2)
+    np.testing.assert_allclose(forces, [[[0, 0, 0], [-0.5, 28, -1]], np.zeros((2, 3))], atol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "capacity"), [(2, 4), (900, 2)])
+def test_only_contacts_that_exist_are_read(device, count, capacity):
+    # Contact 2 is stale in the first case, and beyond the capacity in the second, whose count ran on past it.
+    forces = geom_forces(device, count=count, capacity=capacity, column_of_geom=[0, 1, 2, 3] + [-1] * 6, num_geoms=4)
+    assert forces[0, 0, 1] == 10
+    assert not forces[0, 2].any()
+
+
+def test_cpu_is_deterministic():
+    states, forces = random_states(50, 3), random_forces(50, 5)
+    one, other = (sums_after(states, np.zeros((50, 3)), forces, "cpu", steps=3) for _ in range(2))
+    np.testing.assert_array_equal(one, other)
