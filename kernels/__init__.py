@@ -4,4 +4,7 @@ import warp as wp
 
 # Nothing here is differentiated: without adjoint code, kernels compile in half the time.
 wp.config.enable_backward = False
-wp.config.log_level = 30  # warnings and worse: not a line for each module loaded
+# Errors only while Warp starts, which else warns of every missing GPU; then warnings, but no line for each module loaded.
+wp.config.log_level = 40
+wp.init()
+wp.config.log_level = 30

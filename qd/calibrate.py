@@ -1,0 +1,111 @@
+"""Penalty scales: what each raw penalty comes to on hard-random terrains, so that the six can be added and compared.
+
+The scale of a penalty is its mean over all valid episodes;
+where it is 0 in over half of them, its mean over the others.
+Scales are measured once with the shipped controller, before any search, and never tuned on an archive.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from qd.cli import run_command
+from qd.files import to_json, write_atomically
+from qd.provenance import provenance
+from qd.workers import EvaluatorCfg, check_policy, open_evaluator, resolve_device
+
+if TYPE_CHECKING:
+    from sim.rollout import RolloutResult
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateCfg:
+    """Measure the penalty scales of a robot with a controller, on hard-random terrains.
+
+    Writes them beside the shipped controller, where every search reads them.
+    """
+
+    robot: str = "anymal"
+    """Which robot."""
+    policy: str | None = None
+    """Controller: a file or module:callable; the shipped one."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    terrains: int = 300
+    """Hard-random terrains."""
+    replicas: int = 20
+    """Episodes a terrain."""
+    seed: int = 0
+    """Draws terrains and starts."""
+    out: Path | None = None
+    """Where to write; sim/robots/<robot>.scales.json."""
+
+
+def penalty_scales(result: "RolloutResult") -> dict[str, float]:
+    """Scale of each penalty over the valid episodes of a rollout.
+
+    Raises:
+        ValueError: If no episode is valid, or a penalty is 0 in all of them.
+    """
+    rows: NDArray[np.float64] = np.asarray(result.penalties, dtype=np.float64)[~result.invalid]
+    if len(rows) == 0:
+        raise ValueError("no episode was valid: there is nothing to measure a scale by; look at the controller")
+    scales = {}
+    for name, values in zip(result.penalty_names, rows.T, strict=True):
+        hit = values > 0.0
+        if not hit.any():
+            raise ValueError(
+                f"penalty '{name}' is 0 in all {len(values)} episodes, so it has no scale: "
+                "leave it out of the robot's penalties, or calibrate on more terrains"
+            )
+        scales[name] = float(values[hit].mean() if hit.mean() < 0.5 else values.mean())
+    return scales
+
+
+def calibrate(cfg: CalibrateCfg) -> Path:
+    """Measure the scales, print them, write the file; returns its path.
+
+    Raises:
+        ValueError: If something asked for cannot be had, or a penalty never occurred.
+    """
+    from sim.robot import get_robot
+    from sim.terrain import hard_random_genes
+
+    robot = get_robot(cfg.robot)
+    device = resolve_device(cfg.device)
+    policy = cfg.policy or str(robot.policy_file)
+    check_policy(policy, cfg.robot, device)
+    out = cfg.out or robot.scales_file
+    genes = hard_random_genes(cfg.terrains, cfg.seed)
+    seeds = np.random.SeedSequence(cfg.seed).generate_state(cfg.terrains, np.uint32)
+    evaluator = EvaluatorCfg(
+        robot=cfg.robot, policy=policy, num_terrains=cfg.terrains, num_replicas=cfg.replicas, device=device
+    )
+    print(f"Crossing {cfg.terrains} hard-random terrains {cfg.replicas} times on {device}.")
+    with open_evaluator(evaluator) as evaluate, tqdm(total=100, unit="%", desc="calibrate", disable=None) as bar:
+        result = evaluate(genes, seeds, progress=lambda share: bar.update(round(100 * share) - bar.n))
+    scales = penalty_scales(result)
+    rows = np.asarray(result.penalties)[~result.invalid]
+    report = {
+        **provenance(device, cfg.seed),
+        "robot": cfg.robot,
+        "policy": Path(policy).name,
+        "terrains": cfg.terrains,
+        "episodes": int(result.outcome.size),
+        "invalid_episodes": int(result.invalid.sum()),
+        "scales": scales,
+        "share_of_episodes_with": {
+            name: float((values > 0.0).mean()) for name, values in zip(result.penalty_names, rows.T, strict=True)
+        },
+    }
+    write_atomically(out, to_json(report))
+    print("\n".join(f"  {name:<14}{scale:12.4f}" for name, scale in scales.items()))
+    return out
+
+
+if __name__ == "__main__":
+    run_command(CalibrateCfg, calibrate)
