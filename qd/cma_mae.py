@@ -5,7 +5,6 @@ middle of its cell. The search is unbounded; archives hold the unclipped solutio
 genes as data.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,49 +14,7 @@ from ribs.emitters import EvolutionStrategyEmitter
 
 from qd import space
 from qd.fitness import FITNESS_FLOOR, Evaluation
-
-ES_KINDS = ("cma_es", "sep_cma_es")
-RESTART_RULES = ("basic", "no_improvement")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CmaMaeCfg:
-    """Settings of CMA-MAE."""
-
-    emitters: int = 10
-    """Emitters, each with an evolution strategy of its own."""
-    batch_size: int = 20
-    """Terrains an emitter asks for in an iteration."""
-    learning_rate: float = 0.09
-    """Step of a cell's acceptance threshold toward the fitness found there; 1 is elitist, 0 pure optimisation."""
-    sigma0: float = 0.5
-    """First step size; genes live in [-1, 1]."""
-    restart_rule: str = "50"
-    """When an emitter restarts at an elite: every so many iterations, or one of `basic` and `no_improvement`."""
-    es: str = "cma_es"
-    """Evolution strategy: `cma_es` adapts all covariances, `sep_cma_es` the variances alone."""
-
-    def __post_init__(self) -> None:
-        if self.emitters < 1 or self.batch_size < 2:
-            raise ValueError(
-                f"emitters must be at least 1 and batch_size at least 2, got {self.emitters} and {self.batch_size}"
-            )
-        if not 0.0 <= self.learning_rate <= 1.0:
-            raise ValueError(f"learning_rate must lie in [0, 1], got {self.learning_rate}")
-        if not 0.0 < self.sigma0 < np.inf:
-            raise ValueError(f"sigma0 must be a positive number, got {self.sigma0}")
-        if self.es not in ES_KINDS:
-            raise ValueError(f"es must be one of {', '.join(ES_KINDS)}, got {self.es}")
-        if self.restart_rule not in RESTART_RULES and not (self.restart_rule.isdecimal() and int(self.restart_rule)):
-            raise ValueError(
-                f"restart_rule must be a positive number of iterations or one of {', '.join(RESTART_RULES)}, "
-                f"got {self.restart_rule}"
-            )
-
-    @property
-    def num_terrains(self) -> int:
-        """Terrains of one iteration."""
-        return self.emitters * self.batch_size
+from qd.settings import CmaMaeCfg
 
 
 class CmaMae:

@@ -20,7 +20,7 @@ from qd.worker_process import Crosser, EvaluatorError, WorkerProcess
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
-__all__ = ["Crosser", "Evaluate", "EvaluatorCfg", "EvaluatorError", "open_evaluator"]
+__all__ = ["Crosser", "Evaluate", "EvaluatorCfg", "EvaluatorError", "episode_seeds", "open_evaluator"]
 
 _MIN_ROWS = 4  # torch's linear layers give the same bits for batches of 4 rows and more, other ones for fewer
 
@@ -65,6 +65,22 @@ class Evaluate(Protocol):
             progress: Called now and then with the share that is done.
         """
         ...
+
+
+def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = 0) -> NDArray[np.uint32]:
+    """Seeds of the terrains of one evaluation; the same for the same numbers, so that a resumed search repeats nothing.
+
+    Args:
+        seed: The run's seed.
+        iteration: Number of the evaluation.
+        count: Number of terrains.
+        stream: Set apart what must not share its episodes with the search.
+
+    Returns:
+        One seed a terrain, shape (count,).
+    """
+    sequence = np.random.SeedSequence([seed, iteration], spawn_key=(stream,) if stream else ())
+    return sequence.generate_state(count, np.uint32).astype(np.uint32)
 
 
 def available_cores() -> int:

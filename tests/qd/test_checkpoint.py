@@ -8,8 +8,9 @@ import pytest
 
 from qd import checkpoint
 from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.cma_mae import CmaMae, CmaMaeCfg
+from qd.cma_mae import CmaMae
 from qd.descriptors import Cells
+from qd.settings import CmaMaeCfg
 from tests.qd.test_cma_mae import advance, make_search
 
 

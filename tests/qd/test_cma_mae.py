@@ -3,9 +3,10 @@ import pickle
 import numpy as np
 import pytest
 
-from qd.cma_mae import CmaMae, CmaMaeCfg
+from qd.cma_mae import CmaMae
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
+from qd.settings import CmaMaeCfg
 from tests.qd import stand_in
 
 CELLS = Cells(6)

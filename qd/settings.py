@@ -1,0 +1,186 @@
+"""Settings of a search: presets, what the command line changes of them, and what a run directory remembers.
+
+Nothing here imports pyribs, which takes seconds: `--help` and the worker processes do without.
+"""
+
+import hashlib
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qd.descriptors import Cells
+from qd.fitness import FitnessCfg
+
+if TYPE_CHECKING:
+    from sim.robot import RobotCfg
+
+ES_KINDS = ("cma_es", "sep_cma_es")
+RESTART_RULES = ("basic", "no_improvement")
+SHIPPED = "shipped"
+"""Name of the controller that comes with the robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CmaMaeCfg:
+    """Settings of CMA-MAE."""
+
+    emitters: int = 10
+    """Emitters, each with an evolution strategy of its own."""
+    batch_size: int = 20
+    """Terrains an emitter asks for in an iteration."""
+    learning_rate: float = 0.09
+    """Step of a cell's acceptance threshold toward the fitness found there; 1 is elitist, 0 pure optimisation."""
+    sigma0: float = 0.5
+    """First step size; genes live in [-1, 1]."""
+    restart_rule: str = "50"
+    """When an emitter restarts at an elite: every so many iterations, or one of `basic` and `no_improvement`."""
+    es: str = "cma_es"
+    """Evolution strategy: `cma_es` adapts all covariances, `sep_cma_es` the variances alone."""
+
+    def __post_init__(self) -> None:
+        if self.emitters < 1 or self.batch_size < 2:
+            raise ValueError(
+                f"emitters must be at least 1 and batch_size at least 2, got {self.emitters} and {self.batch_size}"
+            )
+        if not 0.0 <= self.learning_rate <= 1.0:
+            raise ValueError(f"learning_rate must lie in [0, 1], got {self.learning_rate}")
+        if not 0.0 < self.sigma0 < float("inf"):
+            raise ValueError(f"sigma0 must be a positive number, got {self.sigma0}")
+        if self.es not in ES_KINDS:
+            raise ValueError(f"es must be one of {', '.join(ES_KINDS)}, got {self.es}")
+        if self.restart_rule not in RESTART_RULES and not (self.restart_rule.isdecimal() and int(self.restart_rule)):
+            raise ValueError(
+                f"restart_rule must be a positive number of iterations or one of {', '.join(RESTART_RULES)}, "
+                f"got {self.restart_rule}"
+            )
+
+    @property
+    def num_terrains(self) -> int:
+        """Terrains of one iteration."""
+        return self.emitters * self.batch_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchCfg:
+    """What is searched, with what, and how; runs that agree in all but ``iterations`` are the same run."""
+
+    robot: str
+    preset: str
+    policy: str
+    """Controller: ``shipped``, a file or ``module:callable``."""
+    policy_sha256: str | None
+    """Hash of the controller's file, None for code."""
+    seed: int
+    iterations: int
+    """Iterations to reach; may be raised later."""
+    replicas: int
+    """Episodes a terrain."""
+    intervals: int
+    """Intervals of each ratio."""
+    collision_bit: bool
+    """Whether base collision is a descriptor of its own."""
+    fitness: FitnessCfg
+    cma: CmaMaeCfg
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "replicas", "intervals"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+
+    @property
+    def cells(self) -> Cells:
+        """The archive's cells."""
+        return Cells(len(self.fitness.penalties), self.intervals, collision_bit=self.collision_bit)
+
+    @property
+    def episodes_per_iteration(self) -> int:
+        """Episodes of one iteration."""
+        return self.cma.num_terrains * self.replicas
+
+
+def paper(robot: "RobotCfg") -> SearchCfg:
+    """The paper's search: 10 emitters x 20 terrains x 20 episodes, 1,000 iterations; for a GPU."""
+    return SearchCfg(
+        robot=robot.name,
+        preset="paper",
+        policy=SHIPPED,
+        policy_sha256=None,
+        seed=0,
+        iterations=1000,
+        replicas=20,
+        intervals=10,
+        collision_bit=robot.collision_bit,
+        fitness=FitnessCfg(penalties=robot.penalties, scales=robot.read_penalty_scales()),
+        cma=CmaMaeCfg(),
+    )
+
+
+def small(robot: "RobotCfg") -> SearchCfg:
+    """A search that a laptop finishes while one waits: 4 emitters x 8 terrains x 4 episodes, 10 iterations."""
+    return replace(paper(robot), preset="small", iterations=10, replicas=4, cma=CmaMaeCfg(emitters=4, batch_size=8))
+
+
+PRESETS = {"paper": paper, "small": small}
+
+
+def preset(name: str, robot: "RobotCfg") -> SearchCfg:
+    """Settings by the name of a preset.
+
+    Raises:
+        ValueError: If there is no such preset, or the robot's penalty scales were never measured.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset '{name}': expected one of {', '.join(sorted(PRESETS))}")
+    return PRESETS[name](robot)
+
+
+def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:
+    """Settings with some of them changed, wherever they stand.
+
+    Args:
+        cfg: Settings.
+        changes: New values by the names of fields of this class, its fitness or its CMA-MAE; None changes nothing.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+    given = {name: value for name, value in changes.items() if value is not None}
+    for part in ("fitness", "cma"):
+        current = getattr(cfg, part)
+        names = {field.name for field in fields(current)} & given.keys()
+        cfg = replace(cfg, **{part: replace(current, **{name: given.pop(name) for name in names})})
+    return replace(cfg, **given)
+
+
+def from_settings(settings: dict[str, Any], iterations: int) -> SearchCfg:
+    """Settings as a run directory remembers them.
+
+    Args:
+        settings: All fields but ``iterations``, as JSON values.
+        iterations: Iterations to reach.
+
+    Raises:
+        ValueError: If they are not the settings of a search.
+    """
+    try:
+        fitness = settings["fitness"]
+        lists = {name: tuple(fitness[name]) for name in ("penalties", "scales")}
+        parts = {"fitness": FitnessCfg(**{**fitness, **lists}), "cma": CmaMaeCfg(**settings["cma"])}
+        return SearchCfg(**{**settings, **parts, "iterations": iterations})
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
+
+
+def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
+    """What to load the controller from: a file or ``module:callable``."""
+    return str(robot.policy_file) if cfg.policy == SHIPPED else cfg.policy
+
+
+def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
+    """Settings with the robot's present penalties and scales and the present hash of the controller's file."""
+    file = Path(policy_spec(cfg, robot))
+    digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+    fitness = replace(cfg.fitness, penalties=robot.penalties, scales=robot.read_penalty_scales())
+    return replace(cfg, policy_sha256=digest, fitness=fitness, collision_bit=robot.collision_bit)
