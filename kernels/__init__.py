@@ -4,7 +4,4 @@ import warp as wp
 
 # Nothing here is differentiated: without adjoint code, kernels compile in half the time.
 wp.config.enable_backward = False
-# Errors only while Warp starts, which else warns of every missing GPU; then warnings, but no line for each module loaded.
-wp.config.log_level = 40
-wp.init()
-wp.config.log_level = 30
+wp.config.log_level = 30  # warnings and worse: not a line for each module loaded

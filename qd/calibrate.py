@@ -87,7 +87,11 @@ def calibrate(cfg: CalibrateCfg) -> Path:
     )
     print(f"Crossing {cfg.terrains} hard-random terrains {cfg.replicas} times on {device}.")
     with open_evaluator(evaluator) as evaluate, tqdm(total=100, unit="%", desc="calibrate", disable=None) as bar:
-        result = evaluate(genes, seeds, progress=lambda share: bar.update(round(100 * share) - bar.n))
+
+        def show(share: float) -> None:
+            bar.update(round(100 * share) - bar.n)
+
+        result = evaluate(genes, seeds, progress=show)
     scales = penalty_scales(result)
     rows = np.asarray(result.penalties)[~result.invalid]
     report = {
