@@ -65,7 +65,7 @@ def test_permuting_environments(device):
 
 
 def test_velocity_errors_by_hand(device):
-    # Level base turned by 90 degrees: it looks along world y. A world velocity of its mass centre of (-0.2, 1, 0) m/s is
+    # Level base turned by 90 degrees: it looks along world y. Its mass centre moving with (-0.2, 1, 0) m/s is
     # (1, 0.2) in the base frame. Commanded (0.75, 0, 0.1), not turning: errors 0.25, 0.2, yaw rate 0.1.
     # Two steps of 0.005 s: 0.0025, 0.002, 0.001.
     q, qd = upright(1, 3)
