@@ -111,5 +111,9 @@ def calibrate(cfg: CalibrateCfg) -> Path:
     return out
 
 
+def _move(bar: tqdm, share: float) -> None:
+    bar.update(round(100 * share) - bar.n)
+
+
 if __name__ == "__main__":
     run_command(CalibrateCfg, calibrate)

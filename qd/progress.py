@@ -55,8 +55,8 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, processes: int) -> 
             f"Searching for terrains that break {cfg.robot} with {controller}, each in its own way.",
             f"  preset {cfg.preset}, seed {cfg.seed}: {iterations} of {cfg.cma.num_terrains} terrains x {cfg.replicas} "
             "episodes of up to 20 s",
-            f"  {left * cfg.episodes_per_iteration:,} episodes on {where}: about {duration}, and a minute or two more where "
-            "kernels must be compiled",
+            f"  {left * cfg.episodes_per_iteration:,} episodes on {where}: about {duration}, and a minute or two more "
+            "where kernels must be compiled",
             f"  {cfg.cells.num_cells:,} reachable cells of {len(cfg.fitness.penalties)} penalties; results in {path}",
         ]
     )
@@ -78,10 +78,9 @@ class ProgressBar:
             file=sys.stderr,
             dynamic_ncols=True,
             mininterval=0.5,
-            bar_format="{desc} {percentage:3.0f}%|{bar:12}| {postfix} [{elapsed}, ETA {remaining}]",
+            bar_format="{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]",
         )
-        self._bar.set_description_str(f"iteration {done + 1}/{iterations}", refresh=False)
-        self._bar.set_postfix_str("compiling and evaluating", refresh=True)
+        self._describe(done, "compiling and evaluating")
 
     def __enter__(self) -> "ProgressBar":
         """Nothing to do: the bar is there from the start."""
@@ -105,13 +104,14 @@ class ProgressBar:
         if row["iteration"] == self._first + 1:
             left = (self._iterations - row["iteration"]) * row["wall_s"]
             self._bar.write(f"First iteration: {row['wall_s']:.1f} s; about {clock(left)} to go.", file=sys.stderr)
-        self._bar.set_description_str(
-            f"iteration {min(row['iteration'] + 1, self._iterations)}/{self._iterations}", refresh=False
-        )
-        self._bar.set_postfix_str(
+        self._describe(
+            row["iteration"],
             f"{row['elites']} elites ({row['reachable_coverage']:.1%} of reachable), QD {row['qd_score']:.0f}, "
-            f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s"
+            f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s",
         )
+
+    def _describe(self, done: int, state: str) -> None:
+        self._bar.set_description_str(f"iteration {min(done + 1, self._iterations)}/{self._iterations}: {state}")
 
     def _move_to(self, position: float) -> None:
         self._bar.update(position - self._at)

@@ -4,8 +4,8 @@ The checkpoint is the one truth and is written first; metrics and archive are ma
 that a kill between any two writes leaves a run that goes on as if nothing had been.
 """
 
-import dataclasses
 import fcntl
+import itertools
 import json
 import os
 from collections.abc import Iterator
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from qd.archive import ARCHIVE_FILE, Archive, write_archive
 from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.files import read_json, to_json, write_atomically
+from qd.settings import Settings
 
 if TYPE_CHECKING:
     from qd.cma_mae import CmaMae
@@ -24,19 +25,14 @@ CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"
 
-Settings = dict[str, Any]
-"""The settings that make a run what it is, as JSON values."""
 Metrics = list[dict[str, Any]]
 """One row an iteration."""
 
 
-def new_path(root: Path, name: str) -> Path:
-    """A directory that does not exist yet: ``name``, else ``name-2``, ``name-3`` and so on."""
-    path, number = root / name, 1
-    while path.exists():
-        number += 1
-        path = root / f"{name}-{number}"
-    return path
+def numbered(root: Path, name: str) -> Iterator[Path]:
+    """Directories a run may be put in: ``name``, ``name-2``, ``name-3`` and so on."""
+    yield root / name
+    yield from (root / f"{name}-{number}" for number in itertools.count(2))
 
 
 def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:
@@ -126,23 +122,28 @@ class RunDirectory:
         content = {"settings": settings, "iterations": iterations, **origin}
         write_atomically(self.path / CONFIG_FILE, to_json(content))
 
-    def save(self, settings: Settings, search: "CmaMae", metrics: Metrics) -> None:
+    def save(self, settings: Settings, search: "CmaMae", metrics: Metrics, archive: Archive) -> None:
         """Saves an iteration; killed anywhere in here, the run is either before or after it.
 
         Args:
             settings: The run's settings, so that a checkpoint that strayed here is noticed.
             search: The search after ``tell``.
             metrics: All rows up to this iteration.
+            archive: What the search has found.
         """
-        state = {"settings": settings, "metrics": metrics, **search.state()}
-        save_checkpoint(self.path / CHECKPOINT_FILE, state)
-        self.write_derived(settings, search, metrics)
+        save_checkpoint(self.path / CHECKPOINT_FILE, {"settings": settings, "metrics": metrics, **search.state()})
+        self.write_derived(metrics, archive)
 
-    def write_derived(self, settings: Settings, search: "CmaMae", metrics: Metrics) -> None:
+    def write_derived(self, metrics: Metrics, archive: Archive) -> None:
         """Writes the files that follow from a checkpoint: metrics and archive."""
         rows = "".join(json.dumps(row, allow_nan=False) + "\n" for row in metrics)
         write_atomically(self.path / METRICS_FILE, rows.encode())
-        write_archive(self.path / ARCHIVE_FILE, archive_of(settings, search, len(metrics)))
+        write_archive(self.path / ARCHIVE_FILE, archive)
+
+    def iterations_done(self) -> int:
+        """Rows of the metrics file, without reading the checkpoint."""
+        file = self.path / METRICS_FILE
+        return len(file.read_text(encoding="utf-8").splitlines()) if file.exists() else 0
 
     def load(self, settings: Settings) -> tuple["CmaMae", Metrics] | None:
         """The search as its checkpoint has it.
@@ -188,9 +189,3 @@ def archive_of(settings: Settings, search: "CmaMae", iterations: int) -> Archive
         iterations=iterations,
         **search.elites(),
     )
-
-
-def as_settings(cfg: Any, *, leave_out: tuple[str, ...] = ()) -> Settings:
-    """A configuration dataclass as JSON values, without the named fields."""
-    values = {name: value for name, value in dataclasses.asdict(cfg).items() if name not in leave_out}
-    return json.loads(json.dumps(values))

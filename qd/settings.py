@@ -4,7 +4,8 @@ Nothing here imports pyribs, which takes seconds: `--help` and the worker proces
 """
 
 import hashlib
-from dataclasses import dataclass, fields, replace
+import json
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,9 @@ ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
+
+Settings = dict[str, Any]
+"""The settings that make a run what it is, as JSON values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +158,13 @@ def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:
     return replace(cfg, **given)
 
 
-def from_settings(settings: dict[str, Any], iterations: int) -> SearchCfg:
+def as_settings(cfg: SearchCfg) -> Settings:
+    """What makes a run what it is: all fields but ``iterations``, as JSON values."""
+    values = {name: value for name, value in asdict(cfg).items() if name != "iterations"}
+    return json.loads(json.dumps(values))
+
+
+def from_settings(settings: Settings, iterations: int) -> SearchCfg:
     """Settings as a run directory remembers them.
 
     Args:

@@ -1,0 +1,180 @@
+"""What a command line of the search means: a new run, or an old one that goes on."""
+
+import itertools
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from qd.provenance import provenance
+from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
+from qd.settings import SearchCfg, as_settings, changed, from_settings, measured_now, policy_spec, preset
+from qd.workers import EvaluatorCfg, check_policy, resolve_device
+
+_RUNS = Path("runs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """Search the terrains on which a controller fails, each in its own way.
+
+    Every iteration asks CMA-MAE for terrains, lets robots cross them, and files each terrain by the proportions of what
+    went wrong. State is saved after every iteration: stop with Ctrl-C whenever you like and go on with --resume.
+    """
+
+    robot: str | None = None
+    """Which robot: anymal, unless resuming."""
+    preset: str | None = None
+    """Size of the search: paper (a GPU's work) or small (minutes on a CPU); by default what the device can do."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    iterations: int | None = None
+    """Iterations to reach; with --resume, more than before extend a finished run."""
+    policy: str | None = None
+    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript file, or module:callable."""
+    seed: int | None = None
+    """Seed of everything drawn; 0."""
+    resume: Path | None = None
+    """Go on with the run in this directory."""
+    run_dir: Path | None = None
+    """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
+    replicas: int | None = None
+    """Episodes a terrain."""
+    emitters: int | None = None
+    """Emitters."""
+    batch_size: int | None = None
+    """Terrains an emitter asks for in an iteration."""
+    learning_rate: float | None = None
+    """Step of a cell's acceptance threshold."""
+    sigma0: float | None = None
+    """First step size of an emitter."""
+    restart_rule: str | None = None
+    """When emitters restart: a number of iterations, basic or no_improvement."""
+    es: str | None = None
+    """Evolution strategy: cma_es or sep_cma_es."""
+    intervals: int | None = None
+    """Intervals of each ratio."""
+    alpha: float | None = None
+    """Weight of the standard deviations in the fitness."""
+    lam: float | None = None
+    """Weight of the share of episodes without collision in the fitness."""
+    workers: int | None = None
+    """Processes on the CPU; one a core."""
+    reproduce: Literal["auto", "yes", "no"] = "auto"
+    """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
+
+
+_NOT_SETTINGS = ("device", "resume", "run_dir", "workers", "reproduce")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A search that can begin: everything a user may have got wrong has been looked at."""
+
+    cfg: SearchCfg
+    path: Path
+    """The run directory."""
+    resumes: bool
+    """Whether the directory holds the run already."""
+    evaluator: EvaluatorCfg
+    reproduce: bool
+    """Whether the elites are evaluated again at the end."""
+    origin: dict[str, Any]
+    """Provenance of the run's beginning."""
+    resume_command: str
+    """How to go on with it."""
+
+    @property
+    def device(self) -> str:
+        """Warp device name."""
+        return self.evaluator.device
+
+
+def job_of(args: Arguments) -> Job:
+    """The job that a command line asks for.
+
+    Raises:
+        FileNotFoundError: If there is no run to resume.
+        ValueError: If robot, preset, device, controller, a setting or the run directory is not as it must be.
+    """
+    from sim.robot import get_robot
+
+    if args.resume and args.run_dir:
+        raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
+    config = RunDirectory(args.resume).read_config() if args.resume else None
+    robot = get_robot(args.robot or (config["settings"].get("robot", "") if config else "anymal"))
+    device = resolve_device(args.device)
+    changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
+    if args.resume and config:
+        path, cfg = args.resume, _resumed(args.resume, config, robot, changes)
+        origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
+    else:
+        name = args.preset or ("paper" if device.startswith("cuda") else "small")
+        cfg = measured_now(changed(preset(name, robot), changes), robot)
+        path, origin = _free_path(args, cfg), provenance(device, cfg.seed)
+    policy = policy_spec(cfg, robot)
+    check_policy(policy, cfg.robot, device)
+    return Job(
+        cfg=cfg,
+        path=path,
+        resumes=config is not None,
+        evaluator=EvaluatorCfg(
+            robot=cfg.robot,
+            policy=policy,
+            num_terrains=cfg.cma.num_terrains,
+            num_replicas=cfg.replicas,
+            device=device,
+            num_workers=args.workers,
+        ),
+        reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
+        origin=origin,
+        resume_command=_resume_command(cfg.robot, path, args.device),
+    )
+
+
+def _resumed(path: Path, config: dict[str, Any], robot: Any, changes: dict[str, Any]) -> SearchCfg:
+    """The settings of a run that goes on; nothing but its number of iterations may change."""
+    there = from_settings(config["settings"], config["iterations"])
+    wanted = measured_now(changed(there, changes), robot)
+    different = differences(as_settings(there), as_settings(wanted))
+    if different:
+        raise ValueError(f"{path} holds a run of other settings: {', '.join(different)}: start a new run for those")
+    return wanted
+
+
+def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
+    """Directory of a new run; never one that holds something."""
+    if args.run_dir is None:
+        name = f"{cfg.robot}-{cfg.preset}-{cfg.seed}"
+        path = next(path for path in numbered(_RUNS, name) if not path.exists())
+        _mention_unfinished(name, cfg, args.device)
+        return path
+    if (args.run_dir / CONFIG_FILE).exists():
+        different = differences(RunDirectory(args.run_dir).read_config()["settings"], as_settings(cfg))
+        if different:
+            raise ValueError(
+                f"{args.run_dir} holds a run of other settings: {', '.join(different)}: give another --run-dir"
+            )
+        command = _resume_command(cfg.robot, args.run_dir, args.device)
+        raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
+    if args.run_dir.is_dir() and any(args.run_dir.iterdir()):
+        raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
+    return args.run_dir
+
+
+def _mention_unfinished(name: str, cfg: SearchCfg, device: str | None) -> None:
+    """Says so where the new run repeats one that was stopped; starting over is still the user's to choose."""
+    for path in itertools.takewhile(Path.exists, numbered(_RUNS, name)):
+        run = RunDirectory(path)
+        try:
+            config, done = run.read_config(), run.iterations_done()
+        except (OSError, ValueError):
+            continue
+        if done < config["iterations"] and not differences(config["settings"], as_settings(cfg)):
+            print(
+                f"{path} holds the same search, stopped after {done} of {config['iterations']} iterations. Go on with:"
+            )
+            print(f"  {_resume_command(cfg.robot, path, device)}")
+
+
+def _resume_command(robot: str, path: Path, device: str | None) -> str:
+    return f"make archive ROBOT={robot} RESUME={path}" + (f" DEVICE={device}" if device else "")

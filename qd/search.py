@@ -1,0 +1,167 @@
+"""Search the terrains that break a controller: ask for terrains, let robots cross them, tell what became of them."""
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from qd.archive import Archive
+from qd.arguments import Arguments, Job, job_of
+from qd.cli import Interrupted, run_command
+from qd.files import to_json, write_atomically
+from qd.fitness import Evaluation, evaluation_of
+from qd.progress import ProgressBar, clock, plan
+from qd.provenance import provenance
+from qd.reevaluate import FRESH_EPISODES, reproduced
+from qd.report import summary, write_figures
+from qd.run_directory import Metrics, RunDirectory, archive_of, claimed
+from qd.settings import SearchCfg, as_settings
+from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
+
+if TYPE_CHECKING:
+    from qd.cma_mae import CmaMae
+
+SUMMARY_FILE = "archive.json"
+
+Open = Callable[[EvaluatorCfg], AbstractContextManager[Evaluate]]
+
+
+def search_terrains(
+    cfg: SearchCfg, run: RunDirectory, search: "CmaMae", metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
+) -> None:
+    """The loop: runs the iterations that are left, each saved before the next begins.
+
+    Args:
+        cfg: The search.
+        run: Where it is saved.
+        search: State of CMA-MAE, told so far.
+        metrics: Rows so far; one more an iteration.
+        evaluate: Crosses terrains.
+        bar: Shows progress.
+    """
+    settings, cells = as_settings(cfg), cfg.cells
+    began = time.perf_counter()
+    for iteration in range(len(metrics) + 1, cfg.iterations + 1):
+        genes = search.ask()
+        seeds = episode_seeds(cfg.seed, iteration, len(genes))
+        result = evaluate(genes, seeds, bar.within(iteration))
+        evaluation = evaluation_of(result, cells, cfg.fitness)
+        search.tell(evaluation, iteration)
+        ended = time.perf_counter()
+        found = archive_of(settings, search, iteration)
+        metrics.append(
+            {
+                "iteration": iteration,
+                "elites": len(found),
+                "reachable_coverage": found.reachable_coverage,
+                "qd_score": found.qd_score,
+                "mean_fitness": found.mean_fitness,
+                **_batch_row(evaluation),
+                "physics_steps": int(result.physics_steps),
+                "rollout_s": float(result.wall_s),
+                "wall_s": ended - began,  # from the end of the iteration before, so saving counts
+                "episodes_per_s": int(evaluation.episodes.sum()) / (ended - began),
+            }
+        )
+        began = ended
+        run.save(settings, search, metrics, found)
+        bar.show(metrics[-1])
+
+
+def _batch_row(evaluation: Evaluation) -> dict[str, Any]:
+    """What an iteration's own terrains were like."""
+    return {
+        "terrains": len(evaluation.fitness),
+        "episodes": int(evaluation.episodes.sum()),
+        "invalid_episodes": int(evaluation.invalid_episodes.sum()),
+        "invalid_terrains": int((~evaluation.valid).sum()),
+        "batch_fitness": float(evaluation.fitness.mean()),
+        "batch_collision_rate": float(evaluation.collision_rate.mean()),
+        "batch_goal_rate": float(evaluation.goal_rate.mean()),
+    }
+
+
+def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
+    """Runs a search to its end: loop, figures, numbers, and what to do next.
+
+    Args:
+        job: What to do; nothing is written before the simulation stands.
+        open_evaluator: Opens what crosses the terrains.
+
+    Returns:
+        The archive.
+
+    Raises:
+        ValueError: If the run directory does not fit the job.
+        Interrupted: On Ctrl-C or SIGTERM; all iterations that ended are saved.
+        EvaluatorError: If a worker is lost; likewise.
+    """
+    cfg, run = job.cfg, RunDirectory(job.path)
+    with claimed(job.path):
+        loaded = run.load(as_settings(cfg)) if job.resumes else None
+        done = len(loaded[1]) if loaded else 0
+        if done > cfg.iterations:
+            raise ValueError(
+                f"iterations must be at least {done}, as many as {job.path} has done, got {cfg.iterations}"
+            )
+        print(plan(cfg, job.path, done, job.device, job.evaluator.processes), flush=True)
+        try:
+            with open_evaluator(job.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
+                search, metrics = loaded or _begin(cfg)
+                run.write_config(as_settings(cfg), cfg.iterations, job.origin)
+                if evaluate is not None:
+                    with ProgressBar(cfg.iterations, done) as bar:
+                        search_terrains(cfg, run, search, metrics, evaluate, bar)
+            return _finish(job, run, search, metrics, open_evaluator)
+        except KeyboardInterrupt:
+            raise Interrupted(f"Stopped; finished iterations are saved. Go on with:  {job.resume_command}") from None
+        except EvaluatorError as error:
+            raise EvaluatorError(f"{error}. Go on with:  {job.resume_command}") from None
+
+
+def _begin(cfg: SearchCfg) -> tuple["CmaMae", Metrics]:
+    from qd.cma_mae import CmaMae
+
+    num_ratios = len(cfg.fitness.penalties)
+    return CmaMae(cfg.cma, num_cells=cfg.cells.num_cells, num_ratios=num_ratios, seed=cfg.seed), []
+
+
+def _finish(job: Job, run: RunDirectory, search: "CmaMae", metrics: Metrics, open_evaluator: Open) -> Archive:
+    """Figures and numbers of a search that reached its iterations."""
+    archive = archive_of(as_settings(job.cfg), search, len(metrics))
+    run.write_derived(metrics, archive)
+    figures = write_figures(job.path, archive, metrics)
+    count = _count_reproduced(job, archive, open_evaluator) if job.reproduce else None
+    numbers = summary(
+        archive,
+        metrics,
+        gpus=int(job.device.startswith("cuda")),
+        num_reproduced=count,
+        origin=provenance(job.device, job.cfg.seed),
+    )
+    write_atomically(job.path / SUMMARY_FILE, to_json(numbers))
+    print(
+        f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
+        f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes in "
+        f"{clock(numbers['wall_s'])}" + (f"; {count:,} elites reproduced" if count is not None else "")
+    )
+    print(f"Figures: {', '.join(map(str, figures))}")
+    print(f"Next, see the worst terrain:  make replay ROBOT={job.cfg.robot} RUN={job.path} ELITE=0")
+    return archive
+
+
+def _count_reproduced(job: Job, archive: Archive, open_evaluator: Open) -> int:
+    print(f"Evaluating {len(archive):,} elites again with {FRESH_EPISODES} fresh episodes each.", flush=True)
+    at_once = max(1, job.cfg.episodes_per_iteration // FRESH_EPISODES)
+    with open_evaluator(replace(job.evaluator, num_terrains=at_once, num_replicas=FRESH_EPISODES)) as evaluate:
+        return int(reproduced(archive, evaluate, seed=job.cfg.seed).sum())
+
+
+def main(args: Arguments) -> None:
+    """The command."""
+    run_search(job_of(args))
+
+
+if __name__ == "__main__":
+    run_command(Arguments, main)

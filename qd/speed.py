@@ -1,0 +1,154 @@
+"""How fast the search runs beside the bare physics it is made of: ``python -m qd.speed --robot anymal``.
+
+The iterations timed are those of a real search, ask to saved checkpoint, in a directory that is thrown away. The bare
+rate is measured right after, on the terrains of the last of them, with as many environments and the same solver.
+"""
+
+import json
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.cli import run_command
+from qd.cma_mae import CmaMae
+from qd.files import to_json, write_atomically
+from qd.progress import ProgressBar
+from qd.provenance import provenance
+from qd.run_directory import Metrics, RunDirectory
+from qd.search import search_terrains
+from qd.settings import SearchCfg, changed, policy_spec, preset
+from qd.workers import Evaluate, EvaluatorCfg, open_evaluator, resolve_device
+
+_WARM_UP = 2
+_CURVE_REPLICAS = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """Time a preset's iteration, the bare physics of the same terrains, and episodes a second over env counts."""
+
+    robot: str = "anymal"
+    """Which robot."""
+    preset: str = "paper"
+    """Whose iteration is timed."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    iterations: int = 20
+    """Iterations timed, after two that are not."""
+    steps: int = 1000
+    """Physics steps of the bare measurement."""
+    curve: tuple[int, ...] = (1024, 2048, 4096, 8192, 16384, 32768)
+    """Numbers of environments of the curve, multiples of 16; none to leave it out."""
+    train_speed: Path | None = None
+    """Output of train.speed, whose rates are taken over."""
+    out: Path | None = None
+    """Where to write; printed alone if left out."""
+
+
+class _Recorder:
+    """Evaluates, and remembers the terrains of the last evaluation."""
+
+    def __init__(self, evaluate: Evaluate) -> None:
+        self._evaluate = evaluate
+        self.terrains: NDArray[Any] = np.zeros((0, 0))
+
+    def __call__(self, terrains: NDArray, seeds: NDArray, progress: Any = None) -> Any:
+        self.terrains = terrains
+        return self._evaluate(terrains, seeds, progress)
+
+
+def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, NDArray[Any]]:
+    """Runs a search from the start; its metrics rows, and the terrains of its last iteration."""
+    search = CmaMae(cfg.cma, num_cells=cfg.cells.num_cells, num_ratios=len(cfg.fitness.penalties), seed=cfg.seed)
+    metrics: Metrics = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        open_evaluator(evaluator) as evaluate,
+        ProgressBar(cfg.iterations, 0) as bar,
+    ):
+        recorder = _Recorder(evaluate)
+        search_terrains(cfg, RunDirectory(Path(folder)), search, metrics, recorder, bar)
+    return metrics, recorder.terrains
+
+
+def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[int, ...]) -> list[dict[str, float]]:
+    """Episodes a second of one evaluation over numbers of environments, terrains repeated as needed."""
+    rows = []
+    for count in counts:
+        num_terrains = count // _CURVE_REPLICAS
+        genes = terrains[np.arange(num_terrains) % len(terrains)]
+        seeds = np.arange(num_terrains, dtype=np.uint32)
+        with open_evaluator(replace(evaluator, num_terrains=num_terrains, num_replicas=_CURVE_REPLICAS)) as evaluate:
+            result = evaluate(genes, seeds)
+        rows.append(
+            {
+                "num_envs": count,
+                "episodes_per_s": count / result.wall_s,
+                "world_steps_per_s": count * result.physics_steps / result.wall_s,
+            }
+        )
+        print(f"  {count:>6} environments: {rows[-1]['episodes_per_s']:,.0f} episodes/s", flush=True)
+    return rows
+
+
+def training_rates(file: Path | None) -> dict[str, float | None]:
+    """PPO's env-steps a second with learning, as train.speed wrote them; None where it did not run."""
+    rows = json.loads(file.read_text())["training"] if file else []
+    rate = {row["num_envs"]: row["train_env_steps_per_s"] for row in rows}
+    return {"train_env_steps_per_s": rate.get(4096), "train_env_steps_per_s_8192": rate.get(8192)}
+
+
+def measure(args: Arguments) -> dict[str, Any]:
+    """Everything of ``speed.json``.
+
+    Raises:
+        ValueError: If something asked for cannot be had.
+    """
+    from sim.bare import measure_bare_physics
+    from sim.robot import get_robot
+
+    robot, device = get_robot(args.robot), resolve_device(args.device)
+    training = training_rates(args.train_speed)
+    cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
+    evaluator = EvaluatorCfg(
+        robot=robot.name,
+        policy=policy_spec(cfg, robot),
+        num_terrains=cfg.cma.num_terrains,
+        num_replicas=cfg.replicas,
+        device=device,
+        num_workers=1,  # bare physics is measured in one process too
+    )
+    metrics, terrains = time_iterations(cfg, evaluator)
+    num_envs = cfg.episodes_per_iteration
+    bare = measure_bare_physics(robot, terrains, num_envs, device=device, steps=args.steps)
+    rates = [num_envs * row["physics_steps"] / row["wall_s"] for row in metrics[_WARM_UP:]]
+    return {
+        **provenance(device, cfg.seed),
+        "robot": robot.name,
+        "preset": args.preset,
+        "num_envs": num_envs,
+        "iteration_s_median": float(np.median([row["wall_s"] for row in metrics[_WARM_UP:]])),
+        "bare_physics_ratio": float(np.median(rates)) / bare,
+        "world_steps_per_s": float(np.median(rates)),
+        "bare_world_steps_per_s": bare,
+        **training,
+        "envs_curve": time_curve(evaluator, terrains, args.curve) or None,
+    }
+
+
+def main(args: Arguments) -> None:
+    """The command."""
+    report = measure(args)
+    print(to_json(report).decode())
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(args.out, to_json(report))
+        print(f"written to {args.out}")
+
+
+if __name__ == "__main__":
+    run_command(Arguments, main)

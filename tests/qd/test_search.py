@@ -1,0 +1,355 @@
+"""The search over the stand-in evaluator: what it finds, what it leaves behind, and what a kill costs."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qd import files, search
+from qd.archive import read_archive
+from qd.arguments import Job
+from qd.cli import Interrupted
+from qd.fitness import FitnessCfg
+from qd.search import run_search
+from qd.settings import CmaMaeCfg, SearchCfg
+from qd.workers import EvaluatorCfg, EvaluatorError
+from tests.qd import stand_in
+
+CFG = SearchCfg(
+    robot="anymal",
+    preset="small",
+    policy="shipped",
+    policy_sha256=None,
+    seed=3,
+    iterations=2,
+    replicas=4,
+    intervals=10,
+    collision_bit=False,
+    fitness=FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES),
+    cma=CmaMaeCfg(emitters=2, batch_size=6, restart_rule="3"),
+)
+KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.json", "curves.png", "metrics.jsonl")
+
+
+def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
+    cfg = dataclasses.replace(CFG, **changes)
+    evaluator = EvaluatorCfg(
+        robot="anymal", policy="p", num_terrains=cfg.cma.num_terrains, num_replicas=cfg.replicas, num_workers=1
+    )
+    return Job(
+        cfg=cfg,
+        path=path,
+        resumes=resumes,
+        evaluator=evaluator,
+        reproduce=reproduce,
+        origin={"command": "test"},
+        resume_command=f"make archive RESUME={path}",
+    )
+
+
+def run(path: Path, **settings):
+    return run_search(make_job(path, **settings), open_evaluator=open_stand_in)
+
+
+@contextmanager
+def open_stand_in(cfg: EvaluatorCfg):
+    yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds, cfg.num_replicas)
+
+
+def rows_of(path: Path, *, timed: bool = False) -> list[dict]:
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if timed or k not in ("wall_s", "episodes_per_s")} for row in rows]
+
+
+@pytest.fixture
+def plain_figures(monkeypatch):
+    """Figures take longer to draw than a search over the stand-in takes."""
+
+    def write_figures(folder, archive, metrics):
+        files.write_atomically(folder / "archive.png", b"a figure")
+        return [folder / "archive.png"]
+
+    monkeypatch.setattr(search, "write_figures", write_figures)
+
+
+def test_golden_search(tmp_path, capsys):
+    archive = run(tmp_path / "run")
+    assert sorted(os.listdir(tmp_path / "run")) == sorted(KEPT)
+    assert (len(archive), archive.iterations) == (GOLDEN["elites"], 2)
+    assert archive.cell[:5].tolist() == GOLDEN["cells"]
+    assert archive.fitness[:5] == pytest.approx(GOLDEN["fitness"], abs=1e-4)
+    output = capsys.readouterr().out
+    assert "2 iterations of 12 terrains x 4 episodes of up to 20 s" in output
+    assert f"make replay ROBOT=anymal RUN={tmp_path / 'run'} ELITE=0" in output
+
+
+GOLDEN = {
+    "elites": 24,
+    "cells": [3904, 2497, 3149, 3449, 1009],
+    "fitness": [3.23625, 3.04963, 2.86269, 2.72434, 2.58613],
+}
+
+
+def test_files_agree_with_each_other(tmp_path):
+    path = tmp_path / "run"
+    archive = run(path, iterations=4)
+    on_disk = read_archive(path)
+    assert np.array_equal(on_disk.genes, archive.genes)
+    numbers = json.loads((path / "archive.json").read_text())
+    last = rows_of(path, timed=True)[-1]
+    assert [row["iteration"] for row in rows_of(path)] == [1, 2, 3, 4]
+    for key in ("elites", "reachable_coverage", "qd_score", "mean_fitness"):
+        assert numbers[key] == last[key]
+    assert numbers["terrains_evaluated"] == 4 * 12
+    assert numbers["episodes"] == 4 * 12 * 4
+    assert numbers["reachable_cells"] == 4795
+    assert numbers["elites_reproduced"] is None
+    assert numbers["gpus"] == 0
+    for key in ("command", "commit", "device", "versions", "seed", "date", "wall_s", "invalid_episodes"):
+        assert key in numbers
+    assert on_disk.qd_score == pytest.approx(numbers["qd_score"])
+
+
+def test_seed_decides(tmp_path, plain_figures):
+    first, again, other = (run(tmp_path / name, seed=seed) for name, seed in (("a", 3), ("b", 3), ("c", 4)))
+    assert (tmp_path / "a/archive.npz").read_bytes() == (tmp_path / "b/archive.npz").read_bytes()
+    assert np.array_equal(first.genes, again.genes)
+    assert not np.array_equal(first.genes, other.genes)
+
+
+WRITES = 1 + 3 * 3 + 2 + 1 + 1
+"""Config, three files in each of 3 iterations, metrics and archive again, the stand-in figure, numbers."""
+
+
+class KilledError(BaseException):
+    """Stands for SIGKILL: nothing in the program catches it."""
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_killed_at_any_write_a_search_resumes_to_the_same_bits(tmp_path, monkeypatch, plain_figures, when):
+    run(tmp_path / "whole", iterations=3)
+    replace = os.replace
+
+    for kill_at in range(WRITES):
+        path, count = tmp_path / f"killed-{kill_at}", 0
+
+        def killing_replace(source, target, kill_at=kill_at):
+            nonlocal count
+            count += 1
+            if when == "after" or count <= kill_at:
+                replace(source, target)
+            if count > kill_at:
+                raise KilledError
+
+        monkeypatch.setattr(files.os, "replace", killing_replace)
+        with pytest.raises(KilledError):
+            run(path, iterations=3)
+        monkeypatch.setattr(files.os, "replace", replace)
+        # Killed before its config was there a run was never begun: the same command begins it.
+        run(path, iterations=3, resumes=(path / "config.json").exists())
+        assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes(), kill_at
+        assert rows_of(path) == rows_of(tmp_path / "whole"), kill_at
+        assert (path / "archive.json").exists()
+
+
+def test_every_write_was_killed(tmp_path, monkeypatch, plain_figures):
+    count, replace = 0, os.replace
+
+    def counting_replace(source, target):
+        nonlocal count
+        count += 1
+        replace(source, target)
+
+    monkeypatch.setattr(files.os, "replace", counting_replace)
+    run(tmp_path / "run", iterations=3)
+    assert count == WRITES
+
+
+def test_a_finished_run_is_extended_as_if_it_had_been_longer_from_the_start(tmp_path, plain_figures):
+    run(tmp_path / "whole", iterations=9)
+    run(tmp_path / "pieces", iterations=4)
+    run(tmp_path / "pieces", iterations=9, resumes=True)
+    assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
+    assert json.loads((tmp_path / "pieces/config.json").read_text())["iterations"] == 9
+
+
+def test_resuming_a_finished_run_evaluates_nothing_and_writes_its_results_again(tmp_path, plain_figures, capsys):
+    path = tmp_path / "run"
+    run(path)
+    before = (path / "archive.npz").read_bytes()
+    for name in ("archive.npz", "archive.json", "metrics.jsonl"):
+        (path / name).unlink()
+
+    def never(cfg):
+        raise AssertionError("nothing is left to evaluate")
+
+    run_search(make_job(path, resumes=True), open_evaluator=never)
+    assert (path / "archive.npz").read_bytes() == before
+    assert json.loads((path / "archive.json").read_text())["iterations"] == 2
+    assert "All 2 iterations" in capsys.readouterr().out
+
+
+def test_fewer_iterations_than_done_are_refused(tmp_path, plain_figures):
+    run(tmp_path / "run", iterations=3)
+    with pytest.raises(ValueError, match=r"iterations must be at least 3, as many as .* has done, got 2"):
+        run(tmp_path / "run", iterations=2, resumes=True)
+
+
+def test_elites_are_evaluated_again_with_forty_fresh_episodes(tmp_path, plain_figures):
+    replicas, seeds_seen = [], []
+
+    @contextmanager
+    def watching(cfg: EvaluatorCfg):
+        replicas.append(cfg.num_replicas)
+
+        def evaluate(genes, seeds, progress=None):
+            seeds_seen.append(seeds)
+            return stand_in.evaluate(genes, seeds, cfg.num_replicas)
+
+        yield evaluate
+
+    archive = run_search(make_job(tmp_path / "run", reproduce=True), open_evaluator=watching)
+    numbers = json.loads((tmp_path / "run/archive.json").read_text())
+    assert replicas == [4, 40]
+    assert len(seeds_seen[-1]) == len(archive)
+    assert not set(seeds_seen[-1].tolist()) & set(np.concatenate(seeds_seen[:-1]).tolist())
+    # The stand-in's noise of 10 % moves a mean of 40 episodes by under 2 %: all land in their cell or beside it.
+    assert numbers["elites_reproduced"] == len(archive)
+
+
+def test_an_interrupt_says_how_to_go_on(tmp_path, plain_figures):
+    path = tmp_path / "run"
+
+    @contextmanager
+    def interrupted(cfg: EvaluatorCfg):
+        def evaluate(genes, seeds, progress=None):
+            if (path / "checkpoint.bin").exists():
+                raise KeyboardInterrupt
+            return stand_in.evaluate(genes, seeds)
+
+        yield evaluate
+
+    with pytest.raises(Interrupted, match=f"Go on with:  make archive RESUME={path}"):
+        run_search(make_job(path, iterations=3), open_evaluator=interrupted)
+    assert len(rows_of(path)) == 1
+    run(path, iterations=3, resumes=True)
+    run(tmp_path / "whole", iterations=3)
+    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
+
+
+def test_a_lost_worker_says_how_to_go_on(tmp_path):
+    @contextmanager
+    def lost(cfg: EvaluatorCfg):
+        def evaluate(genes, seeds, progress=None):
+            raise EvaluatorError("a worker process died (signal SIGKILL)")
+
+        yield evaluate
+
+    with pytest.raises(EvaluatorError, match=r"SIGKILL.*Go on with:  make archive RESUME="):
+        run_search(make_job(tmp_path / "run"), open_evaluator=lost)
+
+
+def test_a_simulation_that_cannot_be_built_leaves_no_directory(tmp_path):
+    @contextmanager
+    def refusing(cfg: EvaluatorCfg):
+        raise ValueError("policy 'x' does not fit")
+        yield
+
+    with pytest.raises(ValueError, match="does not fit"):
+        run_search(make_job(tmp_path / "run"), open_evaluator=refusing)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_checkpoint_of_another_run_is_refused_and_left_alone(tmp_path, plain_figures):
+    run(tmp_path / "a")
+    run(tmp_path / "b", seed=4, cma=dataclasses.replace(CFG.cma, sigma0=0.25))
+    strayed = (tmp_path / "b/checkpoint.bin").read_bytes()
+    (tmp_path / "a/checkpoint.bin").write_bytes(strayed)
+    before = {name: (tmp_path / "a" / name).read_bytes() for name in os.listdir(tmp_path / "a")}
+    with pytest.raises(
+        ValueError, match=r"other settings: cma\.sigma0 \(0\.25 there, 0\.5 wanted\), seed \(4 there, 3"
+    ):
+        run(tmp_path / "a", resumes=True, iterations=5)
+    assert {name: (tmp_path / "a" / name).read_bytes() for name in os.listdir(tmp_path / "a")} == before
+
+
+def test_two_searches_do_not_share_a_directory(tmp_path):
+    path = tmp_path / "run"
+
+    @contextmanager
+    def intruding(cfg: EvaluatorCfg):
+        with pytest.raises(ValueError, match="another search works in"):
+            run(path)
+        yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds)
+
+    run_search(make_job(path), open_evaluator=intruding)
+    assert len(rows_of(path)) == 2
+
+
+@pytest.mark.parametrize("target", ["/dev/null/run", "/proc/run"])
+def test_a_directory_that_cannot_be_written_to(target):
+    with pytest.raises(ValueError, match=r"cannot be written to: .*: give another --run-dir"):
+        run(Path(target))
+
+
+SLOW_SEARCH = """
+import sys, time
+from pathlib import Path
+from qd.cli import run_command
+from qd.search import run_search
+from tests.qd import stand_in, test_search
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+@contextmanager
+def slow(cfg):
+    def evaluate(genes, seeds, progress=None):
+        time.sleep(0.3)
+        return stand_in.evaluate(genes, seeds)
+    yield evaluate
+
+@dataclass
+class Arguments:
+    path: Path
+
+run_command(Arguments, lambda args: run_search(test_search.make_job(args.path, iterations=500), open_evaluator=slow))
+"""
+
+
+def stopped_by(signum: int, path: Path, **environment: str) -> tuple[int, str]:
+    """Exit code and error output of a search that gets a signal after two iterations."""
+    program = subprocess.Popen(
+        [sys.executable, "-c", SLOW_SEARCH, "--path", str(path)],
+        stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2], env={**os.environ, **environment},
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not ((path / "metrics.jsonl").exists() and len(rows_of(path)) >= 2):
+        time.sleep(0.05)
+    program.send_signal(signum)
+    errors = program.communicate(timeout=30)[1]
+    return program.returncode, errors
+
+
+def test_a_search_killed_by_the_system_resumes_to_the_same_bits(tmp_path, plain_figures):
+    path = tmp_path / "run"
+    assert stopped_by(signal.SIGKILL, path)[0] == -signal.SIGKILL
+    done = len(rows_of(path))
+    run(path, iterations=done + 1, resumes=True)
+    run(tmp_path / "whole", iterations=done + 1)
+    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
+
+
+def test_ctrl_c_ends_without_a_traceback_and_says_how_to_go_on(tmp_path):
+    path = tmp_path / "run"
+    code, errors = stopped_by(signal.SIGINT, path, NUMBA_DISABLE_JIT="1")  # spares compiling for a look at the messages
+    assert code == 130
+    assert "Traceback" not in errors
+    assert f"Go on with:  make archive RESUME={path}" in errors
