@@ -117,17 +117,22 @@ def job_of(args: Arguments) -> Job:
         cfg=cfg,
         path=path,
         resumes=config is not None,
-        evaluator=EvaluatorCfg(
-            robot=cfg.robot,
-            policy=policy,
-            num_terrains=cfg.cma.num_terrains,
-            num_replicas=cfg.replicas,
-            device=device,
-            num_workers=args.workers,
-        ),
+        evaluator=_evaluator(cfg, policy, device, args.workers),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
         origin=origin,
         resume_command=_resume_command(cfg.robot, path, args.device),
+    )
+
+
+def _evaluator(cfg: SearchCfg, policy: str, device: str, workers: int | None) -> EvaluatorCfg:
+    """What evaluates an iteration's terrains all at once."""
+    return EvaluatorCfg(
+        robot=cfg.robot,
+        policy=policy,
+        num_terrains=cfg.cma.num_terrains,
+        num_replicas=cfg.replicas,
+        device=device,
+        num_workers=workers,
     )
 
 

@@ -1,25 +1,26 @@
 """Penalty scales: what each raw penalty comes to on hard-random terrains, so that the six can be added and compared.
 
-The scale of a penalty is its mean over all valid episodes;
-where it is 0 in over half of them, its mean over the others.
+The scale of a penalty is its mean over all valid episodes or, where it is 0 in over half of them, over the others.
 Scales are measured once with the shipped controller, before any search, and never tuned on an archive.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.cli import run_command
-from qd.files import to_json, write_atomically
+from qd.files import check_writable, to_json, write_atomically
 from qd.provenance import provenance
 from qd.workers import EvaluatorCfg, check_policy, open_evaluator, resolve_device
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
+
+_CPU_TERRAINS = 16  # at once: enough to keep some cores busy, little enough memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,40 +76,44 @@ def calibrate(cfg: CalibrateCfg) -> Path:
     from sim.robot import get_robot
     from sim.terrain import hard_random_genes
 
+    if cfg.terrains < 1 or cfg.replicas < 1:
+        raise ValueError(f"terrains and replicas must be at least 1, got {cfg.terrains} and {cfg.replicas}")
     robot = get_robot(cfg.robot)
     device = resolve_device(cfg.device)
     policy = cfg.policy or str(robot.policy_file)
     check_policy(policy, cfg.robot, device)
     out = cfg.out or robot.scales_file
+    check_writable(out.parent)
+    print(f"Crossing {cfg.terrains} hard-random terrains {cfg.replicas} times on {device}.", flush=True)
+    evaluator = EvaluatorCfg(
+        robot=cfg.robot,
+        policy=policy,
+        num_terrains=cfg.terrains if device.startswith("cuda") else min(cfg.terrains, _CPU_TERRAINS),
+        num_replicas=cfg.replicas,
+        device=device,
+    )
     genes = hard_random_genes(cfg.terrains, cfg.seed)
     seeds = np.random.SeedSequence(cfg.seed).generate_state(cfg.terrains, np.uint32)
-    evaluator = EvaluatorCfg(
-        robot=cfg.robot, policy=policy, num_terrains=cfg.terrains, num_replicas=cfg.replicas, device=device
-    )
-    print(f"Crossing {cfg.terrains} hard-random terrains {cfg.replicas} times on {device}.")
     with open_evaluator(evaluator) as evaluate, tqdm(total=100, unit="%", desc="calibrate", disable=None) as bar:
-
-        def show(share: float) -> None:
-            bar.update(round(100 * share) - bar.n)
-
-        result = evaluate(genes, seeds, progress=show)
-    scales = penalty_scales(result)
-    rows = np.asarray(result.penalties)[~result.invalid]
-    report = {
-        **provenance(device, cfg.seed),
-        "robot": cfg.robot,
-        "policy": Path(policy).name,
-        "terrains": cfg.terrains,
-        "episodes": int(result.outcome.size),
-        "invalid_episodes": int(result.invalid.sum()),
-        "scales": scales,
-        "share_of_episodes_with": {
-            name: float((values > 0.0).mean()) for name, values in zip(result.penalty_names, rows.T, strict=True)
-        },
-    }
+        result = evaluate(genes, seeds, lambda share: _move(bar, share))
+    report = {**provenance(device, cfg.seed), "robot": cfg.robot, "policy": Path(policy).name, **_measured(result)}
     write_atomically(out, to_json(report))
-    print("\n".join(f"  {name:<14}{scale:12.4f}" for name, scale in scales.items()))
+    print("\n".join(f"  {name:<14}{scale:12.4f}" for name, scale in report["scales"].items()))
+    print(f"Written to {out}")
     return out
+
+
+def _measured(result: "RolloutResult") -> dict[str, Any]:
+    """The scales, and what they were measured on."""
+    rows = np.asarray(result.penalties)[~result.invalid]
+    shares = (rows > 0.0).mean(axis=0).tolist()
+    return {
+        "terrains": result.invalid.shape[0],
+        "episodes": int(result.invalid.size),
+        "invalid_episodes": int(result.invalid.sum()),
+        "scales": penalty_scales(result),
+        "share_of_episodes_with": dict(zip(result.penalty_names, shares, strict=True)),
+    }
 
 
 def _move(bar: tqdm, share: float) -> None:

@@ -36,6 +36,20 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.close(folder)
 
 
+def check_writable(folder: Path) -> None:
+    """Finds out whether files can be made in a folder, before the work whose result goes there.
+
+    Raises:
+        ValueError: If they cannot.
+    """
+    probe = folder / ".write-test"
+    try:
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be written to: {error.strerror}: give another place") from None
+
+
 def to_json(content: dict[str, Any]) -> bytes:
     """A dictionary as indented JSON; a number that is not finite is an error, since JSON has none."""
     return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, write_archive
 from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.files import read_json, to_json, write_atomically
+from qd.files import check_writable, read_json, to_json, write_atomically
 from qd.settings import Settings
 
 if TYPE_CHECKING:
@@ -65,14 +65,10 @@ def claimed(path: Path) -> Iterator[None]:
     made = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / ".write-test"
-        probe.touch()
-        probe.unlink()
-        handle = os.open(path, os.O_RDONLY)
     except OSError as error:
-        raise ValueError(
-            f"run directory {path} cannot be written to: {error.strerror}: give another --run-dir"
-        ) from None
+        raise ValueError(f"run directory {path} cannot be made: {error.strerror}: give another --run-dir") from None
+    check_writable(path)
+    handle = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -50,23 +50,23 @@ def search_terrains(
         search.tell(evaluation, iteration)
         ended = time.perf_counter()
         found = archive_of(settings, search, iteration)
-        metrics.append(
-            {
-                "iteration": iteration,
-                "elites": len(found),
-                "reachable_coverage": found.reachable_coverage,
-                "qd_score": found.qd_score,
-                "mean_fitness": found.mean_fitness,
-                **_batch_row(evaluation),
-                "physics_steps": int(result.physics_steps),
-                "rollout_s": float(result.wall_s),
-                "wall_s": ended - began,  # from the end of the iteration before, so saving counts
-                "episodes_per_s": int(evaluation.episodes.sum()) / (ended - began),
-            }
-        )
+        timing = {"wall_s": ended - began}  # from the end of the iteration before, so saving counts
+        timing["episodes_per_s"] = evaluation.episodes.sum().item() / timing["wall_s"]
+        physics = {"physics_steps": int(result.physics_steps), "rollout_s": float(result.wall_s)}
+        metrics.append({"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics, **timing})
         began = ended
         run.save(settings, search, metrics, found)
         bar.show(metrics[-1])
+
+
+def _scores(archive: Archive) -> dict[str, Any]:
+    """How good the archive is."""
+    return {
+        "elites": len(archive),
+        "reachable_coverage": archive.reachable_coverage,
+        "qd_score": archive.qd_score,
+        "mean_fitness": archive.mean_fitness,
+    }
 
 
 def _batch_row(evaluation: Evaluation) -> dict[str, Any]:

@@ -296,7 +296,7 @@ def test_two_searches_do_not_share_a_directory(tmp_path):
 
 @pytest.mark.parametrize("target", ["/dev/null/run", "/proc/run"])
 def test_a_directory_that_cannot_be_written_to(target):
-    with pytest.raises(ValueError, match=r"cannot be written to: .*: give another --run-dir"):
+    with pytest.raises(ValueError, match=r"cannot be made: .*: give another --run-dir"):
         run(Path(target))
 
 
