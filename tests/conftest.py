@@ -2,10 +2,13 @@
 
 import os
 
+import numpy as np
 import pytest
 
+from sim.bank import TerrainBank
 from sim.robot import get_robot
-from sim.simulation import resolve_device
+from sim.simulation import Simulation, resolve_device
+from tests.sim.scenes import Stepper
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +20,16 @@ def device() -> str:
 @pytest.fixture(scope="session")
 def anymal():
     return get_robot("anymal")
+
+
+@pytest.fixture(scope="session")
+def eight(anymal, device):
+    """Eight ANYmals, each on a grid of its own; a test puts ground and robots where it wants them."""
+    bank = TerrainBank(8, device=device)
+    return Simulation(anymal, bank, np.arange(8))
+
+
+@pytest.fixture(scope="session")
+def eight_stepper(eight):
+    """Steps the eight ANYmals by four physics steps at a time."""
+    return Stepper(eight)

@@ -1,0 +1,104 @@
+"""Ground to stand on and bodies to drop on it, for the physics tests."""
+
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from sim.bank import TerrainBank
+from sim.robot import RobotCfg
+from sim.simulation import Simulation
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+
+NODE_X = np.arange(NUM_COLS) * SPACING
+NODE_Y = np.arange(NUM_ROWS) * SPACING
+PHYSICS_DT = 0.005
+
+
+def slope(angle_x: float = 0.0, angle_y: float = 0.0) -> np.ndarray:
+    """A plane through (8, 4, 0) that rises along x and y by the given angles [rad]."""
+    return np.float32(np.tan(angle_x) * (NODE_X[None, :] - 8) + np.tan(angle_y) * (NODE_Y[:, None] - 4))
+
+
+def free_body(folder: Path, geom: str, *, mass: float, friction: float = 0.5) -> RobotCfg:
+    """A robot without joints: one free body of one geom, e.g. ``type="sphere" size="0.03"``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "body.xml"
+    file.write_text(
+        '<mujoco><worldbody><body name="body"><freejoint/>'
+        f'<geom name="body" {geom} mass="{mass}" friction="{friction}"/></body></worldbody></mujoco>'
+    )
+    return RobotCfg(
+        name="body",
+        model_file=file,
+        base_geoms=(),
+        foot_geoms=("body",),
+        limb_geoms=(),
+        joint_names=(),
+        default_joint_pos=(),
+        default_base_height=1.0,
+        footprint=(0.1, 0.1),
+        scan_x=(),
+        scan_y=(),
+        contact_force_limit=500.0,
+        penalties=(),
+        collision_bit=False,
+        njmax=160,
+    )
+
+
+def simulate(robot: RobotCfg, grids: np.ndarray, device: str) -> Simulation:
+    """One robot on each grid."""
+    bank = TerrainBank(len(grids), device=device)
+    bank.set_heights(np.float32(grids))
+    return Simulation(robot, bank, np.arange(len(grids)))
+
+
+def put(sim: Simulation, joint_q: np.ndarray, joint_qd: np.ndarray | None = None) -> None:
+    """Put the robots there, at rest or with the given velocities, holding their joints where they are."""
+    sim.joint_q.assign(np.float32(joint_q))
+    sim.joint_qd.assign(np.zeros(sim.joint_qd.shape, np.float32) if joint_qd is None else np.float32(joint_qd))
+    sim.targets.assign(np.float32(joint_q))
+    sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
+    sim.refresh()
+
+
+class Stepper:
+    """Steps a simulation by a captured graph of four physics steps, or of one."""
+
+    def __init__(self, sim: Simulation, steps: int = 4) -> None:
+        def launch() -> None:
+            sim.refresh()
+            for _ in range(steps):
+                sim.physics_step()
+            sim.read_geom_forces()
+
+        self._sim = sim
+        self._graph = sim.capture(launch)
+        self._steps = steps
+
+    def run(self, duration_s: float, each: object = None) -> None:
+        """Let the time pass; ``each()`` is called after every launch of the graph."""
+        for _ in range(round(duration_s / (PHYSICS_DT * self._steps))):
+            self._sim.launch(self._graph)
+            if callable(each):
+                each()
+
+
+def positions(sim: Simulation) -> np.ndarray:
+    """A copy of the joint coordinates, shape (num_envs, 7 + num_joints), float64 (on the CPU numpy() is a view)."""
+    return np.array(sim.joint_q.numpy(), dtype=np.float64)
+
+
+def velocities(sim: Simulation) -> np.ndarray:
+    """A copy of the joint velocities, shape (num_envs, 6 + num_joints), float64."""
+    return np.array(sim.joint_qd.numpy(), dtype=np.float64)
+
+
+def lying(num: int, x: float, y: float, z: float, axis: tuple[float, float, float] = (0, 0, 1), angle: float = 0.0):
+    """Poses of free bodies turned about ``axis`` by ``angle`` [rad], shape (num, 7)."""
+    q = np.zeros((num, 7))
+    q[:, :3] = x, y, z
+    q[:, 3:6] = np.array(axis) * np.sin(angle / 2)
+    q[:, 6] = np.cos(angle / 2)
+    return q
