@@ -20,7 +20,7 @@ from tests.sim.scenes import positions, put, velocities
 
 NUM_DROPS = int(os.environ.get("FAULTLINE_DROPS", "256"))
 CLEARANCE = 0.3
-SETTLE_S = 3.0
+SETTLE_S = 4.0
 REACH = 0.3
 
 
