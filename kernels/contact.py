@@ -90,8 +90,8 @@ def _collide_strips_kernel(
     layout: Layout,
     contacts_out: ContactBuffer,
 ):
-    """Grid (num_envs, num_strips)."""
-    env, strip = wp.tid()
+    """Grid (num_strips, num_envs): the threads of a warp look at the same part of different robots."""
+    strip, env = wp.tid()
     t = terrain_of_env[env]
     radius = probes.strip_radius[strip]
     pose = body_q[env * layout.bodies_per_env + probes.strip_body[strip]]
@@ -102,14 +102,20 @@ def _collide_strips_kernel(
     lowest = wp.min(a[2], b[2]) - radius
     lower = wp.vec2(wp.min(a[0], b[0]) - radius, wp.min(a[1], b[1]) - radius)
     upper = wp.vec2(wp.max(a[0], b[0]) + radius, wp.max(a[1], b[1]) + radius)
-    if not (lowest < ceiling_over(terrain, t, lower, upper)):
+    ceiling = ceiling_over(terrain, t, lower, upper)
+    if not (lowest < ceiling):
         return  # also where the state is NaN
     first = int(-1)
     last = int(-1)
     deepest = int(-1)
     depth = float(0.0)
+    point = SurfacePoint()
     for k in range(begin, end):
-        point = _touch_probe(terrain, t, pose, probes, k, radius)
+        centre = wp.transform_point(pose, probes.position[k])
+        if centre[2] - radius < ceiling:
+            point = nearest_surface_point(terrain, t, centre, radius)
+        else:
+            point.distance = radius
         if point.distance < radius:
             if first < 0:
                 first = k
@@ -162,7 +168,7 @@ def collide_strips(
         )
     wp.launch(
         _collide_strips_kernel,
-        dim=(num_envs, probes.strip_radius.shape[0]),
+        dim=(probes.strip_radius.shape[0], num_envs),
         inputs=[body_q, terrain_of_env, terrain, probes, layout],
         outputs=[contacts_out],
         device=body_q.device,

@@ -131,18 +131,9 @@ def nearest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.ve
 
 
 @wp.func
-def nearest_in_cell(
-    terrain: Terrain, t: int, row: int, col: int, p: wp.vec3, reach: float, nearest: wp.vec3
-) -> wp.vec3:
-    """The nearer to ``p`` of ``nearest`` and the cell's two triangles; a cell lower than ``p.z - reach`` is skipped."""
-    h00 = node_height(terrain, t, row, col)
-    h10 = node_height(terrain, t, row, col + 1)
-    h01 = node_height(terrain, t, row + 1, col)
-    h11 = node_height(terrain, t, row + 1, col + 1)
-    if p[2] - wp.max(wp.max(h00, h10), wp.max(h01, h11)) >= reach:
-        return nearest
-    x = float(col) * terrain.spacing
-    y = float(row) * terrain.spacing
+def nearest_in_cell(terrain: Terrain, h00: float, h10: float, h01: float, h11: float, x: float, y: float,
+                    p: wp.vec3, nearest: wp.vec3) -> wp.vec3:  # fmt: skip
+    """The nearer to ``p`` of ``nearest`` and the two triangles of the cell with low corner (x, y) [m]."""
     low_high = wp.vec3(x, y + terrain.spacing, h01)
     high_low = wp.vec3(x + terrain.spacing, y, h10)
     first = nearest_on_triangle(p, wp.vec3(x, y, h00), high_low, low_high)
@@ -166,23 +157,42 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
     col0 = int(wp.floor((p[0] - reach) / terrain.spacing))
     col1 = int(wp.floor((p[0] + reach) / terrain.spacing))
     nearest = wp.vec3(p[0], p[1], p[2] + _FAR)
+    searched = bool(False)
     for row in range(row0, row1 + 1):
         for col in range(col0, col1 + 1):
-            nearest = nearest_in_cell(terrain, t, row, col, p, reach, nearest)
+            h00 = node_height(terrain, t, row, col)
+            h10 = node_height(terrain, t, row, col + 1)
+            h01 = node_height(terrain, t, row + 1, col)
+            h11 = node_height(terrain, t, row + 1, col + 1)
+            if p[2] - wp.max(wp.max(h00, h10), wp.max(h01, h11)) < reach:
+                searched = True
+                x = float(col) * terrain.spacing
+                y = float(row) * terrain.spacing
+                nearest = nearest_in_cell(terrain, h00, h10, h01, h11, x, y, p, nearest)
     point = SurfacePoint()
-    height = height_at(terrain, t, p[0], p[1])
-    point.normal = normal_at(terrain, t, p[0], p[1])
+    point.normal = wp.vec3(0.0, 0.0, 1.0)
+    point.distance = _FAR
+    if searched:
+        point = _sign_distance(terrain, t, p, reach, nearest)
+    return point
+
+
+@wp.func
+def _sign_distance(terrain: Terrain, t: int, p: wp.vec3, reach: float, nearest: wp.vec3) -> SurfacePoint:
+    point = SurfacePoint()
     distance = wp.length(p - nearest)
     point.distance = distance
+    height = height_at(terrain, t, p[0], p[1])
     if p[2] < height:
         if distance > reach:
+            point.normal = normal_at(terrain, t, p[0], p[1])
             point.distance = (p[2] - height) * point.normal[2]
-        else:
-            point.distance = -distance
-            if distance > _ON_SURFACE:
-                point.normal = (nearest - p) / distance
-    elif distance > _ON_SURFACE:
-        point.normal = (p - nearest) / distance
+            return point
+        point.distance = -distance
+    if distance > _ON_SURFACE:
+        point.normal = (p - nearest) / point.distance
+    else:
+        point.normal = normal_at(terrain, t, p[0], p[1])
     return point
 
 

@@ -10,6 +10,8 @@ from sim.robot import RobotCfg
 from sim.simulation import Simulation, SolverCfg
 from sim.terrain import NUM_COLS, NUM_ROWS
 
+_CROSSING_X = (2.0, 14.0)
+
 
 def measure_bare_physics(
     robot: RobotCfg,
@@ -23,7 +25,8 @@ def measure_bare_physics(
 ) -> float:
     """Physics steps a second over all environments of the captured graph of terrain contacts and solver alone.
 
-    The robots start where a crossing does and hold their default pose (definitions: bare physics rate).
+    The robots hold their default pose, spread over each terrain from a crossing's start to its goal: contact costs
+    what the ground under the robots makes it cost.
 
     Args:
         robot: Robot settings.
@@ -43,7 +46,8 @@ def measure_bare_physics(
     (bank.set_heights if terrains.ndim == 3 else bank.set_genes)(terrains)
     terrain_of_env = np.repeat(np.arange(len(terrains)), num_envs // len(terrains))
     sim = Simulation(robot, bank, terrain_of_env, cfg=solver)
-    stand_on_terrain(sim)
+    x = np.linspace(*_CROSSING_X, num_envs // len(terrains))
+    stand_on_terrain(sim, np.tile(x, len(terrains)))
 
     def control_step() -> None:
         for _ in range(robot.decimation):
@@ -61,15 +65,17 @@ def measure_bare_physics(
     return num_envs * launches * robot.decimation / (time.perf_counter() - began)
 
 
-def stand_on_terrain(sim: Simulation, x: float = 2.0, y: float = 4.0) -> None:
-    """Put every robot in its default pose at world-local (x, y) [m] over its terrain, and hold that pose."""
+def stand_on_terrain(sim: Simulation, x: np.ndarray, y: float = 4.0) -> None:
+    """Put every robot in its default pose over its terrain at world-local (x, y) [m], x of shape (num_envs,); held."""
     robot, spacing = sim.robot, sim.bank.terrain.spacing
-    heights = sim.bank.heights.numpy()[np.array(sim.terrain_of_env.numpy(), dtype=np.intp)]
-    row, col = round(y / spacing), round(x / spacing)
+    heights = sim.bank.heights.numpy()
     length, width = (round(half / spacing) for half in robot.footprint)
-    ground = heights[:, row - width : row + width + 1, col - length : col + length + 1].max(axis=(1, 2))
+    row = round(y / spacing)
     joint_q = np.zeros(sim.joint_q.shape, dtype=np.float32)
-    joint_q[:, 0], joint_q[:, 1], joint_q[:, 2] = x, y, ground + robot.default_base_height
+    for env, t in enumerate(np.array(sim.terrain_of_env.numpy(), dtype=np.intp)):
+        col = round(float(x[env]) / spacing)
+        under = heights[t, row - width : row + width + 1, max(col - length, 0) : col + length + 1]
+        joint_q[env, :3] = x[env], y, under.max() + robot.default_base_height
     joint_q[:, 6] = 1.0
     joint_q[:, 7:] = robot.default_joint_pos
     sim.joint_q.assign(joint_q)

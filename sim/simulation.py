@@ -28,8 +28,11 @@ class SolverCfg:
     feet sink less on edges but doubles the peak forces.
     """
 
-    iterations: int = 10
-    ls_iterations: int = 20
+    iterations: int = 4
+    """Newton iterations a step at most. A walking robot takes 1.1 on average, but all worlds wait for the slowest; caps
+    of 4 to 10 gave the same crossing rates within their intervals, 3 shifted the penalties by 3 %."""
+    ls_iterations: int = 10
+    """Line-search iterations at most."""
 
 
 def resolve_device(name: str | None) -> str:
