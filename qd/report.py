@@ -109,7 +109,7 @@ def draw_archive(archive: Archive) -> "Figure":
     figure = new_figure(1.6 * count + 1.4, 4.6)
     axes = figure.subplots()
     axes.set_title(
-        f"{_title(archive)}: {len(archive):,} terrains that break it, "
+        f"{_title(archive)}: {len(archive):,} elites, "
         f"{archive.reachable_coverage:.1%} of {archive.cells.num_cells:,} reachable cells"
     )
     positions = np.arange(count)
@@ -129,12 +129,13 @@ def draw_archive(archive: Archive) -> "Figure":
     axes.set_ylabel("share of the penalties")
     axes.grid(axis="y", alpha=0.25)
     axes.spines[:].set_visible(False)
-    figure.colorbar(lines, ax=axes, label="fitness", pad=0.02)
+    figure.colorbar(lines, ax=axes, label="fitness", pad=0.02, extend="both")
     return figure
 
 
-def _range(values: np.ndarray) -> tuple[float, float]:
-    return (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+def _range(fitness: np.ndarray) -> tuple[float, float]:
+    """Colour limits that a few outliers do not stretch."""
+    return (float(np.quantile(fitness, 0.02)), float(np.quantile(fitness, 0.98))) if len(fitness) else (0.0, 1.0)
 
 
 def summary(

@@ -122,8 +122,8 @@ def paper(robot: "RobotCfg") -> SearchCfg:
 
 
 def small(robot: "RobotCfg") -> SearchCfg:
-    """A search that a laptop finishes while one waits: 4 emitters x 8 terrains x 4 episodes, 10 iterations."""
-    return replace(paper(robot), preset="small", iterations=10, replicas=4, cma=CmaMaeCfg(emitters=4, batch_size=8))
+    """A search that a laptop finishes while one waits: 4 emitters x 8 terrains x 4 episodes, 20 iterations."""
+    return replace(paper(robot), preset="small", iterations=20, replicas=4, cma=CmaMaeCfg(emitters=4, batch_size=8))
 
 
 PRESETS = {"paper": paper, "small": small}

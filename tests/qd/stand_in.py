@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from qd.workers import EvaluatorCfg
+
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 SCALES = (1.0, 2.0, 1.0, 4.0, 1.0, 1.0)
 
@@ -49,6 +51,6 @@ def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> Res
 
 
 @contextmanager
-def open_stand_in(*, num_replicas: int = 4, **_: object) -> Iterator:
+def open_stand_in(cfg: EvaluatorCfg) -> Iterator:
     """Opened like the real evaluator."""
-    yield lambda genes, seeds: evaluate(genes, seeds, num_replicas)
+    yield lambda genes, seeds, progress=None: evaluate(genes, seeds, cfg.num_replicas)

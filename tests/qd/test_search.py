@@ -22,6 +22,7 @@ from qd.search import run_search
 from qd.settings import CmaMaeCfg, SearchCfg
 from qd.workers import EvaluatorCfg, EvaluatorError
 from tests.qd import stand_in
+from tests.qd.stand_in import open_stand_in
 
 CFG = SearchCfg(
     robot="anymal",
@@ -57,11 +58,6 @@ def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **ch
 
 def run(path: Path, **settings):
     return run_search(make_job(path, **settings), open_evaluator=open_stand_in)
-
-
-@contextmanager
-def open_stand_in(cfg: EvaluatorCfg):
-    yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds, cfg.num_replicas)
 
 
 def rows_of(path: Path, *, timed: bool = False) -> list[dict]:

@@ -1,0 +1,222 @@
+"""One elite again: its numbers beside those of fresh episodes, and its terrain with the robots' paths over it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.archive import ARCHIVE_FILE, Archive, read_archive
+from qd.cli import run_command
+from qd.fitness import Evaluation, FitnessCfg, evaluation_of
+from qd.report import new_figure, save_figure
+from qd.run_directory import CONFIG_FILE, RunDirectory
+from qd.settings import SHIPPED, from_settings
+from qd.workers import check_policy, episode_seeds, resolve_device
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sim.rollout import RolloutResult
+
+_RUNS = Path("runs")
+_REPLAY_STREAM = 2
+_UNITS = {"yaw_rate": "rad", "vel_x": "m", "vel_y": "m", "contact_force": "N s", "stumble": "s", "collision": "s"}
+_LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayCfg:
+    """Print one elite of an archive and draw its terrain with the robots' paths.
+
+    Elites are numbered by descending fitness: 0 is the worst terrain for the robot.
+    """
+
+    robot: str = "anymal"
+    """Which robot."""
+    run: Path | None = None
+    """Run directory; the newest of this robot under runs/."""
+    elite: int = 0
+    """Number of the elite."""
+    policy: str | None = None
+    """Controller other than the one the archive was made with."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    replicas: int = 20
+    """Episodes to run."""
+    seed: int = 0
+    """Seed of the fresh episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """An elite and what became of it this time."""
+
+    folder: Path
+    """Where the archive lies."""
+    archive: Archive
+    elite: int
+    heights: NDArray[np.float32]
+    """Terrain [m], shape (nrow, ncol)."""
+    result: "RolloutResult"
+    """One terrain, with paths."""
+    fresh: Evaluation
+
+
+def newest_run(robot: str) -> Path:
+    """The run of a robot under runs/ whose archive changed last.
+
+    Raises:
+        FileNotFoundError: If there is none.
+    """
+    files = sorted(_RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
+    for file in files:
+        if read_archive(file).robot == robot:
+            return file.parent
+    raise FileNotFoundError(
+        f"no archive of {robot} under {_RUNS}/: make one with `make archive ROBOT={robot}`, or give --run"
+    )
+
+
+def replay(cfg: ReplayCfg) -> Replay:
+    """Crosses an elite's terrain again.
+
+    Raises:
+        FileNotFoundError: If there is no archive.
+        ValueError: If there is no such elite, or robot, device or controller are not as they must be.
+    """
+    from sim.robot import get_robot
+    from sim.rollout import Rollout
+
+    robot = get_robot(cfg.robot)
+    run = cfg.run or newest_run(cfg.robot)
+    archive = _archive_with(cfg, run)
+    device = resolve_device(cfg.device)
+    policy, fitness = _as_searched(run, archive)
+    policy = cfg.policy or (str(robot.policy_file) if policy == SHIPPED else policy)
+    check_policy(policy, cfg.robot, device)
+    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.replicas, device=device)
+    seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=_REPLAY_STREAM)
+    result = rollout.evaluate(archive.genes[cfg.elite : cfg.elite + 1], seeds, record_paths=True)
+    return Replay(
+        folder=run if run.is_dir() else run.parent,
+        archive=archive,
+        elite=cfg.elite,
+        heights=rollout.sim.bank.heights.numpy()[0],
+        result=result,
+        fresh=evaluation_of(result, archive.cells, fitness),
+    )
+
+
+def _archive_with(cfg: ReplayCfg, run: Path) -> Archive:
+    """The archive of a run, which must be of the robot and have the elite."""
+    archive = read_archive(run)
+    if archive.robot != cfg.robot:
+        raise ValueError(f"{run} is of {archive.robot}, got --robot {cfg.robot}: give that robot or another --run")
+    if not 0 <= cfg.elite < len(archive):
+        valid = f"expected 0 to {len(archive) - 1}" if len(archive) else "the archive is empty"
+        raise ValueError(f"{run} has no elite {cfg.elite}: {valid}")
+    return archive
+
+
+def _as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:
+    """Controller and fitness of the search that made an archive; defaults where it lies without its config."""
+    folder = run if run.is_dir() else run.parent
+    if (folder / CONFIG_FILE).exists():
+        config = RunDirectory(folder).read_config()
+        cfg = from_settings(config["settings"], config["iterations"])
+        return cfg.policy, cfg.fitness
+    return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)
+
+
+def describe(replay: Replay) -> str:
+    """An elite's numbers as they were found, beside those of the fresh episodes."""
+    archive, n, fresh = replay.archive, replay.elite, replay.fresh
+    cells = archive.cells
+    episodes = int(archive.episodes[n]), int(fresh.episodes[0])
+    near = bool(fresh.valid[0]) and bool(cells.are_neighbours(archive.cell[n : n + 1], fresh.cell)[0])
+    lines = [
+        f"Elite {n} of {len(archive):,} of {archive.robot}, found in iteration {archive.iteration[n]}, with ratios in "
+        f"{cells.describe(int(archive.cell[n]))}",
+        f"  {'':22}{f'found ({episodes[0]} episodes)':>34}{f'now ({episodes[1]} episodes)':>34}",
+        f"  {'fitness':22}{archive.fitness[n]:>34.2f}{fresh.fitness[0]:>34.2f}",
+    ]
+    for k, name in enumerate(archive.penalties):
+        unit = _UNITS.get(name, "")
+        found = _penalty(archive.penalty_mean[n, k], archive.penalty_std[n, k], archive.scales[k], archive.ratios[n, k])
+        again = _penalty(fresh.penalty_mean[0, k], fresh.penalty_std[0, k], archive.scales[k], fresh.ratios[0, k])
+        lines.append(f"  {f'{name} [{unit}]':22}{found:>34}{again:>34}")
+    for label, name in (("base collision", "collision_rate"), ("goal reached", "goal_rate"), ("fallen", "fallen_rate")):
+        old = _rate(getattr(archive, name)[n], episodes[0] - int(archive.invalid_episodes[n]))
+        new = _rate(getattr(fresh, name)[0], episodes[1] - int(fresh.invalid_episodes[0]))
+        lines.append(f"  {label:22}{old:>34}{new:>34}")
+    lines.append(
+        f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} again."
+    )
+    return "\n".join(lines)
+
+
+def _penalty(mean: float, std: float, scale: float, ratio: float) -> str:
+    return f"{mean * scale:.2f} +- {std * scale:.2f} ({ratio:.0%} of all)"
+
+
+def _rate(rate: float, count: int) -> str:
+    return f"{round(rate * count)} of {count} ({rate:.0%})"
+
+
+def draw(replay: Replay) -> "Figure":
+    """The height map of an elite with the robots' paths, and marks where they ended, by how."""
+    figure = new_figure(11.0, 6.2)
+    axes = figure.subplots()
+    image = axes.imshow(replay.heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap="gray", alpha=0.9)
+    figure.colorbar(image, ax=axes, label="height [m]", shrink=0.7)
+    paths = replay.result.paths
+    ends = _ends(replay.result)
+    for label, (color, marker, chosen) in ends.items():
+        for k in np.flatnonzero(chosen):
+            if paths is not None:
+                axes.plot(paths[0, k, :, 0], paths[0, k, :, 1], color=color, linewidth=0.9, alpha=0.8)
+        end = replay.result.final_position[0, chosen]
+        label = f"{label} ({len(end)})"
+        axes.scatter(end[:, 0], end[:, 1], color=color, marker=marker, s=55, edgecolors="white", label=label, zorder=3)
+    axes.plot(2.0, 4.0, marker=">", color="white", markeredgecolor="black", markersize=11, linestyle="", label="start")
+    axes.plot(14.0, 4.0, marker="*", color="white", markeredgecolor="black", markersize=16, linestyle="", label="goal")
+    archive, n = replay.archive, replay.elite
+    axes.set_title(
+        f"{archive.robot}, elite {n} of {len(archive):,} after {archive.iterations:,} iterations: fitness "
+        f"{archive.fitness[n]:.2f} as found, {replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
+    )
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.set_xlim(min(0.0, axes.get_xlim()[0]), max(_LENGTH, axes.get_xlim()[1]))
+    axes.set_aspect("equal")
+    figure.legend(loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _ends(result: "RolloutResult") -> dict[str, tuple[str, str, NDArray[np.bool_]]]:
+    """Label, colour, marker and episodes of each way to end that happened."""
+    from kernels.episode import Outcome
+
+    styles = {
+        Outcome.GOAL: ("reached the goal", "#009e73", "o"),
+        Outcome.BASE_COLLISION: ("base collision", "#d55e00", "X"),
+        Outcome.TIME_OUT: ("out of time", "#0072b2", "s"),
+        Outcome.OUT: ("left the terrain", "#cc79a7", "^"),
+    }
+    chosen = {outcome: result.outcome[0] == outcome for outcome in styles}
+    return {styles[o][0]: (*styles[o][1:], mask) for o, mask in chosen.items() if mask.any()}
+
+
+def main(cfg: ReplayCfg) -> None:
+    """The command."""
+    done = replay(cfg)
+    print(describe(done))
+    path = done.folder / f"elite-{cfg.elite}.png"
+    save_figure(path, draw(done))
+    print(f"Figure: {path}")
+
+
+if __name__ == "__main__":
+    run_command(ReplayCfg, main)

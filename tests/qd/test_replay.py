@@ -1,0 +1,76 @@
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from kernels.episode import Outcome
+from qd.descriptors import Cells
+from qd.fitness import FitnessCfg, evaluation_of
+from qd.replay import Replay, ReplayCfg, describe, draw, newest_run
+from tests.qd.stand_in import make_result
+from tests.qd.test_archive import small_archive
+
+
+@pytest.fixture
+def done(tmp_path):
+    cells = Cells(2)
+    ratios = np.array([[0.35, 0.65]])
+    archive = dataclasses.replace(
+        small_archive(1),
+        ratios=ratios,
+        cell=cells.cell_of(ratios),
+        penalty_mean=np.array([[2.0, 3.0]]),
+        penalty_std=np.array([[1.0, 0.5]]),
+        fitness=np.array([3.25]),
+        collision_rate=np.array([0.25]),
+        goal_rate=np.array([0.75]),
+        fallen_rate=np.array([0.0]),
+    )
+    # raw sums of four episodes; scales .5 and 2 make them (4, 8), a ratio of 1/3
+    result = make_result([[[2.0, 16.0]] * 4], base_collision=[[True, False, False, False]])
+    fresh = evaluation_of(result, cells, FitnessCfg(penalties=archive.penalties, scales=archive.scales))
+    paths = np.full((1, 4, 30, 3), np.nan)
+    paths[0, :, :20, 0] = np.linspace(2, 10, 20)
+    paths[0, :, :20, 1] = 4 + np.arange(4)[:, None] / 10
+    outcome = np.array([[Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]])
+    shown = SimpleNamespace(**vars(result), outcome=outcome, paths=paths, final_position=paths[:, :, 19])
+    heights = np.random.default_rng(0).normal(size=(161, 321)).astype(np.float32)
+    return Replay(folder=tmp_path, archive=archive, elite=0, heights=heights, result=shown, fresh=fresh)  # pyright: ignore
+
+
+def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
+    text = describe(done)
+    row = next(line for line in text.splitlines() if "yaw_rate [rad]" in line)
+    assert " ".join(row.split()) == "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)"
+    row = next(line for line in text.splitlines() if "vel_x [m]" in line)
+    assert " ".join(row.split()) == "vel_x [m] 6.00 +- 1.00 (65% of all) 16.00 +- 0.00 (67% of all)"
+    row = next(line for line in text.splitlines() if "base collision" in line)
+    assert " ".join(row.split()) == "base collision 1 of 4 (25%) 1 of 4 (25%)"
+    # fresh: 4 + 8 - 0 - 2 * 3/4
+    assert next(line for line in text.splitlines() if "fitness" in line).split() == ["fitness", "3.25", "10.50"]
+    assert "lands in its cell or a neighbour of it again" in text
+
+
+def test_the_drawing_has_all_paths_and_how_they_ended(done):
+    axes = draw(done).axes[0]
+    paths = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == 30]
+    assert len(paths) == 4
+    image = axes.images[0]
+    assert image.get_array().shape == (161, 321)
+    assert tuple(image.get_extent()) == (0.0, 16.0, 0.0, 8.0)
+    labels = [text for text in axes.get_legend_handles_labels()[1] if "(" in text]
+    assert labels == ["reached the goal (2)", "base collision (1)", "out of time (1)"]
+
+
+def test_without_paths_the_ends_are_drawn(done):
+    result = SimpleNamespace(**{**vars(done.result), "paths": None})
+    axes = draw(dataclasses.replace(done, result=result)).axes[0]
+    assert len(axes.collections) == 3
+
+
+def test_no_run_yet(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`make archive ROBOT=anymal`"):
+        newest_run("anymal")
+    assert ReplayCfg().elite == 0

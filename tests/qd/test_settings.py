@@ -1,0 +1,94 @@
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from qd import settings
+from qd.settings import as_settings, changed, from_settings, measured_now, paper, policy_spec, preset, small
+from tests.qd import stand_in
+
+
+def robot(policy_file: Path = Path("missing.pt"), scales=stand_in.SCALES):
+    """What settings read of a robot."""
+    return SimpleNamespace(
+        name="anymal",
+        policy_file=policy_file,
+        collision_bit=False,
+        penalties=stand_in.PENALTIES,
+        read_penalty_scales=lambda: scales,
+    )
+
+
+def test_paper_has_the_papers_numbers():
+    cfg = paper(robot())
+    assert (cfg.cma.emitters, cfg.cma.batch_size, cfg.replicas, cfg.iterations) == (10, 20, 20, 1000)
+    assert cfg.episodes_per_iteration == 4000
+    assert (cfg.fitness.alpha, cfg.fitness.lam, cfg.intervals) == (1.0, 2.0, 10)
+
+
+def test_small_crosses_every_terrain_at_least_four_times():
+    cfg = small(robot())
+    assert cfg.replicas >= 4
+    assert cfg.episodes_per_iteration == 128
+
+
+def test_unknown_preset():
+    with pytest.raises(ValueError, match="unknown preset 'huge': expected one of paper, small"):
+        preset("huge", robot())
+
+
+def test_changes_land_where_the_setting_stands():
+    cfg = changed(paper(robot()), {"sigma0": 0.25, "alpha": 0.0, "replicas": 8, "seed": None, "iterations": 5})
+    assert (cfg.cma.sigma0, cfg.fitness.alpha, cfg.replicas, cfg.iterations, cfg.seed) == (0.25, 0.0, 8, 5, 0)
+    assert cfg.cma.emitters == 10
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("iterations", 0, "iterations must be at least 1, got 0"),
+        ("replicas", -1, "replicas must be at least 1, got -1"),
+        ("intervals", 0, "intervals must be at least 1, got 0"),
+        ("seed", -1, "seed must not be negative, got -1"),
+        ("emitters", 0, "emitters must be at least 1"),
+    ],
+)
+def test_values_out_of_range(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        changed(paper(robot()), {name: value})
+
+
+def test_settings_survive_json():
+    cfg = changed(small(robot()), {"learning_rate": 0.01, "restart_rule": "basic"})
+    back = from_settings(json.loads(json.dumps(as_settings(cfg))), 7)
+    assert back == dataclasses.replace(cfg, iterations=7)
+    assert "iterations" not in as_settings(cfg)
+
+
+@pytest.mark.parametrize(
+    "bad", [{}, {"fitness": {}, "cma": {}}, {"fitness": {"penalties": [], "scales": []}, "cma": {}}]
+)
+def test_settings_of_something_else(bad):
+    with pytest.raises(ValueError, match="settings must be those of a search of this version"):
+        from_settings(bad, 1)
+
+
+def test_the_controllers_file_is_part_of_the_settings(tmp_path):
+    shipped, own = tmp_path / "anymal.pt", tmp_path / "own.pt"
+    shipped.write_bytes(b"a")
+    own.write_bytes(b"b")
+    cfg = paper(robot(shipped))
+    digests = [
+        measured_now(changed(cfg, {"policy": policy}), robot(shipped)).policy_sha256
+        for policy in (None, "shipped", str(own), "module:callable")
+    ]
+    assert digests[0] == digests[1] != digests[2]
+    assert digests[3] is None
+    assert policy_spec(cfg, robot(shipped)) == str(shipped)
+    assert measured_now(cfg, robot(shipped, scales=(9.0,) * 6)).fitness.scales == (9.0,) * 6
+
+
+def test_nothing_slow_is_imported():
+    assert "ribs" not in vars(settings)
