@@ -35,7 +35,7 @@ CFG = SearchCfg(
     intervals=10,
     collision_bit=False,
     fitness=FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES),
-    cma=CmaMaeCfg(emitters=2, batch_size=6, restart_rule="3"),
+    cma=CmaMaeCfg(emitters=2, batch_size=6, sigma0=0.5, restart_rule="3"),
 )
 KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.json", "curves.png", "metrics.jsonl")
 

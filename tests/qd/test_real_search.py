@@ -1,0 +1,78 @@
+"""The search over the real simulation on the CPU: small, but nothing in it is a stand-in."""
+
+import dataclasses
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from qd.fitness import FitnessCfg
+from qd.search import run_search
+from qd.settings import CmaMaeCfg
+from qd.space import random
+from qd.workers import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
+from sim.robot import get_robot
+from sim.rollout import RolloutResult
+from tests.qd import stand_in
+from tests.qd.test_search import make_job, rows_of
+
+ROBOT = get_robot("anymal")
+CFG = EvaluatorCfg(
+    robot="anymal", policy=str(ROBOT.policy_file), num_terrains=4, num_replicas=2, device="cpu", num_workers=2
+)
+SETTINGS = {
+    "replicas": 2,
+    "fitness": FitnessCfg(penalties=ROBOT.penalties, scales=(1.0, 2.0, 1.0, 300.0, 0.05, 0.3)),
+    "cma": CmaMaeCfg(emitters=1, batch_size=4, sigma0=1.0),
+}
+
+
+@pytest.fixture(scope="module")
+def evaluate():
+    with open_evaluator(CFG) as evaluate:
+        yield evaluate
+
+
+def test_the_stand_in_has_the_fields_of_a_result():
+    assert ROBOT.penalties == stand_in.PENALTIES
+    real = {field.name for field in dataclasses.fields(RolloutResult)} | set(vars(RolloutResult))
+    assert {field.name for field in dataclasses.fields(stand_in.Result)} <= real
+
+
+def test_one_and_two_processes_give_the_same_bits(evaluate):
+    terrains, seeds = random(4, 0), episode_seeds(0, 1, 4)
+    with open_evaluator(dataclasses.replace(CFG, num_workers=1)) as evaluate_alone:
+        one = evaluate_alone(terrains, seeds)
+    two = evaluate(terrains, seeds)
+    assert np.array_equal(one.penalties, two.penalties)
+    assert np.array_equal(one.outcome, two.outcome)
+    assert one.penalties.shape == (4, 2, 6)
+    assert (one.penalties[:, :, 1] > 0).all()
+
+
+def test_a_resumed_search_equals_the_uninterrupted_one_bit_for_bit(tmp_path, evaluate):
+    @contextmanager
+    def opened(cfg):
+        yield evaluate
+
+    left = 2
+
+    @contextmanager
+    def lost_in_the_third(cfg):
+        def evaluate_twice(genes, seeds, progress=None):
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise EvaluatorError("a worker process died")
+            return evaluate(genes, seeds, progress)
+
+        yield evaluate_twice
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    archive = run_search(make_job(whole, iterations=3, **SETTINGS), open_evaluator=opened)
+    with pytest.raises(EvaluatorError):
+        run_search(make_job(killed, iterations=3, **SETTINGS), open_evaluator=lost_in_the_third)
+    assert len(rows_of(killed)) == 2
+    run_search(make_job(killed, iterations=3, resumes=True, **SETTINGS), open_evaluator=opened)
+    assert (whole / "archive.npz").read_bytes() == (killed / "archive.npz").read_bytes()
+    assert len(archive) >= 1
