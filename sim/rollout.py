@@ -210,7 +210,7 @@ class Rollout:
     def _collect(self, control_steps: int, began: float, paths: list[np.ndarray] | None) -> RolloutResult:
         shape = (self.num_terrains, self.num_replicas)
         outcome = self._episode.outcome.numpy().astype(np.uint8).reshape(shape)
-        pose = self._episode.final_pose.numpy().reshape(*shape, 7)
+        pose = self._episode.final_pose.numpy().reshape(*shape, 7).copy()  # on the CPU numpy() is a view
         columns = [PENALTIES.index(name) for name in self.robot.penalties]
         penalties = self._sums.numpy().astype(np.float64)[:, columns].reshape(*shape, len(columns))
         penalties[outcome == Outcome.INVALID] = np.nan

@@ -214,8 +214,14 @@ class Simulation:
         sum_geom_forces(self._solver_contacts, self._column_of_geom, self.geom_force)
 
     def clear_solver(self, mask: Any) -> None:
-        """Forget the solver's warm start in the environments where ``mask`` (num_envs,) is not 0."""
-        clear_rows(mask, self.solver.mjw_data.qacc_warmstart)
+        """Forget the solver's memory in the environments where ``mask`` (num_envs,) is not 0: warm start and Jacobian.
+
+        The solver multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that once was not
+        finite would stay so for ever, whatever state it is reset to.
+        """
+        data = self.solver.mjw_data
+        clear_rows(mask, data.qacc_warmstart)
+        clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))
 
     def capture(self, launch_all: Callable[[], None]) -> Any:
         """Record the launches of ``launch_all`` once as a graph for :meth:`launch`, on CUDA and CPU alike.
