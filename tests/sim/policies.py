@@ -1,0 +1,51 @@
+"""Controllers that need no training."""
+
+import torch
+
+NUM_JOINTS = 12
+
+
+def stand(observation):
+    """Holds the default pose."""
+    return torch.zeros((len(observation), NUM_JOINTS), device=observation.device)
+
+
+def stretch(observation):
+    """A deterministic function of the whole row: legs that stretch and bend with what the robot feels."""
+    return 0.3 * torch.sin(observation[:, 12:24] * 3 + observation.sum(dim=1, keepdim=True))
+
+
+def too_few_actions(observation):
+    """Forgets the last joint."""
+    return stand(observation)[:, :-1]
+
+
+def not_finite(observation):
+    """Returns NaN."""
+    return stand(observation) * float("nan")
+
+
+def list_of_actions(observation):
+    """Returns no tensor."""
+    return [0.0] * NUM_JOINTS
+
+
+def fails(observation):
+    """Raises."""
+    raise RuntimeError("expected 48 columns")
+
+
+class Controller:
+    """Made with robot and device, as a factory asks for."""
+
+    faultline_factory = True
+
+    def __init__(self, robot, device):
+        self.num_joints = robot.num_joints
+        self.device = device
+
+    def __call__(self, observation):
+        return torch.full((len(observation), self.num_joints), 0.25, device=self.device)
+
+
+NOT_CALLABLE = 3

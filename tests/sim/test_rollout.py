@@ -1,0 +1,268 @@
+"""The crossing: how episodes end, that they depend on nothing but themselves, and what they cost."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from kernels.episode import Outcome
+from kernels.penalties import PENALTIES
+from sim.crossing import CrossingCfg
+from sim.policy import load_policy
+from sim.rollout import Rollout, evaluate
+from sim.terrain import crossing_terrain, uniform_random_genes
+from tests.kernels import oracle
+from tests.sim.policies import stand, stretch
+from tests.sim.scenes import positions, put, velocities
+
+SHORT = CrossingCfg(max_duration_s=0.6, poll_every_s=0.1)
+FLAT = np.zeros((161, 321), np.float32)
+TERRAINS, REPLICAS = 4, 4
+
+
+def spike():
+    """A needle of 1 m under the start; the robot starts over its tip and falls on it."""
+    grid = FLAT.copy()
+    grid[79:82, 39:42] = 1.0
+    return grid
+
+
+@pytest.fixture(scope="module")
+def grids():
+    return np.stack(
+        [
+            crossing_terrain("stairs_up_down", 9, 3),
+            FLAT,
+            crossing_terrain("boxes", 5, 1),
+            crossing_terrain("noise", 9, 2),
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def shipped(anymal, device):
+    return load_policy(anymal.policy_file, anymal, device)
+
+
+@pytest.fixture(scope="module")
+def rollout(anymal, shipped, device):
+    return Rollout(anymal, shipped, num_terrains=TERRAINS, num_replicas=REPLICAS, device=device, cfg=SHORT)
+
+
+def crossing(anymal, device, policy=stand, num_terrains=1, replicas=4, **cfg):
+    settings = {"max_duration_s": 0.6, "poll_every_s": 0.1} | cfg
+    return Rollout(
+        anymal, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=CrossingCfg(**settings)
+    )
+
+
+def test_a_robot_that_stands_times_out(anymal, device):
+    # "Success" without the goal: the full time, no collision, upright, still at the start.
+    result = crossing(anymal, device).evaluate(FLAT[None], np.array([1]), record_paths=True)
+    assert (result.outcome == Outcome.TIME_OUT).all()
+    assert not (result.base_collision | result.reached_goal | result.invalid | result.fallen).any()
+    np.testing.assert_allclose(result.duration_s, 0.6, atol=1e-6)
+    assert result.physics_steps == 120
+    np.testing.assert_allclose(result.final_position[..., :2], [[[2, 4]] * 4], atol=0.25)
+    assert result.paths.shape == (1, 4, 30, 3)
+    assert np.isfinite(result.paths).all()
+    # Standing still against a command of 0.75 m/s for 0.6 s costs about 0.45 m in vel_x (it starts with up to 0.2 m/s).
+    np.testing.assert_allclose(result.penalties[0, :, PENALTIES.index("vel_x")], 0.45, atol=0.1)
+
+
+def test_a_base_on_a_spike_collides(anymal, device):
+    result = crossing(anymal, device, max_duration_s=2.0).evaluate(spike()[None], np.array([1]), record_paths=True)
+    assert (result.outcome == Outcome.BASE_COLLISION).all()
+    assert result.base_collision.all()
+    assert (result.duration_s < 1.0).all()
+    # The path ends with the episode, and all is over before the two seconds are.
+    steps = np.ceil(result.duration_s / anymal.control_dt - 1e-6).astype(int)
+    np.testing.assert_array_equal(np.isfinite(result.paths[..., 0]).sum(axis=2), steps)
+    assert result.physics_steps < 400
+
+
+def test_a_robot_beside_the_goal_reaches_it(anymal, device):
+    # From (13.45, 4) +- 0.1 m the goal's 0.5 m circle round (14, 4) is entered with 0.75 m/s at most 0.2 m later.
+    result = crossing(anymal, device, start=(13.8, 4.0)).evaluate(FLAT[None], np.array([1]))
+    assert result.reached_goal.all()
+    np.testing.assert_allclose(result.duration_s, anymal.physics_dt, atol=1e-6)
+
+
+@pytest.mark.parametrize("start", [(18.3, 4.0), (-2.3, 4.0), (9.0, 10.3), (9.0, -2.3)])
+def test_a_robot_out_of_bounds_is_out(anymal, device, start):
+    result = crossing(anymal, device, start=start, max_duration_s=0.1).evaluate(FLAT[None], np.array([1]))
+    assert (result.outcome == Outcome.OUT).all()
+
+
+def test_a_robot_on_its_back_has_fallen(anymal, device):
+    stander = crossing(anymal, device, max_duration_s=0.1, poll_every_s=0.02, base_force=1e9)
+
+    def turn(step, most):
+        q = np.array(stander.sim.joint_q.numpy())
+        q[1:, 3:7] = [1, 0, 0, 0]
+        q[1:, 2] = 0.6
+        stander.sim.joint_q.assign(q)
+        stander.sim.refresh()
+
+    result = stander.evaluate(FLAT[None], np.array([1]), progress=turn)
+    assert result.fallen.tolist() == [[False, True, True, True]]
+    assert (result.outcome == Outcome.TIME_OUT).all()  # tilt alone ends nothing
+
+
+@pytest.mark.parametrize("what", ["not a number", "too fast"])
+def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
+    seeds = np.arange(TERRAINS)
+    clean = rollout.evaluate(grids, seeds)
+
+    def break_one(step, most):
+        array = rollout.sim.joint_q if what == "not a number" else rollout.sim.joint_qd
+        values = np.array(array.numpy())
+        values[6, 8] = np.nan if what == "not a number" else 300.0  # terrain 1, replica 2
+        array.assign(values)
+
+    result = rollout.evaluate(grids, seeds, progress=break_one)
+    expected = np.zeros((TERRAINS, REPLICAS), bool)
+    expected[1, 2] = True
+    np.testing.assert_array_equal(result.invalid, expected)
+    assert np.isnan(result.penalties[1, 2]).all()
+    assert np.isfinite(result.penalties[~expected]).all()
+    # The step that broke is the first after the first poll at 0.1 s.
+    assert result.duration_s[1, 2] == pytest.approx(0.105, abs=0.0051)
+    # Nothing of it is left the next time: the solver's memory of a world that was not finite is cleared too.
+    again = rollout.evaluate(grids, seeds)
+    assert not again.invalid.any()
+    if rollout.sim.device == "cpu":
+        np.testing.assert_array_equal(result.penalties[~expected], clean.penalties[~expected])
+        np.testing.assert_array_equal(result.outcome[~expected], clean.outcome[~expected])
+        same(clean, again)
+
+
+def test_penalties_equal_a_replay_on_the_host(anymal, device):
+    """The captured rollout against single eager steps of the same actions, summed by the float64 oracle."""
+    rows, actions, starts = [], [], []
+
+    def record(observation):
+        if not starts:
+            starts.append((positions(sim), velocities(sim)))
+        action = stretch(observation)
+        rows.append(np.array(observation.cpu().numpy(), dtype=np.float64))
+        actions.append(np.array(action.cpu().numpy(), dtype=np.float32))
+        return action
+
+    cfg = CrossingCfg(max_duration_s=0.4)
+    recorder = Rollout(anymal, record, num_terrains=2, num_replicas=2, device=device, cfg=cfg)
+    sim = recorder.sim
+    result = recorder.evaluate(np.stack([FLAT, spike()]), np.array([3, 4]))
+    put(sim, *starts[0])
+    feet = [sim.geom_names.index(name) for name in anymal.foot_geoms]
+    touchy = [k for k, name in enumerate(sim.geom_names) if name not in anymal.foot_geoms]
+    bases = [sim.geom_names.index(name) for name in anymal.base_geoms]
+    sums, ended = np.zeros((4, 6)), np.zeros(4, bool)
+    with wp.ScopedDevice(device):
+        for row, action in zip(rows, actions, strict=True):
+            targets = np.zeros((4, 19), np.float32)
+            targets[:, 7:] = np.float32(anymal.default_joint_pos) + np.float32(anymal.action_scale) * action
+            sim.targets.assign(targets)
+            command = row[:, 9:12] / [2, 2, 0.25]
+            for _ in range(anymal.decimation):
+                sim.physics_step()
+                sim.read_geom_forces()
+                q, qd = positions(sim), velocities(sim)
+                force = np.array(sim.geom_force.numpy(), dtype=np.float64)
+                for env in np.flatnonzero(~ended):
+                    sums[env] += anymal.physics_dt * oracle.penalties(
+                        q[env], qd[env], list(sim.sensors.base_com), command[env], force[env], feet, touchy, 500.0
+                    )
+                ended |= np.linalg.norm(force[:, bases], axis=2).max(axis=1) > 1
+    assert ended.tolist() == [False, False, True, True]
+    np.testing.assert_array_equal(result.base_collision.ravel(), ended)
+    np.testing.assert_allclose(result.penalties.reshape(4, 6), sums, rtol=1e-4, atol=1e-6)
+    assert (sums[:, :3] > 0.01).all()
+    assert sums[2:, 5].min() > 0  # the base's touch itself is counted
+
+
+def test_penalties_may_start_late(anymal, device):
+    early, late = (
+        crossing(anymal, device, penalties_from_s=s).evaluate(FLAT[None], np.array([1])).penalties for s in (0.0, 0.3)
+    )
+    share = late[..., PENALTIES.index("vel_x")] / early[..., PENALTIES.index("vel_x")]
+    np.testing.assert_allclose(share, 0.5, atol=0.15)
+    assert (late <= early).all()
+
+
+def same(one, other, terrains=slice(None)):
+    for field in ("penalties", "outcome", "fallen", "duration_s", "final_position"):
+        np.testing.assert_array_equal(getattr(one, field)[terrains], getattr(other, field))
+
+
+def test_the_same_episodes_give_the_same_numbers(anymal, shipped, grids):
+    again = Rollout(anymal, shipped, num_terrains=TERRAINS, num_replicas=REPLICAS, device="cpu", cfg=SHORT)
+    seeds = np.array([5, 6, 7, 8])
+    first = again.evaluate(grids, seeds)
+    again.evaluate(grids[::-1].copy(), seeds + 100)  # leaves the solver, the sums and the latch in another state
+    same(first, again.evaluate(grids, seeds))
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.trace. is deprecated")
+@pytest.mark.parametrize("policy", ["shipped", "script"])
+def test_an_episode_depends_on_nothing_but_its_terrain_seed_and_replica(anymal, shipped, grids, policy):
+    """Permuted, and sharded to one terrain at a time: bit-equal on the CPU (with at least four rows a batch)."""
+    controller = shipped if policy == "shipped" else torch.jit.trace(stretch, torch.zeros(4, anymal.observation_size))
+    seeds, order = np.array([5, 6, 7, 8]), [2, 0, 3, 1]
+    together = Rollout(anymal, controller, num_terrains=4, num_replicas=4, device="cpu", cfg=SHORT)
+    expected = together.evaluate(grids, seeds)
+    assert len(np.unique(expected.penalties[..., 0])) == 16
+    same(expected, together.evaluate(grids[order], seeds[order]), order)
+    alone = Rollout(anymal, controller, num_terrains=1, num_replicas=4, device="cpu", cfg=SHORT)
+    for t in range(4):
+        same(expected, alone.evaluate(grids[t : t + 1], seeds[t : t + 1]), slice(t, t + 1))
+
+
+def test_genes_and_their_heights_are_the_same_terrain(rollout):
+    genes, seeds = uniform_random_genes(TERRAINS, 3), np.arange(TERRAINS)
+    by_genes = rollout.evaluate(genes, seeds)
+    by_heights = rollout.evaluate(np.array(rollout.sim.bank.heights.numpy()), seeds)
+    np.testing.assert_array_equal(by_genes.final_position, by_heights.final_position)
+
+
+def test_progress_is_told_at_every_poll(rollout, grids):
+    told = []
+    rollout.evaluate(grids, np.arange(TERRAINS), progress=lambda done, most: told.append((done, most)))
+    assert told == [(5 * k, 30) for k in range(1, 7)]
+
+
+def test_a_robots_choice_of_penalties_is_kept(anymal, device):
+    chosen = dataclasses.replace(anymal, penalties=("collision", "vel_y"))
+    result = crossing(chosen, device).evaluate(FLAT[None], np.array([1]))
+    everything = crossing(anymal, device).evaluate(FLAT[None], np.array([1]))
+    assert result.penalty_names == ("collision", "vel_y")
+    np.testing.assert_allclose(result.penalties, everything.penalties[..., [5, 2]], rtol=1e-4, atol=1e-5)
+
+
+def test_evaluate_in_one_call(anymal, device):
+    result = evaluate(anymal, "tests.sim.policies:stand", spike()[None], 4, seed=1, device=device)
+    assert result.outcome.shape == (1, 4)
+    assert result.base_collision.all()
+
+
+@pytest.mark.parametrize(
+    ("terrains", "seeds", "message"),
+    [
+        (np.zeros((4, 63)), np.arange(4), r"\(4, 64\), got \(4, 63\)"),
+        (np.zeros((3, 64)), np.arange(4), r"\(4, 64\), got \(3, 64\)"),
+        (np.zeros((4, 161, 320)), np.arange(4), r"\(4, 161, 321\).*got \(4, 161, 320\)"),
+        (np.full((4, 64), np.nan), np.arange(4), "finite, got 256"),
+        (np.zeros((4, 64)), np.arange(3), r"\(4,\).*got \(3,\)"),
+    ],
+)
+def test_wrong_input_is_named(rollout, terrains, seeds, message):
+    with pytest.raises(ValueError, match=message):
+        rollout.evaluate(terrains, seeds)
+
+
+@pytest.mark.parametrize("numbers", [{"num_terrains": 0}, {"replicas": 0}])
+def test_numbers_must_be_positive(anymal, device, numbers):
+    with pytest.raises(ValueError, match="positive, got"):
+        crossing(anymal, device, **numbers)
