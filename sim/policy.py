@@ -115,7 +115,10 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
         raise ValueError(
             f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', found {found}"
         )
-    policy = MlpPolicy(state)
+    try:
+        policy = MlpPolicy(state)
+    except (KeyError, RuntimeError, AttributeError, TypeError, IndexError) as error:
+        raise ValueError(f"policy '{path}' holds a damaged layer: {error}; save the checkpoint anew") from error
     expected = (robot.observation_size, robot.num_joints)
     if policy.sizes != expected:
         raise ValueError(
