@@ -191,7 +191,7 @@ def draw(replay: Replay) -> "Figure":
     axes.set_ylabel("y [m]")
     axes.set_xlim(min(0.0, axes.get_xlim()[0]), max(_LENGTH, axes.get_xlim()[1]))
     axes.set_aspect("equal")
-    figure.legend(loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(loc="outside lower center", ncols=6, frameon=False)
     return figure
 
 

@@ -20,7 +20,17 @@ from qd.worker_process import Crosser, EvaluatorError, WorkerProcess
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
-__all__ = ["Crosser", "Evaluate", "EvaluatorCfg", "EvaluatorError", "episode_seeds", "open_evaluator"]
+__all__ = [
+    "Evaluate",
+    "EvaluatorCfg",
+    "EvaluatorError",
+    "available_cores",
+    "build_rollout",
+    "check_policy",
+    "episode_seeds",
+    "open_evaluator",
+    "resolve_device",
+]
 
 _MIN_ROWS = 4  # torch's linear layers give the same bits for batches of 4 rows and more, other ones for fewer
 
