@@ -36,7 +36,8 @@ class CmaMaeCfg:
     """Step of a cell's acceptance threshold toward the fitness found there; 1 is elitist, 0 pure optimisation."""
     sigma0: float = 2.0
     """First step size; genes live in [-1, 1]. So wide a start asks for terrains at the genes' limits, which are the
-    hard ones: 172 elites after 15 iterations of the paper preset, against 152 from 1.0 and 114 from 0.5 (one seed each)."""
+    hard ones: 172 elites after 15 iterations of the paper preset, against 152 from 1.0 and 114 from 0.5 (a seed each).
+    """
     restart_rule: str = "50"
     """When an emitter restarts at an elite: every so many iterations, or one of `basic` and `no_improvement`."""
     es: str = "cma_es"
