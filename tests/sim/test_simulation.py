@@ -1,0 +1,201 @@
+"""The simulation as a machine: torques, forces, randomisation, capture, reset, limits and errors."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from sim.bank import TerrainBank
+from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, resolve_device
+from sim.terrain import hard_random_genes
+from tests.kernels import oracle
+from tests.sim.scenes import Stepper, lying, positions, put, velocities
+
+
+def standing(robot, num, z=0.6, x=8.0):
+    return np.column_stack([lying(num, x, 4, z), np.tile(robot.default_joint_pos, (num, 1))])
+
+
+def flatten(sim):
+    sim.bank.set_heights(np.zeros(sim.bank.heights.shape, np.float32))
+
+
+def step(sim, count=1):
+    with wp.ScopedDevice(sim.device):
+        for _ in range(count):
+            sim.physics_step()
+        sim.read_geom_forces()
+
+
+def test_torque_is_the_pd_law_and_clamped(eight, anymal):
+    # In the air, at rest: 80 N m/rad * 0.5 rad = 40 N m; at 5 rad the 80 N m limit. Moving at 3 rad/s: 40 - 2 * 3 = 34,
+    # less what the joint gains in the step itself, since damping is implicit.
+    flatten(eight)
+    q, qd = standing(anymal, 8, z=3.0), np.zeros((8, 18))
+    qd[2, 6:] = 3.0
+    put(eight, q, qd)
+    targets = q.copy()
+    targets[0, 7:] += 0.5
+    targets[1, 7:] -= 5.0
+    targets[2, 7:] += 0.5
+    eight.targets.assign(np.float32(targets))
+    step(eight)
+    torque = np.array(eight.joint_torque.numpy())
+    np.testing.assert_allclose(torque[0, 6:], 40, rtol=1e-4)
+    np.testing.assert_allclose(torque[1, 6:], -80, rtol=1e-4)
+    np.testing.assert_allclose(torque[2, 6:], 34, rtol=1e-3)
+    np.testing.assert_allclose(torque[3, 6:], 0, atol=1e-3)
+    assert not torque[:, :6].any()  # nothing drives the base
+
+
+def test_free_fall(eight, anymal):
+    # v = g t after one step, for the base's mass centre; the air holds no contact.
+    flatten(eight)
+    put(eight, standing(anymal, 8, z=3.0))
+    step(eight)
+    np.testing.assert_allclose(velocities(eight)[:, :3], [[0, 0, -9.81 * 0.005]] * 8, atol=1e-4)
+    assert eight.contact_count.numpy()[0] == 0
+    assert not eight.geom_force.numpy().any()
+
+
+def test_forces_are_on_the_geoms_that_touch(eight, eight_stepper, anymal):
+    # A robot lying on its side on flat ground: its legs and base carry it, and the columns say which.
+    flatten(eight)
+    q = standing(anymal, 8, z=0.35)
+    q[:, 3:7] = np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4)  # turned about x: the right side is down
+    put(eight, q)
+    eight_stepper.run(2.0)
+    forces = dict(zip(eight.geom_names, np.array(eight.geom_force.numpy())[0], strict=True))
+    touching = {name for name, force in forces.items() if np.linalg.norm(force) > 1}
+    assert any(name.startswith("R") for name in touching)
+    assert all(force[2] >= 0 for force in forces.values())
+    assert eight.geom_names == anymal.geom_names
+    # Geoms whose lowest point is clear of the ground by 2 cm have no force.
+    assert forces["LF_FOOT"][2] == forces["LH_THIGH"][2] == 0
+
+
+def test_state_rows_are_what_they_say(eight, anymal):
+    # joint_qd's first three are the velocity of the base's mass centre: turning about the base's origin moves it.
+    flatten(eight)
+    com = np.array(eight.sensors.base_com)
+    q, qd = standing(anymal, 8, z=3.0), np.zeros((8, 18))
+    qd[:, 3:6] = [0, 0, 1.0]
+    qd[:, :3] = np.cross([0, 0, 1.0], com)
+    put(eight, q, qd)
+    step(eight)
+    lin_vel_b, _ = oracle.base_velocities(positions(eight)[0], velocities(eight)[0], com)
+    np.testing.assert_allclose(lin_vel_b[:2], 0, atol=2e-3)
+    assert np.linalg.norm(com) > 0.015  # else this test could not fail
+
+
+def run_rough(sim, q, steps):
+    put(sim, q)
+    for _ in range(steps):
+        step(sim)
+    return positions(sim), velocities(sim), np.array(sim.geom_force.numpy())
+
+
+@pytest.fixture
+def rough_start(eight, anymal):
+    eight.bank.set_genes(hard_random_genes(8, 3))
+    return standing(anymal, 8, z=1.0, x=7.0)
+
+
+@pytest.fixture
+def on_cpu(device):
+    if device != "cpu":
+        pytest.skip("the solver is bitwise repeatable on the CPU alone")
+
+
+@pytest.mark.usefixtures("on_cpu")
+def test_captured_equals_eager(eight, eight_stepper, rough_start):
+    eager = run_rough(eight, rough_start, 40)
+    put(eight, rough_start)
+    eight_stepper.run(0.2)
+    for one, other in zip(eager, (positions(eight), velocities(eight), eight.geom_force.numpy()), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert eager[2].any()
+
+
+@pytest.mark.usefixtures("on_cpu")
+def test_permuting_environments(eight, rough_start):
+    order = np.array([3, 1, 7, 0, 2, 6, 5, 4])
+    expected = run_rough(eight, rough_start, 40)
+    eight.bank.set_genes(hard_random_genes(8, 3)[order])
+    got = run_rough(eight, rough_start[order], 40)
+    np.testing.assert_array_equal(got[0], expected[0][order])
+    # Forces of one geom's contacts add up in the order they were found, which rounds differently.
+    np.testing.assert_allclose(got[2], expected[2][order], rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.usefixtures("on_cpu")
+def test_a_reset_forgets_everything(eight, rough_start, anymal):
+    expected = run_rough(eight, rough_start, 30)
+    run_rough(eight, standing(anymal, 8, z=0.45, x=9.0), 17)
+    for one, other in zip(expected, run_rough(eight, rough_start, 30), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_only_masked_worlds_are_cleared(eight, rough_start):
+    run_rough(eight, rough_start, 40)
+    before = np.array(eight.solver.mjw_data.qacc_warmstart.numpy())
+    eight.clear_solver(wp.array([0, 1] * 4, dtype=int, device=eight.device))
+    after = eight.solver.mjw_data.qacc_warmstart.numpy()
+    np.testing.assert_array_equal(after[::2], before[::2])
+    assert not after[1::2].any()
+    assert before[1::2].any()
+
+
+def test_friction_and_mass_of_each_robot(anymal, device):
+    # Three robots on the same ground: they weigh 47.13, 52.13 and 57.13 kg, and every contact has its robot's friction.
+    bank = TerrainBank(1, device=device)
+    friction, mass = np.array([0.5, 0.9, 1.25]), np.array([-5.0, 0.0, 5.0])
+    sim = Simulation(anymal, bank, np.zeros(3, int), friction=friction, added_base_mass=mass)
+    put(sim, standing(anymal, 3))
+    stepper, forces = Stepper(sim), np.zeros((3, 3))
+    stepper.run(4.0)
+    stepper.run(0.4, lambda: np.add(forces, np.array(sim.geom_force.numpy()).sum(1) / 20, out=forces))
+    np.testing.assert_allclose(forces[:, 2], (52.13 + mass) * 9.81, rtol=0.01)
+    data = sim.solver.mjw_data
+    count = int(data.nacon.numpy()[0])
+    assert count >= 9
+    worlds = data.contact.worldid.numpy()[:count]
+    np.testing.assert_allclose(data.contact.friction.numpy()[:count, :2], friction[worlds][:, None] * [1, 1], rtol=1e-5)
+    assert friction.min() > GROUND_FRICTION
+
+
+def test_contacts_past_the_capacity_are_counted(anymal, device):
+    # Room for one contact a robot: the count goes on, so that the crossing can call the episodes invalid.
+    bank = TerrainBank(1, device=device)
+    sim = Simulation(dataclasses.replace(anymal, nconmax=1), bank, np.zeros(2, int))
+    put(sim, standing(anymal, 2, z=0.5))
+    sim.collide()
+    assert sim.contact_capacity == 2
+    assert sim.contact_count.numpy()[0] > 2
+
+
+def test_solver_options_arrive(anymal, device):
+    bank = TerrainBank(1, device=device)
+    sim = Simulation(anymal, bank, np.zeros(1, int), cfg=SolverCfg(iterations=7, ls_iterations=13))
+    assert (sim.solver.mjw_model.opt.iterations, sim.solver.mjw_model.opt.ls_iterations) == (7, 13)
+
+
+@pytest.mark.parametrize("terrains", [[0, 2], [-1, 0]])
+def test_a_terrain_that_is_not_there_is_named(anymal, device, terrains):
+    with pytest.raises(ValueError, match=rf"0\.\.1, got {min(terrains)}\.\.{max(terrains)}"):
+        Simulation(anymal, TerrainBank(2, device=device), np.array(terrains))
+
+
+def test_devices():
+    assert resolve_device("cpu") == "cpu"
+    with pytest.raises(ValueError, match=r"unknown device 'tpu': expected one of cpu"):
+        resolve_device("tpu")
+    if wp.is_cuda_available():
+        assert resolve_device(None) == resolve_device("cuda") == "cuda:0"
+        with pytest.raises(ValueError, match="unknown device 'cuda:99'"):
+            resolve_device("cuda:99")
+    else:
+        assert resolve_device(None) == "cpu"
+        with pytest.raises(ValueError, match="no CUDA device was found here: use --device cpu"):
+            resolve_device("cuda")
