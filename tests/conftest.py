@@ -4,11 +4,18 @@ import os
 
 import numpy as np
 import pytest
+import torch
 
 from sim.bank import TerrainBank
 from sim.robot import get_robot
 from sim.simulation import Simulation, resolve_device
 from tests.sim.scenes import Stepper
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """One core for torch, as the search's workers have it: its threads spin for each other on a busy machine."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
