@@ -1,7 +1,7 @@
 """How fast the search runs beside the bare physics it is made of: ``python -m qd.speed --robot anymal``.
 
 The iterations timed are those of a real search, ask to saved checkpoint, in a directory that is thrown away. The bare
-rate is measured right after, on the terrains of the last of them, with as many environments and the same solver.
+rates are measured right after, on the terrains of the last of them, with as many environments and the same solver.
 """
 
 import json
@@ -21,7 +21,7 @@ from qd.provenance import provenance
 from qd.run_directory import Metrics, RunDirectory
 from qd.search import search_terrains
 from qd.settings import SearchCfg, changed, policy_spec, preset
-from qd.workers import Evaluate, EvaluatorCfg, open_evaluator, resolve_device
+from qd.workers import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
 
 _WARM_UP = 2
 _CURVE_REPLICAS = 16
@@ -29,7 +29,11 @@ _CURVE_REPLICAS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Time a preset's iteration, the bare physics of the same terrains, and episodes a second over env counts."""
+    """Time a preset's iteration, the bare physics of the same crossings, and episodes a second over env counts.
+
+    The bare rate is that of contacts and solver alone: `walking` in the crossings' own motion, replayed from recorded
+    states and joint targets, and `standing` holding the default pose at the start.
+    """
 
     robot: str = "anymal"
     """Which robot."""
@@ -124,7 +128,10 @@ def measure(args: Arguments) -> dict[str, Any]:
     )
     metrics, terrains = time_iterations(cfg, evaluator)
     num_envs = cfg.episodes_per_iteration
-    bare = measure_bare_physics(robot, terrains, num_envs, device=device, steps=args.steps)
+    rollout: Any = build_rollout(evaluator, evaluator.num_terrains)
+    seeds = episode_seeds(cfg.seed, cfg.iterations, len(terrains))
+    bare = measure_bare_physics(rollout, terrains, seeds, steps=args.steps)
+    del rollout
     rates = [num_envs * row["physics_steps"] / row["wall_s"] for row in metrics[_WARM_UP:]]
     return {
         **provenance(device, cfg.seed),
@@ -132,9 +139,11 @@ def measure(args: Arguments) -> dict[str, Any]:
         "preset": args.preset,
         "num_envs": num_envs,
         "iteration_s_median": float(np.median([row["wall_s"] for row in metrics[_WARM_UP:]])),
-        "bare_physics_ratio": float(np.median(rates)) / bare,
+        "bare_physics_ratio": float(np.median(rates)) / bare.walking,
+        "bare_physics_ratio_standing": float(np.median(rates)) / bare.standing,
         "world_steps_per_s": float(np.median(rates)),
-        "bare_world_steps_per_s": bare,
+        "bare_world_steps_per_s": bare.walking,
+        "bare_world_steps_per_s_standing": bare.standing,
         **training,
         "envs_curve": time_curve(evaluator, terrains, args.curve) or None,
     }

@@ -1,84 +1,108 @@
-"""The bare physics rate: what the solver and the terrain contact alone can do, the yardstick of everything else."""
+"""The bare physics rate: what terrain contact and solver alone can do, the yardstick of everything else."""
 
 import time
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from sim.bank import TerrainBank
-from sim.robot import RobotCfg
-from sim.simulation import Simulation, SolverCfg
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.rollout import Rollout
 
-_CROSSING_X = (2.0, 14.0)
+_SEGMENT_STEPS = 10
+_SEGMENT_EVERY = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class BareRates:
+    """Physics steps a second over all environments, of the captured graph of terrain contacts and solver alone."""
+
+    walking: float
+    """In the motion of the crossings themselves: states and joint targets recorded from a rollout, physics replayed."""
+    standing: float
+    """Holding the default pose at the start of the crossings; cheaper, since hardly any contact changes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Segment:
+    joint_q: Any
+    joint_qd: Any
+    targets: list[Any]
 
 
 def measure_bare_physics(
-    robot: RobotCfg,
-    terrains: np.ndarray,
-    num_envs: int,
-    *,
-    device: str,
-    steps: int = 1000,
-    warmup_steps: int = 400,
-    solver: SolverCfg | None = None,
-) -> float:
-    """Physics steps a second over all environments of the captured graph of terrain contacts and solver alone.
+    rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray, *, steps: int = 1000
+) -> BareRates:
+    """Bare physics rates on a rollout's own terrains, environments and solver.
 
-    The robots hold their default pose, spread over each terrain from a crossing's start to its goal: contact costs
-    what the ground under the robots makes it cost.
+    The walking rate replays short segments, each from a recorded state: over 0.2 s a replayed robot still moves as the
+    recorded one did, which over a whole crossing without its controller it would not.
 
     Args:
-        robot: Robot settings.
-        terrains: Genes (num_terrains, 64) or heights (num_terrains, nrow, ncol); environments share them evenly.
-        num_envs: Robots, a multiple of the number of terrains.
-        device: Warp device name.
-        steps: Physics steps timed, at least.
-        warmup_steps: Physics steps made before, in which the robots settle.
-        solver: Solver options.
-
-    Raises:
-        ValueError: If the environments cannot be shared out evenly.
+        rollout: Built for the terrains.
+        terrains: Genes or heights, as :meth:`Rollout.evaluate` takes them.
+        seeds: One a terrain, uint32.
+        steps: Physics steps timed at least.
     """
-    if num_envs % len(terrains):
-        raise ValueError(f"num_envs must be a multiple of the {len(terrains)} terrains, got {num_envs}")
-    bank = TerrainBank(len(terrains), device=device, nrow=NUM_ROWS, ncol=NUM_COLS)
-    (bank.set_heights if terrains.ndim == 3 else bank.set_genes)(terrains)
-    terrain_of_env = np.repeat(np.arange(len(terrains)), num_envs // len(terrains))
-    sim = Simulation(robot, bank, terrain_of_env, cfg=solver)
-    x = np.linspace(*_CROSSING_X, num_envs // len(terrains))
-    stand_on_terrain(sim, np.tile(x, len(terrains)))
+    sim = rollout.sim
 
     def control_step() -> None:
-        for _ in range(robot.decimation):
+        for _ in range(rollout.robot.decimation):
             sim.physics_step()
 
-    graph = sim.capture(control_step)
+    segments = _record(rollout, terrains, seeds)
+    with wp.ScopedDevice(sim.device):
+        graph = sim.capture(control_step)
+        _replay(rollout, graph, segments[:2])
+        rounds = -(-steps // (len(segments) * _SEGMENT_STEPS * rollout.robot.decimation))
+        wp.synchronize_device(sim.device)
+        began = time.perf_counter()
+        for _ in range(rounds):
+            _replay(rollout, graph, segments)
+        wp.synchronize_device(sim.device)
+        replayed = rounds * sum(len(segment.targets) for segment in segments) * rollout.robot.decimation
+        walking = sim.num_envs * replayed / (time.perf_counter() - began)
+        return BareRates(walking=walking, standing=_time_standing(rollout, graph, terrains, seeds, steps))
+
+
+def _record(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -> list[_Segment]:
+    """State and targets of the first 10 of every 20 control steps of the crossings."""
+    sim, segments = rollout.sim, []
+    most = round(rollout.cfg.max_duration_s / rollout.robot.control_dt)
+    rollout.begin(terrains, seeds)
+    for step in range(most):
+        if step % _SEGMENT_EVERY == 0:
+            segments.append(_Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
+        rollout.control_step()
+        if step % _SEGMENT_EVERY < _SEGMENT_STEPS:
+            segments[-1].targets.append(wp.clone(sim.targets))
+    return segments
+
+
+def _replay(rollout: Rollout, graph: Any, segments: list[_Segment]) -> None:
+    sim = rollout.sim
+    for segment in segments:
+        wp.copy(sim.joint_q, segment.joint_q)
+        wp.copy(sim.joint_qd, segment.joint_qd)
+        sim.refresh()
+        for targets in segment.targets:
+            wp.copy(sim.targets, targets)
+            wp.capture_launch(graph)
+
+
+def _time_standing(rollout: Rollout, graph: Any, terrains: np.ndarray, seeds: np.ndarray, steps: int) -> float:
+    sim, robot = rollout.sim, rollout.robot
+    rollout.begin(terrains, seeds)
+    sim.joint_qd.zero_()
+    targets = np.zeros(sim.targets.shape, dtype=np.float32)
+    targets[:, 7:] = robot.default_joint_pos
+    sim.targets.assign(targets)
     launches = -(-steps // robot.decimation)
-    for _ in range(warmup_steps // robot.decimation):
-        sim.launch(graph)
-    wp.synchronize_device(device)
+    for _ in range(100):  # 2 s, in which they settle
+        wp.capture_launch(graph)
+    wp.synchronize_device(sim.device)
     began = time.perf_counter()
     for _ in range(launches):
-        sim.launch(graph)
-    wp.synchronize_device(device)
-    return num_envs * launches * robot.decimation / (time.perf_counter() - began)
-
-
-def stand_on_terrain(sim: Simulation, x: np.ndarray, y: float = 4.0) -> None:
-    """Put every robot in its default pose over its terrain at world-local (x, y) [m], x of shape (num_envs,); held."""
-    robot, spacing = sim.robot, sim.bank.terrain.spacing
-    heights = sim.bank.heights.numpy()
-    length, width = (round(half / spacing) for half in robot.footprint)
-    row = round(y / spacing)
-    joint_q = np.zeros(sim.joint_q.shape, dtype=np.float32)
-    for env, t in enumerate(np.array(sim.terrain_of_env.numpy(), dtype=np.intp)):
-        col = round(float(x[env]) / spacing)
-        under = heights[t, row - width : row + width + 1, max(col - length, 0) : col + length + 1]
-        joint_q[env, :3] = x[env], y, under.max() + robot.default_base_height
-    joint_q[:, 6] = 1.0
-    joint_q[:, 7:] = robot.default_joint_pos
-    sim.joint_q.assign(joint_q)
-    sim.joint_qd.zero_()
-    sim.targets.assign(joint_q)
-    sim.refresh()
+        wp.capture_launch(graph)
+    wp.synchronize_device(sim.device)
+    return sim.num_envs * launches * robot.decimation / (time.perf_counter() - began)

@@ -100,7 +100,7 @@ class Rollout:
             self._allocate()
             self._start(np.zeros(num_terrains, dtype=np.uint32))
             self._policy = PolicyRunner(loaded, self._observation, self._action)
-            self._graph = self.sim.capture(self._control_step)
+            self._graph = self.sim.capture(self._launch_control_step)
 
     def _allocate(self) -> None:
         num_envs, robot = self.sim.num_envs, self.robot
@@ -140,7 +140,7 @@ class Rollout:
             self.sim.bank.terrain, self.sim.sensors, Noise(), self._noise_seed, self._observation,
         )  # fmt: skip
 
-    def _control_step(self) -> None:
+    def _launch_control_step(self) -> None:
         sim, robot = self.sim, self.robot
         apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
         for _ in range(robot.decimation):
@@ -177,18 +177,27 @@ class Rollout:
         Raises:
             ValueError: If a shape does not fit or a value is not finite.
         """
+        began = time.perf_counter()
+        self.begin(terrains, seeds)
+        paths: list[np.ndarray] | None = [] if record_paths else None
+        control_steps = self._run(progress, paths)
+        return self._collect(control_steps, began, paths)
+
+    def begin(self, terrains: np.ndarray, seeds: np.ndarray) -> None:
+        """Set the terrains and put every robot at its start; arguments and errors as of :meth:`evaluate`."""
         if seeds.shape != (self.num_terrains,):
             raise ValueError(f"seeds must have shape ({self.num_terrains},), one a terrain, got {seeds.shape}")
-        began = time.perf_counter()
         with wp.ScopedDevice(self.sim.device):
             if terrains.ndim == 3:
                 self.sim.bank.set_heights(terrains)
             else:
                 self.sim.bank.set_genes(terrains)
             self._start(seeds.astype(np.uint32))
-            paths: list[np.ndarray] | None = [] if record_paths else None
-            control_steps = self._run(progress, paths)
-        return self._collect(control_steps, began, paths)
+
+    def control_step(self) -> None:
+        """Let the policy act, then run the captured control step, without waiting for either."""
+        self._policy()
+        self.sim.launch(self._graph)
 
     def _run(self, progress: Callable[[int, int], None] | None, paths: list[np.ndarray] | None) -> int:
         most = round(self.cfg.max_duration_s / self.robot.control_dt)
@@ -197,8 +206,7 @@ class Rollout:
             if paths is not None:
                 running = self._episode.outcome.numpy() == Outcome.RUNNING
                 paths.append(np.where(running[:, None], self.sim.joint_q.numpy()[:, :3], np.nan))
-            self._policy()
-            wp.capture_launch(self._graph)
+            self.control_step()
             if step % poll == 0 or step == most:
                 running_count = int(self._episode.num_running.numpy()[0])
                 if progress is not None:
