@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.descriptors import Cells
-from qd.files import write_atomically
 from qd.fitness import FITNESS_FLOOR
 from qd.space import NUM_GENES
+from sim.files import write_atomically
 
 ARCHIVE_FILE = "archive.npz"
 """Name of the archive in a run directory."""

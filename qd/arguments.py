@@ -5,10 +5,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from qd.provenance import provenance
 from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
 from qd.settings import SearchCfg, as_settings, changed, from_settings, measured_now, policy_spec, preset
 from qd.workers import EvaluatorCfg, check_policy, resolve_device
+from sim.provenance import provenance
 
 _RUNS = Path("runs")
 

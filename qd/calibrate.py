@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.cli import run_command
-from qd.files import check_writable, to_json, write_atomically
-from qd.provenance import provenance
 from qd.workers import EvaluatorCfg, check_policy, open_evaluator, resolve_device
+from sim.files import check_writable, to_json, write_atomically
+from sim.provenance import provenance
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult

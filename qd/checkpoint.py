@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from qd.files import write_atomically
+from sim.files import write_atomically
 
 _MAGIC = b"faultline search checkpoint 1\n"
 _HASH_BYTES = 32

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qd.archive import Archive
-from qd.files import write_atomically
+from sim.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

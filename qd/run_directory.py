@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, write_archive
 from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.files import check_writable, read_json, to_json, write_atomically
 from qd.settings import Settings
+from sim.files import check_writable, read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
     from qd.cma_mae import CmaMae

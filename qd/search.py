@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 from qd.archive import Archive
 from qd.arguments import Arguments, Job, job_of
 from qd.cli import Interrupted, run_command
-from qd.files import to_json, write_atomically
 from qd.fitness import Evaluation, evaluation_of
 from qd.progress import ProgressBar, clock, plan
-from qd.provenance import provenance
 from qd.reevaluate import FRESH_EPISODES, reproduced
 from qd.report import summary, write_figures
 from qd.run_directory import Metrics, RunDirectory, archive_of, claimed
 from qd.settings import SearchCfg, as_settings
 from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
+from sim.files import to_json, write_atomically
+from sim.provenance import provenance
 
 if TYPE_CHECKING:
     from qd.cma_mae import CmaMae

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from qd.cli import run_command
 from qd.cma_mae import CmaMae
-from qd.files import to_json, write_atomically
 from qd.progress import ProgressBar
-from qd.provenance import provenance
 from qd.run_directory import Metrics, RunDirectory
 from qd.search import search_terrains
 from qd.settings import SearchCfg, changed, policy_spec, preset
 from qd.workers import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
+from sim.files import to_json, write_atomically
+from sim.provenance import provenance
 
 _WARM_UP = 2
 _CURVE_REPLICAS = 16

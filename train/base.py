@@ -15,12 +15,13 @@ from typing import Any
 import torch
 import tyro
 
+from sim.files import to_json, write_atomically
+from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
 from train.learner import Learner, read_checkpoint
 from train.ppo import PpoCfg
 from train.progress import Progress
-from train.record import provenance, write_json, write_whole
 from train.task import CommandTask
 from train.task_cfg import TaskCfg
 from train.vec_env import CommandVecEnv
@@ -109,7 +110,7 @@ def _prepare_run_dir(cfg: BaseCfg, device: str) -> Path:
         )
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
-        write_json(run_dir / "config.json", {"device": device, **_plain(asdict(cfg))})
+        write_atomically(run_dir / "config.json", to_json({"device": device, **_plain(asdict(cfg))}))
         if cfg.export is not None:
             cfg.export.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -139,8 +140,8 @@ def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
     buffer = io.BytesIO()
     torch.save({"actor_state_dict": learner.actor_state(), "iter": learner.iteration}, buffer)
-    write_whole(path, buffer.getvalue())
-    write_json(path.with_suffix(".train.json"), record)
+    write_atomically(path, buffer.getvalue())
+    write_atomically(path.with_suffix(".train.json"), to_json(record))
 
 
 def train(cfg: BaseCfg) -> int:

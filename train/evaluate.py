@@ -14,11 +14,12 @@ import tyro
 from tqdm import tqdm
 
 from kernels.episode import Outcome
+from sim.files import to_json, write_atomically
+from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.rollout import CrossingCfg, Rollout, RolloutResult
 from sim.simulation import resolve_device
 from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
-from train.record import provenance, write_json
 
 FULL = (300, 20)
 """Terrains a set and episodes a terrain of the published tables."""
@@ -221,7 +222,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
     out = cfg.out or (Path("results") / robot.name / "base.json" if (terrains, episodes) == FULL else None)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(out, report)
+        write_atomically(out, to_json(report))
         print(f"written to {out}")
     return report
 

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
+from sim.files import write_atomically
 from train.ppo import PpoCfg, runner_settings
-from train.record import write_whole
 from train.vec_env import CommandVecEnv
 
 CHECKPOINT_FORMAT = "faultline training checkpoint 1"
@@ -110,7 +110,7 @@ class Learner:
         }
         buffer = io.BytesIO()
         torch.save(content, buffer)
-        write_whole(path, buffer.getvalue())
+        write_atomically(path, buffer.getvalue())
 
     def resume(self, content: dict[str, Any]) -> None:
         """Go on from a checkpoint: networks, optimiser, learning rate, terrain levels, random numbers.

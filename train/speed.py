@@ -10,11 +10,12 @@ from typing import Any
 import torch
 import tyro
 
+from sim.files import to_json, write_atomically
+from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
 from train.learner import Learner
 from train.ppo import PpoCfg
-from train.record import provenance, write_json
 from train.task import CommandTask
 from train.task_cfg import TaskCfg
 from train.vec_env import CommandVecEnv
@@ -74,7 +75,7 @@ def main() -> int:
         report = {**provenance(device, cfg.seed), "robot": robot.name, "training": runs}
         print(json.dumps(report, indent=2))
         if cfg.out is not None:
-            write_json(cfg.out, report)
+            write_atomically(cfg.out, to_json(report))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

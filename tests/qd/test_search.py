@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd import files, search
+from qd import search
 from qd.archive import read_archive
 from qd.arguments import Job
 from qd.cli import Interrupted
@@ -21,6 +21,7 @@ from qd.fitness import FitnessCfg
 from qd.search import run_search
 from qd.settings import CmaMaeCfg, SearchCfg
 from qd.workers import EvaluatorCfg, EvaluatorError
+from sim import files
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 

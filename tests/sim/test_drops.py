@@ -86,9 +86,9 @@ def measure_gaps(sim):
     return [np.array(array.numpy(), dtype=np.float64) for array in out]
 
 
-def mixed_ground(num):
+def mixed_ground(num, device):
     """Hard-random gene terrains and every hand-crafted kind at its hardest, in turn."""
-    bank = TerrainBank(4, device="cpu")
+    bank = TerrainBank(4, device=device)
     bank.set_genes(hard_random_genes(4, 21))
     crossings = [crossing_terrain(kind, 9, 22) for kind in CROSSING_TYPES]
     grids = np.concatenate([np.array(bank.heights.numpy()), np.stack(crossings)])
@@ -116,7 +116,7 @@ def above_ground(sim, robot, rng):
 @pytest.fixture(scope="module")
 def dropped(anymal, device):
     """The simulation after all have fallen and come to rest, and what they went through."""
-    grids, terrain_of_env = mixed_ground(NUM_DROPS)
+    grids, terrain_of_env = mixed_ground(NUM_DROPS, device)
     bank = TerrainBank(len(grids), device=device)
     bank.set_heights(grids)
     sim = Simulation(anymal, bank, terrain_of_env)

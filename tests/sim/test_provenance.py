@@ -5,7 +5,8 @@ import re
 
 import pytest
 
-from train.record import provenance, write_json, write_whole
+from sim.files import to_json, write_atomically
+from sim.provenance import provenance
 
 
 def test_provenance_has_its_keys(monkeypatch):
@@ -13,7 +14,7 @@ def test_provenance_has_its_keys(monkeypatch):
     origin = provenance("cpu", 7)
     assert list(origin) == ["command", "commit", "device", "versions", "seed", "date"]
     assert origin["commit"] == "abc123" and origin["seed"] == 7
-    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", origin["date"])
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", origin["date"])
     assert all(re.match(r"\d+\.", number) for number in origin["versions"].values())
     json.dumps(origin, allow_nan=False)
 
@@ -26,10 +27,10 @@ def test_commit_comes_from_git_otherwise(monkeypatch):
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.json"
-    write_json(path, {"x": 1})
+    write_atomically(path, to_json({"x": 1}))
     with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(path, {"x": float("nan")})
+        write_atomically(path, to_json({"x": float("nan")}))
     assert json.loads(path.read_text()) == {"x": 1}
     with pytest.raises(OSError, match="absent"):
-        write_whole(tmp_path / "absent" / "a", b"")
+        write_atomically(tmp_path / "absent" / "a", b"")
     assert [file.name for file in tmp_path.iterdir()] == ["a.json"]

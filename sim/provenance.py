@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("faultline", "newton", "mujoco-warp", "warp-lang", "torch", "ribs", "numpy")
+_PACKAGES = ("newton", "mujoco-warp", "warp-lang", "torch", "ribs", "rsl-rl-lib", "numpy")
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
         "command": shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
         "commit": os.environ.get("FAULTLINE_COMMIT") or _output(["git", "rev-parse", "HEAD"]),
         "device": _device_name(device),
-        "versions": {name: _version(name) for name in _PACKAGES},
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
         "seed": seed,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
