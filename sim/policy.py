@@ -58,10 +58,15 @@ class MlpPolicy(torch.nn.Module):
         return self.layers(observation)
 
 
-def share_stream(device: str) -> None:
-    """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting."""
+def prepare_torch(device: str) -> None:
+    """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting.
+
+    On the CPU, torch gets one thread, as Warp has: the batches are small, and a second thread only waits on a busy core.
+    """
     if device.startswith("cuda"):
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
+    else:
+        torch.set_num_threads(1)
 
 
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:

@@ -13,7 +13,7 @@ from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges, make_task
-from sim.policy import PolicyRunner, PolicySpec, load_policy, share_stream
+from sim.policy import PolicyRunner, PolicySpec, load_policy, prepare_torch
 from sim.robot import RobotCfg
 from sim.simulation import Simulation, SolverCfg
 
@@ -91,7 +91,7 @@ class Rollout:
         self.cfg = cfg or CrossingCfg()
         self.num_terrains = num_terrains
         self.num_replicas = num_replicas
-        share_stream(device)
+        prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         bank = TerrainBank(num_terrains, device=device)
         terrain_of_env = np.repeat(np.arange(num_terrains), num_replicas)

@@ -14,7 +14,7 @@ from kernels.restart import command_episodes, promote_episodes, remember_steps, 
 from kernels.rewards import REWARDS, Motion, RewardWeights, make_feet, reward_steps
 from kernels.training import STATISTICS, End, judge_steps, make_episodes, record_steps
 from sim.bank import TerrainBank
-from sim.policy import share_stream
+from sim.policy import prepare_torch
 from sim.robot import RobotCfg
 from sim.simulation import Simulation
 from train.curriculum import first_levels, make_tiles
@@ -51,7 +51,7 @@ class CommandTask:
         """
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        share_stream(device)
+        prepare_torch(device)
         self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
         tile_seed, level_seed, model_seed, count_seed = np.random.SeedSequence(seed).generate_state(4)
         first_count = int(count_seed) % 2**30  # far from where a 32-bit counter wraps
