@@ -61,7 +61,7 @@ class MlpPolicy(torch.nn.Module):
 def prepare_torch(device: str) -> None:
     """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting.
 
-    On the CPU, torch gets one thread, as Warp has: the batches are small, and a second thread only waits on a busy core.
+    On the CPU, torch gets one thread, as Warp has: batches are small, and a second thread only waits on a busy core.
     """
     if device.startswith("cuda"):
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
