@@ -1,7 +1,6 @@
 """Controllers as black boxes: a batch of observation rows to a batch of actions."""
 
 import importlib
-import pickle
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -69,6 +68,17 @@ def prepare_torch(device: str) -> None:
         torch.set_num_threads(1)
 
 
+def reason_of(error: BaseException) -> str:
+    """What went wrong, in one line; of a refused file torch's finding, without its advice to load it as code."""
+    _, _, finding = str(error).partition("WeightsUnpickler error: ")
+    lines = [line.strip() for line in (finding or str(error)).splitlines() if line.strip()]
+    lines = [line for line in lines if not line.startswith("Weights only load failed")]
+    if not lines:
+        return type(error).__name__
+    line = lines[-1] if lines[0].startswith("The following operation failed") else lines[0].partition(". Please")[0]
+    return line if isinstance(error, RuntimeError | ValueError | OSError) else f"{type(error).__name__}: {line}"
+
+
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Load a controller and try it on one batch of zeros.
 
@@ -84,6 +94,11 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
         ValueError: If the controller cannot be loaded, or its actions have the wrong shape or are not finite.
     """
     where = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
+    if where != "cpu" and not torch.cuda.is_available():
+        raise ValueError(
+            f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build or "
+            "use --device cpu"
+        )
     match = re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_][\w.]*)", str(spec))
     if match and not Path(spec).exists():
         policy = _import_callable(str(spec), *match.groups(), robot=robot, device=where)
@@ -98,12 +113,15 @@ def _import_callable(spec: str, module: str, name: str, *, robot: RobotCfg, devi
         target: Any = importlib.import_module(module)
         for part in name.split("."):
             target = getattr(target, part)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"policy '{spec}' cannot be imported: {error}; expected {_FORMATS}") from error
+    except Exception as error:  # a module can fail with anything
+        raise ValueError(f"policy '{spec}' cannot be imported: {reason_of(error)}; expected {_FORMATS}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
     if getattr(target, "faultline_factory", False):
-        target = target(robot, device)
+        try:
+            target = target(robot, device)
+        except Exception as error:
+            raise ValueError(f"policy '{spec}' is a factory that failed: {reason_of(error)}; mend it first") from error
     return target
 
 
@@ -112,7 +130,7 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError) as error:
+    except Exception as error:  # a stream of pickle opcodes can fail with anything
         return _load_script(path, device, error)
     state = content.get("actor_state_dict") if isinstance(content, dict) else None
     if not isinstance(state, dict) or "mlp.0.weight" not in state:
@@ -136,11 +154,10 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
 def _load_script(path: Path, device: str, reason: Exception) -> Policy:
     try:
         return torch.jit.load(str(path), map_location=device).eval()
-    except (RuntimeError, ValueError, OSError) as error:
-        first = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
+    except Exception as error:
         raise ValueError(
             f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
-            f"or holding code): {first}; expected {_FORMATS}"
+            f"or holding code): {reason_of(reason)}; expected {_FORMATS}"
         ) from error
 
 
@@ -150,10 +167,10 @@ def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None
     try:
         with torch.inference_mode():
             action = policy(observation)
-    except (RuntimeError, TypeError, ValueError, IndexError) as error:
+    except Exception as error:  # a controller can fail with anything
         raise ValueError(
             f"policy '{spec}' failed on observations of shape {tuple(observation.shape)}, which robot '{robot.name}' "
-            f"gives: {str(error).splitlines()[0]}"
+            f"gives: {reason_of(error)}"
         ) from error
     if not isinstance(action, torch.Tensor) or tuple(action.shape) != expected:
         got = tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import pickle
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +11,11 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from sim.files import write_atomically
+from sim.policy import reason_of
 from train.ppo import PpoCfg, runner_settings
 from train.vec_env import CommandVecEnv
 
 CHECKPOINT_FORMAT = "faultline training checkpoint 1"
-_CORRUPT = (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,10 +155,9 @@ def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
         raise ValueError(f"no checkpoint at {path}: {remedy}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except _CORRUPT as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except Exception as error:  # a stream of pickle opcodes can fail with anything
         raise ValueError(
-            f"{path} is no checkpoint (truncated, foreign, or holding code): {reason}; {remedy}"
+            f"{path} is no checkpoint (truncated, foreign, or holding code): {reason_of(error)}; {remedy}"
         ) from error
     if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:
         raise ValueError(f"{path} must be a '{CHECKPOINT_FORMAT}', got another kind of file: {remedy}")

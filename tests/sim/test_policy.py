@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pickle
+import sys
 
 import pytest
 import torch
@@ -185,6 +186,41 @@ def test_a_checkpoint_with_a_damaged_layer_is_refused(tmp_path, anymal, damage):
     path = save_checkpoint(tmp_path / "damaged.pt", state)
     with pytest.raises(ValueError, match=r"damaged\.pt"):
         load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.parametrize("opcodes", [b"\x80\x02.", b"\x80\x02\x86.", b"\x80\x02K", b"hello world\n"])
+def test_a_broken_stream_of_opcodes_is_refused(tmp_path, anymal, opcodes):
+    (tmp_path / "broken.pt").write_bytes(opcodes)
+    with pytest.raises(ValueError, match=r"broken\.pt.*truncated, foreign"):
+        load_policy(tmp_path / "broken.pt", anymal, "cpu")
+
+
+def test_the_reason_is_the_finding_without_torchs_advice(tmp_path, anymal):
+    torch.save(Bomb(str(tmp_path / "it_ran")), tmp_path / "bomb.pt")
+    with pytest.raises(ValueError, match=r"posix\.mkdir") as caught:
+        load_policy(tmp_path / "bomb.pt", anymal, "cpu")
+    assert "Re-running" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("def policy(:", "cannot be imported: SyntaxError"),
+        ("1 / 0", "cannot be imported: ZeroDivisionError"),
+        ("def policy(observation): raise ValueError", "failed on observations.*ValueError"),
+        ("def policy(observation): return {}['gone']", "failed on observations.*KeyError: 'gone'"),
+        (
+            "def policy(robot, device): raise KeyError('gone')\npolicy.faultline_factory = True",
+            "factory that failed: KeyError",
+        ),
+    ],
+)
+def test_code_that_fails_is_named(tmp_path, anymal, monkeypatch, source, message):
+    (tmp_path / "theirs.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "theirs", raising=False)
+    with pytest.raises(ValueError, match=message):
+        load_policy("theirs:policy", anymal, "cpu")
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path, anymal):
