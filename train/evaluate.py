@@ -14,7 +14,7 @@ import tyro
 from tqdm import tqdm
 
 from kernels.episode import Outcome
-from sim.files import to_json, write_atomically
+from sim.files import check_writable, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.rollout import CrossingCfg, Rollout, RolloutResult
@@ -49,7 +49,7 @@ class EvaluateCfg:
     seed: int = 0
     """Draws other test sets."""
     out: Path | None = None
-    """Where to write the numbers; with 300 x 20 results/<robot>/base.json, else nowhere."""
+    """Where to write the numbers; of the shipped controller and 300 x 20 results/<robot>/base.json, else nowhere."""
 
 
 def set_rng(number: int, seed: int) -> np.random.Generator:
@@ -204,6 +204,11 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
     if small and cfg.terrains is None and cfg.episodes is None:
         print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {FULL[0]} x {FULL[1]}.")
     policy = cfg.policy or robot.policy_file
+    published = cfg.policy is None and (terrains, episodes) == FULL
+    out = cfg.out or (Path("results") / robot.name / "base.json" if published else None)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(out.parent)
     rollout = Rollout(
         robot,
         policy,
@@ -219,9 +224,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
         **evaluate_sets(rollout, cfg.seed),
     }
     _print_table(report)
-    out = cfg.out or (Path("results") / robot.name / "base.json" if (terrains, episodes) == FULL else None)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, to_json(report))
         print(f"written to {out}")
     return report
