@@ -15,7 +15,7 @@ from typing import Any
 import torch
 import tyro
 
-from sim.files import to_json, write_atomically
+from sim.files import read_json, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
@@ -108,9 +108,12 @@ def _prepare_run_dir(cfg: BaseCfg, device: str) -> Path:
         raise ValueError(
             f"{run_dir} already holds a training run: go on with --resume {run_dir}, or name another --run-dir"
         )
+    config = run_dir / "config.json"
+    if config.exists() and "settings" in read_json(config):
+        raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
-        write_atomically(run_dir / "config.json", to_json({"device": device, **_plain(asdict(cfg))}))
+        write_atomically(config, to_json({"device": device, **_plain(asdict(cfg))}))
         if cfg.export is not None:
             cfg.export.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -204,7 +207,7 @@ def main() -> int:
     cfg = tyro.cli(BaseCfg, description=__doc__)
     try:
         return train(cfg)
-    except (ValueError, FloatingPointError) as error:
+    except (ValueError, OSError, FloatingPointError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
