@@ -8,7 +8,8 @@ BIN := .venv/bin
 STAMP := .venv/.setup-done
 
 # The flags of the variables that are set, of those named: $(call flags,DEVICE SEED) -> --device cpu
-flags = $(foreach name,$(1),$(if $($(name)),--$(FLAG_$(name)) '$($(name))'))
+flags = $(foreach name,$(1),$(if $($(name)),--$(FLAG_$(name)) $(call quoted,$($(name)))))
+quoted = '$(subst ','\'',$(1))'
 FLAG_PRESET := preset
 FLAG_DEVICE := device
 FLAG_ITERATIONS := iterations
@@ -50,19 +51,19 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 archive: setup ## Search the terrains on which the controller of ROBOT fails; writes a run under runs/
-	$(BIN)/python -m qd.search --robot '$(ROBOT)' $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME)
+	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME)
 
 train: setup ## Train the base controller of ROBOT from scratch
-	$(BIN)/python -m train.base --robot '$(ROBOT)' $(call flags,DEVICE ITERATIONS SEED RESUME)
+	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
-	$(BIN)/python -m qd.calibrate --robot '$(ROBOT)' $(call flags,DEVICE POLICY SEED)
+	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED)
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
-	$(BIN)/python -m qd.replay --robot '$(ROBOT)' $(call flags,RUN ELITE DEVICE POLICY)
+	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
 
 evaluate: setup ## Success and goal rates of the controller of ROBOT
-	$(BIN)/python -m train.evaluate --robot '$(ROBOT)' $(call flags,DEVICE POLICY SEED)
+	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED)
 
 test: setup ## Run the tests
 	$(BIN)/python -m pytest

@@ -1,6 +1,7 @@
 """What a command line of the search means: a new run, or an old one that goes on."""
 
 import itertools
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -182,4 +183,4 @@ def _mention_unfinished(name: str, cfg: SearchCfg, device: str | None) -> None:
 
 
 def _resume_command(robot: str, path: Path, device: str | None) -> str:
-    return f"make archive ROBOT={robot} RESUME={path}" + (f" DEVICE={device}" if device else "")
+    return f"make archive ROBOT={robot} RESUME={shlex.quote(str(path))}" + (f" DEVICE={device}" if device else "")

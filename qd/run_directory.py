@@ -101,7 +101,7 @@ class RunDirectory:
         """
         file = self.path / CONFIG_FILE
         if not file.exists():
-            raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}")
+            raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
         config = read_json(file)
         if not isinstance(config.get("settings"), dict) or not isinstance(config.get("iterations"), int):
             raise ValueError(f"{file} must hold settings and iterations of a search, got {', '.join(config)}")

@@ -1,5 +1,6 @@
 """Search the terrains that break a controller: ask for terrains, let robots cross them, tell what became of them."""
 
+import shlex
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -147,7 +148,7 @@ def _finish(job: Job, run: RunDirectory, search: "CmaMae", metrics: Metrics, ope
         f"{clock(numbers['wall_s'])}" + (f"; {count:,} elites reproduced" if count is not None else "")
     )
     print(f"Figures: {', '.join(map(str, figures))}")
-    print(f"Next, see the worst terrain:  make replay ROBOT={job.cfg.robot} RUN={job.path} ELITE=0")
+    print(f"Next, see the worst terrain:  make replay ROBOT={job.cfg.robot} RUN={shlex.quote(str(job.path))} ELITE=0")
     return archive
 
 
