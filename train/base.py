@@ -15,7 +15,7 @@ from typing import Any
 import torch
 import tyro
 
-from sim.files import read_json, to_json, write_atomically
+from sim.files import check_writable, read_json, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
@@ -28,6 +28,7 @@ from train.vec_env import CommandVecEnv
 
 CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.pt"
+CONFIG = "config.json"
 _RESERVE_S = 10.0  # kept back of --max-seconds for the last save
 
 
@@ -100,24 +101,25 @@ def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
     return device, num_envs, iterations
 
 
-def _prepare_run_dir(cfg: BaseCfg, device: str) -> Path:
-    """The run directory, made and written to."""
+def _prepare_run_dir(cfg: BaseCfg) -> Path:
+    """The run directory, made and fit to be written to."""
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     run_dir = cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-base-{stamp}"
     if (run_dir / CHECKPOINT).exists() and (cfg.resume is None or run_dir.resolve() != cfg.resume.resolve()):
         raise ValueError(
             f"{run_dir} already holds a training run: go on with --resume {run_dir}, or name another --run-dir"
         )
-    config = run_dir / "config.json"
+    config = run_dir / CONFIG
     if config.exists() and "settings" in read_json(config):
         raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
-        write_atomically(config, to_json({"device": device, **_plain(asdict(cfg))}))
         if cfg.export is not None:
             cfg.export.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"cannot write to {error.filename}: {error.strerror}; name another place") from error
+    for folder in {run_dir, cfg.export.parent if cfg.export else run_dir}:
+        check_writable(folder)
     return run_dir
 
 
@@ -159,7 +161,7 @@ def train(cfg: BaseCfg) -> int:
     saved = read_checkpoint(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
-    run_dir = _prepare_run_dir(cfg, device)
+    run_dir = _prepare_run_dir(cfg)
     settings = {"seed": seed, "num_envs": num_envs, "task": asdict(cfg.task), "ppo": asdict(cfg.ppo)}
     for change in changes(saved["extra"]["settings"], settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
@@ -169,6 +171,7 @@ def train(cfg: BaseCfg) -> int:
         learner = Learner(env, cfg.ppo, seed=seed)
         if saved is not None:
             learner.resume(saved)
+        write_atomically(run_dir / CONFIG, to_json({"device": device, **_plain(asdict(cfg))}))
         about = {**provenance(device, seed), "settings": settings}
         progress = Progress(run_dir, learner, iterations, rows=cfg.rows, about=about, saved=saved and saved["extra"])
         deadline = began + cfg.max_seconds - _RESERVE_S if cfg.max_seconds else float("inf")

@@ -120,6 +120,20 @@ def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monke
     assert message in error and error.startswith("error: ") and error.count("\n") == 1
 
 
+def test_networks_that_do_not_fit_leave_the_run_as_it_was(finished):
+    before = {file.name: file.read_bytes() for file in finished.glob("*.*") if "tfevents" not in file.name}
+    with pytest.raises(ValueError, match="do not fit"):
+        train(config(None, resume=finished, iterations=3, ppo=replace(PPO, hidden_dims=(8, 8))))
+    assert {name: (finished / name).read_bytes() for name in before} == before
+
+
+def test_a_run_of_a_search_is_not_written_to(tmp_path):
+    (tmp_path / "config.json").write_text('{"settings": {}, "iterations": 3}')
+    with pytest.raises(ValueError, match="holds the run of a search"):
+        train(config(tmp_path))
+    assert [file.name for file in tmp_path.iterdir()] == ["config.json"]
+
+
 def test_a_run_is_not_overwritten(finished, tmp_path):
     before = (finished / "checkpoint.pt").read_bytes()
     for resume in (None, tmp_path / "other"):
