@@ -15,6 +15,7 @@ from sim.files import write_atomically
 
 _MAGIC = b"faultline search checkpoint 1\n"
 _HASH_BYTES = 32
+_REMEDY = "put a copy of it back, or start a new run"
 _MAX_STATE_BYTES = 1 << 30  # a search has about 10 MB; a compressed bomb unfolds to more
 
 _ADMITTED = frozenset(
@@ -85,14 +86,16 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"no checkpoint at {path}: give the directory of a search's run") from None
     header = len(_MAGIC) + _HASH_BYTES
     if not data.startswith(_MAGIC):
-        raise ValueError(f"{path} must start as a search checkpoint, got {data[:16]!r}: it is another file")
+        raise ValueError(f"{path} must start as a search checkpoint, got {data[:16]!r}: it is another file; {_REMEDY}")
     payload = data[header:]
     if hashlib.sha256(payload).digest() != data[len(_MAGIC) : header]:
-        raise ValueError(f"{path} is truncated or damaged: its {len(payload)} bytes of state do not have their SHA-256")
+        raise ValueError(
+            f"{path} is truncated or damaged: its {len(payload)} bytes of state do not have their SHA-256; {_REMEDY}"
+        )
     try:
         state = _StateUnpickler(io.BytesIO(_decompress(payload))).load()
     except Exception as error:  # a stream of pickle opcodes can fail with anything
-        raise ValueError(f"{path} is no checkpoint of a search: {_one_line(error)}") from None
+        raise ValueError(f"{path} is no checkpoint of a search: {_one_line(error)}; {_REMEDY}") from None
     if not isinstance(state, dict):
         raise ValueError(f"{path} is no checkpoint of a search: expected a dictionary, got {type(state).__name__}")
     return state

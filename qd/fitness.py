@@ -30,6 +30,10 @@ class FitnessCfg:
     lam: float = 2.0
     """Weight of the share of episodes without a base collision."""
 
+    def __post_init__(self) -> None:
+        if not np.isfinite([self.alpha, self.lam]).all():
+            raise ValueError(f"alpha and lam must be finite numbers, got {self.alpha} and {self.lam}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:

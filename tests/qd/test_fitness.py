@@ -93,3 +93,9 @@ def test_scales_must_be_positive_one_a_penalty(scales):
     cfg = FitnessCfg(penalties=CFG.penalties, scales=scales)
     with pytest.raises(ValueError, match="scales must be one positive number a penalty"):
         evaluation_of(make_result([[[1, 10]] * 4]), CELLS, cfg)
+
+
+@pytest.mark.parametrize("weight", [{"alpha": float("nan")}, {"lam": float("inf")}])
+def test_weights_must_be_finite(weight):
+    with pytest.raises(ValueError, match="must be finite"):
+        FitnessCfg(penalties=("a", "b"), scales=(1.0, 1.0), **weight)
