@@ -78,6 +78,11 @@ def calibrate(cfg: CalibrateCfg) -> Path:
 
     if cfg.terrains < 1 or cfg.replicas < 1:
         raise ValueError(f"terrains and replicas must be at least 1, got {cfg.terrains} and {cfg.replicas}")
+    if cfg.policy is not None and cfg.out is None:
+        raise ValueError(
+            "the scales kept with a robot are those of its shipped controller, got another one (--policy): "
+            "name a file for its scales with --out"
+        )
     robot = get_robot(cfg.robot)
     device = resolve_device(cfg.device)
     policy = cfg.policy or str(robot.policy_file)

@@ -5,6 +5,7 @@ Nothing here imports pyribs, which takes seconds: `--help` and the worker proces
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
+_MAX_CELLS = 500_000  # an archive holds all of its cells in memory
+
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
 
@@ -92,6 +95,12 @@ class SearchCfg:
         for name in ("iterations", "replicas", "intervals"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        bins = math.comb(self.intervals + len(self.fitness.penalties) - 1, self.intervals)
+        if bins > _MAX_CELLS:
+            raise ValueError(
+                f"intervals must leave fewer than {_MAX_CELLS:,} cells for {len(self.fitness.penalties)} penalties, "
+                f"got {self.intervals}: take fewer"
+            )
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
 

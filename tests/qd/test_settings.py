@@ -51,6 +51,7 @@ def test_changes_land_where_the_setting_stands():
         ("iterations", 0, "iterations must be at least 1, got 0"),
         ("replicas", -1, "replicas must be at least 1, got -1"),
         ("intervals", 0, "intervals must be at least 1, got 0"),
+        ("intervals", 100, "intervals must leave fewer than 500,000 cells for 6 penalties, got 100"),
         ("seed", -1, "seed must not be negative, got -1"),
         ("emitters", 0, "emitters must be at least 1"),
     ],
