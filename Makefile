@@ -18,6 +18,7 @@ FLAG_SEED := seed
 FLAG_RESUME := resume
 FLAG_RUN := run
 FLAG_ELITE := elite
+FLAG_OUT := out
 
 help: ## This list
 	@echo 'faultline: find the terrains that break a legged robot. Targets:'
@@ -33,6 +34,7 @@ help: ## This list
 	@echo '  SEED=N           seed of everything drawn          archive train calibrate evaluate'
 	@echo '  RESUME=DIR       go on with this run               archive train'
 	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
+	@echo '  OUT=FILE         where to write the numbers        calibrate evaluate'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
 	@echo '  TORCH=SPEC       torch other than the pinned one, e.g. a build for your GPU driver: a requirement or a wheel'
 	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.replay, train.base, ...)'
@@ -57,13 +59,13 @@ train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
-	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED)
+	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT)
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
 	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
 
 evaluate: setup ## Success and goal rates of the controller of ROBOT
-	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED)
+	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT)
 
 test: setup ## Run the tests
 	$(BIN)/python -m pytest

@@ -56,5 +56,5 @@ def test_mistakes_are_found_before_the_work(tmp_path, stand_in_evaluator):
         calibrate.calibrate(CalibrateCfg(device="cpu", out=tmp_path / "missing" / "scales.json"))
     with pytest.raises(ValueError, match="terrains and replicas must be at least 1, got 0 and 20"):
         calibrate.calibrate(CalibrateCfg(device="cpu", terrains=0))
-    with pytest.raises(ValueError, match="those of its shipped controller, got another one .* name a file"):
+    with pytest.raises(ValueError, match=r"those of its shipped controller, got another one .* name a file"):
         calibrate.calibrate(CalibrateCfg(device="cpu", policy="mine.pt"))
