@@ -59,20 +59,17 @@ class ContactBuffer:
 
 
 @wp.func
-def _touch_probe(terrain: Terrain, t: int, pose: wp.transform, probes: Probes, k: int, radius: float) -> SurfacePoint:
-    return nearest_surface_point(terrain, t, wp.transform_point(pose, probes.position[k]), radius)
-
-
-@wp.func
 def _emit_contact(
-    contacts: ContactBuffer, slot: int, layout: Layout, shape: int, pose: wp.transform, centre: wp.vec3, radius: float,
-    point: SurfacePoint,
+    contacts: ContactBuffer, slot: int, ground_shape: int, shape: int, terrain: Terrain, t: int, pose: wp.transform,
+    centre: wp.vec3, radius: float,
 ):  # fmt: skip
-    # The capacity is checked by the solver's overflow bit: the count runs on past it, the records do not.
+    # The capacity is checked by whoever reads the count: it runs on past it, the records do not.
     if slot < contacts.shape0.shape[0]:
-        contacts.shape0[slot] = layout.ground_shape
+        centre_w = wp.transform_point(pose, centre)
+        point = nearest_surface_point(terrain, t, centre_w, radius)
+        contacts.shape0[slot] = ground_shape
         contacts.shape1[slot] = shape
-        contacts.point0[slot] = wp.transform_point(pose, centre) - point.normal * point.distance
+        contacts.point0[slot] = centre_w - point.normal * point.distance
         contacts.point1[slot] = centre
         contacts.normal[slot] = point.normal
         contacts.offset0[slot] = wp.vec3(0.0)
@@ -132,16 +129,14 @@ def _collide_strips_kernel(
     if last != deepest:
         wanted += 1
     slot = wp.atomic_add(contacts_out.count, 0, wanted)
-    point = _touch_probe(terrain, t, pose, probes, deepest, radius)
-    _emit_contact(contacts_out, slot, layout, shape, pose, probes.position[deepest], radius, point)
+    ground = layout.ground_shape
+    _emit_contact(contacts_out, slot, ground, shape, terrain, t, pose, probes.position[deepest], radius)
     if first != deepest:
         slot += 1
-        point = _touch_probe(terrain, t, pose, probes, first, radius)
-        _emit_contact(contacts_out, slot, layout, shape, pose, probes.position[first], radius, point)
+        _emit_contact(contacts_out, slot, ground, shape, terrain, t, pose, probes.position[first], radius)
     if last != deepest:
         slot += 1
-        point = _touch_probe(terrain, t, pose, probes, last, radius)
-        _emit_contact(contacts_out, slot, layout, shape, pose, probes.position[last], radius, point)
+        _emit_contact(contacts_out, slot, ground, shape, terrain, t, pose, probes.position[last], radius)
 
 
 def collide_strips(

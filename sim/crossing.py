@@ -7,8 +7,7 @@ import warp as wp
 from kernels.episode import Task
 from kernels.start import StartRanges
 from sim.robot import RobotCfg
-
-_CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)  # all of mujoco_warp's bits but its two iteration caps
+from sim.simulation import CAPACITY_OVERFLOWS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +52,7 @@ def make_task(cfg: CrossingCfg, robot: RobotCfg) -> Task:
     task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
     task.base_force = cfg.base_force
     task.max_speed = cfg.max_speed
-    task.overflow_mask = _CAPACITY_OVERFLOWS
+    task.overflow_mask = CAPACITY_OVERFLOWS
     return task
 
 

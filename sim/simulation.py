@@ -18,6 +18,8 @@ from sim.robot import RobotCfg, build_robot, leaf_name
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
+CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
+"""mujoco_warp's overflow bits but those of its two iteration caps, reaching which is no fault."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,9 +8,9 @@ import numpy as np
 from kernels.start import StartRanges
 from kernels.training import Rules
 from sim.robot import RobotCfg
+from sim.simulation import CAPACITY_OVERFLOWS
 from train.curriculum import CurriculumCfg
 
-ITERATION_CAP_BITS = 512 | 1024  # solver bits that say "stopped at the iteration cap", which is no fault
 _TILE_SIDE = 8.0
 _TILE_CENTRE = (8.0, 4.0)
 
@@ -105,7 +105,7 @@ def make_rules(cfg: TaskCfg, control_dt: float, num_levels: int, num_columns: in
         base_force=cfg.base_force,
         max_gravity_z=cfg.max_gravity_z,
         max_speed=cfg.max_speed,
-        overflow_mask=~ITERATION_CAP_BITS,
+        overflow_mask=CAPACITY_OVERFLOWS,
         num_levels=num_levels,
         num_columns=num_columns,
         promotion_distance=0.5 * _TILE_SIDE,
