@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from sim.rollout import Rollout
+from sim.simulation import Simulation
 
 _SEGMENT_STEPS = 10
 _SEGMENT_EVERY = 20
@@ -24,10 +25,15 @@ class BareRates:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Segment:
+class Segment:
+    """A stretch of the robots' motion to replay: where it begins, and what the controller wanted from there on."""
+
     joint_q: Any
+    """Joint coordinates at its begin, on the device, shape (num_envs, 7 + num_joints)."""
     joint_qd: Any
+    """Joint velocities, shape (num_envs, 6 + num_joints)."""
     targets: list[Any]
+    """Joint targets of each control step, shape (num_envs, 7 + num_joints)."""
 
 
 def measure_bare_physics(
@@ -50,37 +56,37 @@ def measure_bare_physics(
         for _ in range(rollout.robot.decimation):
             sim.physics_step()
 
-    segments = _record(rollout, terrains, seeds)
+    segments = record_segments(rollout, terrains, seeds)
     with wp.ScopedDevice(sim.device):
         graph = sim.capture(control_step)
-        _replay(rollout, graph, segments[:2])
+        replay_segments(sim, graph, segments[:2])
         rounds = -(-steps // (len(segments) * _SEGMENT_STEPS * rollout.robot.decimation))
         wp.synchronize_device(sim.device)
         began = time.perf_counter()
         for _ in range(rounds):
-            _replay(rollout, graph, segments)
+            replay_segments(sim, graph, segments)
         wp.synchronize_device(sim.device)
         replayed = rounds * sum(len(segment.targets) for segment in segments) * rollout.robot.decimation
         walking = sim.num_envs * replayed / (time.perf_counter() - began)
         return BareRates(walking=walking, standing=_time_standing(rollout, graph, terrains, seeds, steps))
 
 
-def _record(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -> list[_Segment]:
+def record_segments(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -> list[Segment]:
     """State and targets of the first 10 of every 20 control steps of the crossings."""
     sim, segments = rollout.sim, []
     most = round(rollout.cfg.max_duration_s / rollout.robot.control_dt)
     rollout.begin(terrains, seeds)
     for step in range(most):
         if step % _SEGMENT_EVERY == 0:
-            segments.append(_Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
+            segments.append(Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
         rollout.control_step()
         if step % _SEGMENT_EVERY < _SEGMENT_STEPS:
             segments[-1].targets.append(wp.clone(sim.targets))
     return segments
 
 
-def _replay(rollout: Rollout, graph: Any, segments: list[_Segment]) -> None:
-    sim = rollout.sim
+def replay_segments(sim: Simulation, graph: Any, segments: list[Segment]) -> None:
+    """Play segments back: ``graph`` is launched once a control step."""
     for segment in segments:
         wp.copy(sim.joint_q, segment.joint_q)
         wp.copy(sim.joint_qd, segment.joint_qd)

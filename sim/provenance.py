@@ -33,7 +33,7 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
 def _module() -> str:
     """Name of the module that runs, as after ``python -m``."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
-    return spec.name if spec else Path(sys.argv[0]).stem
+    return spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
 
 
 def _version(package: str) -> str | None:

@@ -69,6 +69,10 @@ class Simulation:
         overflow: mujoco_warp's overflow bits of the last step, shape (num_envs,).
         contact_count: Terrain contacts found in the last step over all environments, shape (1,).
         contact_capacity: Contacts that fit.
+        contact_records: The contacts themselves, as the solver reads them.
+        body_q: Body poses, world-local frame, transforms of shape (num_envs * bodies_per_env,).
+        solver_contacts: Contacts and constraint forces of the last step, as the solver keeps them.
+        column_of_geom: Column in ``geom_force`` of each solver geom, -1 for none.
     """
 
     def __init__(
@@ -164,21 +168,22 @@ class Simulation:
             rigid_contact_max=self.contact_capacity, soft_contact_max=0, device=self.device
         )
         self.contact_count = self._contacts.rigid_contact_count
-        self._buffer = ContactBuffer()
+        self.contact_records = ContactBuffer()
         for field in ContactBuffer.vars:
-            setattr(self._buffer, field, getattr(self._contacts, f"rigid_contact_{field}"))
+            setattr(self.contact_records, field, getattr(self._contacts, f"rigid_contact_{field}"))
         geom_of_shape = self.solver.newton_shape_to_mjc_geom.numpy()
         names = [leaf_name(label) for label in builder.shape_label]
         column_of_geom = np.full(self.solver.mjw_model.ngeom, -1)
         for column, name in enumerate(self.robot.geom_names):
             column_of_geom[geom_of_shape[first_shape + names.index(name)]] = column
-        self._column_of_geom = wp.array(column_of_geom, dtype=int)
+        self.column_of_geom = wp.array(column_of_geom, dtype=int)
         self.geom_role = wp.array([self.robot.role_of(name) for name in self.robot.geom_names], dtype=int)
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
         self._state = model.state()
         self._control = model.control()
+        self.body_q = self._state.body_q
         self.joint_q = self._state.joint_q.reshape((self.num_envs, 7 + num_joints))
         self.joint_qd = self._state.joint_qd.reshape((self.num_envs, 6 + num_joints))
         self.targets = self._control.joint_target_q.reshape((self.num_envs, 7 + num_joints))
@@ -186,7 +191,7 @@ class Simulation:
         self.joint_torque = data.qfrc_actuator
         self.overflow = data.overflow
         self.geom_names = self.robot.geom_names
-        self._solver_contacts = view_solver_contacts(data)
+        self.solver_contacts = view_solver_contacts(data)
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()
@@ -203,7 +208,7 @@ class Simulation:
         """Find the terrain contacts of the present poses."""
         self._contacts.clear()
         collide_strips(
-            self._state.body_q, self.terrain_of_env, self.bank.terrain, self.probes, self.layout, self._buffer
+            self.body_q, self.terrain_of_env, self.bank.terrain, self.probes, self.layout, self.contact_records
         )
 
     def physics_step(self) -> None:
@@ -213,7 +218,7 @@ class Simulation:
 
     def read_geom_forces(self) -> None:
         """Sum the last step's contact forces into ``geom_force``."""
-        sum_geom_forces(self._solver_contacts, self._column_of_geom, self.geom_force)
+        sum_geom_forces(self.solver_contacts, self.column_of_geom, self.geom_force)
 
     def clear_solver(self, mask: Any) -> None:
         """Forget the solver's memory in the environments where ``mask`` (num_envs,) is not 0: warm start and Jacobian.

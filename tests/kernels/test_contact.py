@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import oracle
 from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
 from sim.terrain import SPACING, crossing_terrain, hard_random_genes
-from tests.kernels import oracle
 from tests.kernels.test_heightfield import make_terrain
 
 RADII = (0.0175, 0.03, 0.06, 0.1)

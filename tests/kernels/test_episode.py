@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import oracle
 from kernels.episode import EpisodeState, Outcome, command_goal, latch_outcomes, start_episodes
 from kernels.penalties import BASE, FOOT, LIMB
 from sim.crossing import CrossingCfg, make_start_ranges, make_task
-from tests.kernels import oracle
 from tests.kernels.states import random_states, upright
 from tests.kernels.test_heightfield import make_terrain, rough
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import oracle
 from kernels.heightfield import (
     BLOCK,
     Terrain,
@@ -14,7 +15,6 @@ from kernels.heightfield import (
     nearest_surface_point,
     normal_at,
 )
-from tests.kernels import oracle
 
 SPACING = 0.05
 RNG_SEED = 5

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.observation import Noise, Sensors, apply_action, write_observation
-from tests.kernels import oracle
+from kernels import oracle
+from kernels.observation import Noise, Sensors, apply_action, write_observation, write_scan
 from tests.kernels.states import random_states, upright
 from tests.kernels.test_heightfield import SPACING, make_terrain, rough
 
@@ -71,6 +71,22 @@ def test_parity_with_the_oracle(device, num_envs, num_joints, num_scan):
         np.testing.assert_allclose(
             got[env, len(expected) - num_scan :], expected[len(expected) - num_scan :], atol=3e-4
         )
+
+
+def test_the_scan_alone_is_that_of_the_row(device):
+    states, command, action, terrain_of_env, grids, scan = random_case(20, 3, 15)
+    out = wp.zeros((20, 15), dtype=float, device=device)
+    arguments = [
+        wp.array(states[0], device=device),
+        wp.array(terrain_of_env, dtype=int, device=device),
+        make_terrain(grids, device),
+        make_sensors(3, scan, device),
+    ]
+    write_scan(*arguments, out)
+    row = observe(states, command, action, terrain_of_env, grids, scan, device)
+    np.testing.assert_array_equal(out.numpy(), row[:, -15:])
+    with pytest.raises(ValueError, match=r"\(20, 15\), got \(20, 14\)"):
+        write_scan(*arguments, wp.zeros((20, 14), dtype=float, device=device))
 
 
 def test_permuting_environments(device):

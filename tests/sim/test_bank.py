@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from kernels import oracle
 from sim.bank import TerrainBank
 from sim.terrain import NUM_COLS, NUM_ROWS, uniform_random_genes
-from tests.kernels import oracle
 from tests.sim.scenes import NODE_X, NODE_Y
 
 

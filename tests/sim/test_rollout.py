@@ -7,13 +7,13 @@ import pytest
 import torch
 import warp as wp
 
+from kernels import oracle
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
 from sim.policy import load_policy
 from sim.rollout import Rollout, evaluate
 from sim.terrain import crossing_terrain, uniform_random_genes
-from tests.kernels import oracle
 from tests.sim.policies import stand, stretch
 from tests.sim.scenes import positions, put, velocities
 

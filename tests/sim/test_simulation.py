@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import oracle
 from sim.bank import TerrainBank
 from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, resolve_device
 from sim.terrain import hard_random_genes
-from tests.kernels import oracle
 from tests.sim.scenes import Stepper, lying, positions, put, velocities
 
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import oracle
 from sim.robot import build_robot
 from sim.simulation import GROUND_FRICTION, SolverCfg
 from sim.terrain import SPACING, uniform_random_genes
-from tests.kernels import oracle
 from tests.sim import mujoco_c
 from tests.sim.scenes import lying, positions, put, slope
 

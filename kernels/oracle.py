@@ -1,9 +1,11 @@
 """What the kernels compute, written a second time: float64 NumPy, straight from the definitions, slow and plain.
 
-Nothing here is shared with the kernels or ported from them. Vectors are world-local unless a name ends in ``_b``.
+The tests and :mod:`sim.bench` hold the kernels against it; nothing here is shared with the kernels or ported from them.
+Vectors are world-local unless a name ends in ``_b``.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 TABLE_I = {  # the paper's minimum and maximum of each parameter, in gene order
     "mu_x": (6, 10),
@@ -17,7 +19,7 @@ TABLE_I = {  # the paper's minimum and maximum of each parameter, in gene order
 }
 
 
-def mixture_height(genes, x, y):
+def mixture_height(genes: ArrayLike, x: ArrayLike, y: ArrayLike) -> NDArray:
     """The paper's equation 1 for one terrain: genes (8 * num_bumps,), heights of the shape of x and y."""
     height = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
     for bump in np.clip(np.float64(genes), -1, 1).reshape(-1, 8):
@@ -32,7 +34,7 @@ def mixture_height(genes, x, y):
     return height
 
 
-def triangles(grid, spacing, x, y, reach):
+def triangles(grid: NDArray, spacing: float, x: float, y: float, reach: float) -> NDArray:
     """Corners (num, 3, 3) of every surface triangle within ``reach`` of (x, y); edge heights continue outside.
 
     Each cell is cut from its (low x, high y) to its (high x, low y) corner; corners run counter-clockwise from above.
@@ -41,7 +43,7 @@ def triangles(grid, spacing, x, y, reach):
     rows = np.arange(np.floor((y - reach) / spacing) - 1, np.floor((y + reach) / spacing) + 2).astype(int)
     row, col = (index.ravel() for index in np.meshgrid(rows, cols, indexing="ij"))
 
-    def node(i, j):
+    def node(i: NDArray, j: NDArray) -> NDArray:
         inside = np.clip(i, 0, grid.shape[0] - 1), np.clip(j, 0, grid.shape[1] - 1)
         return np.stack([j * spacing, i * spacing, np.float64(grid[inside])], axis=-1)
 
@@ -50,11 +52,11 @@ def triangles(grid, spacing, x, y, reach):
     return np.concatenate([low, high])
 
 
-def _area(u, v):
+def _area(u: NDArray, v: NDArray) -> NDArray:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def _under(corners, point):
+def _under(corners: NDArray, point: ArrayLike) -> NDArray:
     """Barycentric weights (num, 3) of the vertical through ``point`` in each triangle."""
     a, b, c = corners[:, 0, :2], corners[:, 1, :2], corners[:, 2, :2]
     q = np.float64(point)
@@ -62,7 +64,7 @@ def _under(corners, point):
     return weights / _area(b - a, c - a)[:, None]
 
 
-def surface_height(grid, spacing, x, y):
+def surface_height(grid: NDArray, spacing: float, x: float, y: float) -> float:
     """Height of the triangulated surface at one (x, y)."""
     corners = triangles(grid, spacing, x, y, 0.0)
     weights = _under(corners, (x, y))
@@ -70,7 +72,7 @@ def surface_height(grid, spacing, x, y):
     return float(weights[k] @ corners[k, :, 2])
 
 
-def surface_normal(grid, spacing, x, y):
+def surface_normal(grid: NDArray, spacing: float, x: float, y: float) -> NDArray:
     """Upward unit normal of the triangle at one (x, y)."""
     corners = triangles(grid, spacing, x, y, 0.0)
     a, b, c = corners[np.argmax(_under(corners, (x, y)).min(axis=1))]
@@ -78,13 +80,13 @@ def surface_normal(grid, spacing, x, y):
     return normal / np.linalg.norm(normal)
 
 
-def _nearest_on_segments(p, start, end):
+def _nearest_on_segments(p: NDArray, start: NDArray, end: NDArray) -> NDArray:
     along = end - start
     share = np.clip(((p - start) * along).sum(1) / (along * along).sum(1), 0, 1)
     return start + share[:, None] * along
 
 
-def nearest_on_surface(grid, spacing, p, reach):
+def nearest_on_surface(grid: NDArray, spacing: float, p: ArrayLike, reach: float) -> tuple[float, NDArray | None]:
     """Signed distance of ``p`` to the surface and the nearest point; (inf, None) if nothing is within ``reach``.
 
     Brute force: on every triangle near, the foot of the perpendicular where it falls inside, and the best of all edges.
@@ -108,21 +110,53 @@ def nearest_on_surface(grid, spacing, p, reach):
     return (-distances[best] if below else distances[best]), candidates[best]
 
 
-def rotation_matrix(quaternion_xyzw):
+def strip_contacts(grid: NDArray, spacing: float, centres: NDArray, radius: float) -> tuple[NDArray, NDArray]:
+    """Signed distance of each probe of a strip (n,), and which become contacts: first, deepest and last that touch.
+
+    ``centres`` (n, 3) in world-local coordinates, in order along the strip; no probe twice in the second array.
+    """
+    distance = np.array([nearest_on_surface(grid, spacing, centre, radius)[0] for centre in centres])
+    touching = np.flatnonzero(distance < radius)
+    if len(touching) == 0:
+        return distance, touching
+    return distance, np.unique([touching[0], np.argmin(distance), touching[-1]])
+
+
+def rotation_matrix(quaternion_xyzw: ArrayLike) -> NDArray:
     """Matrix that turns base-frame vectors into the world frame."""
     x, y, z, w = np.float64(quaternion_xyzw) / np.linalg.norm(np.float64(quaternion_xyzw))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
-def base_velocities(q, qd, base_com):
+def base_velocities(q: NDArray, qd: NDArray, base_com: ArrayLike) -> tuple[NDArray, NDArray]:
     """Base-frame velocity of the base link's origin, and base-frame angular velocity."""
     to_base = rotation_matrix(q[3:7]).T
     ang_vel_b = to_base @ np.float64(qd[3:6])
     return to_base @ np.float64(qd[:3]) - np.cross(ang_vel_b, base_com), ang_vel_b
 
 
-def penalties(q, qd, base_com, command, forces, feet, base_and_limbs, force_limit):
+def geom_forces(
+    world: NDArray, column: NDArray, frame: NDArray, friction: NDArray, efc_address: NDArray, efc_force: NDArray,
+    shape: tuple[int, int],
+) -> NDArray:  # fmt: skip
+    """Sum of contact forces on each geom, (num_envs, num_geoms, 3): each pyramid edge pushes along itself.
+
+    The edges of a contact are ``normal + mu_i tangent_i`` and ``normal - mu_i tangent_i``, i = 1, 2, in this order;
+    ``column`` is the geom's column in the result, -1 for none; an ``efc_address`` below 0 is a contact without force.
+    """
+    total = np.zeros((*shape, 3))
+    for c in np.flatnonzero((column >= 0) & (efc_address[:, 0] >= 0)):
+        normal, *tangents = np.float64(frame[c])
+        edges = [normal + sign * friction[c, i] * tangents[i] for i in range(2) for sign in (1, -1)]
+        total[world[c], column[c]] += np.float64(efc_force[world[c], efc_address[c]]) @ np.array(edges)
+    return total
+
+
+def penalties(
+    q: NDArray, qd: NDArray, base_com: ArrayLike, command: NDArray, forces: ArrayLike, feet: list[int],
+    base_and_limbs: list[int], force_limit: float,
+) -> NDArray:  # fmt: skip
     """The six raw penalties of one physics step, before times dt (definitions: raw penalties)."""
     lin_vel_b, ang_vel_b = base_velocities(q, qd, base_com)
     forces = np.float64(forces)
@@ -140,13 +174,16 @@ def penalties(q, qd, base_com, command, forces, feet, base_and_limbs, force_limi
     )
 
 
-def yaw_of(quaternion_xyzw):
+def yaw_of(quaternion_xyzw: ArrayLike) -> float:
     """Heading of the base's x axis."""
     forward = rotation_matrix(quaternion_xyzw)[:, 0]
     return np.arctan2(forward[1], forward[0])
 
 
-def observation(q, qd, command, last_action, grid, spacing, default_joint_pos, scan, base_com):
+def observation(
+    q: ArrayLike, qd: ArrayLike, command: ArrayLike, last_action: ArrayLike, grid: NDArray, spacing: float,
+    default_joint_pos: ArrayLike, scan: ArrayLike, base_com: ArrayLike,
+) -> NDArray:  # fmt: skip
     """One observation row; ``scan`` (num_scan_points, 2) in the yaw frame."""
     num_joints = len(default_joint_pos)
     q, qd = np.float64(q), np.float64(qd)
@@ -169,14 +206,19 @@ def observation(q, qd, command, last_action, grid, spacing, default_joint_pos, s
     )
 
 
-def goal_command(position, yaw, goal, speed=0.75, gain=0.5, limit=1.0):
+def goal_command(
+    position: ArrayLike, yaw: float, goal: ArrayLike, speed: float = 0.75, gain: float = 0.5, limit: float = 1.0
+) -> NDArray:
     """Velocity toward the goal in the yaw frame, and the yaw rate that turns the robot to it."""
     to_goal = np.float64(goal) - position
     error = (np.arctan2(to_goal[1], to_goal[0]) - yaw + np.pi) % (2 * np.pi) - np.pi
     return np.array([speed * np.cos(error), speed * np.sin(error), np.clip(gain * error, -limit, limit)])
 
 
-def outcome(q, qd, base_force, overflow, steps, max_steps, goal=(14.0, 4.0)):
+def outcome(
+    q: NDArray, qd: NDArray, base_force: float, overflow: int, steps: int, max_steps: int,
+    goal: tuple[float, float] = (14.0, 4.0),
+) -> str:  # fmt: skip
     """Name of how an episode stands after a step (definitions: a crossing)."""
     state = np.concatenate([q, qd])
     if not np.isfinite(state).all() or np.abs(qd).max() > 100 or overflow & ~(512 | 1024):
