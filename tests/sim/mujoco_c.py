@@ -11,7 +11,13 @@ from sim.simulation import GROUND_FRICTION
 def _finish(root: ET.Element, ground: dict[str, str]) -> mujoco.MjModel:
     # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
     ET.SubElement(
-        root.find("worldbody"), "geom", name="ground", conaffinity="1", friction=str(GROUND_FRICTION), **ground
+        root.find("worldbody"),
+        "geom",
+        name="ground",
+        conaffinity="1",
+        solmix="0",
+        friction=str(GROUND_FRICTION),
+        **ground,
     )
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 

@@ -119,7 +119,7 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
     def break_one(step, most):
         array = rollout.sim.joint_q if what == "not a number" else rollout.sim.joint_qd
         values = np.array(array.numpy())
-        values[6, 8] = np.nan if what == "not a number" else 300.0  # terrain 1, replica 2
+        values[6, 8] = np.nan if what == "not a number" else 3000.0  # terrain 1, replica 2
         array.assign(values)
 
     result = rollout.evaluate(grids, seeds, progress=break_one)

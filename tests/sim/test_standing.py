@@ -33,7 +33,8 @@ def settle_on_own_plane(robot, joint_q, device):
     newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
     scene.rigid_gap = 0.0
     scene.default_shape_cfg.mu = GROUND_FRICTION
-    scene.add_ground_plane()
+    plane = {"plane": (0.0, 0.0, 1.0, 0.0), "width": 0.0, "length": 0.0}
+    scene.add_shape_plane(**plane, custom_attributes={"mujoco:geom_solmix": 0.0})
     scene.replicate(build_robot(robot), 1)
     model = scene.finalize(device=device)
     solver = newton.solvers.SolverMuJoCo(
@@ -88,7 +89,7 @@ def test_contact_forces_carry_the_weight(eight, eight_stepper, anymal):
     q = standing(anymal)
     q[:, 2] += 0.08
     put(eight, q)
-    eight_stepper.run(4.0)
+    eight_stepper.run(6.0)
     forces = np.zeros((8, 3))
     eight_stepper.run(0.4, lambda: np.add(forces, np.array(eight.geom_force.numpy()).sum(1) / 20, out=forces))
     weight = 52.13 * 9.81

@@ -1,0 +1,278 @@
+"""Do terrains break the controller in another simulator too? ``python -m sim.crosscheck --robot anymal``.
+
+Of a pool of terrains, those are taken on which a first set of episodes succeeds in 30 to 90 %. On each of them fresh
+episodes are then held against more of plain MuJoCo C: the same robot file, height grid, controller and starts, but
+MuJoCo's own heightfield contact, a converged solver, and a second implementation of everything round it.
+"""
+
+import json
+import multiprocessing
+import os
+import sys
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from sim.agreement import Pair, summarise
+from sim.bank import TerrainBank
+from sim.files import check_writable, to_json, write_atomically
+from sim.plain_crossing import PlainCrossings, Starts, cross, draw_starts, join
+from sim.policy import load_policy, prepare_torch
+from sim.provenance import provenance
+from sim.robot import RobotCfg, get_robot
+from sim.rollout import Rollout, RolloutResult
+from sim.simulation import resolve_device
+from sim.terrain import hard_random_genes
+
+_KEY = 20250605  # with the seed, the entropy of everything drawn here
+_CHUNK = 25  # episodes of plain MuJoCo at a time: enough for the policy's batch, few enough to share out
+_MAX_POOL = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrosscheckCfg:
+    """Hold the crossings of the parallel simulation against the same crossings in plain MuJoCo C.
+
+    The full check is 20 terrains x 200 episodes of MuJoCo: half an hour on two cores, two minutes on 16. Look at the
+    cheap one first: --terrains 4 --plain-episodes 20.
+    """
+
+    robot: str = "anymal"
+    """Which robot."""
+    policy: str | None = None
+    """An rsl_rl checkpoint, a TorchScript file or module:callable; the shipped controller."""
+    device: str | None = None
+    """Of the parallel simulation: cpu, cuda or cuda:N; CUDA where there is one. Plain MuJoCo always runs on the CPU."""
+    genes: Path | None = None
+    """Pool of terrains: an archive.npz, or any .npz with genes (num_terrains, 64); drawn hard-random if left out."""
+    terrains: int = 20
+    """Terrains to compare on."""
+    between: tuple[float, float] = (0.3, 0.9)
+    """Success rate in the first set of episodes that a terrain must have."""
+    episodes: int = 20
+    """Episodes a terrain of the parallel simulation, in the first set and in the fresh one."""
+    plain_episodes: int = 200
+    """Episodes a terrain of plain MuJoCo; the first of them begin exactly as the fresh ones do."""
+    processes: int | None = None
+    """Processes of plain MuJoCo; one a core."""
+    seed: int = 0
+    """Draws pool, choice and starts."""
+    out: Path | None = None
+    """Where to write; printed alone if left out."""
+
+
+def read_pool(path: Path) -> NDArray[np.float32]:
+    """Genes of a pool, shape (num_terrains, 64).
+
+    Raises:
+        ValueError: If the file holds none.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            genes = content["genes"]
+    except Exception as error:  # a damaged zip archive can fail with anything
+        raise ValueError(f"--genes {path}: expected an .npz file with an array 'genes', got: {error}") from error
+    if genes.ndim != 2 or genes.shape[1] != 64 or genes.dtype.kind != "f" or not np.isfinite(genes).all():
+        raise ValueError(
+            f"--genes {path}: 'genes' must be finite floats of shape (num_terrains, 64), got {genes.dtype} of shape "
+            f"{genes.shape}"
+        )
+    return genes.astype(np.float32)
+
+
+def success_rates(result: RolloutResult) -> NDArray[np.float64]:
+    """Share of each terrain's valid episodes without base collision, NaN without any; shape (num_terrains,)."""
+    valid = (~result.invalid).sum(axis=1)
+    return np.where(valid > 0, 1.0 - result.base_collision.sum(axis=1) / np.maximum(valid, 1), np.nan)
+
+
+class Crosscheck:
+    """One comparison: the pool, the choice, both simulators."""
+
+    def __init__(self, cfg: CrosscheckCfg) -> None:
+        """Read and load everything.
+
+        Raises:
+            ValueError: If something asked for cannot be had.
+        """
+        low, high = cfg.between
+        if not 0.0 <= low < high <= 1.0 or min(cfg.terrains, cfg.episodes, cfg.plain_episodes) < 1:
+            raise ValueError(
+                "terrains, episodes and plain-episodes must be positive and between two rising rates, got "
+                f"{cfg.terrains}, {cfg.episodes}, {cfg.plain_episodes} and {cfg.between}"
+            )
+        self.cfg = cfg
+        self.robot = get_robot(cfg.robot)
+        self.device = resolve_device(cfg.device)
+        self.policy = cfg.policy or self.robot.policy_file
+        self.rng = np.random.default_rng([_KEY, cfg.seed])
+        self._pool = None if cfg.genes is None else read_pool(cfg.genes)
+
+    def choose(self) -> tuple[NDArray[np.float32], NDArray[np.float64], int]:
+        """Terrains of middling difficulty: genes, their first success rates, and how many were looked at.
+
+        Raises:
+            ValueError: If the pool has too few.
+        """
+        cfg, at_once = self.cfg, 200 if self.device.startswith("cuda") else 32
+        pool = self._pool
+        if pool is None:
+            pool = hard_random_genes(_MAX_POOL, self.rng).astype(np.float32)
+        else:
+            pool = pool[self.rng.permutation(len(pool))]
+        rollout = Rollout(self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device)
+        chosen: list[NDArray[np.float32]] = []
+        rates: list[float] = []
+        looked_at = 0
+        with tqdm(desc="choosing terrains", total=cfg.terrains, unit="terrain", disable=None) as bar:
+            while len(chosen) < cfg.terrains and looked_at < len(pool):
+                batch = pool[np.arange(looked_at, looked_at + at_once) % len(pool)]
+                new = min(at_once, len(pool) - looked_at)
+                first = success_rates(rollout.evaluate(batch, self._seeds(at_once)))[:new]
+                hits = np.flatnonzero((first >= cfg.between[0]) & (first <= cfg.between[1]))
+                hits = hits[: cfg.terrains - len(chosen)]
+                chosen += list(batch[hits])
+                rates += list(first[hits])
+                looked_at += new
+                bar.update(len(hits))
+        if len(chosen) < cfg.terrains:
+            raise ValueError(
+                f"only {len(chosen)} of {looked_at} terrains have a success rate within {cfg.between}, expected "
+                f"{cfg.terrains}: give a larger --genes, fewer --terrains or a wider --between"
+            )
+        return np.array(chosen), np.array(rates), looked_at
+
+    def _seeds(self, count: int) -> NDArray[np.uint32]:
+        return self.rng.integers(2**32, size=count, dtype=np.uint32)
+
+    def run(self) -> dict[str, Any]:
+        """Choose, cross in both simulators, compare; everything of the results file."""
+        cfg = self.cfg
+        genes, first, looked_at = self.choose()
+        seeds = self._seeds(cfg.terrains)
+        rollout = Rollout(
+            self.robot, self.policy, num_terrains=cfg.terrains, num_replicas=cfg.episodes, device=self.device
+        )
+        ours = rollout.evaluate(genes, seeds)
+        bank = TerrainBank(cfg.terrains, device=self.device)
+        bank.set_genes(genes)
+        heights: Any = bank.heights.numpy()
+        starts = [
+            draw_starts(self.robot, grid, int(seed), cfg.plain_episodes, self.device)
+            for grid, seed in zip(heights, seeds, strict=True)
+        ]
+        plain = run_plain(self.robot, str(self.policy), heights, starts, cfg.processes or os.cpu_count() or 1)
+        pairs = [Pair(first=float(rate), ours=ours.outcome[k], plain=plain[k].outcome) for k, rate in enumerate(first)]
+        return {
+            **provenance(self.device, cfg.seed),
+            "robot": self.robot.name,
+            "policy": Path(str(self.policy)).name,
+            "pool": "hard_random" if cfg.genes is None else str(cfg.genes),
+            "looked_at": looked_at,
+            **summarise(pairs, cfg.seed),
+            "penalties": {
+                name: {"ours": float(np.nanmean(ours.penalties[..., k])), "mujoco_c": float(np.nanmean(column))}
+                for k, name in enumerate(ours.penalty_names)
+                for column in [np.concatenate([crossings.penalties[:, k] for crossings in plain])]
+            },
+        }
+
+
+_worker: dict[str, Any] = {}
+
+
+def _start_worker(robot: RobotCfg, policy: str) -> None:
+    prepare_torch("cpu")
+    _worker.update(robot=robot, policy=load_policy(policy, robot, "cpu"))
+
+
+def _cross_chunk(heights: NDArray[np.float32], starts: Starts) -> PlainCrossings:
+    return cross(_worker["robot"], _worker["policy"], heights, starts)
+
+
+def run_plain(
+    robot: RobotCfg, policy: str, heights: NDArray[np.float32], starts: list[Starts], processes: int
+) -> list[PlainCrossings]:
+    """Cross every terrain from its starts in plain MuJoCo, shared out over processes.
+
+    Args:
+        robot: Robot settings.
+        policy: The controller, as :func:`sim.policy.load_policy` takes it.
+        heights: Height grids [m], shape (num_terrains, nrow, ncol).
+        starts: Of each terrain.
+        processes: How many at once.
+    """
+    context = multiprocessing.get_context("spawn")
+    parts: list[list[PlainCrossings | None]] = []
+    pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker, initargs=(robot, policy))
+    try:
+        place: dict[Future[PlainCrossings], tuple[int, int]] = {}
+        for terrain, start in enumerate(starts):
+            chunks = [slice(k, k + _CHUNK) for k in range(0, len(start.qpos), _CHUNK)]
+            parts.append([None] * len(chunks))
+            for k, rows in enumerate(chunks):
+                chunk = replace(start, qpos=start.qpos[rows], qvel=start.qvel[rows])
+                place[pool.submit(_cross_chunk, heights[terrain], chunk)] = terrain, k
+        waiting = set(place)
+        with tqdm(desc="plain MuJoCo", total=sum(len(s.qpos) for s in starts), unit="episode", disable=None) as bar:
+            while waiting:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in done:
+                    terrain, k = place[future]
+                    parts[terrain][k] = future.result()
+                    bar.update(len(future.result().outcome))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return [join([part for part in terrain if part is not None]) for terrain in parts]
+
+
+def _print_table(report: dict[str, Any]) -> None:
+    print(f"{'terrain':>7} {'success: ours':>22} {'MuJoCo C':>9} {'':>8} {'goal: ours':>19} {'MuJoCo C':>9}")
+    for k, row in enumerate(report["terrains"]):
+        cells = [f"{k:>7}"]
+        for kind in ("success", "goal"):
+            low, high = row[kind]["interval"]
+            cells.append(f"{row[kind]['ours']:>8.2f} [{low:.2f} {high:.2f}] {row[kind]['mujoco_c']:>9.2f}")
+            cells.append("inside  " if row[kind]["inside"] else "outside ")
+        print(" ".join(cells))
+    for kind in ("success", "goal"):
+        total = report[kind]
+        low, high = total["bias_interval"]
+        print(
+            f"{kind}: {total['inside']} of {len(report['terrains'])} rates of MuJoCo C inside our interval; mean "
+            f"{total['ours']:.3f} against {total['mujoco_c']:.3f}, bias {total['bias']:+.3f} [{low:+.3f} {high:+.3f}]"
+        )
+    print(f"invalid episodes: {report['invalid']}")
+    print("mean penalties: " + json.dumps(report["penalties"]))
+
+
+def main() -> int:
+    """Command line; returns the exit status."""
+    cfg = tyro.cli(CrosscheckCfg, description=__doc__)
+    try:
+        check = Crosscheck(cfg)
+        if cfg.out is not None:
+            cfg.out.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(cfg.out.parent)
+        report = check.run()
+        _print_table(report)
+        if cfg.out is not None:
+            write_atomically(cfg.out, to_json(report))
+            print(f"written to {cfg.out}")
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nStopped.", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,32 @@
+"""95 % intervals of measured rates and means."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Z = 1.959963984540054  # the normal distribution's 97.5 % quantile
+_BOOTSTRAP_DRAWS = 10_000
+
+
+def wilson_interval(hits: int, count: int) -> tuple[float, float]:
+    """95 % Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials.
+
+    Raises:
+        ValueError: If there are no trials or more hits than trials.
+    """
+    if not 0 <= hits <= count or count == 0:
+        raise ValueError(f"a rate needs 0 <= hits <= count and a trial, got {hits} of {count}")
+    rate, spread = hits / count, _Z * _Z / count
+    centre = (rate + spread / 2) / (1 + spread)
+    half = _Z * math.sqrt(rate * (1 - rate) / count + spread / (4 * count)) / (1 + spread)
+    # At 0 and 1 the interval begins and ends there exactly, whatever the rounding.
+    return (0.0 if hits == 0 else centre - half), (1.0 if hits == count else centre + half)
+
+
+def bootstrap_interval(values: NDArray[np.floating], rng: np.random.Generator) -> list[float] | None:
+    """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains; None without any."""
+    if len(values) == 0:
+        return None
+    means = values[rng.integers(len(values), size=(_BOOTSTRAP_DRAWS, len(values)))].mean(axis=1)
+    return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
