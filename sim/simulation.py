@@ -26,14 +26,14 @@ CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 class SolverCfg:
     """Options of the physics solver, chosen by measurement (results/*/speed.json).
 
-    The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that a physics step of
-    0.005 s allows. At MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius, where what
+    The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that a physics step
+    of 0.005 s allows. At MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius, where what
     happens next is the simulator's invention: success rates in MuJoCo C were then 14 points lower (sim.crosscheck).
     """
 
     iterations: int = 6
-    """Newton iterations a step at most. A walking robot takes 1.3 on average, one step in a thousand takes 6 or more; all
-    worlds wait for the slowest, so a cap of 10 costs time and changes nothing."""
+    """Newton iterations a step at most. A walking robot takes 1.3 on average, one step in a thousand takes 6 or more;
+    all worlds wait for the slowest, so a cap of 10 costs time and changes nothing."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
 
