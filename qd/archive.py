@@ -4,6 +4,7 @@ Reading an archive needs NumPy alone, so that training and figures do not depend
 """
 
 import io
+import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,10 @@ class Archive:
 
 
 _SETTINGS = ("robot", "penalties", "scales", "intervals", "collision_bit", "iterations")
+_KINDS = {"robot": "U", "penalties": "U", "collision_bit": "b"} | dict.fromkeys(
+    ("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"
+)
+_MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
 PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in _SETTINGS)
 """Names of the arrays that have one row an elite."""
 
@@ -124,15 +129,22 @@ def read_archive(path: str | Path) -> Archive:
     if not file.exists():
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
-        with np.load(file, allow_pickle=False) as data:
-            content = {field.name: data[field.name] for field in fields(Archive)}
+        with zipfile.ZipFile(file) as members:  # np.load would leave some checksums unread
+            content = {field.name: _read_array(members.read(f"{field.name}.npy")) for field in fields(Archive)}
+        _check_kinds(content)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         raise ValueError(
-            f"{file} must be the archive of a search, but it is damaged or another file: {error}"
+            f"{file} must be the archive of a search, but it is damaged or another file: {error}: going on with its "
+            "run (--resume) writes it again"
         ) from None
     archive = Archive(**{name: _from_array(name, value) for name, value in content.items()})
-    _check(archive, file)
+    _check_shapes(archive, file)
+    _check_values(archive, file)
     return archive
+
+
+def _read_array(data: bytes) -> NDArray[Any]:
+    return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
 
 
 def _from_array(name: str, value: NDArray) -> Any:
@@ -142,8 +154,18 @@ def _from_array(name: str, value: NDArray) -> Any:
     return tuple(value.tolist()) if value.ndim else value.item()
 
 
-def _check(archive: Archive, file: Path) -> None:
-    num_elites, num_penalties = len(archive.genes), len(archive.penalties)
+def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
+    """That every field holds numbers, strings or flags as it should, and every setting one or a row of them."""
+    for name, value in content.items():
+        expected = _KINDS.get(name, "f")
+        if value.dtype.kind != expected or value.dtype.itemsize > _MAX_ITEM_BYTES:
+            raise ValueError(f"{name} must be of kind '{expected}', got {value.dtype}")
+        if name in _SETTINGS and value.ndim != int(name in ("penalties", "scales")):
+            raise ValueError(f"{name} has shape {value.shape}")
+
+
+def _check_shapes(archive: Archive, file: Path) -> None:
+    num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
     columns = {"genes": NUM_GENES, "ratios": num_penalties, "penalty_mean": num_penalties, "penalty_std": num_penalties}
     for name in PER_ELITE:
         expected = (num_elites, columns[name]) if name in columns else (num_elites,)
@@ -152,3 +174,18 @@ def _check(archive: Archive, file: Path) -> None:
             raise ValueError(
                 f"{file}: {name} must have shape {expected}, got {actual}: the file is no archive of a search"
             )
+
+
+def _check_values(archive: Archive, file: Path) -> None:
+    """That the numbers are such as a search finds."""
+    finite = all(np.isfinite(getattr(archive, name)).all() for name in PER_ELITE)
+    if not finite or not (np.abs(archive.genes) <= 1.0).all():
+        raise ValueError(f"{file} must hold finite numbers, and genes in [-1, 1]: it is no archive of a search")
+    if len(archive.scales) != len(archive.penalties) or not all(0.0 < scale < np.inf for scale in archive.scales):
+        raise ValueError(f"{file}: scales must be one positive number a penalty, got {archive.scales}")
+    try:
+        num_cells = archive.cells.num_cells
+    except ValueError as error:
+        raise ValueError(f"{file} is no archive of a search: {error}") from None
+    if not ((archive.cell >= 0) & (archive.cell < num_cells)).all():
+        raise ValueError(f"{file}: cell must lie in 0 to {num_cells - 1}: the file is no archive of a search")

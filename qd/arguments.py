@@ -2,13 +2,14 @@
 
 import itertools
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
-from qd.settings import SearchCfg, as_settings, changed, from_settings, measured_now, policy_spec, preset
+from qd.settings import SearchCfg, as_settings, changed, file_hash, measured_now, policy_spec, preset
 from qd.workers import EvaluatorCfg, check_policy, resolve_device
+from sim.files import is_leftover
 from sim.provenance import provenance
 
 _RUNS = Path("runs")
@@ -101,27 +102,30 @@ def job_of(args: Arguments) -> Job:
 
     if args.resume and args.run_dir:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
-    config = RunDirectory(args.resume).read_config() if args.resume else None
-    robot = get_robot(args.robot or (config["settings"].get("robot", "") if config else "anymal"))
+    there = RunDirectory(args.resume).read_cfg() if args.resume else None
+    robot = get_robot(args.robot or (there.robot if there else "anymal"))
     device = resolve_device(args.device)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
-    if args.resume and config:
-        path, cfg = args.resume, _resumed(args.resume, config, robot, changes)
+    moved = None
+    if args.resume and there:
+        moved = _moved_policy(there, args.policy)
+        path, cfg = args.resume, _resumed(args.resume, there, robot, changes, moved)
+        config = RunDirectory(path).read_config()
         origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
     else:
         name = args.preset or ("paper" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
         path, origin = _free_path(args, cfg), provenance(device, cfg.seed)
-    policy = policy_spec(cfg, robot)
+    policy = moved or policy_spec(cfg, robot)
     check_policy(policy, cfg.robot, device)
     return Job(
         cfg=cfg,
         path=path,
-        resumes=config is not None,
+        resumes=there is not None,
         evaluator=_evaluator(cfg, policy, device, args.workers),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
         origin=origin,
-        resume_command=_resume_command(cfg.robot, path, args.device),
+        resume_command=_resume_command(cfg.robot, path, args.device, moved),
     )
 
 
@@ -137,10 +141,24 @@ def _evaluator(cfg: SearchCfg, policy: str, device: str, workers: int | None) ->
     )
 
 
-def _resumed(path: Path, config: dict[str, Any], robot: Any, changes: dict[str, Any]) -> SearchCfg:
+def _moved_policy(there: SearchCfg, given: str | None) -> str | None:
+    """The file given for a run's controller, if it is the run's own in another place."""
+    same = given is not None and there.policy_sha256 is not None and file_hash(Path(given)) == there.policy_sha256
+    return given if same else None
+
+
+def _resumed(path: Path, there: SearchCfg, robot: Any, changes: dict[str, Any], moved: str | None) -> SearchCfg:
     """The settings of a run that goes on; nothing but its number of iterations may change."""
-    there = from_settings(config["settings"], config["iterations"])
+    if moved is not None:
+        changes = {**changes, "policy": None}
     wanted = measured_now(changed(there, changes), robot)
+    if moved is not None:
+        wanted = replace(wanted, policy_sha256=there.policy_sha256)
+    elif wanted.policy == there.policy and there.policy_sha256 is not None and wanted.policy_sha256 is None:
+        raise ValueError(
+            f"{path} was searched with the controller in {policy_spec(there, robot)}, got no such file now: put it "
+            "back, or say where it is now with --policy"
+        )
     different = differences(as_settings(there), as_settings(wanted))
     if different:
         raise ValueError(f"{path} holds a run of other settings: {', '.join(different)}: start a new run for those")
@@ -160,9 +178,9 @@ def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
             raise ValueError(
                 f"{args.run_dir} holds a run of other settings: {', '.join(different)}: give another --run-dir"
             )
-        command = _resume_command(cfg.robot, args.run_dir, args.device)
+        command = _resume_command(cfg.robot, args.run_dir, args.device, None)
         raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
-    if args.run_dir.is_dir() and any(args.run_dir.iterdir()):
+    if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
         raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
     return args.run_dir
 
@@ -179,8 +197,9 @@ def _mention_unfinished(name: str, cfg: SearchCfg, device: str | None) -> None:
             print(
                 f"{path} holds the same search, stopped after {done} of {config['iterations']} iterations. Go on with:"
             )
-            print(f"  {_resume_command(cfg.robot, path, device)}")
+            print(f"  {_resume_command(cfg.robot, path, device, None)}")
 
 
-def _resume_command(robot: str, path: Path, device: str | None) -> str:
-    return f"make archive ROBOT={robot} RESUME={shlex.quote(str(path))}" + (f" DEVICE={device}" if device else "")
+def _resume_command(robot: str, path: Path, device: str | None, moved_policy: str | None) -> str:
+    flags = {"ROBOT": robot, "RESUME": str(path), "DEVICE": device, "POLICY": moved_policy}
+    return " ".join(["make archive", *(f"{name}={shlex.quote(value)}" for name, value in flags.items() if value)])

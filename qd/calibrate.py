@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from qd.cli import run_command
 from qd.workers import EvaluatorCfg, check_policy, open_evaluator, resolve_device
-from sim.files import check_writable, to_json, write_atomically
+from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def calibrate(cfg: CalibrateCfg) -> Path:
     policy = cfg.policy or str(robot.policy_file)
     check_policy(policy, cfg.robot, device)
     out = cfg.out or robot.scales_file
-    check_writable(out.parent)
+    prepare_output(out)
     print(f"Crossing {cfg.terrains} hard-random terrains {cfg.replicas} times on {device}.", flush=True)
     evaluator = EvaluatorCfg(
         robot=cfg.robot,

@@ -84,6 +84,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         data = path.read_bytes()
     except FileNotFoundError:
         raise FileNotFoundError(f"no checkpoint at {path}: give the directory of a search's run") from None
+    except OSError as error:
+        raise ValueError(f"{path} must be a search checkpoint, got: {error.strerror}; {_REMEDY}") from None
     header = len(_MAGIC) + _HASH_BYTES
     if not data.startswith(_MAGIC):
         raise ValueError(f"{path} must start as a search checkpoint, got {data[:16]!r}: it is another file; {_REMEDY}")

@@ -4,11 +4,13 @@ The ratios of a terrain sum to 1, so most tuples of intervals can never occur. C
 tuples alone: those that hold more than single points of the plane sum(ratios) = 1.
 """
 
+import math
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+_MAX_CELLS = 500_000  # an archive holds all of its cells in memory
 _SUM_TOLERANCE = 1e-9  # a mean over 20 episodes of ratios that sum to 1 is off by about 1e-16
 
 
@@ -60,7 +62,7 @@ class Cells:
         collision_bit: Whether "at least one episode has a base collision" is a descriptor too.
 
     Raises:
-        ValueError: If there are fewer than 2 ratios or no interval.
+        ValueError: If there are fewer than 2 ratios, no interval, or too many cells.
     """
 
     def __init__(self, num_ratios: int, intervals: int = 10, *, collision_bit: bool = False) -> None:
@@ -68,6 +70,11 @@ class Cells:
             raise ValueError(f"num_ratios must be at least 2, got {num_ratios}: a single ratio is always 1")
         if intervals < 1:
             raise ValueError(f"intervals must be at least 1, got {intervals}")
+        if math.comb(intervals + num_ratios - 1, intervals) > _MAX_CELLS:
+            raise ValueError(
+                f"intervals must leave fewer than {_MAX_CELLS:,} cells for {num_ratios} penalties, got {intervals}: "
+                "take fewer"
+            )
         self.num_ratios = num_ratios
         self.intervals = intervals
         self.collision_bit = collision_bit

@@ -12,7 +12,7 @@ from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.report import new_figure, save_figure
 from qd.run_directory import CONFIG_FILE, RunDirectory
-from qd.settings import SHIPPED, from_settings
+from qd.settings import SHIPPED
 from qd.workers import check_policy, episode_seeds, resolve_device
 
 if TYPE_CHECKING:
@@ -124,8 +124,12 @@ def _as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:
     """Controller and fitness of the search that made an archive; defaults where it lies without its config."""
     folder = run if run.is_dir() else run.parent
     if (folder / CONFIG_FILE).exists():
-        config = RunDirectory(folder).read_config()
-        cfg = from_settings(config["settings"], config["iterations"])
+        cfg = RunDirectory(folder).read_cfg()
+        if cfg.fitness.penalties != archive.penalties:
+            raise ValueError(
+                f"{folder / CONFIG_FILE} is of a search with penalties {', '.join(cfg.fitness.penalties)}, but its "
+                f"archive has {', '.join(archive.penalties)}: put back the one that is not this run's"
+            )
         return cfg.policy, cfg.fitness
     return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)
 

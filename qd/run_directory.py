@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, write_archive
 from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.settings import Settings
+from qd.settings import SearchCfg, Settings, from_settings
 from sim.files import check_writable, read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"
+_REMEDY = "put a copy of it back, or start a new run"
 
 Metrics = list[dict[str, Any]]
 """One row an iteration."""
@@ -103,9 +104,24 @@ class RunDirectory:
         if not file.exists():
             raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
         config = read_json(file)
-        if not isinstance(config.get("settings"), dict) or not isinstance(config.get("iterations"), int):
-            raise ValueError(f"{file} must hold settings and iterations of a search, got {', '.join(config)}")
+        if not isinstance(config.get("settings"), dict) or type(config.get("iterations")) is not int:
+            raise ValueError(
+                f"{file} must hold settings and iterations of a search, got {', '.join(config)}; {_REMEDY}"
+            )
         return config
+
+    def read_cfg(self) -> SearchCfg:
+        """The search as its config has it.
+
+        Raises:
+            FileNotFoundError: If there is no run here.
+            ValueError: If the file is damaged, or of another version.
+        """
+        config = self.read_config()
+        try:
+            return from_settings(config["settings"], config["iterations"])
+        except ValueError as error:
+            raise ValueError(f"{self.path / CONFIG_FILE}: {error}; {_REMEDY}") from None
 
     def write_config(self, settings: Settings, iterations: int, origin: dict[str, Any]) -> None:
         """Writes what the run is asked to do.
@@ -151,21 +167,31 @@ class RunDirectory:
             The search and its metrics, or None if the run was killed before its first checkpoint.
 
         Raises:
-            ValueError: If the checkpoint is damaged, or belongs to a run of other settings.
+            ValueError: If the checkpoint is damaged, lost, or belongs to a run of other settings.
         """
         file = self.path / CHECKPOINT_FILE
+        derived = [self.path / name for name in (METRICS_FILE, ARCHIVE_FILE)]
+        for made in derived:
+            if made.is_dir():
+                raise ValueError(f"{made} is a directory, expected a file or nothing: move it away")
         if not file.exists():
+            lost = [made.name for made in derived if made.exists()]
+            if lost:
+                raise ValueError(f"{file} is lost: expected it beside {' and '.join(lost)}; {_REMEDY}")
             return None
         from qd.cma_mae import CmaMae  # pyribs takes two seconds to import: not for `--help`
 
         state = load_checkpoint(file)
-        different = differences(state.get("settings") or {}, settings)
+        there, metrics = state.get("settings"), state.get("metrics")
+        if not isinstance(there, dict) or not isinstance(metrics, list):
+            raise ValueError(f"{file} is no checkpoint of a search: it lacks settings or metrics; {_REMEDY}")
+        different = differences(there, settings)
         if different:
-            raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}")
+            raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}; {_REMEDY}")
         try:
-            return CmaMae.from_state(state), list(state["metrics"])
+            return CmaMae.from_state(state), metrics
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{file} is no checkpoint of a search: {error}") from None
+            raise ValueError(f"{file} is no checkpoint of a search: {error}; {_REMEDY}") from None
 
 
 def archive_of(settings: Settings, search: "CmaMae", iterations: int) -> Archive:

@@ -14,7 +14,7 @@ from qd.fitness import Evaluation, evaluation_of
 from qd.progress import ProgressBar, clock, plan
 from qd.reevaluate import FRESH_EPISODES, reproduced
 from qd.report import summary, write_figures
-from qd.run_directory import Metrics, RunDirectory, archive_of, claimed
+from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed
 from qd.settings import SearchCfg, as_settings
 from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
 from sim.files import to_json, write_atomically
@@ -116,9 +116,15 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                         search_terrains(cfg, run, search, metrics, evaluate, bar)
             return _finish(job, run, search, metrics, open_evaluator)
         except KeyboardInterrupt:
-            raise Interrupted(f"Stopped; finished iterations are saved. Go on with:  {job.resume_command}") from None
-        except EvaluatorError as error:
-            raise EvaluatorError(f"{error}. Go on with:  {job.resume_command}") from None
+            raise Interrupted(f"Stopped; finished iterations are saved. {_how_to_go_on(job)}") from None
+        except (EvaluatorError, OSError) as error:
+            raise type(error)(f"{error}. {_how_to_go_on(job)}") from None
+
+
+def _how_to_go_on(job: Job) -> str:
+    if not (job.path / CONFIG_FILE).exists():
+        return "No iteration is finished: start it again"
+    return f"Go on with:  {job.resume_command}"
 
 
 def _begin(cfg: SearchCfg) -> tuple["CmaMae", Metrics]:

@@ -5,10 +5,9 @@ Nothing here imports pyribs, which takes seconds: `--help` and the worker proces
 
 import hashlib
 import json
-import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
@@ -18,10 +17,12 @@ if TYPE_CHECKING:
 
 ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
-_MAX_CELLS = 500_000  # an archive holds all of its cells in memory
+_MAX_WHOLE = 1 << 53  # up to which whole numbers are floats too
 
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
+
+Built = TypeVar("Built")
 
 Settings = dict[str, Any]
 """The settings that make a run what it is, as JSON values."""
@@ -95,12 +96,7 @@ class SearchCfg:
         for name in ("iterations", "replicas", "intervals"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        bins = math.comb(self.intervals + len(self.fitness.penalties) - 1, self.intervals)
-        if bins > _MAX_CELLS:
-            raise ValueError(
-                f"intervals must leave fewer than {_MAX_CELLS:,} cells for {len(self.fitness.penalties)} penalties, "
-                f"got {self.intervals}: take fewer"
-            )
+        Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
 
@@ -186,12 +182,35 @@ def from_settings(settings: Settings, iterations: int) -> SearchCfg:
         ValueError: If they are not the settings of a search.
     """
     try:
-        fitness = settings["fitness"]
-        lists = {name: tuple(fitness[name]) for name in ("penalties", "scales")}
-        parts = {"fitness": FitnessCfg(**{**fitness, **lists}), "cma": CmaMaeCfg(**settings["cma"])}
-        return SearchCfg(**{**settings, **parts, "iterations": iterations})
-    except (KeyError, TypeError) as error:
+        return _built(SearchCfg, {**settings, "iterations": iterations}, "a search")
+    except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
+
+
+def _built(kind: type[Built], values: Any, name: str) -> Built:
+    """A settings class from JSON values, each of the type its field is annotated with."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{name} must be an object, got {_brief(values)}")
+    hints = get_type_hints(kind)
+    return kind(**{key: _typed(hints[key], value, key) if key in hints else value for key, value in values.items()})
+
+
+def _typed(hint: Any, value: Any, name: str) -> Any:
+    """A JSON value as a field wants it: a nested class, a tuple, or a value of just that type."""
+    if is_dataclass(hint):
+        return _built(hint, value, name)  # pyright: ignore[reportArgumentType] - a hint is a class, no instance
+    if get_origin(hint) is tuple and isinstance(value, list):
+        return tuple(_typed(get_args(hint)[0], item, name) for item in value)
+    kinds = get_args(hint) or (hint,)
+    if type(value) in kinds or (type(value) is int and float in kinds and abs(value) < _MAX_WHOLE):
+        return value
+    expected = " or ".join(getattr(kind, "__name__", str(kind)) for kind in kinds)
+    raise ValueError(f"{name} must be {expected}, got {_brief(value)}")
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
@@ -199,9 +218,13 @@ def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
     return str(robot.policy_file) if cfg.policy == SHIPPED else cfg.policy
 
 
+def file_hash(file: Path) -> str | None:
+    """SHA-256 of a file; None where there is none."""
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+
+
 def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
     """Settings with the robot's present penalties and scales and the present hash of the controller's file."""
-    file = Path(policy_spec(cfg, robot))
-    digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+    digest = file_hash(Path(policy_spec(cfg, robot)))
     fitness = replace(cfg.fitness, penalties=robot.penalties, scales=robot.read_penalty_scales())
     return replace(cfg, policy_sha256=digest, fitness=fitness, collision_bit=robot.collision_bit)

@@ -4,7 +4,6 @@ The iterations timed are those of a real search, ask to saved checkpoint, in a d
 rates are measured right after, on the terrains of the last of them, with as many environments and the same solver.
 """
 
-import json
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from qd.run_directory import Metrics, RunDirectory
 from qd.search import search_terrains
 from qd.settings import SearchCfg, changed, policy_spec, preset
 from qd.workers import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
-from sim.files import to_json, write_atomically
+from sim.files import prepare_output, read_json, to_json, write_atomically
 from sim.provenance import provenance
 
 _WARM_UP = 2
@@ -101,8 +100,11 @@ def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[in
 
 def training_rates(file: Path | None) -> dict[str, float | None]:
     """PPO's env-steps a second with learning, as train.speed wrote them; None where it did not run."""
-    rows = json.loads(file.read_text())["training"] if file else []
-    rate = {row["num_envs"]: row["train_env_steps_per_s"] for row in rows}
+    try:
+        rows = read_json(file)["training"] if file else []
+        rate = {row["num_envs"]: float(row["train_env_steps_per_s"]) for row in rows}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} must be the output of train.speed, but: {error}: give its --out") from None
     return {"train_env_steps_per_s": rate.get(4096), "train_env_steps_per_s_8192": rate.get(8192)}
 
 
@@ -151,10 +153,11 @@ def measure(args: Arguments) -> dict[str, Any]:
 
 def main(args: Arguments) -> None:
     """The command."""
+    if args.out is not None:
+        prepare_output(args.out)
     report = measure(args)
     print(to_json(report).decode())
     if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(args.out, to_json(report))
         print(f"written to {args.out}")
 

@@ -1,5 +1,6 @@
 """One process that evaluates terrains for another, and dies with it."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -78,7 +79,7 @@ class WorkerProcess:
         self._process.join(timeout=5)
         code = self._process.exitcode
         reason = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
-        raise EvaluatorError(f"a worker process died ({reason}): out of memory? Saved iterations are whole") from None
+        raise EvaluatorError(f"a worker process died ({reason}): out of memory?") from None
 
     def stop(self) -> None:
         """Ends the process, whatever it does."""
@@ -99,9 +100,15 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
             terrains, seeds = connection.recv()
             report = lambda done, most: connection.send(("progress", done / most))  # noqa: E731
             connection.send(("result", crosser.evaluate(terrains, seeds, progress=report)))
-    except (EOFError, BrokenPipeError):
+    except (EOFError, ConnectionError):  # the other end is gone: closed, or killed with unread messages
         sys.exit(0)
     except ValueError as error:
-        connection.send(("refused", str(error)))
+        _send_last(connection, "refused", str(error))
     except Exception as error:
-        connection.send(("failed", f"{type(error).__name__}: {error}"))
+        _send_last(connection, "failed", f"{type(error).__name__}: {error}")
+
+
+def _send_last(connection: Connection, message: str, value: str) -> None:
+    """Says why the process ends, if anybody is left to hear it."""
+    with contextlib.suppress(ConnectionError):
+        connection.send((message, value))

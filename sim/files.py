@@ -1,9 +1,14 @@
 """Files that are whole or absent: a reader never sees half of one, whenever the writer is killed."""
 
+import contextlib
 import json
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
+
+_TEMPORARY = ".tmp"
+_PROBE = ".write-test"
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -17,23 +22,42 @@ def write_atomically(path: Path, data: bytes) -> None:
         data: The whole content.
 
     Raises:
-        OSError: If the folder cannot be written to; the old file is then untouched.
+        OSError: If the file cannot be written, as on a full disk; the old file, or the new one, is then whole.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}{_TEMPORARY}")
     try:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
+        _sync_folder(path.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise unwritable(path, error) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Puts a rename on the disk, which may be lost otherwise."""
+    handle = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(folder)  # or the rename itself may be lost
+        os.fsync(handle)
     finally:
-        os.close(folder)
+        os.close(handle)
+
+
+def unwritable(path: Path, error: OSError) -> OSError:
+    """The error of a write that failed, with what it was to write and what to do; a bare one names neither."""
+    return OSError(
+        f"{path} cannot be written: {error.strerror or error}: make room there or give another place; "
+        "what was saved before is whole"
+    )
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether a file is what a killed write leaves behind, to be overwritten by the next one."""
+    return path.name == _PROBE or (path.name.startswith(".") and path.name.endswith(_TEMPORARY))
 
 
 def check_writable(folder: Path) -> None:
@@ -42,12 +66,27 @@ def check_writable(folder: Path) -> None:
     Raises:
         ValueError: If they cannot.
     """
-    probe = folder / ".write-test"
+    probe = folder / _PROBE
     try:
         probe.touch()
-        probe.unlink()
+        probe.unlink(missing_ok=True)
     except OSError as error:
         raise ValueError(f"{folder} cannot be written to: {error.strerror}: give another place") from None
+
+
+def prepare_output(file: Path) -> None:
+    """Makes the folder of a file to be written after long work, and finds out whether the file can be.
+
+    Raises:
+        ValueError: If it cannot.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"cannot write to {error.filename}: {error.strerror}: give another place") from None
+    if file.is_dir():
+        raise ValueError(f"{file} is a directory, expected a file to write: name a file in it")
+    check_writable(file.parent)
 
 
 def to_json(content: dict[str, Any]) -> bytes:
@@ -60,12 +99,38 @@ def read_json(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it holds something else.
+        ValueError: If it cannot be read, or holds something else.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} must be a JSON file, got: {error}") from None
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ValueError(f"{path} must be a JSON file, got: {reason}: put a copy of it back") from None
     if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {type(content).__name__}")
+        raise ValueError(
+            f"{path} must hold a JSON object, got {type(content).__name__}: put a copy of the right file there"
+        )
     return content
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name}, which is no number")
+
+
+def check_zip(path: Path) -> None:
+    """Compares the parts of a zip file, such as torch and NumPy write, with their checksums.
+
+    Torch never looks at them when it loads: a flipped bit would be another weight.
+
+    Raises:
+        ValueError: If the file is no zip file or a part is damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            damaged = file.testzip()
+    except Exception as error:  # zipfile and zlib answer damage with a dozen types
+        raise ValueError(f"{type(error).__name__}: {error}") from None
+    if damaged is not None:
+        raise ValueError(f"its part '{damaged}' does not have its checksum")

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,6 +10,7 @@ from typing import Any, Protocol
 import torch
 import warp as wp
 
+from sim.files import check_zip
 from sim.robot import RobotCfg
 
 _FORMATS = (
@@ -79,6 +81,17 @@ def reason_of(error: BaseException) -> str:
     return line if isinstance(error, RuntimeError | ValueError | OSError) else f"{type(error).__name__}: {line}"
 
 
+def read_weights(path: Path) -> Any:
+    """What ``torch.save`` wrote: plain tensors and values, as data only, and compared with its checksums.
+
+    Raises:
+        Exception: Anything, if the file is damaged, foreign, or holds code.
+    """
+    if zipfile.is_zipfile(path):
+        check_zip(path)
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Load a controller and try it on one batch of zeros.
 
@@ -129,7 +142,7 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
     if not path.is_file():
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = read_weights(path)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         return _load_script(path, device, error)
     state = content.get("actor_state_dict") if isinstance(content, dict) else None

@@ -1,6 +1,6 @@
 """Robots: their settings, and their MJCF file as a Newton model."""
 
-import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from kernels.observation import NUM_BASE_COLUMNS
 from kernels.penalties import BASE, FOOT, LIMB, PENALTIES
+from sim.files import read_json
 
 _ROBOTS_DIR = Path(__file__).parent / "robots"
 
@@ -109,11 +110,16 @@ class RobotCfg:
         remedy = f"run `make calibrate ROBOT={self.name}`"
         if not self.scales_file.exists():
             raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
-        scales = json.loads(self.scales_file.read_text())["scales"]
-        missing = [name for name in self.penalties if not scales.get(name, 0.0) > 0.0]
+        scales = read_json(self.scales_file).get("scales")
+        scales = scales if isinstance(scales, dict) else {}
+        missing = [name for name in self.penalties if not _is_positive(scales.get(name))]
         if missing:
             raise ValueError(f"{self.scales_file} holds no positive scale for {', '.join(missing)}: {remedy}")
         return tuple(float(scales[name]) for name in self.penalties)
+
+
+def _is_positive(value: object) -> bool:
+    return isinstance(value, int | float) and value is not True and 0.0 < value <= sys.float_info.max
 
 
 def _steps(low: int, high: int) -> tuple[float, ...]:
@@ -191,5 +197,3 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
         )
     _require("geom", robot.geom_names, [leaf_name(label) for label in builder.shape_label], robot)
     return builder
-
-

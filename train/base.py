@@ -19,9 +19,10 @@ from sim.files import check_writable, read_json, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
-from train.learner import Learner, read_checkpoint
+from train.command import exit_code_of
+from train.learner import Learner, check_entries, read_checkpoint
 from train.ppo import PpoCfg
-from train.progress import Progress
+from train.progress import STATE, Progress
 from train.task import CommandTask
 from train.task_cfg import TaskCfg
 from train.vec_env import CommandVecEnv
@@ -141,6 +142,14 @@ def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> 
     return found
 
 
+def _read_saved(path: Path, robot: str) -> dict[str, Any]:
+    """The checkpoint of a training run, with the progress it had made."""
+    saved = read_checkpoint(path, robot)
+    check_entries(saved["extra"], STATE, path)
+    check_entries(saved["extra"]["settings"], {"seed": (int,)}, path)
+    return saved
+
+
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
     buffer = io.BytesIO()
@@ -158,7 +167,7 @@ def train(cfg: BaseCfg) -> int:
     began = time.monotonic()
     robot = get_robot(cfg.robot)
     device, num_envs, iterations = _resolve_size(cfg)
-    saved = read_checkpoint(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
+    saved = _read_saved(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
     run_dir = _prepare_run_dir(cfg)
@@ -175,17 +184,27 @@ def train(cfg: BaseCfg) -> int:
         about = {**provenance(device, seed), "settings": settings}
         progress = Progress(run_dir, learner, iterations, rows=cfg.rows, about=about, saved=saved and saved["extra"])
         deadline = began + cfg.max_seconds - _RESERVE_S if cfg.max_seconds else float("inf")
-        _iterate(learner, progress, cfg, run_dir / CHECKPOINT, stop, deadline)
-        progress.close()
-        learner.save(run_dir / CHECKPOINT, progress.state())
-        record = progress.record()
-        for path in (run_dir / POLICY, cfg.export):
-            if path is not None:
-                export_policy(path, learner, record)
-                print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+        try:
+            _iterate(learner, progress, cfg, run_dir / CHECKPOINT, stop, deadline)
+            _finish(learner, progress, cfg, run_dir)
+        except OSError as error:
+            if not (run_dir / CHECKPOINT).exists():
+                raise
+            raise OSError(f"{error}. Go on with: --resume {run_dir}") from error
     if learner.iteration < iterations:
         print(f"Stopped after {learner.iteration} of {iterations} iterations. Go on with: --resume {run_dir}")
     return 130 if stop.requested else 0
+
+
+def _finish(learner: Learner, progress: Progress, cfg: BaseCfg, run_dir: Path) -> None:
+    """The last checkpoint, the controller and its record."""
+    progress.close()
+    learner.save(run_dir / CHECKPOINT, progress.state())
+    record = progress.record()
+    for path in (run_dir / POLICY, cfg.export):
+        if path is not None:
+            export_policy(path, learner, record)
+            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
 
 
 def _iterate(
@@ -208,11 +227,7 @@ def _iterate(
 def main() -> int:
     """Command line; returns the exit status."""
     cfg = tyro.cli(BaseCfg, description=__doc__)
-    try:
-        return train(cfg)
-    except (ValueError, OSError, FloatingPointError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return exit_code_of(lambda: train(cfg))
 
 
 if __name__ == "__main__":

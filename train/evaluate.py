@@ -14,12 +14,13 @@ import tyro
 from tqdm import tqdm
 
 from kernels.episode import Outcome
-from sim.files import check_writable, to_json, write_atomically
+from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.rollout import CrossingCfg, Rollout, RolloutResult
 from sim.simulation import resolve_device
 from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
+from train.command import exit_code_of
 
 FULL = (300, 20)
 """Terrains a set and episodes a terrain of the published tables."""
@@ -207,8 +208,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
     published = cfg.policy is None and (terrains, episodes) == FULL
     out = cfg.out or (Path("results") / robot.name / "base.json" if published else None)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        check_writable(out.parent)
+        prepare_output(out)
     rollout = Rollout(
         robot,
         policy,
@@ -233,12 +233,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
 def main() -> int:
     """Command line; returns the exit status."""
     cfg = tyro.cli(EvaluateCfg, description=__doc__)
-    try:
-        evaluate(cfg)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return exit_code_of(lambda: int(evaluate(cfg) is None))
 
 
 if __name__ == "__main__":

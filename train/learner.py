@@ -11,11 +11,20 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from sim.files import write_atomically
-from sim.policy import reason_of
+from sim.policy import read_weights, reason_of
 from train.ppo import PpoCfg, runner_settings
 from train.vec_env import CommandVecEnv
 
 CHECKPOINT_FORMAT = "faultline training checkpoint 1"
+_ENTRIES = {
+    "robot": (str,),
+    "iter": (int,),
+    "levels": (torch.Tensor,),
+    "counter": (int,),
+    "rng_cpu": (torch.Tensor,),
+    "rng_cuda": (torch.Tensor, type(None)),
+    "extra": (dict,),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,24 +126,34 @@ class Learner:
         Episodes begin anew. With another number of environments the levels are dealt out in turn.
 
         Raises:
-            ValueError: If the networks have other shapes.
+            ValueError: If the networks have other shapes, or something in it is damaged.
         """
         try:
             self.alg.load(content, None, True)
-        except (RuntimeError, ValueError, KeyError) as error:
+        except Exception as error:  # torch answers states that do not fit with many types
             raise ValueError(
-                f"the checkpoint's networks do not fit: {str(error).splitlines()[-1].strip()}; "
+                f"the checkpoint's networks do not fit: {' '.join(str(error).splitlines()[-1:]).strip()}; "
                 "give the --ppo.hidden-dims it was trained with"
             ) from error
+        try:
+            self._restore(content)
+        except Exception as error:
+            raise ValueError(f"the checkpoint is damaged: {reason_of(error)}; give a copy of it to --resume") from error
+        self._begin()
+
+    def _restore(self, content: dict[str, Any]) -> None:
+        """Iteration, terrain levels and random numbers of a checkpoint."""
         task = self.env.task
-        self.iteration = int(content["iter"])
+        self.iteration = content["iter"]
+        most = task.tiles.num_levels - 1
+        if len(content["levels"]) == 0 or int(content["levels"].max()) > most:
+            raise ValueError(f"levels must be at least one, and at most {most} each")
         levels = content["levels"].to(task.levels.device, task.levels.dtype)
         task.counter.fill_(content["counter"])
         task.restart_all(levels[torch.arange(task.num_envs, device=levels.device) % len(levels)])
         torch.set_rng_state(content["rng_cpu"])
         if content["rng_cuda"] is not None and task.observation.is_cuda:
             torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)
-        self._begin()
 
 
 def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
@@ -154,13 +173,30 @@ def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError(f"no checkpoint at {path}: {remedy}")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = read_weights(path)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         raise ValueError(
             f"{path} is no checkpoint (truncated, foreign, or holding code): {reason_of(error)}; {remedy}"
         ) from error
     if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:
         raise ValueError(f"{path} must be a '{CHECKPOINT_FORMAT}', got another kind of file: {remedy}")
-    if content["robot"] != robot:
-        raise ValueError(f"{path} is of robot '{content['robot']}', expected '{robot}': {remedy} of '{robot}'")
+    if content.get("robot") != robot:
+        raise ValueError(f"{path} is of robot '{content.get('robot')}', expected '{robot}': {remedy} of '{robot}'")
+    check_entries(content, _ENTRIES, path)
     return content
+
+
+def check_entries(content: dict[str, Any], expected: dict[str, tuple[type, ...]], path: Path) -> None:
+    """That a part of a checkpoint has its entries, each of one of its types.
+
+    Raises:
+        ValueError: If one is absent or of another type.
+    """
+    wrong = {
+        name: type(content.get(name)).__name__
+        for name, kinds in expected.items()
+        if type(content.get(name)) not in kinds
+    }
+    if wrong:
+        found = ", ".join(f"{name} must be {expected[name][0].__name__}, got {got}" for name, got in wrong.items())
+        raise ValueError(f"{path} is a damaged checkpoint: {found}; put a copy of it back")

@@ -7,9 +7,12 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 
 from kernels.rewards import REWARDS
+from sim.files import unwritable
 from train.learner import Iteration, Learner
 
 _ENDS = ("time_out", "base_collision", "tilt", "invalid")
+STATE = {"settings": (dict,), "curve": (list,), "pieces": (list,), "env_steps": (int,), "wall_s": (float, int)}
+"""Entries of :meth:`Progress.state` and their types."""
 _HEADER = (
     f"{'iteration':>12} {'env-steps':>10} {'steps/s':>9} {'collect':>8} {'learn':>8} {'reward':>7} {'length':>7} "
     f"{'falls':>6} {'v err':>6} {'w err':>6} {'level':>6} {'std':>5} {'rate':>8} {'ETA':>7}"
@@ -62,7 +65,11 @@ class Progress:
         self._wall_s = float(saved["wall_s"]) if saved else 0.0
         self._pieces.append({**about, "from_iteration": learner.iteration})
         self._about = about
-        self._writer = SummaryWriter(log_dir=str(run_dir), flush_secs=10)
+        self._run_dir = run_dir
+        try:
+            self._writer = SummaryWriter(log_dir=str(run_dir), flush_secs=10)
+        except OSError as error:
+            raise unwritable(run_dir, error) from error
         self._window: list[Iteration] = []
         self._piece_began = time.monotonic()
         self.warm = False
@@ -80,7 +87,10 @@ class Progress:
         """Finish the last row and TensorBoard's file."""
         if self._window:
             self._finish_row()
-        self._writer.close()
+        try:
+            self._writer.close()
+        except OSError as error:
+            raise unwritable(self._run_dir, error) from error
         self._wall_s += time.monotonic() - self._piece_began
         self._piece_began = time.monotonic()
 
@@ -140,7 +150,10 @@ class Progress:
         self._curve.append(_rounded(row))
         self._window = []
         self._print(row)
-        self._write_scalars(row)
+        try:
+            self._write_scalars(row)
+        except OSError as error:  # of the thread that writes TensorBoard's file
+            raise unwritable(self._run_dir, error) from error
 
     def _print(self, row: dict[str, Any]) -> None:
         left = (self.iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])

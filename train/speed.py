@@ -10,10 +10,11 @@ from typing import Any
 import torch
 import tyro
 
-from sim.files import to_json, write_atomically
+from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
+from train.command import exit_code_of
 from train.learner import Learner
 from train.ppo import PpoCfg
 from train.task import CommandTask
@@ -63,23 +64,29 @@ def time_training(robot: RobotCfg, num_envs: int, *, iterations: int, device: st
     }
 
 
+def measure(cfg: SpeedCfg) -> int:
+    """Time what is asked for, print it, write the file.
+
+    Raises:
+        ValueError: If something asked for cannot be had; raised before any long work.
+    """
+    robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
+    if cfg.out is not None:
+        prepare_output(cfg.out)
+    runs = [
+        time_training(robot, count, iterations=cfg.iterations, device=device, seed=cfg.seed) for count in cfg.num_envs
+    ]
+    report = {**provenance(device, cfg.seed), "robot": robot.name, "training": runs}
+    print(json.dumps(report, indent=2))
+    if cfg.out is not None:
+        write_atomically(cfg.out, to_json(report))
+    return 0
+
+
 def main() -> int:
     """Command line; returns the exit status."""
     cfg = tyro.cli(SpeedCfg, description=__doc__)
-    try:
-        robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
-        runs = [
-            time_training(robot, count, iterations=cfg.iterations, device=device, seed=cfg.seed)
-            for count in cfg.num_envs
-        ]
-        report = {**provenance(device, cfg.seed), "robot": robot.name, "training": runs}
-        print(json.dumps(report, indent=2))
-        if cfg.out is not None:
-            write_atomically(cfg.out, to_json(report))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return exit_code_of(lambda: measure(cfg))
 
 
 if __name__ == "__main__":

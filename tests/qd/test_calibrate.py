@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,8 +53,10 @@ def test_the_file_is_what_the_robot_reads(tmp_path, stand_in_evaluator, monkeypa
 def test_mistakes_are_found_before_the_work(tmp_path, stand_in_evaluator):
     with pytest.raises(ValueError, match="unknown robot 'dog': expected one of anymal"):
         calibrate.calibrate(CalibrateCfg(robot="dog"))
-    with pytest.raises(ValueError, match="cannot be written to"):
-        calibrate.calibrate(CalibrateCfg(device="cpu", out=tmp_path / "missing" / "scales.json"))
+    with pytest.raises(ValueError, match="cannot write to /proc/missing: "):
+        calibrate.calibrate(CalibrateCfg(device="cpu", out=Path("/proc/missing/scales.json")))
+    with pytest.raises(ValueError, match="is a directory, expected a file to write: name a file in it"):
+        calibrate.calibrate(CalibrateCfg(device="cpu", out=tmp_path))
     with pytest.raises(ValueError, match="terrains and replicas must be at least 1, got 0 and 20"):
         calibrate.calibrate(CalibrateCfg(device="cpu", terrains=0))
     with pytest.raises(ValueError, match=r"those of its shipped controller, got another one .* name a file"):

@@ -1,0 +1,24 @@
+"""How every command of this room ends: an exit code, and one line on stderr for what a user can mend."""
+
+import sys
+from collections.abc import Callable
+
+
+def exit_code_of(command: Callable[[], int]) -> int:
+    """Runs a command.
+
+    Args:
+        command: Returns its exit code.
+
+    Returns:
+        That code; 2 for anything a user can mend (ValueError, OSError, FloatingPointError) and 130 for Ctrl-C, after a
+        line on stderr.
+    """
+    try:
+        return command()
+    except (ValueError, OSError, FloatingPointError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nStopped.", file=sys.stderr)
+        return 130
