@@ -110,18 +110,6 @@ def nearest_on_surface(grid: NDArray, spacing: float, p: ArrayLike, reach: float
     return (-distances[best] if below else distances[best]), candidates[best]
 
 
-def strip_contacts(grid: NDArray, spacing: float, centres: NDArray, radius: float) -> tuple[NDArray, NDArray]:
-    """Signed distance of each probe of a strip (n,), and which become contacts: first, deepest and last that touch.
-
-    ``centres`` (n, 3) in world-local coordinates, in order along the strip; no probe twice in the second array.
-    """
-    distance = np.array([nearest_on_surface(grid, spacing, centre, radius)[0] for centre in centres])
-    touching = np.flatnonzero(distance < radius)
-    if len(touching) == 0:
-        return distance, touching
-    return distance, np.unique([touching[0], np.argmin(distance), touching[-1]])
-
-
 def rotation_matrix(quaternion_xyzw: ArrayLike) -> NDArray:
     """Matrix that turns base-frame vectors into the world frame."""
     x, y, z, w = np.float64(quaternion_xyzw) / np.linalg.norm(np.float64(quaternion_xyzw))

@@ -1,0 +1,252 @@
+"""The kernels under test as the simulation launches them, each with its counterpart, its check and its work."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from kernels.observation import ANG_VEL_SCALE, LIN_VEL_SCALE, Noise, write_observation, write_scan
+from kernels.penalties import BASE, FOOT, LIMB, add_penalties
+from kernels.super_gaussian import LOWER, UPPER, rasterise
+from sim.bench import counterparts
+from sim.bench.checks import Truth
+from sim.bench.contact_counterpart import collide, make_tables
+from sim.bench.scene import Scene
+from sim.bench.work import (
+    Work,
+    contact_work,
+    geom_forces_work,
+    observation_work,
+    penalties_work,
+    rasterise_work,
+    scan_work,
+)
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+
+CONTROL_STEPS_PER_ITERATION = 1000
+"""Terrains are rasterised once for crossings of so many control steps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One kernel under test."""
+
+    name: str
+    launch: Callable[[], None]
+    """Launches it in its production form."""
+    counterpart: Callable[..., Any]
+    """The same work in torch."""
+    arguments: tuple[Any, ...]
+    """What the counterpart is called with."""
+    check_ours: Callable[[], None]
+    """Launches it and holds its output against the oracle."""
+    check_torch: Callable[[str, Any], None]
+    """Holds the counterpart's output against the oracle; first the name of the variant."""
+    work: Work
+    per_control_step: float
+    """Launches a control step."""
+    part_of: str | None = None
+    """Kernel that contains its work, so that the two are not to be added."""
+
+
+def _rasterise_case(scene: Scene, truth: Truth) -> Case:
+    genes = wp.to_torch(scene.genes_on_device)
+
+    def bounds(values: np.ndarray) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=genes.device)
+
+    x = torch.arange(NUM_COLS, device=genes.device) * SPACING
+    y = torch.arange(NUM_ROWS, device=genes.device) * SPACING
+
+    def launch() -> None:
+        rasterise(scene.genes_on_device, SPACING, scene.fresh.heights)
+
+    def check_ours() -> None:
+        scene.fresh.heights.zero_()
+        launch()
+        truth.check_rasterise("kernel", scene.fresh.heights.numpy())
+
+    return Case(
+        name="rasterise",
+        launch=launch,
+        counterpart=counterparts.rasterise,
+        arguments=(genes, bounds(LOWER), bounds(UPPER), x, y),
+        check_ours=check_ours,
+        check_torch=lambda who, heights: truth.check_rasterise(who, heights.cpu().numpy()),
+        work=rasterise_work(scene),
+        per_control_step=1.0 / CONTROL_STEPS_PER_ITERATION,
+    )
+
+
+def kernel_contacts(scene: Scene) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """The records of the contact kernel: environment and probe of each, and what :meth:`Truth.check_contact` takes."""
+    sim: Any = scene.rollout.sim
+    count = int(sim.contact_count.numpy()[0])
+    if count > sim.contact_capacity:
+        raise ValueError(f"{count} contacts do not fit in {sim.contact_capacity}: raise the robot's nconmax")
+    names = ("point0", "point1", "normal", "offset1")
+    records = {name: getattr(sim.contact_records, name).numpy()[:count].copy() for name in names}
+    shape = sim.contact_records.shape1.numpy()[:count] - sim.layout.first_shape
+    env, shape = np.divmod(shape, sim.layout.shapes_per_env)
+    lengths = np.diff(sim.probes.strip_start.numpy())
+    shape_of_probe = np.repeat(sim.probes.strip_shape.numpy(), lengths)
+    # A record names its shape and the centre: among the shape's probes, the one that stands there.
+    away = np.abs(records["point1"][:, None] - sim.probes.position.numpy()[None]).sum(2)
+    probe = np.argmin(np.where(shape_of_probe == shape[:, None], away, np.inf), axis=1)
+    return env, probe, records
+
+
+def _check_dense_contacts(truth: Truth, who: str, outputs: tuple[torch.Tensor, ...]) -> None:
+    probe, *values = (output.cpu().numpy() for output in outputs)
+    exists = probe >= 0
+    records = {
+        name: value[exists] for name, value in zip(("point0", "point1", "normal", "offset1"), values, strict=True)
+    }
+    truth.check_contact(who, np.nonzero(exists)[0], probe[exists], records)
+
+
+def _contact_case(scene: Scene, truth: Truth) -> Case:
+    sim: Any = scene.rollout.sim
+    body_q = wp.to_torch(sim.body_q).view(sim.num_envs, -1, 7)
+    probes = [getattr(sim.probes, name).numpy() for name in ("position", "strip_start", "strip_radius", "strip_body")]
+    tables = make_tables(*probes, spacing=SPACING, device=body_q.device)
+
+    def check_ours() -> None:
+        sim.collide()
+        truth.check_contact("kernel", *kernel_contacts(scene))
+
+    return Case(
+        name="contact",
+        launch=sim.collide,
+        counterpart=collide,
+        arguments=(body_q, wp.to_torch(sim.terrain_of_env), wp.to_torch(sim.bank.heights), SPACING, tables),
+        check_ours=check_ours,
+        check_torch=lambda who, outputs: _check_dense_contacts(truth, who, outputs),
+        work=contact_work(scene, truth),
+        per_control_step=scene.robot.decimation,
+    )
+
+
+def _scan_case(scene: Scene, truth: Truth) -> Case:
+    sim, out = scene.rollout.sim, scene.buffers["scan"]
+    arrays = (sim.joint_q, sim.terrain_of_env, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y)
+
+    def launch() -> None:
+        write_scan(sim.joint_q, sim.terrain_of_env, sim.bank.terrain, sim.sensors, out)
+
+    def check_ours() -> None:
+        launch()
+        truth.check_scan("kernel", out.numpy())
+
+    return Case(
+        name="scan",
+        launch=launch,
+        counterpart=counterparts.scan,
+        arguments=(*map(wp.to_torch, arrays), SPACING),
+        check_ours=check_ours,
+        check_torch=lambda who, scan: truth.check_scan(who, scan.cpu().numpy()),
+        work=scan_work(scene),
+        per_control_step=1.0,
+        part_of="observation",
+    )
+
+
+def _observation_case(scene: Scene, truth: Truth) -> Case:
+    sim, out = scene.rollout.sim, scene.buffers["observation"]
+    seed = wp.zeros(1, dtype=int, device=sim.device)
+    arrays = (
+        sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env, sim.bank.heights,
+        sim.sensors.scan_x, sim.sensors.scan_y, sim.sensors.default_joint_pos,
+    )  # fmt: skip
+    tensors = [wp.to_torch(array) for array in arrays]
+
+    def constant(*values: float) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=tensors[0].device)
+
+    def launch() -> None:
+        write_observation(
+            sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env, sim.bank.terrain,
+            sim.sensors, Noise(), seed, out,
+        )  # fmt: skip
+
+    def check_ours() -> None:
+        launch()
+        truth.check_observation("kernel", out.numpy())
+
+    scale = constant(LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE)
+    return Case(
+        name="observation",
+        launch=launch,
+        counterpart=counterparts.observation,
+        arguments=(*tensors, constant(*sim.sensors.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
+        check_ours=check_ours,
+        check_torch=lambda who, row: truth.check_observation(who, row.cpu().numpy()),
+        work=observation_work(scene),
+        per_control_step=1.0,
+    )
+
+
+def _penalties_case(scene: Scene, truth: Truth) -> Case:
+    sim, robot, sums = scene.rollout.sim, scene.robot, scene.buffers["penalties"]
+    roles = sim.geom_role.numpy()
+    joint_q, joint_qd, command, force = map(wp.to_torch, (sim.joint_q, sim.joint_qd, scene.command, sim.geom_force))
+    start = torch.zeros_like(wp.to_torch(sums))
+    feet, others = (torch.tensor(np.flatnonzero(roles & role), device=force.device) for role in (FOOT, BASE | LIMB))
+    base_com = torch.tensor(list(sim.sensors.base_com), dtype=torch.float32, device=force.device)
+
+    def launch() -> None:
+        add_penalties(
+            sim.joint_q, sim.joint_qd, sim.sensors.base_com, scene.command, sim.geom_force, sim.geom_role,
+            robot.contact_force_limit, robot.physics_dt, scene.counted, sums,
+        )  # fmt: skip
+
+    def check_ours() -> None:
+        sums.zero_()
+        launch()
+        truth.check_penalties("kernel", sums.numpy())
+
+    return Case(
+        name="penalties",
+        launch=launch,
+        counterpart=counterparts.penalties,
+        arguments=(
+            joint_q, joint_qd, base_com, command, force, feet, others, wp.to_torch(scene.counted), start,
+            robot.contact_force_limit, robot.physics_dt,
+        ),
+        check_ours=check_ours,
+        check_torch=lambda who, sums: truth.check_penalties(who, sums.cpu().numpy()),
+        work=penalties_work(scene),
+        per_control_step=robot.decimation,
+    )  # fmt: skip
+
+
+def _geom_forces_case(scene: Scene, truth: Truth) -> Case:
+    sim: Any = scene.rollout.sim
+    contacts = sim.solver_contacts
+    names = ("count", "world", "geom", "frame", "friction", "efc_address", "efc_force")
+    tensors = [wp.to_torch(getattr(contacts, name)) for name in names]
+
+    def check_ours() -> None:
+        sim.read_geom_forces()
+        truth.check_geom_forces("kernel", sim.geom_force.numpy())
+
+    return Case(
+        name="contact_forces",
+        launch=sim.read_geom_forces,
+        counterpart=counterparts.geom_forces,
+        arguments=(*tensors, wp.to_torch(sim.column_of_geom), len(sim.geom_names)),
+        check_ours=check_ours,
+        check_torch=lambda who, forces: truth.check_geom_forces(who, forces.cpu().numpy()),
+        work=geom_forces_work(scene),
+        per_control_step=scene.robot.decimation,
+    )
+
+
+def make_cases(scene: Scene, truth: Truth) -> list[Case]:
+    """All kernels under test, on one scene."""
+    makers = (_rasterise_case, _contact_case, _scan_case, _observation_case, _penalties_case, _geom_forces_case)
+    with wp.ScopedDevice(scene.rollout.sim.device):
+        return [make(scene, truth) for make in makers]

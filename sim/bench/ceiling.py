@@ -1,0 +1,118 @@
+"""What a device can do at best, measured: copies, multiply-adds, exponentials, and launches that do nothing.
+
+Copies are measured at many sizes, because what fits in a cache moves faster than memory can. A kernel's ceiling is the
+fastest copy of at least as many bytes as it must move: as near to the processor as its own data may be, and without the
+launch, which would hold back a small copy as it does a small kernel.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+import warp as wp
+
+from kernels.ceiling import FLOPS_PER_STEP, SPECIALS_PER_STEP, do_nothing, exponentials, multiply_add
+from sim.bench.timing import TimingCfg, fit_launches, repeat_torch, repeat_warp, time_in_turns
+from sim.bench.work import Work
+
+BOUND_SHARE = 0.25
+"""A kernel that reaches this share of a ceiling is bound by it."""
+LAUNCH_SHARE = 0.5
+"""One that reaches none, but of whose time an empty launch takes this share, is bound by launching."""
+
+BOUND_BY_RULE = (
+    f"the ceiling with the largest share, if that is at least {BOUND_SHARE}; else launch, if an empty launch takes at "
+    f"least {LAUNCH_SHARE} of the time; else latency: waiting for dependent loads, threads that part ways, or "
+    "instructions beyond the work counted"
+)
+_STEPS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """How near a kernel comes to the ceilings; 1 is at the ceiling."""
+
+    ceiling_share: float
+    """The largest of the next three."""
+    bandwidth_share: float
+    arithmetic_share: float
+    special_share: float
+    launch_share: float
+    """Time of an empty launch by the kernel's own; no ceiling, but what a small kernel cannot get under."""
+    bound_by: str
+    """memory, arithmetic, special functions, launch or latency (:data:`BOUND_BY_RULE`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ceiling:
+    """Best rates of a device."""
+
+    copies: dict[int, float]
+    """Bytes a second, read and written, by bytes moved."""
+    flops_per_s: float
+    """Single-precision multiplications and additions a second."""
+    specials_per_s: float
+    """Single-precision exponentials a second."""
+    launch_s: float
+    """Time of an empty kernel in a captured graph [s]."""
+
+    def bytes_per_s(self, moved: int) -> float:
+        """Rate of the fastest copy of at least ``moved`` bytes."""
+        return max([rate for size, rate in self.copies.items() if size >= moved] or [self.copies[max(self.copies)]])
+
+    def judge(self, work: Work, seconds: float) -> Share:
+        """How near work done in ``seconds`` comes to the ceilings."""
+        shares = {
+            "memory": work.bytes / self.bytes_per_s(work.bytes) / seconds,
+            "arithmetic": work.flops / self.flops_per_s / seconds,
+            "special functions": work.specials / self.specials_per_s / seconds,
+        }
+        launch_share = self.launch_s / seconds
+        nearest = max(shares, key=lambda name: shares[name])
+        bound_by = "launch" if launch_share >= LAUNCH_SHARE else "latency"
+        return Share(
+            ceiling_share=shares[nearest],
+            bandwidth_share=shares["memory"],
+            arithmetic_share=shares["arithmetic"],
+            special_share=shares["special functions"],
+            launch_share=launch_share,
+            bound_by=nearest if shares[nearest] >= BOUND_SHARE else bound_by,
+        )
+
+
+def _copy_sizes(device: str) -> list[int]:
+    """Bytes moved: 1 MB to 4 GB on CUDA, 16 KB to 64 MB on the CPU, in powers of 2."""
+    return [1 << k for k in (range(20, 33) if device.startswith("cuda") else range(14, 27))]
+
+
+def measure_ceiling(device: str, timing: TimingCfg) -> Ceiling:
+    """Measure the best rates of a device, all in turns.
+
+    Args:
+        device: Warp device name; torch works on its stream already.
+        timing: How long.
+    """
+    threads = 1 << 20 if device.startswith("cuda") else 64
+    out: Any = wp.zeros(threads, dtype=float, device=device)
+    launches = {
+        "nothing": partial(do_nothing, out),
+        "flops": partial(multiply_add, _STEPS, out),
+        "specials": partial(exponentials, _STEPS, out),
+    }
+    variants = {
+        name: fit_launches(partial(repeat_warp, launch, device=device), device, timing)
+        for name, launch in launches.items()
+    }
+    where = wp.to_torch(out).device
+    for size in _copy_sizes(device):
+        source, target = (torch.zeros(size // 8, dtype=torch.float32, device=where) for _ in range(2))
+        copy = partial(target.copy_, source)
+        variants[str(size)] = fit_launches(partial(repeat_torch, copy, device=device), device, timing)
+    seconds = time_in_turns(variants, device, timing)
+    return Ceiling(
+        copies={size: size / seconds[str(size)] for size in _copy_sizes(device)},
+        flops_per_s=threads * _STEPS * FLOPS_PER_STEP / seconds["flops"],
+        specials_per_s=threads * _STEPS * SPECIALS_PER_STEP / seconds["specials"],
+        launch_s=seconds["nothing"],
+    )
