@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from sim.bench.report import file_of, measure, preset, table
-from sim.files import check_writable, to_json, write_atomically
+from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
@@ -53,10 +53,7 @@ def run(args: Arguments) -> None:
     robot, device = get_robot(args.robot), resolve_device(args.device)
     origin = provenance(device, args.seed)
     out = args.out or file_of(origin["device"])
-    if out.is_dir():
-        raise ValueError(f"{out} is a directory, expected a file to write: name a file in it")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    check_writable(out.parent)
+    prepare_output(out)
     cfg = preset(device, seed=args.seed)
     sizes = {name: getattr(args, name) for name in ("num_envs", "num_terrains", "duration_s", "walk_s")}
     cfg = replace(
