@@ -126,7 +126,7 @@ def read_archive(path: str | Path) -> Archive:
     """
     path = Path(path)
     file = path / ARCHIVE_FILE if path.is_dir() else path
-    if not file.exists():
+    if not file.is_file():
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
         with zipfile.ZipFile(file) as members:  # np.load would leave some checksums unread

@@ -95,8 +95,8 @@ def read_weights(path: Path) -> Any:
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Load a controller and try it on one batch of zeros.
 
-    Files are loaded as data only (``weights_only``; TorchScript holds no Python); code runs only from
-    ``module:callable``.
+    Files are loaded as data only (``weights_only``; TorchScript holds no Python) after a look at their checksums; code
+    runs only from ``module:callable``. TorchScript is read by torch's C++, which a file made to harm can crash.
 
     Args:
         spec: An rsl_rl checkpoint, a TorchScript file, or ``module:callable``.
@@ -142,7 +142,12 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
     if not path.is_file():
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
     try:
-        content = read_weights(path)
+        if zipfile.is_zipfile(path):
+            check_zip(path)
+    except ValueError as error:
+        raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back; expected {_FORMATS}") from error
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         return _load_script(path, device, error)
     state = content.get("actor_state_dict") if isinstance(content, dict) else None

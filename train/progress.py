@@ -4,11 +4,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
-
 from kernels.rewards import REWARDS
-from sim.files import unwritable
 from train.learner import Iteration, Learner
+from train.scalars import ScalarFile
 
 _ENDS = ("time_out", "base_collision", "tilt", "invalid")
 STATE = {"settings": (dict,), "curve": (list,), "pieces": (list,), "env_steps": (int,), "wall_s": (float, int)}
@@ -65,11 +63,7 @@ class Progress:
         self._wall_s = float(saved["wall_s"]) if saved else 0.0
         self._pieces.append({**about, "from_iteration": learner.iteration})
         self._about = about
-        self._run_dir = run_dir
-        try:
-            self._writer = SummaryWriter(log_dir=str(run_dir), flush_secs=10)
-        except OSError as error:
-            raise unwritable(run_dir, error) from error
+        self._scalars = ScalarFile(run_dir)
         self._window: list[Iteration] = []
         self._piece_began = time.monotonic()
         self.warm = False
@@ -84,13 +78,9 @@ class Progress:
             self._finish_row()
 
     def close(self) -> None:
-        """Finish the last row and TensorBoard's file."""
+        """Finish the last row."""
         if self._window:
             self._finish_row()
-        try:
-            self._writer.close()
-        except OSError as error:
-            raise unwritable(self._run_dir, error) from error
         self._wall_s += time.monotonic() - self._piece_began
         self._piece_began = time.monotonic()
 
@@ -150,10 +140,7 @@ class Progress:
         self._curve.append(_rounded(row))
         self._window = []
         self._print(row)
-        try:
-            self._write_scalars(row)
-        except OSError as error:  # of the thread that writes TensorBoard's file
-            raise unwritable(self._run_dir, error) from error
+        self._write_scalars(row)
 
     def _print(self, row: dict[str, Any]) -> None:
         left = (self.iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
@@ -170,11 +157,13 @@ class Progress:
             print(f"  {row['ends']['invalid']} invalid states reset, {row['overflows']} steps with a solver overflow")
 
     def _write_scalars(self, row: dict[str, Any]) -> None:
+        scalars = {}
         for group, value in row.items():
             entries = value if isinstance(value, dict) else {"": value}
             for name, number in entries.items():
                 if number is not None and group != "iteration":
-                    self._writer.add_scalar(f"{group}/{name}" if name else f"train/{group}", number, row["iteration"])
+                    scalars[f"{group}/{name}" if name else f"train/{group}"] = number
+        self._scalars.write(row["iteration"], scalars)
 
 
 def _rounded(value: Any) -> Any:

@@ -52,7 +52,7 @@ class Kill:
 def kill_and_resume(
     start: Callable[[Path, int], Killable],
     folder: Path,
-    whole: tuple[Any, ...],
+    whole: Callable[[], tuple[Any, ...]],
     *,
     kills: int,
     longest_s: float,
@@ -64,7 +64,7 @@ def kill_and_resume(
     Args:
         start: Begins a search in a directory, or goes on with it; also told how many kills there were.
         folder: Where the searches' directories go.
-        whole: Outcome of an undisturbed search, which every other must have.
+        whole: Gives the outcome of an undisturbed search, which every other must have.
         kills: How many.
         longest_s: Moments are uniform up to this [s].
         seed: Draws the moments.
@@ -90,7 +90,7 @@ def kill_and_resume(
             continue
         code = search.wait()
         assert code == 0 and "Traceback" not in search.output, f"{here}: exit code {code}\n{search.output}"
-        assert searches.outcome(path) == whole, f"{here}: another outcome than undisturbed"
+        assert searches.outcome(path) == whole(), f"{here}: another outcome than undisturbed"
         if len(done) == kills:
             return done
         run, saved = run + 1, 0
@@ -111,7 +111,7 @@ class RealSearch:
         self, path: Path, *, iterations: int, workers: int, whole_group: bool = False, **environment: str
     ) -> None:
         self._whole_group = whole_group
-        self._log = path.parent / "log"
+        self._log = path.with_name(f"{path.name}.log")
         place = ["--resume", str(path)] if (path / CONFIG_FILE).exists() else ["--run-dir", str(path), *REAL_SIZE]
         size = ["--device", "cpu", "--iterations", str(iterations), "--workers", str(workers)]
         with self._log.open("wb") as log:

@@ -14,10 +14,10 @@ import torch
 import tqdm
 import warp as wp
 
-from tests.faults import searches
+from tests.faults import commands, searches
 from tests.faults.trainings import TASK
 
-__all__ = ["TASK"]
+__all__ = ["TASK", "commands"]
 
 os.environ.setdefault("FAULTLINE_COMMIT", "under test")  # spares asking git
 tqdm.tqdm.monitor_interval = 0  # or the first bar starts a thread

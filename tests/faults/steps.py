@@ -25,7 +25,8 @@ def kill(name: str, path: str) -> None:
 def fill(name: str, path: str) -> None:
     """There is no space for what the step would write."""
     if name in NEEDS_SPACE:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        named = [path] if name in ("open", "mkdir", "replace") else []  # what works on a handle names no file
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *named)
 
 
 class Steps:

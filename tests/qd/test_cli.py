@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from qd import arguments, replay, search
 from qd.arguments import Arguments
 from qd.cli import Interrupted, run_command
 from qd.worker_process import EvaluatorError
-from sim.robot import RobotCfg
+from sim.robot import RobotCfg, get_robot
 from tests.qd import stand_in
 from tests.qd.test_archive import small_archive
 
@@ -139,6 +140,40 @@ def test_a_damaged_checkpoint_is_reported_and_left_alone(capsys):
         assert everything_in("a") == before
     checkpoint.write_bytes(whole)
     run_main("--resume", "a", "--iterations", "3")
+
+
+def test_a_controller_that_moved_is_asked_for_and_taken_where_it_is_now(capsys):
+    shutil.copy(get_robot("anymal").policy_file, "mine.pt")
+    run_main(*TINY, "--policy", "mine.pt", "--run-dir", "a")
+    Path("mine.pt").rename("moved.pt")
+    Path("other.pt").write_bytes(Path("moved.pt").read_bytes() + b"\0")
+    before = everything_in("a")
+    assert fails(capsys, "--resume", "a") == (
+        "a was searched with the controller in mine.pt, got no such file now: put it back, or say where it is now "
+        "with --policy"
+    )
+    assert 'policy ("mine.pt" there, "other.pt" wanted)' in fails(capsys, "--resume", "a", "--policy", "other.pt")
+    assert everything_in("a") == before
+    run_main("--resume", "a", "--iterations", "2", "--policy", "moved.pt")
+    assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
+    Path("moved.pt").rename("mine.pt")
+    run_main("--resume", "a", "--iterations", "3")
+
+
+def test_what_a_killed_beginning_leaves_is_begun_in_again():
+    Path("a").mkdir()
+    for name in (".config.json.tmp", ".write-test"):
+        Path("a", name).write_text("{")
+    run_main(*TINY, "--run-dir", "a")
+    assert Path("a/archive.npz").exists()
+
+
+def test_a_lost_checkpoint_is_not_begun_over(capsys):
+    run_main(*TINY, "--run-dir", "a")
+    Path("a/checkpoint.bin").unlink()
+    assert "a/checkpoint.bin is lost: expected it beside metrics.jsonl and archive.npz" in fails(
+        capsys, "--resume", "a"
+    )
 
 
 def test_new_runs_get_directories_of_their_own_and_stopped_ones_are_mentioned(capsys):

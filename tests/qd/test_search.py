@@ -122,54 +122,6 @@ def test_seed_decides(tmp_path, plain_figures):
     assert not np.array_equal(first.genes, other.genes)
 
 
-WRITES = 1 + 3 * 3 + 2 + 1 + 1
-"""Config, three files in each of 3 iterations, metrics and archive again, the stand-in figure, numbers."""
-
-
-class KilledError(BaseException):
-    """Stands for SIGKILL: nothing in the program catches it."""
-
-
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_killed_at_any_write_a_search_resumes_to_the_same_bits(tmp_path, monkeypatch, plain_figures, when):
-    run(tmp_path / "whole", iterations=3)
-    replace = os.replace
-
-    for kill_at in range(WRITES):
-        path, count = tmp_path / f"killed-{kill_at}", 0
-
-        def killing_replace(source, target, kill_at=kill_at):
-            nonlocal count
-            count += 1
-            if when == "after" or count <= kill_at:
-                replace(source, target)
-            if count > kill_at:
-                raise KilledError
-
-        monkeypatch.setattr(files.os, "replace", killing_replace)
-        with pytest.raises(KilledError):
-            run(path, iterations=3)
-        monkeypatch.setattr(files.os, "replace", replace)
-        # Killed before its config was there a run was never begun: the same command begins it.
-        run(path, iterations=3, resumes=(path / "config.json").exists())
-        assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes(), kill_at
-        assert rows_of(path) == rows_of(tmp_path / "whole"), kill_at
-        assert (path / "archive.json").exists()
-
-
-def test_every_write_was_killed(tmp_path, monkeypatch, plain_figures):
-    count, replace = 0, os.replace
-
-    def counting_replace(source, target):
-        nonlocal count
-        count += 1
-        replace(source, target)
-
-    monkeypatch.setattr(files.os, "replace", counting_replace)
-    run(tmp_path / "run", iterations=3)
-    assert count == WRITES
-
-
 def test_a_finished_run_is_extended_as_if_it_had_been_longer_from_the_start(tmp_path, plain_figures):
     run(tmp_path / "whole", iterations=9)
     run(tmp_path / "pieces", iterations=4)
@@ -333,15 +285,6 @@ def stopped_by(signum: int, path: Path, **environment: str) -> tuple[int, str]:
     program.send_signal(signum)
     errors = program.communicate(timeout=30)[1]
     return program.returncode, errors
-
-
-def test_a_search_killed_by_the_system_resumes_to_the_same_bits(tmp_path, plain_figures):
-    path = tmp_path / "run"
-    assert stopped_by(signal.SIGKILL, path)[0] == -signal.SIGKILL
-    done = len(rows_of(path))
-    run(path, iterations=done + 1, resumes=True)
-    run(tmp_path / "whole", iterations=done + 1)
-    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
 
 
 def test_ctrl_c_ends_without_a_traceback_and_says_how_to_go_on(tmp_path):

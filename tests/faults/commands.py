@@ -1,0 +1,73 @@
+"""Every command that reads a file which may be damaged, on stand-ins for what takes long, to be run in a child."""
+
+import dataclasses
+import resource
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from kernels.episode import Outcome
+from qd import calibrate, replay
+from qd.cli import run_command
+from sim import rollout
+from sim.policy import load_policy
+from tests.faults import searches, trainings
+from tests.qd import stand_in
+from train import evaluate
+from train.command import exit_code_of
+
+SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
+
+
+def resume_search(path: Path) -> None:
+    """One iteration more than the search had."""
+    searches.run(["--resume", str(path), "--device", "cpu", "--iterations", "3"])
+
+
+def replay_elite(path: Path) -> None:
+    """The worst elite again."""
+    rollout.Rollout = _StandInRollout
+    run_command(replay.ReplayCfg, replay.main, ["--run", str(path), "--device", "cpu", "--replicas", "4"])
+
+
+def resume_training(run_dir: Path) -> int:
+    """One iteration more than the training had."""
+    trainings.base.CommandTask = lambda *_, **__: trainings.TASK
+    cfg = dataclasses.replace(trainings.config(run_dir, 3), resume=run_dir)
+    return exit_code_of(lambda: trainings.base.train(cfg))
+
+
+def calibrate_with(policy: Path) -> None:
+    """Penalty scales with a controller."""
+    calibrate.open_evaluator = stand_in.open_stand_in
+    out = str(policy.parent / "scales.json")
+    argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
+    run_command(calibrate.CalibrateCfg, calibrate.calibrate, argv)
+
+
+def evaluate_with(policy: Path) -> int:
+    """Crossings with a controller, up to where the simulation would be built."""
+    evaluate.Rollout = lambda robot, spec, **_: load_policy(spec, robot, "cpu")
+    evaluate.evaluate_sets = lambda loaded, seed: (_ for _ in ()).throw(SystemExit(0))
+    cfg = evaluate.EvaluateCfg(policy=str(policy), device="cpu", terrains=2, episodes=1)
+    return exit_code_of(lambda: int(evaluate.evaluate(cfg) is None))
+
+
+class _StandInRollout:
+    def __init__(self, robot: Any, policy: Any, *, num_terrains: int, num_replicas: int, device: str) -> None:
+        self.num_replicas = num_replicas
+        self.sim = SimpleNamespace(bank=SimpleNamespace(heights=SimpleNamespace(numpy=lambda: np.zeros((1, 161, 321)))))
+
+    def evaluate(self, genes: np.ndarray, seeds: np.ndarray, *, record_paths: bool) -> Any:
+        result = stand_in.evaluate(genes, seeds, self.num_replicas)
+        shape = result.invalid.shape
+        extra = {"outcome": np.full(shape, int(Outcome.GOAL)), "final_position": np.zeros((*shape, 3)), "paths": None}
+        return SimpleNamespace(**vars(result), **extra)
+
+
+def search_below(limit: int, path: Path, iterations: int) -> None:
+    """The search where no file may grow beyond a number of bytes; the log of this process lies open already."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    searches.search(path, iterations=iterations)
