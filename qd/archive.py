@@ -4,6 +4,7 @@ Reading an archive needs NumPy alone, so that training and figures do not depend
 """
 
 import io
+import os
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -125,8 +126,8 @@ def read_archive(path: str | Path) -> Archive:
         ValueError: If the file is damaged or no archive.
     """
     path = Path(path)
-    file = path / ARCHIVE_FILE if path.is_dir() else path
-    if not file.is_file():
+    file = path / ARCHIVE_FILE if os.path.isdir(path) else path
+    if not os.path.isfile(file):  # False too for a name that no file can have
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
         with zipfile.ZipFile(file) as members:  # np.load would leave some checksums unread

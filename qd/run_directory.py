@@ -101,7 +101,7 @@ class RunDirectory:
             ValueError: If the file is damaged.
         """
         file = self.path / CONFIG_FILE
-        if not file.exists():
+        if not os.path.lexists(file):
             raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
         config = read_json(file)
         if not isinstance(config.get("settings"), dict) or type(config.get("iterations")) is not int:

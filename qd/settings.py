@@ -5,6 +5,7 @@ Nothing here imports pyribs, which takes seconds: `--help` and the worker proces
 
 import hashlib
 import json
+import os
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -220,7 +221,7 @@ def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
 
 def file_hash(file: Path) -> str | None:
     """SHA-256 of a file; None where there is none."""
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+    return hashlib.sha256(file.read_bytes()).hexdigest() if os.path.isfile(file) else None
 
 
 def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:

@@ -1,6 +1,7 @@
 """Controllers as black boxes: a batch of observation rows to a batch of actions."""
 
 import importlib
+import os
 import re
 import zipfile
 from collections.abc import Callable
@@ -139,7 +140,7 @@ def _import_callable(spec: str, module: str, name: str, *, robot: RobotCfg, devi
 
 
 def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
-    if not path.is_file():
+    if not os.path.isfile(path):  # False too for a name that no file can have
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
     try:
         if zipfile.is_zipfile(path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,7 +171,7 @@ def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
         ValueError: If the file is absent, truncated, foreign or of another robot.
     """
     remedy = "give the run directory of a training run to --resume"
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise ValueError(f"no checkpoint at {path}: {remedy}")
     try:
         content = read_weights(path)

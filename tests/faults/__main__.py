@@ -60,7 +60,9 @@ def measure(cfg: FaultsCfg, folder: Path) -> dict[str, Any]:
         print(f"  run {kill.run}: killed at {kill.moment_s:.2f} s, {kill.saved} iterations saved", flush=True)
 
     longest_s = 0.9 * undisturbed_s if cfg.real else 0.6
-    kills = kill_and_resume(start, folder, whole, kills=cfg.kills, longest_s=longest_s, seed=cfg.seed, report=report)
+    kills = kill_and_resume(
+        start, folder, lambda: whole, kills=cfg.kills, longest_s=longest_s, seed=cfg.seed, report=report
+    )
     return {
         **provenance("cpu", cfg.seed),
         "simulation": "real" if cfg.real else "stand-in",

@@ -1,7 +1,9 @@
 """Every command that reads a file which may be damaged, on stand-ins for what takes long, to be run in a child."""
 
 import dataclasses
+import os
 import resource
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,7 +37,7 @@ def replay_elite(path: Path) -> None:
 def resume_training(run_dir: Path) -> int:
     """One iteration more than the training had."""
     trainings.base.CommandTask = lambda *_, **__: trainings.TASK
-    cfg = dataclasses.replace(trainings.config(run_dir, 3), resume=run_dir)
+    cfg = dataclasses.replace(trainings.config(Path("none"), 3), run_dir=None, resume=run_dir)
     return exit_code_of(lambda: trainings.base.train(cfg))
 
 
@@ -53,6 +55,14 @@ def evaluate_with(policy: Path) -> int:
     evaluate.evaluate_sets = lambda loaded, seed: (_ for _ in ()).throw(SystemExit(0))
     cfg = evaluate.EvaluateCfg(policy=str(policy), device="cpu", terrains=2, episodes=1)
     return exit_code_of(lambda: int(evaluate.evaluate(cfg) is None))
+
+
+def as_nobody(command: Callable[[Path], Any], path: Path) -> Any:
+    """A command by a user who owns nothing, where this process may become one."""
+    if os.geteuid() == 0:
+        os.setgid(65534)
+        os.setuid(65534)
+    return command(path)
 
 
 class _StandInRollout:

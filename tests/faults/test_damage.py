@@ -21,7 +21,7 @@ def error_of(code: int, output: str, what: str) -> str:
     assert code == 2, f"{what}: exit code {code}\n{output}"
     (line,) = [line for line in output.splitlines() if line.startswith("error: ")]
     # What, expected or got, and a remedy after it.
-    assert len(line) > 60 and re.search(r"expected|must|no |damaged|truncated|lost|other|directory", line), line
+    assert len(line) > 60 and re.search(r"expected|must|\bno |damaged|truncated|lost|other|directory", line), line
     return line
 
 
@@ -126,6 +126,44 @@ def test_damaged_files_of_a_training_and_going_on_with_it(folder, training_run):
             assert snapshot(run) == before, f"{file.name}, {name}: the run was changed"
 
     each(cases, check)
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("config.json", commands.resume_search),
+        ("checkpoint.bin", commands.resume_search),
+        ("config.json", commands.replay_elite),
+        ("archive.npz", commands.replay_elite),
+        ("checkpoint.pt", commands.resume_training),
+        ("", commands.resume_search),
+        ("", commands.resume_training),
+    ],
+)
+def test_files_that_may_not_be_read_and_folders_that_may_not_be_written(
+    folder, search_run, training_run, name, command
+):
+    whole = training_run[0] if command is commands.resume_training else search_run[0]
+    run = copied(whole, folder / "run")
+    before = snapshot(run)
+    folder.chmod(0o755)
+    run.chmod(0o777 if name else 0o555)
+    if name:
+        (run / name).chmod(0o000)
+    error_of(*run_child(folder / "log", commands.as_nobody, command, run), f"{name or 'the folder'} forbidden")
+    run.chmod(0o755)
+    (run / name).chmod(0o755)
+    assert snapshot(run) == before
+
+
+@pytest.mark.parametrize("path", ["missing", "/dev/null", "/dev/null/run", "n" * 300])
+def test_paths_that_lead_nowhere(folder, path):
+    for command in vars(commands).values():
+        if getattr(command, "__module__", "") == commands.__name__ and command.__name__.endswith(ON_A_PATH):
+            error_of(*run_child(folder / "log", command, Path(path)), f"{command.__name__} {path}")
+
+
+ON_A_PATH = ("_search", "_training", "_elite", "_with")
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,15 @@
 import dataclasses
+import multiprocessing
 import os
 import signal
+import threading
 import time
 
 import numpy as np
 import pytest
 
 from qd import workers
+from qd.worker_process import _serve
 from qd.workers import EvaluatorCfg, EvaluatorError, open_evaluator
 from tests.qd import stand_in
 
@@ -148,3 +151,19 @@ def test_seeds_must_be_one_a_terrain():
         pytest.raises(ValueError, match=r"seeds must have shape \(15,\)"),
     ):
         evaluate(GENES, SEEDS[:3])
+
+
+def test_a_worker_whose_parent_was_killed_with_unread_messages_leaves_quietly(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # put back after the worker's function has set it
+    ours, theirs = multiprocessing.Pipe()
+
+    def die() -> None:
+        assert ours.poll(10)  # "ready" is there and stays unread: the worker's next read is a reset, no end of file
+        ours.close()
+
+    parent = threading.Thread(target=die)
+    parent.start()
+    with pytest.raises(SystemExit) as exit:
+        _serve(theirs, None, 1, lambda cfg, num_terrains: None)
+    parent.join()
+    assert exit.value.code == 0
