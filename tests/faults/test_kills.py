@@ -9,8 +9,8 @@ from tests.faults.campaign import RealSearch, kill_and_resume
 from tests.faults.children import Child, run_child
 
 KILLS = 100
-ITERATIONS = 40
-LONGEST_S = 0.45
+ITERATIONS = 28
+LONGEST_S = 0.3
 
 
 def test_a_hundred_kills_at_random_moments(folder):
@@ -41,5 +41,5 @@ def test_kills_of_the_real_search_and_its_workers(tmp_path):
         return searches.outcome(tmp_path / "whole")
 
     undisturbed = RealSearch(tmp_path / "whole", iterations=2, workers=1, **fast)  # on the other core meanwhile
-    kills = kill_and_resume(start, tmp_path, whole, kills=3, longest_s=18.0, seed=4)
+    kills = kill_and_resume(start, tmp_path, whole, kills=3, longest_s=11.0, seed=9)
     assert len(kills) == 3
