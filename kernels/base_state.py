@@ -20,13 +20,24 @@ def base_rotation(joint_q: wp.array2d[float], env: int) -> wp.quat:
 
 
 @wp.func
-def base_yaw(joint_q: wp.array2d[float], env: int) -> float:
-    """Heading of the base's x axis in the world's horizontal plane [rad]."""
+def base_heading(joint_q: wp.array2d[float], env: int) -> wp.vec2:
+    """Cosine and sine of the heading of the base's x axis in the world's horizontal plane; (1, 0) where it has none."""
     x = joint_q[env, 3]
     y = joint_q[env, 4]
     z = joint_q[env, 5]
     w = joint_q[env, 6]
-    return wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    forward = wp.vec2(1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y))
+    length = wp.length(forward)
+    if length == 0.0:
+        return wp.vec2(1.0, 0.0)
+    return forward / length
+
+
+@wp.func
+def base_yaw(joint_q: wp.array2d[float], env: int) -> float:
+    """Heading of the base's x axis [rad]."""
+    heading = base_heading(joint_q, env)
+    return wp.atan2(heading[1], heading[0])
 
 
 @wp.func

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_ang_vel_b, base_lin_vel_b, base_yaw, projected_gravity
+from kernels.base_state import base_ang_vel_b, base_heading, base_lin_vel_b, projected_gravity
 from kernels.heightfield import Terrain, height_at
 
 NUM_BASE_COLUMNS = 12
@@ -66,9 +66,9 @@ def _base_column(
 
 @wp.func
 def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: Sensors, env: int, k: int) -> float:
-    yaw = base_yaw(joint_q, env)
-    x = joint_q[env, 0] + wp.cos(yaw) * sensors.scan_x[k] - wp.sin(yaw) * sensors.scan_y[k]
-    y = joint_q[env, 1] + wp.sin(yaw) * sensors.scan_x[k] + wp.cos(yaw) * sensors.scan_y[k]
+    heading = base_heading(joint_q, env)
+    x = joint_q[env, 0] + heading[0] * sensors.scan_x[k] - heading[1] * sensors.scan_y[k]
+    y = joint_q[env, 1] + heading[1] * sensors.scan_x[k] + heading[0] * sensors.scan_y[k]
     return wp.clamp(joint_q[env, 2] - SCAN_OFFSET - height_at(terrain, t, x, y), -1.0, 1.0) * SCAN_SCALE
 
 

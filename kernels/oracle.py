@@ -125,19 +125,16 @@ def base_velocities(q: NDArray, qd: NDArray, base_com: ArrayLike) -> tuple[NDArr
 
 
 def geom_forces(
-    world: NDArray, column: NDArray, frame: NDArray, friction: NDArray, efc_address: NDArray, efc_force: NDArray,
+    world: NDArray, column: NDArray, frame: NDArray, efc_address: NDArray, efc_force: NDArray,
     shape: tuple[int, int],
 ) -> NDArray:  # fmt: skip
-    """Sum of contact forces on each geom, (num_envs, num_geoms, 3): each pyramid edge pushes along itself.
+    """Sum of contact forces on each geom, (num_envs, num_geoms, 3), each along its frame's normal and two tangents.
 
-    The edges of a contact are ``normal + mu_i tangent_i`` and ``normal - mu_i tangent_i``, i = 1, 2, in this order;
     ``column`` is the geom's column in the result, -1 for none; an ``efc_address`` below 0 is a contact without force.
     """
     total = np.zeros((*shape, 3))
     for c in np.flatnonzero((column >= 0) & (efc_address[:, 0] >= 0)):
-        normal, *tangents = np.float64(frame[c])
-        edges = [normal + sign * friction[c, i] * tangents[i] for i in range(2) for sign in (1, -1)]
-        total[world[c], column[c]] += np.float64(efc_force[world[c], efc_address[c]]) @ np.array(edges)
+        total[world[c], column[c]] += np.float64(efc_force[world[c], efc_address[c, :3]]) @ np.float64(frame[c])
     return total
 
 

@@ -20,7 +20,7 @@ COLLISION_FORCE = wp.constant(0.1)
 
 @wp.struct
 class SolverContacts:
-    """Contacts and constraint forces of the last solver step, as mujoco_warp keeps them for pyramidal cones."""
+    """Contacts and constraint forces of the last solver step, as mujoco_warp keeps them for elliptic cones."""
 
     count: wp.array[int]
     capacity: int
@@ -28,31 +28,24 @@ class SolverContacts:
     geom: wp.array[wp.vec2i]
     frame: wp.array[wp.mat33]
     """Rows: normal (toward the second geom) and two tangents, world frame."""
-    friction: wp.array[wp.types.vector(5, float)]
     efc_address: wp.array2d[int]
     """Constraint rows of each contact; negative where the contact is inactive."""
     efc_force: wp.array2d[float]
 
 
 @wp.func
-def pyramid_force(contacts: SolverContacts, c: int) -> wp.vec3:
+def contact_force(contacts: SolverContacts, c: int) -> wp.vec3:
     """Force of a contact on its second geom, world frame [N].
 
-    A pyramidal cone of two tangents has four rows, one an edge ``normal +- mu * tangent``: the normal force is their
-    sum, a tangential force mu times the difference of its pair (MuJoCo, Computation, "Friction cones").
+    An elliptic cone has a constraint row for the normal and one for each tangent (MuJoCo, Computation, "Friction
+    cones").
     """
     row = contacts.efc_address[c, 0]
     if row < 0:
         return wp.vec3(0.0)
     world = contacts.world[c]
-    edge0 = contacts.efc_force[world, row]
-    edge1 = contacts.efc_force[world, row + 1]
-    edge2 = contacts.efc_force[world, row + 2]
-    edge3 = contacts.efc_force[world, row + 3]
     local = wp.vec3(
-        edge0 + edge1 + edge2 + edge3,
-        (edge0 - edge1) * contacts.friction[c][0],
-        (edge2 - edge3) * contacts.friction[c][1],
+        contacts.efc_force[world, row], contacts.efc_force[world, row + 1], contacts.efc_force[world, row + 2]
     )
     return wp.transpose(contacts.frame[c]) * local
 
@@ -68,7 +61,7 @@ def _sum_geom_forces_kernel(
     # The robot's geom is second in every contact that kernels.contact writes.
     column = column_of_geom[contacts.geom[c][1]]
     if column >= 0:
-        wp.atomic_add(geom_force_out, contacts.world[c], column, pyramid_force(contacts, c))
+        wp.atomic_add(geom_force_out, contacts.world[c], column, contact_force(contacts, c))
 
 
 def sum_geom_forces(contacts: SolverContacts, column_of_geom: Any, geom_force_out: Any) -> None:

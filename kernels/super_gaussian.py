@@ -13,7 +13,26 @@ LOWER = np.array([6.0, 2.0, 0.5, 0.5, 1.0, 1.0, -np.pi, -0.25])
 UPPER = np.array([10.0, 6.0, 3.0, 3.0, 4.0, 4.0, np.pi, 0.25])
 """Table I, maximum of each parameter: the value of a gene of 1."""
 
-_bump = wp.types.vector(GENES_PER_BUMP, float)
+NEGLIGIBLE = wp.constant(30.0)
+"""An exponent beyond which a bump adds less than 3e-14 m, nothing in single precision."""
+
+_genes = wp.types.vector(GENES_PER_BUMP, float)
+
+
+@wp.struct
+class Bump:
+    """One bump, with everything worked out that is the same at every node."""
+
+    centre: wp.vec2
+    across: wp.vec2
+    """First row of the rotation over sigma_x [1/m]."""
+    along: wp.vec2
+    """Second row of the rotation over sigma_y [1/m]."""
+    power: wp.vec2
+    """Exponents, 2 p_x and 2 p_y."""
+    reach: wp.vec2
+    """Scaled distances beyond which the bump adds nothing."""
+    height: float
 
 
 @wp.func
@@ -22,29 +41,37 @@ def _decode_gene(gene: float, lower: float, upper: float) -> float:
 
 
 @wp.func
-def super_gaussian(bump: _bump, x: float, y: float) -> float:
+def super_gaussian(bump: Bump, x: float, y: float) -> float:
     """Height [m] one bump adds at (x, y) [m] (equation 1)."""
-    cos_theta = wp.cos(bump[6])
-    sin_theta = wp.sin(bump[6])
-    x_rot = cos_theta * (x - bump[0]) - sin_theta * (y - bump[1])
-    y_rot = sin_theta * (x - bump[0]) + cos_theta * (y - bump[1])
-    across = wp.pow(wp.abs(x_rot) / bump[2], 2.0 * bump[4])
-    along = wp.pow(wp.abs(y_rot) / bump[3], 2.0 * bump[5])
-    return bump[7] * wp.exp(-across - along)
+    offset = wp.vec2(x, y) - bump.centre
+    u = wp.abs(wp.dot(bump.across, offset))
+    v = wp.abs(wp.dot(bump.along, offset))
+    if u > bump.reach[0] or v > bump.reach[1]:
+        return 0.0
+    return bump.height * wp.exp(-wp.pow(u, bump.power[0]) - wp.pow(v, bump.power[1]))
 
 
 @wp.kernel
-def _decode_genes_kernel(genes: wp.array2d[float], lower: _bump, upper: _bump, bumps_out: wp.array2d[_bump]):
+def _decode_genes_kernel(genes: wp.array2d[float], lower: _genes, upper: _genes, bumps_out: wp.array2d[Bump]):
     """Grid (num_terrains, num_bumps)."""
     t, b = wp.tid()
-    bump = _bump()
+    value = _genes()
     for k in range(GENES_PER_BUMP):
-        bump[k] = _decode_gene(genes[t, b * GENES_PER_BUMP + k], lower[k], upper[k])
+        value[k] = _decode_gene(genes[t, b * GENES_PER_BUMP + k], lower[k], upper[k])
+    cos_theta = wp.cos(value[6])
+    sin_theta = wp.sin(value[6])
+    bump = Bump()
+    bump.centre = wp.vec2(value[0], value[1])
+    bump.across = wp.vec2(cos_theta, -sin_theta) / value[2]
+    bump.along = wp.vec2(sin_theta, cos_theta) / value[3]
+    bump.power = wp.vec2(2.0 * value[4], 2.0 * value[5])
+    bump.reach = wp.vec2(wp.pow(NEGLIGIBLE, 1.0 / bump.power[0]), wp.pow(NEGLIGIBLE, 1.0 / bump.power[1]))
+    bump.height = value[7]
     bumps_out[t, b] = bump
 
 
 @wp.kernel
-def _rasterise_bumps_kernel(bumps: wp.array2d[_bump], spacing: float, heights_out: wp.array3d[float]):
+def _rasterise_bumps_kernel(bumps: wp.array2d[Bump], spacing: float, heights_out: wp.array3d[float]):
     """Grid (num_terrains, nrow, ncol)."""
     t, row, col = wp.tid()
     x = float(col) * spacing
@@ -76,11 +103,11 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
             "one grid per row of genes"
         )
     num_bumps = genes.shape[1] // GENES_PER_BUMP
-    bumps = wp.empty((genes.shape[0], num_bumps), dtype=_bump, device=genes.device)
+    bumps = wp.empty((genes.shape[0], num_bumps), dtype=Bump, device=genes.device)
     wp.launch(
         _decode_genes_kernel,
         dim=bumps.shape,
-        inputs=[genes, _bump(*LOWER), _bump(*UPPER)],
+        inputs=[genes, _genes(*LOWER), _genes(*UPPER)],
         outputs=[bumps],
         device=genes.device,
     )

@@ -54,8 +54,8 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating]) -> Any:
     position = f"{centre[0]} {centre[1]} {lowest}"
     # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
     # solmix 0: the stiffness of a contact is the robot's.
-    ground = {"type": "hfield", "hfield": "grid", "pos": position, "friction": str(GROUND_FRICTION)}
-    ET.SubElement(world, "geom", name="ground", conaffinity="1", solmix="0", **ground)
+    ground = {"name": "ground", "type": "hfield", "hfield": "grid", "pos": position, "friction": str(GROUND_FRICTION)}
+    ET.SubElement(world, "geom", ground | {"conaffinity": "1", "solmix": "0"})
     sensors = ET.SubElement(root, "sensor")
     for name in robot.geom_names:
         ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")

@@ -226,7 +226,7 @@ def _penalties_case(scene: Scene, truth: Truth) -> Case:
 def _geom_forces_case(scene: Scene, truth: Truth) -> Case:
     sim: Any = scene.rollout.sim
     contacts = sim.solver_contacts
-    names = ("count", "world", "geom", "frame", "friction", "efc_address", "efc_force")
+    names = ("count", "world", "geom", "frame", "efc_address", "efc_force")
     tensors = [wp.to_torch(getattr(contacts, name)) for name in names]
 
     def check_ours() -> None:

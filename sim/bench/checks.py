@@ -77,8 +77,7 @@ class Truth:
         geom = contacts.geom.numpy()[:count, 1]
         self._column = sim.column_of_geom.numpy()[geom]
         self._contacts = {
-            name: getattr(contacts, name).numpy()[:count].copy()
-            for name in ("world", "frame", "friction", "efc_address")
+            name: getattr(contacts, name).numpy()[:count].copy() for name in ("world", "frame", "efc_address")
         }
         self._efc_force = contacts.efc_force.numpy().copy()
 

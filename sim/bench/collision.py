@@ -78,7 +78,7 @@ class HeightfieldSimulation(Simulation):
             nconmax=self.robot.nconmax,
             iterations=cfg.iterations,
             ls_iterations=cfg.ls_iterations,
-            cone="pyramidal",
+            cone="elliptic",
             integrator="implicitfast",
             use_mujoco_contacts=True,
             kinematic_switchable_roots=False,

@@ -134,10 +134,10 @@ def penalties(
 
 
 def geom_forces(
-    count: Tensor, world: Tensor, geom: Tensor, frame: Tensor, friction: Tensor, efc_address: Tensor,
-    efc_force: Tensor, column_of_geom: Tensor, num_geoms: int,
+    count: Tensor, world: Tensor, geom: Tensor, frame: Tensor, efc_address: Tensor, efc_force: Tensor,
+    column_of_geom: Tensor, num_geoms: int,
 ) -> Tensor:  # fmt: skip
-    """Contact force on each geom (E, G, 3) [N]: pyramid edges to forces for the whole buffer, then one scatter.
+    """Contact force on each geom (E, G, 3) [N]: rows to forces for the whole buffer, then one scatter.
 
     How many contacts there are is known on the device alone, so every slot is computed. Those without a contact add
     zero to places spread over the result: adding them all to one place would queue them up.
@@ -149,9 +149,7 @@ def geom_forces(
     exists = (slot < count) & (row >= 0) & (column >= 0)
     env = world.masked_fill(~exists, 0).long()
     first = row.masked_fill(~exists, 0).long()
-    edge = efc_force.view(-1)[(env * efc_force.shape[1] + first)[:, None] + torch.arange(4, device=world.device)]
-    sideways = (edge[:, 0::2] - edge[:, 1::2]) * friction[:, :2]
-    local = torch.cat([edge.sum(1, keepdim=True), sideways], dim=1)
+    local = efc_force.view(-1)[(env * efc_force.shape[1] + first)[:, None] + torch.arange(3, device=world.device)]
     force = (frame * local[:, :, None]).sum(1).masked_fill(~exists[:, None], 0.0)
     place = torch.where(exists, env * num_geoms + column, slot % (num_envs * num_geoms))
     total = torch.zeros((num_envs * num_geoms, 3), device=world.device)

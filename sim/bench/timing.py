@@ -31,6 +31,8 @@ class Variant:
 
     replay: Callable[[], None]
     launches: int
+    work: Callable[[], object]
+    """What one launch does; a graph knows only the addresses of its arrays, this keeps them alive."""
     outputs: list[Any] = field(default_factory=list)
     """What the last launch of a torch variant returned; overwritten by each replay."""
 
@@ -48,7 +50,7 @@ def repeat_warp(launch: Callable[[], None], launches: int, device: str) -> Varia
         with wp.ScopedDevice(device):
             wp.capture_launch(graph)
 
-    return Variant(replay=replay, launches=launches)
+    return Variant(replay=replay, launches=launches, work=launch)
 
 
 def repeat_torch(call: Callable[[], object], launches: int, device: str) -> Variant:
@@ -61,7 +63,7 @@ def repeat_torch(call: Callable[[], object], launches: int, device: str) -> Vari
                 outputs[:] = [call()]
 
     if not device.startswith("cuda"):
-        return Variant(replay=call_all, launches=launches, outputs=outputs)
+        return Variant(replay=call_all, launches=launches, work=call, outputs=outputs)
     with torch.no_grad():
         for _ in range(3):  # compiles, and lets the allocator and the autotuner settle
             call()
@@ -69,7 +71,7 @@ def repeat_torch(call: Callable[[], object], launches: int, device: str) -> Vari
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=torch.cuda.current_stream()):
         call_all()
-    return Variant(replay=graph.replay, launches=launches, outputs=outputs)
+    return Variant(replay=graph.replay, launches=launches, work=call, outputs=outputs)
 
 
 def time_once(variant: Variant, device: str) -> float:

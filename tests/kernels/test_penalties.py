@@ -130,7 +130,7 @@ def test_wrong_number_of_columns_is_named(device):
 
 
 def geom_forces(device, *, count, capacity, column_of_geom, num_geoms):
-    """Two worlds; contact k is on geom k of world k % 2, with edge forces k + (1, 2, 3, 4) and friction 0.5, 0.25."""
+    """Two worlds; contact k is on geom k of world k % 2, with forces 10 k + (1, 2, 3) along its normal and tangents."""
     contacts = SolverContacts()
     total = 4
     contacts.count = wp.array([count], dtype=int, device=device)
@@ -140,11 +140,9 @@ def geom_forces(device, *, count, capacity, column_of_geom, num_geoms):
     # Normal along world y, tangents along z and x.
     frame = np.tile([[0, 1, 0], [0, 0, 1], [1, 0, 0]], (total, 1, 1)).astype(np.float32)
     contacts.frame = wp.array(frame, dtype=wp.mat33, device=device)
-    friction = np.tile(np.float32([0.5, 0.25, 9, 9, 9]), (total, 1))
-    contacts.friction = wp.array(friction, dtype=wp.types.vector(5, float), device=device)
-    # World 0 has contacts 0 and 2 in rows 0.. and 4..; world 1 contact 1 in rows 0.., and contact 3 is inactive.
-    contacts.efc_address = wp.array([[0, 1, 2, 3], [0, 1, 2, 3], [4, 5, 6, 7], [-1] * 4], dtype=int, device=device)
-    efc_force = np.float32([[1, 2, 3, 4, 3, 4, 5, 6], [2, 3, 4, 5, 0, 0, 0, 0]])
+    # World 0 has contacts 0 and 2 in rows 0.. and 3..; world 1 contact 1 in rows 0.., and contact 3 is inactive.
+    contacts.efc_address = wp.array([[0, 1, 2], [0, 1, 2], [3, 4, 5], [-1] * 3], dtype=int, device=device)
+    efc_force = np.float32([[1, 2, 3, 21, 22, 23], [11, 12, 13, 0, 0, 0]])
     contacts.efc_force = wp.array(efc_force, device=device)
     out = wp.full((2, num_geoms), wp.vec3(7.0), dtype=wp.vec3, device=device)
     sum_geom_forces(contacts, wp.array(column_of_geom, dtype=int, device=device), out)
@@ -152,27 +150,26 @@ def geom_forces(device, *, count, capacity, column_of_geom, num_geoms):
 
 
 def test_contact_force_by_hand(device):
-    # Contact 0: normal 1 + 2 + 3 + 4 = 10 along y, (1 - 2) * 0.5 = -0.5 along z, (3 - 4) * 0.25 = -0.25 along x.
-    # Contact 2 (edges 3, 4, 5, 6): 18, -0.5, -0.25. Contact 1 (2, 3, 4, 5): 14, -0.5, -0.25. Contact 3: inactive.
+    # Contact 0: 1 N along y, 2 N along z, 3 N along x; contact 2 likewise 21, 22, 23; contact 1 11, 12, 13.
     forces = geom_forces(device, count=4, capacity=4, column_of_geom=[0, 1, 2, 3] + [-1] * 6, num_geoms=4)
     expected = np.zeros((2, 4, 3))
-    expected[0, 0] = -0.25, 10, -0.5
-    expected[0, 2] = -0.25, 18, -0.5
-    expected[1, 1] = -0.25, 14, -0.5
+    expected[0, 0] = 3, 1, 2
+    expected[0, 2] = 23, 21, 22
+    expected[1, 1] = 13, 11, 12
     np.testing.assert_allclose(forces, expected, atol=1e-6)
 
 
 def test_contacts_of_one_geom_add_up_and_others_are_left_out(device):
-    # Geoms 0 and 2 share column 1 (10 + 18 N along y), geom 1 has none.
+    # Geoms 0 and 2 share column 1 (1 + 21 N along y), geom 1 has none.
     forces = geom_forces(device, count=4, capacity=4, column_of_geom=[1, -1, 1, 0] + [-1] * 6, num_geoms=2)
-    np.testing.assert_allclose(forces, [[[0, 0, 0], [-0.5, 28, -1]], np.zeros((2, 3))], atol=1e-6)
+    np.testing.assert_allclose(forces, [[[0, 0, 0], [26, 22, 24]], np.zeros((2, 3))], atol=1e-6)
 
 
 @pytest.mark.parametrize(("count", "capacity"), [(2, 4), (900, 2)])
 def test_only_contacts_that_exist_are_read(device, count, capacity):
     # Contact 2 is stale in the first case, and beyond the capacity in the second, whose count ran on past it.
     forces = geom_forces(device, count=count, capacity=capacity, column_of_geom=[0, 1, 2, 3] + [-1] * 6, num_geoms=4)
-    assert forces[0, 0, 1] == 10
+    assert forces[0, 0, 1] == 1
     assert not forces[0, 2].any()
 
 

@@ -78,7 +78,7 @@ def test_launches_fill_the_replay():
 
     def make(launches):
         made.append(launches)
-        return Variant(replay=lambda: sum(range(launches)), launches=launches)
+        return Variant(replay=lambda: sum(range(launches)), launches=launches, work=list)
 
     assert fit_launches(make, "cpu", TimingCfg(replay_s=1e-12)).launches == 1
     assert fit_launches(make, "cpu", TimingCfg(replay_s=1e3)).launches == MAX_LAUNCHES
@@ -87,7 +87,7 @@ def test_launches_fill_the_replay():
 
 def test_variants_take_turns_after_a_warm_up():
     played = []
-    variants = {name: Variant(replay=lambda name=name: played.append(name), launches=2) for name in "ab"}
+    variants = {name: Variant(replay=lambda name=name: played.append(name), launches=2, work=list) for name in "ab"}
     seconds = time_in_turns(variants, "cpu", TimingCfg(rounds=3))
     assert played == ["a", "b"] * 4
     assert seconds.keys() == {"a", "b"} and min(seconds.values()) > 0

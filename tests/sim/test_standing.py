@@ -43,7 +43,7 @@ def settle_on_own_plane(robot, joint_q, device):
         nconmax=robot.nconmax,
         iterations=SolverCfg().iterations,
         ls_iterations=SolverCfg().ls_iterations,
-        cone="pyramidal",
+        cone="elliptic",
         integrator="implicitfast",
         use_mujoco_contacts=True,
         kinematic_switchable_roots=False,

@@ -1,0 +1,151 @@
+"""What solver and capacity options cost and change: ``python -m sim.options --robot anymal``.
+
+The same crossings of hard-random terrains under each choice, in turns: wall time, rates, mean penalties. The shipped
+choice is the cheapest whose numbers are those of a solver without a cap.
+"""
+
+import statistics
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from sim.files import check_writable, to_json, write_atomically
+from sim.provenance import provenance
+from sim.robot import RobotCfg, get_robot
+from sim.rollout import Rollout
+from sim.simulation import SolverCfg, resolve_device
+from sim.terrain import hard_random_genes
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptionsCfg:
+    """Time the crossings of the paper preset under several solver and capacity options."""
+
+    robot: str = "anymal"
+    """Which robot."""
+    policy: str | None = None
+    """An rsl_rl checkpoint, a TorchScript file or module:callable; the shipped controller."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    terrains: int = 200
+    """Hard-random terrains."""
+    episodes: int = 20
+    """Episodes a terrain."""
+    iterations: tuple[int, ...] = (4, 6, 8, 10, 50)
+    """Caps on the Newton iterations to try."""
+    ls_iterations: tuple[int, ...] = (10,)
+    """Caps on the line search to try with each."""
+    njmax: tuple[int, ...] = ()
+    """Constraint rows an environment to try with the shipped caps, beside the robot's own."""
+    nconmax: tuple[int, ...] = ()
+    """Contacts an environment to try with each of them, as many as --njmax."""
+    rounds: int = 3
+    """Rollouts of each choice; the median counts."""
+    seed: int = 0
+    """Draws terrains and starts."""
+    out: Path | None = None
+    """Where to write; printed alone if left out."""
+
+
+def choices(cfg: OptionsCfg, robot: RobotCfg) -> list[tuple[SolverCfg, RobotCfg]]:
+    """Every choice of solver options, then of capacities.
+
+    Raises:
+        ValueError: If capacities do not come in pairs.
+    """
+    if len(cfg.njmax) != len(cfg.nconmax):
+        raise ValueError(f"--nconmax needs as many numbers as --njmax, got {cfg.nconmax} and {cfg.njmax}")
+    found = [
+        (SolverCfg(iterations=iterations, ls_iterations=line), robot)
+        for iterations in cfg.iterations
+        for line in cfg.ls_iterations
+    ]
+    capacities = zip(cfg.njmax, cfg.nconmax, strict=True)
+    return found + [(SolverCfg(), replace(robot, njmax=rows, nconmax=contacts)) for rows, contacts in capacities]
+
+
+def measure(cfg: OptionsCfg) -> dict[str, Any]:
+    """Everything of the results file.
+
+    Raises:
+        ValueError: If something asked for cannot be had.
+    """
+    robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
+    rng = np.random.default_rng(cfg.seed)
+    genes = hard_random_genes(cfg.terrains, rng)
+    seeds = rng.integers(2**32, size=cfg.terrains, dtype=np.uint32)
+    tried = choices(cfg, robot)
+    rows = []
+    for solver, sized in tqdm(tried, desc="choices", disable=None):
+        rollout = Rollout(
+            sized,
+            cfg.policy or robot.policy_file,
+            num_terrains=cfg.terrains,
+            num_replicas=cfg.episodes,
+            device=device,
+            solver=solver,
+        )
+        results = [rollout.evaluate(genes, seeds) for _ in range(cfg.rounds)]
+        last = results[-1]
+        wall_s = statistics.median(result.wall_s for result in results)
+        rows.append(
+            {
+                "iterations": solver.iterations,
+                "ls_iterations": solver.ls_iterations,
+                "njmax": sized.njmax,
+                "nconmax": sized.nconmax,
+                "wall_s": wall_s,
+                "world_steps_per_s": last.outcome.size * last.physics_steps / wall_s,
+                "success_rate": float(1.0 - last.base_collision[~last.invalid].mean()),
+                "goal_rate": float(last.reached_goal[~last.invalid].mean()),
+                "invalid": int(last.invalid.sum()),
+                "penalties": dict(
+                    zip(last.penalty_names, np.nanmean(last.penalties, axis=(0, 1)).tolist(), strict=True)
+                ),
+            }
+        )
+        del rollout
+    return {**provenance(device, cfg.seed), "robot": robot.name, "episodes": cfg.terrains * cfg.episodes, "rows": rows}
+
+
+def _print_table(report: dict[str, Any]) -> None:
+    names = list(report["rows"][0]["penalties"])
+    head = f"{'iterations':>10} {'search':>6} {'rows':>5} {'contacts':>8} {'wall s':>7} {'M steps/s':>9}"
+    print(f"{head} {'success':>7} {'goal':>6} {'invalid':>7} " + " ".join(f"{name:>13}" for name in names))
+    for row in report["rows"]:
+        print(
+            f"{row['iterations']:>10} {row['ls_iterations']:>6} {row['njmax']:>5} {row['nconmax']:>8} "
+            f"{row['wall_s']:>7.2f} {row['world_steps_per_s'] / 1e6:>9.3f} {row['success_rate']:>7.4f} "
+            f"{row['goal_rate']:>6.4f} {row['invalid']:>7} "
+            + " ".join(f"{row['penalties'][name]:>13.4f}" for name in names)
+        )
+
+
+def main() -> int:
+    """Command line; returns the exit status."""
+    cfg = tyro.cli(OptionsCfg, description=__doc__)
+    try:
+        if cfg.out is not None:
+            cfg.out.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(cfg.out.parent)
+        report = measure(cfg)
+        _print_table(report)
+        if cfg.out is not None:
+            write_atomically(cfg.out, to_json(report))
+            print(f"written to {cfg.out}")
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nStopped.", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
