@@ -17,7 +17,7 @@ from qd.cma_mae import CmaMae
 from qd.progress import ProgressBar
 from qd.run_directory import Metrics, RunDirectory
 from qd.search import search_terrains
-from qd.settings import SearchCfg, changed, policy_spec, preset
+from qd.settings import SearchCfg, as_settings, changed, policy_spec, preset
 from qd.workers import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
 from sim.files import prepare_output, read_json, to_json, write_atomically
 from sim.provenance import provenance
@@ -40,6 +40,8 @@ class Arguments:
     """Whose iteration is timed."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
+    run: Path | None = None
+    """Time the last iterations of this run, made on this machine, instead of running a search for it."""
     iterations: int = 20
     """Iterations timed, after two that are not."""
     steps: int = 1000
@@ -76,6 +78,24 @@ def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, N
         recorder = _Recorder(evaluate)
         search_terrains(cfg, RunDirectory(Path(folder)), search, metrics, recorder, bar)
     return metrics, recorder.terrains
+
+
+def read_iterations(folder: Path, count: int) -> tuple[SearchCfg, Metrics, NDArray[Any]]:
+    """Settings of a run, metrics rows of its last iterations, and the terrains it would ask for next.
+
+    Args:
+        folder: Run directory.
+        count: Iterations wanted.
+
+    Raises:
+        ValueError: If the run is damaged or too short.
+    """
+    run = RunDirectory(folder)
+    cfg = run.read_cfg()
+    search, metrics = run.load(as_settings(cfg)) or (None, [])
+    if search is None or len(metrics) < count + _WARM_UP:
+        raise ValueError(f"--run {folder} must have at least {count + _WARM_UP} iterations, got {len(metrics)}")
+    return cfg, metrics[-count:], search.ask()
 
 
 def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[int, ...]) -> list[dict[str, float]]:
@@ -119,7 +139,11 @@ def measure(args: Arguments) -> dict[str, Any]:
 
     robot, device = get_robot(args.robot), resolve_device(args.device)
     training = training_rates(args.train_speed)
-    cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
+    if args.run is not None:
+        cfg, metrics, terrains = read_iterations(args.run, args.iterations)
+    else:
+        cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
+        metrics, terrains = [], None
     evaluator = EvaluatorCfg(
         robot=robot.name,
         policy=policy_spec(cfg, robot),
@@ -128,19 +152,22 @@ def measure(args: Arguments) -> dict[str, Any]:
         device=device,
         num_workers=1,  # bare physics is measured in one process too
     )
-    metrics, terrains = time_iterations(cfg, evaluator)
+    if terrains is None:
+        metrics, terrains = time_iterations(cfg, evaluator)
+        metrics = metrics[_WARM_UP:]
     num_envs = cfg.episodes_per_iteration
     rollout: Any = build_rollout(evaluator, evaluator.num_terrains)
     seeds = episode_seeds(cfg.seed, cfg.iterations, len(terrains))
     bare = measure_bare_physics(rollout, terrains, seeds, steps=args.steps)
     del rollout
-    rates = [num_envs * row["physics_steps"] / row["wall_s"] for row in metrics[_WARM_UP:]]
+    rates = [num_envs * row["physics_steps"] / row["wall_s"] for row in metrics]
     return {
         **provenance(device, cfg.seed),
         "robot": robot.name,
-        "preset": args.preset,
+        "preset": args.preset if args.run is None else None,
+        "run": None if args.run is None else str(args.run),
         "num_envs": num_envs,
-        "iteration_s_median": float(np.median([row["wall_s"] for row in metrics[_WARM_UP:]])),
+        "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
         "bare_physics_ratio": float(np.median(rates)) / bare.walking,
         "bare_physics_ratio_standing": float(np.median(rates)) / bare.standing,
         "world_steps_per_s": float(np.median(rates)),
