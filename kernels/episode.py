@@ -29,6 +29,9 @@ _TIME_OUT = wp.constant(int(Outcome.TIME_OUT))
 _OUT = wp.constant(int(Outcome.OUT))
 _INVALID = wp.constant(int(Outcome.INVALID))
 
+PARKING_HEIGHT = wp.constant(50.0)
+"""Height at which robots whose episodes have ended are kept [m]."""
+
 
 @wp.struct
 class Task:
@@ -180,6 +183,57 @@ def judge_step(
     if steps >= task.max_steps:
         return _TIME_OUT
     return _RUNNING
+
+
+@wp.kernel
+def _park_ended_kernel(
+    outcome: wp.array[int],
+    default_joint_pos: wp.array[float],
+    joint_q_out: wp.array2d[float],
+    joint_qd_out: wp.array2d[float],
+    targets_out: wp.array2d[float],
+    body_q_out: wp.array2d[wp.transform],
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    if outcome[env] == _RUNNING:
+        return
+    for k in range(joint_qd_out.shape[1]):
+        joint_qd_out[env, k] = 0.0
+    for k in range(6):
+        joint_q_out[env, k] = 0.0
+    joint_q_out[env, 2] = PARKING_HEIGHT
+    joint_q_out[env, 6] = 1.0
+    for j in range(default_joint_pos.shape[0]):
+        joint_q_out[env, 7 + j] = default_joint_pos[j]
+        targets_out[env, 7 + j] = default_joint_pos[j]
+    for b in range(body_q_out.shape[1]):  # or the next contacts would be those of where it was
+        body_q_out[env, b] = wp.transform(wp.vec3(0.0, 0.0, PARKING_HEIGHT), wp.quat_identity())
+
+
+def park_ended(
+    outcome: Any, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, targets_out: Any, body_q_out: Any
+) -> None:
+    """Hold the robots whose episodes have ended at rest, high above the ground, where they touch nothing.
+
+    Left to walk on they would cost as much as the others, and robots on their backs more than that. To be called every
+    control step: in between they fall by millimetres.
+
+    Args:
+        outcome: Shape (num_envs,).
+        default_joint_pos: Default pose [rad], shape (num_joints,).
+        joint_q_out: Shape (num_envs, 7 + num_joints).
+        joint_qd_out: Shape (num_envs, 6 + num_joints).
+        targets_out: Joint targets in columns 7 and up, shape (num_envs, 7 + num_joints).
+        body_q_out: Body poses, shape (num_envs, num_bodies).
+    """
+    wp.launch(
+        _park_ended_kernel,
+        dim=outcome.shape[0],
+        inputs=[outcome, default_joint_pos],
+        outputs=[joint_q_out, joint_qd_out, targets_out, body_q_out],
+        device=outcome.device,
+    )
 
 
 @wp.kernel

@@ -140,12 +140,14 @@ def _finish(job: Job, run: RunDirectory, search: "CmaMae", metrics: Metrics, ope
     run.write_derived(metrics, archive)
     figures = write_figures(job.path, archive, metrics)
     count = _count_reproduced(job, archive, open_evaluator) if job.reproduce else None
+    # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
+    again = provenance(job.device, job.cfg.seed) if count is not None else None
     numbers = summary(
         archive,
         metrics,
-        gpus=int(job.device.startswith("cuda")),
+        gpus=int(not job.origin["device"].startswith("CPU")),
         num_reproduced=count,
-        origin=provenance(job.device, job.cfg.seed),
+        origin={**job.origin, "reproduced_by": again},
     )
     write_atomically(job.path / SUMMARY_FILE, to_json(numbers))
     print(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from kernels.episode import EpisodeState, Outcome, command_goal, latch_outcomes, start_episodes
+from kernels.episode import EpisodeState, Outcome, command_goal, latch_outcomes, park_ended, start_episodes
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
 from sim.bank import TerrainBank
@@ -143,6 +143,10 @@ class Rollout:
     def _launch_control_step(self) -> None:
         sim, robot = self.sim, self.robot
         apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
+        park_ended(
+            self._episode.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets,
+            sim.body_q.reshape((sim.num_envs, -1)),
+        )  # fmt: skip
         for _ in range(robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()

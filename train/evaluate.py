@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from kernels.episode import Outcome
 from sim.files import prepare_output, to_json, write_atomically
+from sim.intervals import bootstrap_interval
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.rollout import CrossingCfg, Rollout, RolloutResult
@@ -29,7 +30,6 @@ SMALL = (24, 4)
 VELOCITY_FROM_S = 2.0
 """The velocity error counts from this time of an episode on [s]: before it the robot gets going."""
 _TEST_KEY = 20250604  # with the set's number and the seed, the entropy of a test set
-_BOOTSTRAP_DRAWS = 10_000
 _MAX_INVALID_SHARE = 0.25
 
 
@@ -56,14 +56,6 @@ class EvaluateCfg:
 def set_rng(number: int, seed: int) -> np.random.Generator:
     """Random numbers of a test set, shared with no other use of ``seed`` in the project."""
     return np.random.default_rng([_TEST_KEY, number, seed])
-
-
-def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> list[float] | None:
-    """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains; None without any."""
-    if len(values) == 0:
-        return None
-    means = values[rng.integers(len(values), size=(_BOOTSTRAP_DRAWS, len(values)))].mean(axis=1)
-    return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
 
 
 def terrain_rates(result: RolloutResult) -> dict[str, np.ndarray]:

@@ -22,6 +22,7 @@ from qd.search import run_search
 from qd.settings import CmaMaeCfg, SearchCfg
 from qd.workers import EvaluatorCfg, EvaluatorError
 from sim import files
+from sim.provenance import provenance
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 
@@ -52,7 +53,7 @@ def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **ch
         resumes=resumes,
         evaluator=evaluator,
         reproduce=reproduce,
-        origin={"command": "test"},
+        origin=provenance("cpu", cfg.seed),
         resume_command=f"make archive RESUME={path}",
     )
 

@@ -111,6 +111,21 @@ def test_a_robot_on_its_back_has_fallen(anymal, device):
     assert (result.outcome == Outcome.TIME_OUT).all()  # tilt alone ends nothing
 
 
+def test_robots_that_are_done_wait_above_the_ground(anymal, device):
+    # One starts at the goal, the other walks on: the first is over at once and touches nothing from then on.
+    rollout = crossing(anymal, device, replicas=2, num_terrains=2, start=(2.0, 4.0), goal_radius=0.5)
+    rollout.begin(np.stack([FLAT, FLAT]), np.arange(2))
+    q = positions(rollout.sim)
+    q[0, :2] = 14.0, 4.0
+    put(rollout.sim, q)
+    for _ in range(25):
+        rollout.control_step()
+    height = positions(rollout.sim)[:, 2]
+    assert height[0] > 49.9 and (height[1:] < 1.0).all()
+    forces = np.linalg.norm(rollout.sim.geom_force.numpy(), axis=(1, 2))
+    assert forces[0] == 0.0 and (forces[1:] > 100.0).all()
+
+
 @pytest.mark.parametrize("what", ["not a number", "too fast"])
 def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
     seeds = np.arange(TERRAINS)

@@ -1,0 +1,110 @@
+"""Comparing two simulators: intervals by hand, agreement of known rates, and what the command refuses."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from kernels.episode import Outcome
+from sim.agreement import Pair, summarise
+from sim.crosscheck import Crosscheck, CrosscheckCfg, read_pool
+from sim.intervals import bootstrap_interval, wilson_interval
+
+
+def test_wilson_interval_by_hand():
+    # 10 of 20: centre 0.5, half width 1.96 sqrt(0.0125 + 0.0480) / (1 + 0.192) = 0.2007 (Wilson 1927).
+    np.testing.assert_allclose(wilson_interval(10, 20), [0.2993, 0.7007], atol=1e-4)
+    # 0 of 20: from 0 to z^2 / (n + z^2) = 3.841 / 23.841.
+    np.testing.assert_allclose(wilson_interval(0, 20), [0.0, 0.1611], atol=1e-4)
+    assert wilson_interval(20, 20)[1] == 1.0
+    for hits, count in ((1, 0), (3, 2), (-1, 2)):
+        with pytest.raises(ValueError, match="hits"):
+            wilson_interval(hits, count)
+
+
+def test_bootstrap_interval():
+    low, high = bootstrap_interval(np.array([0.0, 1.0] * 50), np.random.default_rng(0))
+    # The mean of 100 draws of 0 or 1: 0.5 +- 1.96 * 0.05.
+    np.testing.assert_allclose([low, high], [0.40, 0.60], atol=0.02)
+    assert bootstrap_interval(np.array([]), np.random.default_rng(0)) is None
+
+
+def outcomes(goal, collision, time_out, invalid=0):
+    kinds = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.INVALID)
+    return np.repeat(np.uint8(kinds), (goal, collision, time_out, invalid))
+
+
+def test_rates_and_bias_by_hand():
+    pairs = [
+        # 15 of 20 succeed and 10 arrive; 150 of 200, 100 of 200: no difference.
+        Pair(first=0.7, ours=outcomes(10, 5, 5), plain=outcomes(100, 50, 50)),
+        # 4 of 20 (two more are invalid) against 180 of 200: far outside.
+        Pair(first=0.4, ours=outcomes(4, 16, 0, invalid=2), plain=outcomes(180, 20, 0)),
+    ]
+    report = summarise(pairs, seed=0)
+    assert report["success"]["inside"] == report["goal"]["inside"] == 1
+    assert [row["success"]["inside"] for row in report["terrains"]] == [True, False]
+    np.testing.assert_allclose(report["success"]["ours"], (0.75 + 0.2) / 2)
+    np.testing.assert_allclose(report["success"]["mujoco_c"], (0.75 + 0.9) / 2)
+    np.testing.assert_allclose(report["success"]["bias"], 0.35)
+    np.testing.assert_allclose(report["goal"]["bias"], 0.35)
+    np.testing.assert_allclose(report["success"]["bias_interval"], [0.0, 0.7], atol=1e-9)
+    assert report["invalid"] == {"ours": 2, "mujoco_c": 0}
+    json.dumps(report, allow_nan=False)
+
+
+def test_nothing_valid_is_an_error():
+    with pytest.raises(ValueError, match="terrain 0 has no valid episode"):
+        summarise([Pair(first=0.5, ours=outcomes(0, 0, 0, invalid=3), plain=outcomes(1, 1, 1))], seed=0)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"other": np.zeros((3, 64))},
+        {"genes": np.zeros((3, 63))},
+        {"genes": np.full((3, 64), np.nan)},
+        {"genes": np.array([[None]], dtype=object)},
+    ],
+    ids=["no genes", "shape", "not finite", "objects"],
+)
+def test_a_pool_that_is_none_is_refused(tmp_path, content):
+    file = tmp_path / "pool.npz"
+    np.savez(file, **content)
+    with pytest.raises(ValueError, match="--genes"):
+        read_pool(file)
+
+
+def test_a_pool_that_is_no_file_is_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("not an archive")
+    for name in ("missing.npz", "text.npz", "."):
+        with pytest.raises(ValueError, match="--genes"):
+            read_pool(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"terrains": 0}, {"episodes": 0}, {"between": (0.9, 0.3)}, {"between": (0.0, 1.5)}]
+)
+def test_numbers_without_sense_are_refused(settings):
+    with pytest.raises(ValueError, match="positive"):
+        Crosscheck(CrosscheckCfg(device="cpu", **settings))
+
+
+def test_a_pool_without_middling_terrains_says_how_many_it_has(tmp_path):
+    np.savez(tmp_path / "flat.npz", genes=np.zeros((2, 64), np.float32))  # all bumps of height 0
+    check = Crosscheck(CrosscheckCfg(device="cpu", genes=tmp_path / "flat.npz", terrains=1, episodes=1))
+    with pytest.raises(ValueError, match="only 0 of 2 terrains"):
+        check.choose()
+
+
+def test_command_line_helps_and_refuses(tmp_path):
+    def call(*flags):
+        command = [sys.executable, "-m", "sim.crosscheck", *flags]
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+    assert "--plain-episodes" in call("--help").stdout
+    refused = call("--device", "cpu", "--genes", str(tmp_path / "none.npz"))
+    assert refused.returncode == 2
+    assert "Traceback" not in refused.stderr and "none.npz" in refused.stderr

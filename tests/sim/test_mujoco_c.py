@@ -1,0 +1,139 @@
+"""The second simulator: written from the definitions, it must say what the kernels say about the same state."""
+
+import numpy as np
+import pytest
+
+from kernels import oracle
+from kernels.episode import Outcome
+from kernels.penalties import PENALTIES
+from sim.crosscheck import run_plain
+from sim.crossing import CrossingCfg
+from sim.mujoco_c import crossing_model, goal_commands, observations, step_penalties, surface_heights
+from sim.plain_crossing import cross, draw_starts, join, to_mujoco
+from sim.policy import load_policy
+from sim.rollout import Rollout
+from sim.simulation import GROUND_FRICTION
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING, hard_random_genes
+
+EPISODES = 3
+BASE_COM = np.array([0.1, -0.02, 0.03])
+
+
+@pytest.fixture(scope="module")
+def heights(anymal):
+    return np.float32(0.3) * np.sin(np.arange(NUM_COLS) / 9.0, dtype=np.float32) * np.ones((NUM_ROWS, 1), np.float32)
+
+
+def states(anymal, num=5):
+    rng = np.random.default_rng(2)
+    q = rng.normal(size=(num, 7 + anymal.num_joints))
+    q[:, :2] = rng.uniform([3, 2], [13, 6], (num, 2))
+    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+    return q, rng.normal(size=(num, 6 + anymal.num_joints))
+
+
+def test_surface_heights_are_those_of_the_oracle(heights):
+    x, y = np.random.default_rng(1).uniform([-1, -1], [17, 9], (40, 2)).T
+    expected = [oracle.surface_height(heights, SPACING, *point) for point in zip(x, y, strict=True)]
+    np.testing.assert_allclose(surface_heights(np.float64(heights), x, y), expected, atol=1e-9)
+
+
+def test_observation_command_and_penalties_are_those_of_the_oracle(anymal, heights):
+    q, qd = states(anymal)
+    plain = to_mujoco(q, qd, BASE_COM)
+    cfg = CrossingCfg()
+    command = goal_commands(plain.qpos, cfg)
+    action = np.random.default_rng(3).normal(size=(len(q), anymal.num_joints))
+    rows = observations(anymal, np.float64(heights), plain.qpos, plain.qvel, command, action)
+    forces = np.random.default_rng(4).normal(scale=400.0, size=(len(q), len(anymal.geom_names), 3))
+    found = step_penalties(anymal, plain.qpos, plain.qvel, command, forces)
+    scan = np.stack(anymal.scan_points(), axis=1)
+    feet = [k for k, name in enumerate(anymal.geom_names) if name in anymal.foot_geoms]
+    others = [k for k in range(len(anymal.geom_names)) if k not in feet]
+    for k in range(len(q)):
+        wanted = oracle.goal_command(q[k, :2], oracle.yaw_of(q[k, 3:7]), cfg.goal)
+        np.testing.assert_allclose(command[k], wanted, atol=1e-9)
+        row = oracle.observation(
+            q[k], qd[k], wanted, action[k], heights, SPACING, np.array(anymal.default_joint_pos), scan, BASE_COM
+        )
+        np.testing.assert_allclose(rows[k], row, atol=1e-6)
+        penalties = oracle.penalties(q[k], qd[k], BASE_COM, wanted, forces[k], feet, others, anymal.contact_force_limit)
+        np.testing.assert_allclose(found[k], penalties, atol=1e-9)
+    assert found.shape == (len(q), len(PENALTIES))
+
+
+def test_starts_are_those_of_the_rollout(anymal):
+    genes = hard_random_genes(1, 5)
+    rollout = Rollout(anymal, anymal.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
+    rollout.begin(genes, np.array([77], np.uint32))
+    expected = to_mujoco(
+        rollout.sim.joint_q.numpy(), rollout.sim.joint_qd.numpy(), np.array(rollout.sim.sensors.base_com)
+    )
+    # Asking for more episodes does not change the first.
+    found = draw_starts(anymal, rollout.sim.bank.heights.numpy()[0], 77, EPISODES + 4, "cpu")
+    np.testing.assert_array_equal(found.qpos[:EPISODES], expected.qpos)
+    np.testing.assert_array_equal(found.qvel[:EPISODES], expected.qvel)
+
+
+def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_converge(anymal, heights):
+    model = crossing_model(anymal, heights)
+    ground = model.geom("ground").id
+    assert model.geom_solmix[ground] == 0.0
+    assert model.geom_friction[ground, 0] == GROUND_FRICTION
+    assert model.opt.iterations == 100
+    # The surface, edge heights continued beyond it: what a ray from above meets.
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qpos[2] = 50.0
+    mujoco.mj_forward(model, data)
+    for x, y in [(3.03, 2.2), (8.0, 4.0), (12.31, 7.9), (17.5, 9.5), (-1.5, -1.5)]:
+        down, geom = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
+        distance = mujoco.mj_ray(model, data, np.array([x, y, 5.0]), down, None, 1, -1, geom)
+        assert geom[0] == ground
+        np.testing.assert_allclose(5.0 - distance, oracle.surface_height(heights, SPACING, x, y), atol=1e-5)
+
+
+def test_flat_ground_is_crossed_alike_in_both(anymal):
+    # The same contacts, so the same walk: 4 s of it, penalties within 2 % (float32 and float64 part slowly).
+    flat = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
+    cfg = CrossingCfg(max_duration_s=4.0)
+    rollout = Rollout(anymal, anymal.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg)
+    ours = rollout.evaluate(flat, np.array([5], np.uint32))
+    starts = draw_starts(anymal, flat[0], 5, EPISODES, "cpu")
+    policy = load_policy(anymal.policy_file, anymal, "cpu")
+    plain = cross(anymal, policy, flat[0], starts, cfg)
+    assert (plain.outcome == Outcome.TIME_OUT).all()
+    np.testing.assert_array_equal(ours.outcome[0], plain.outcome)
+    np.testing.assert_array_equal(plain.duration_s, 4.0)
+    velocities = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y")]
+    np.testing.assert_allclose(ours.penalties[0][:, velocities], plain.penalties[:, velocities], rtol=0.02)
+
+
+def test_what_ends_a_crossing(anymal, heights):
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    starts = draw_starts(anymal, flat, 5, 4, "cpu")
+    starts.qpos[0, :2] = 13.7, 4.0  # at the goal
+    starts.qpos[1, 1] = 10.5  # outside
+    starts.qpos[2, 2] = 0.05  # its belly in the ground
+    starts.qvel[3, 8] = 5000.0  # a joint far too fast
+    policy = load_policy(anymal.policy_file, anymal, "cpu")
+    found = cross(anymal, policy, flat, starts, CrossingCfg(max_duration_s=0.1))
+    assert found.outcome.tolist() == [Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]
+    assert np.isnan(found.penalties[3]).all() and np.isfinite(found.penalties[:3]).all()
+    np.testing.assert_allclose(found.duration_s, 0.005)
+    both = join([found, found])
+    assert both.outcome.shape == (8,) and both.penalties.shape == (8, len(PENALTIES))
+
+
+def test_episodes_shared_out_over_processes_come_back_in_order(anymal):
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    heights = np.stack([flat, flat + np.float32(0.2)])
+    starts = [draw_starts(anymal, grid, seed, 30, "cpu") for seed, grid in enumerate(heights)]
+    for start in starts:
+        start.qpos[:, 1] = 10.5  # over at once, but for one
+        start.qpos[27, :2] = 13.8, 4.0
+    found = run_plain(anymal, str(anymal.policy_file), heights, starts, processes=1)
+    for crossings in found:
+        assert len(crossings.outcome) == 30
+        assert np.flatnonzero(crossings.outcome == Outcome.GOAL).tolist() == [27]
