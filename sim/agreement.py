@@ -15,6 +15,8 @@ from sim.intervals import bootstrap_interval, wilson_interval
 class Pair:
     """Crossings of one terrain in both simulators."""
 
+    index: int
+    """Where the terrain stands in its pool."""
     first: float
     """Success rate of the set of episodes by which the terrain was chosen."""
     ours: NDArray[np.uint8]
@@ -59,6 +61,7 @@ def summarise(pairs: Sequence[Pair], seed: int) -> dict[str, Any]:
             raise ValueError(f"terrain {k} has no valid episode in one of the simulators: nothing to compare")
     rows = [
         {
+            "index": pair.index,
             "first_success": pair.first,
             "episodes": [len(pair.ours), len(pair.plain)],
             "success": _compare(pair, "success"),

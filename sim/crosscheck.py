@@ -6,10 +6,8 @@ MuJoCo's own heightfield contact, a converged solver, and a second implementatio
 """
 
 import json
-import multiprocessing
 import os
 import sys
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +20,8 @@ from tqdm import tqdm
 from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
 from sim.files import check_writable, to_json, write_atomically
-from sim.plain_crossing import PlainCrossings, Starts, cross, draw_starts, join
-from sim.policy import load_policy, prepare_torch
+from sim.plain_crossing import draw_starts
+from sim.plain_processes import run_plain
 from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
@@ -31,8 +29,9 @@ from sim.simulation import resolve_device
 from sim.terrain import hard_random_genes
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
-_CHUNK = 25  # episodes of plain MuJoCo at a time: enough for the policy's batch, few enough to share out
 _MAX_POOL = 2000
+_FINE_DT = 0.001
+_FINE_TIME_CONSTANT_S = 0.003
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +58,9 @@ class CrosscheckCfg:
     """Episodes a terrain of the parallel simulation, in the first set and in the fresh one."""
     plain_episodes: int = 200
     """Episodes a terrain of plain MuJoCo; the first of them begin exactly as the fresh ones do."""
+    fine: bool = False
+    """Let plain MuJoCo resolve its contacts: steps of 1 ms, a time constant of 3 ms, five times the work. With the robot
+    file's own 5 and 10 ms, feet sink so far into steep ground that the prisms of its heightfield hold them."""
     processes: int | None = None
     """Processes of plain MuJoCo; one a core."""
     seed: int = 0
@@ -92,6 +94,20 @@ def success_rates(result: RolloutResult) -> NDArray[np.float64]:
     return np.where(valid > 0, 1.0 - result.base_collision.sum(axis=1) / np.maximum(valid, 1), np.nan)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Terrains of a pool that are neither too easy nor too hard to tell two simulators apart."""
+
+    genes: NDArray[np.float32]
+    """Shape (num_terrains, 64)."""
+    index: list[int]
+    """Where they stand in the pool."""
+    first: list[float]
+    """Success rates of the first set of episodes, by which they were chosen."""
+    looked_at: int
+    """Terrains of the pool that were tried."""
+
+
 class Crosscheck:
     """One comparison: the pool, the choice, both simulators."""
 
@@ -114,31 +130,28 @@ class Crosscheck:
         self.rng = np.random.default_rng([_KEY, cfg.seed])
         self._pool = None if cfg.genes is None else read_pool(cfg.genes)
 
-    def choose(self) -> tuple[NDArray[np.float32], NDArray[np.float64], int]:
-        """Terrains of middling difficulty: genes, their first success rates, and how many were looked at.
+    def choose(self) -> Choice:
+        """Terrains of middling difficulty.
 
         Raises:
             ValueError: If the pool has too few.
         """
         cfg, at_once = self.cfg, 200 if self.device.startswith("cuda") else 32
-        pool = self._pool
-        if pool is None:
-            pool = hard_random_genes(_MAX_POOL, self.rng).astype(np.float32)
-        else:
-            pool = pool[self.rng.permutation(len(pool))]
+        pool = hard_random_genes(_MAX_POOL, self.rng).astype(np.float32) if self._pool is None else self._pool
+        order = self.rng.permutation(len(pool))
         rollout = Rollout(self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device)
-        chosen: list[NDArray[np.float32]] = []
+        chosen: list[int] = []
         rates: list[float] = []
         looked_at = 0
         with tqdm(desc="choosing terrains", total=cfg.terrains, unit="terrain", disable=None) as bar:
             while len(chosen) < cfg.terrains and looked_at < len(pool):
-                batch = pool[np.arange(looked_at, looked_at + at_once) % len(pool)]
+                batch = order[np.arange(looked_at, looked_at + at_once) % len(pool)]
                 new = min(at_once, len(pool) - looked_at)
-                first = success_rates(rollout.evaluate(batch, self._seeds(at_once)))[:new]
+                first = success_rates(rollout.evaluate(pool[batch], self._seeds(at_once)))[:new]
                 hits = np.flatnonzero((first >= cfg.between[0]) & (first <= cfg.between[1]))
                 hits = hits[: cfg.terrains - len(chosen)]
-                chosen += list(batch[hits])
-                rates += list(first[hits])
+                chosen += batch[hits].tolist()
+                rates += first[hits].tolist()
                 looked_at += new
                 bar.update(len(hits))
         if len(chosen) < cfg.terrains:
@@ -146,16 +159,23 @@ class Crosscheck:
                 f"only {len(chosen)} of {looked_at} terrains have a success rate within {cfg.between}, expected "
                 f"{cfg.terrains}: give a larger --genes, fewer --terrains or a wider --between"
             )
-        return np.array(chosen), np.array(rates), looked_at
+        return Choice(genes=pool[chosen], index=chosen, first=rates, looked_at=looked_at)
 
     def _seeds(self, count: int) -> NDArray[np.uint32]:
         return self.rng.integers(2**32, size=count, dtype=np.uint32)
 
+    def _plain_robot(self) -> tuple[RobotCfg, float | None]:
+        """The robot as plain MuJoCo steps it, and its contact time constant [s], None for the file's."""
+        if not self.cfg.fine:
+            return self.robot, None
+        decimation = round(self.robot.control_dt / _FINE_DT)
+        return replace(self.robot, physics_dt=_FINE_DT, decimation=decimation), _FINE_TIME_CONSTANT_S
+
     def run(self) -> dict[str, Any]:
         """Choose, cross in both simulators, compare; everything of the results file."""
         cfg = self.cfg
-        genes, first, looked_at = self.choose()
-        seeds = self._seeds(cfg.terrains)
+        choice = self.choose()
+        genes, seeds = choice.genes, self._seeds(cfg.terrains)
         rollout = Rollout(
             self.robot, self.policy, num_terrains=cfg.terrains, num_replicas=cfg.episodes, device=self.device
         )
@@ -167,14 +187,25 @@ class Crosscheck:
             draw_starts(self.robot, grid, int(seed), cfg.plain_episodes, self.device)
             for grid, seed in zip(heights, seeds, strict=True)
         ]
-        plain = run_plain(self.robot, str(self.policy), heights, starts, cfg.processes or os.cpu_count() or 1)
-        pairs = [Pair(first=float(rate), ours=ours.outcome[k], plain=plain[k].outcome) for k, rate in enumerate(first)]
+        simulated, time_constant_s = self._plain_robot()
+        processes = cfg.processes or os.cpu_count() or 1
+        plain = run_plain(
+            simulated, str(self.policy), heights, starts, processes=processes, time_constant_s=time_constant_s
+        )
+        pairs = [
+            Pair(index=choice.index[k], first=rate, ours=ours.outcome[k], plain=plain[k].outcome)
+            for k, rate in enumerate(choice.first)
+        ]
         return {
             **provenance(self.device, cfg.seed),
             "robot": self.robot.name,
             "policy": Path(str(self.policy)).name,
             "pool": "hard_random" if cfg.genes is None else str(cfg.genes),
-            "looked_at": looked_at,
+            "looked_at": choice.looked_at,
+            "mujoco_c": {
+                "physics_dt": simulated.physics_dt,
+                "time_constant_s": "of the robot's file" if time_constant_s is None else time_constant_s,
+            },
             **summarise(pairs, cfg.seed),
             "penalties": {
                 name: {"ours": float(np.nanmean(ours.penalties[..., k])), "mujoco_c": float(np.nanmean(column))}
@@ -182,54 +213,6 @@ class Crosscheck:
                 for column in [np.concatenate([crossings.penalties[:, k] for crossings in plain])]
             },
         }
-
-
-_worker: dict[str, Any] = {}
-
-
-def _start_worker(robot: RobotCfg, policy: str) -> None:
-    prepare_torch("cpu")
-    _worker.update(robot=robot, policy=load_policy(policy, robot, "cpu"))
-
-
-def _cross_chunk(heights: NDArray[np.float32], starts: Starts) -> PlainCrossings:
-    return cross(_worker["robot"], _worker["policy"], heights, starts)
-
-
-def run_plain(
-    robot: RobotCfg, policy: str, heights: NDArray[np.float32], starts: list[Starts], processes: int
-) -> list[PlainCrossings]:
-    """Cross every terrain from its starts in plain MuJoCo, shared out over processes.
-
-    Args:
-        robot: Robot settings.
-        policy: The controller, as :func:`sim.policy.load_policy` takes it.
-        heights: Height grids [m], shape (num_terrains, nrow, ncol).
-        starts: Of each terrain.
-        processes: How many at once.
-    """
-    context = multiprocessing.get_context("spawn")
-    parts: list[list[PlainCrossings | None]] = []
-    pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker, initargs=(robot, policy))
-    try:
-        place: dict[Future[PlainCrossings], tuple[int, int]] = {}
-        for terrain, start in enumerate(starts):
-            chunks = [slice(k, k + _CHUNK) for k in range(0, len(start.qpos), _CHUNK)]
-            parts.append([None] * len(chunks))
-            for k, rows in enumerate(chunks):
-                chunk = replace(start, qpos=start.qpos[rows], qvel=start.qvel[rows])
-                place[pool.submit(_cross_chunk, heights[terrain], chunk)] = terrain, k
-        waiting = set(place)
-        with tqdm(desc="plain MuJoCo", total=sum(len(s.qpos) for s in starts), unit="episode", disable=None) as bar:
-            while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    terrain, k = place[future]
-                    parts[terrain][k] = future.result()
-                    bar.update(len(future.result().outcome))
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return [join([part for part in terrain if part is not None]) for terrain in parts]
 
 
 def _print_table(report: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ _mj: Any = mujoco  # its types are not written down
 Array = NDArray[np.float64]
 
 
-def crossing_model(robot: RobotCfg, heights: NDArray[np.floating]) -> Any:
+def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_constant_s: float | None = None) -> Any:
     """The robot's own file on MuJoCo's heightfield, with a sensor of the net contact force on each geom with a role.
 
     The solver may take as many iterations as it needs: the caps of the parallel simulation are themselves in question.
@@ -33,6 +33,7 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating]) -> Any:
     Args:
         robot: Robot settings.
         heights: Height grid [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`.
+        time_constant_s: Contact time constant of all geoms [s], critically damped; the file's if None.
     """
     grid = np.pad(np.asarray(heights, dtype=np.float64), _MARGIN_NODES, mode="edge")
     lowest, extent = float(grid.min()), max(float(np.ptp(grid)), 1e-3)
@@ -42,6 +43,7 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating]) -> Any:
     ET.SubElement(root, "size", memory=_MEMORY)
     option = root.find("option")
     option = ET.SubElement(root, "option") if option is None else option
+    option.set("timestep", str(robot.physics_dt))
     option.set("iterations", "100")
     option.set("ls_iterations", "50")
     ET.SubElement(option, "flag", autoreset="disable")  # or a state that blows up would begin anew unseen
@@ -61,6 +63,8 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating]) -> Any:
         ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")
     model = _mj.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
     model.hfield_data[:] = ((grid - lowest) / extent).ravel()
+    if time_constant_s is not None:
+        model.geom_solref[:] = time_constant_s, 1.0
     return model
 
 

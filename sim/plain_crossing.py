@@ -164,6 +164,8 @@ def cross(
     heights: NDArray[np.float32],
     starts: Starts,
     cfg: CrossingCfg | None = None,
+    *,
+    time_constant_s: float | None = None,
 ) -> PlainCrossings:
     """Run one crossing from each start in plain MuJoCo C.
 
@@ -173,9 +175,10 @@ def cross(
         heights: Height grid [m], shape (nrow, ncol).
         starts: Initial states.
         cfg: The crossing.
+        time_constant_s: Contact time constant [s]; that of the robot's file if None.
     """
     cfg = cfg or CrossingCfg()
-    episodes = _Episodes(robot, crossing_model(robot, heights), starts)
+    episodes = _Episodes(robot, crossing_model(robot, heights, time_constant_s=time_constant_s), starts)
     count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
     outcome = np.full(count, Outcome.RUNNING)
     steps, sums = np.zeros(count, int), np.zeros((count, len(PENALTIES)))

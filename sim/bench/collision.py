@@ -13,6 +13,8 @@ from sim.bare import Segment, replay_segments
 from sim.simulation import CAPACITY_OVERFLOWS, GROUND_FRICTION, Simulation, SolverCfg
 from sim.terrain import SPACING
 
+_LOST_M = 1.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class CollisionRates:
@@ -25,7 +27,7 @@ class CollisionRates:
     height_difference_m: float | None = None
     """Mean difference of the bases' heights after a replayed segment: the two stand on the same ground."""
     solver_invalid_envs: int | None = None
-    """Environments that are not finite at the end with the solver's collision."""
+    """Environments that the solver's collision lost: not finite at the end, or thrown over a metre away."""
     solver_overflows: int | None = None
     """Environments in which its buffers, as large as ours, were too small in the last step."""
 
@@ -138,11 +140,13 @@ def measure_collision(
     if other is None:
         return CollisionRates(ours=steps / float(seconds[0]))
     heights = [simulated.joint_q.numpy()[:, 2] for simulated in (sim, other)]
-    valid = np.isfinite(heights[1])
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(heights[0] - heights[1])
+        valid = apart < _LOST_M
     return CollisionRates(
         ours=steps / float(seconds[0]),
         solver=steps / float(seconds[1]),
-        height_difference_m=float(np.abs(heights[0] - heights[1])[valid].mean()) if valid.any() else None,
+        height_difference_m=float(apart[valid].mean()) if valid.any() else None,
         solver_invalid_envs=int((~valid).sum()),
         solver_overflows=int(((other.overflow.numpy() & CAPACITY_OVERFLOWS) != 0).sum()),
     )

@@ -39,9 +39,9 @@ def outcomes(goal, collision, time_out, invalid=0):
 def test_rates_and_bias_by_hand():
     pairs = [
         # 15 of 20 succeed and 10 arrive; 150 of 200, 100 of 200: no difference.
-        Pair(first=0.7, ours=outcomes(10, 5, 5), plain=outcomes(100, 50, 50)),
+        Pair(index=3, first=0.7, ours=outcomes(10, 5, 5), plain=outcomes(100, 50, 50)),
         # 4 of 20 (two more are invalid) against 180 of 200: far outside.
-        Pair(first=0.4, ours=outcomes(4, 16, 0, invalid=2), plain=outcomes(180, 20, 0)),
+        Pair(index=3, first=0.4, ours=outcomes(4, 16, 0, invalid=2), plain=outcomes(180, 20, 0)),
     ]
     report = summarise(pairs, seed=0)
     assert report["success"]["inside"] == report["goal"]["inside"] == 1
@@ -57,7 +57,7 @@ def test_rates_and_bias_by_hand():
 
 def test_nothing_valid_is_an_error():
     with pytest.raises(ValueError, match="terrain 0 has no valid episode"):
-        summarise([Pair(first=0.5, ours=outcomes(0, 0, 0, invalid=3), plain=outcomes(1, 1, 1))], seed=0)
+        summarise([Pair(index=3, first=0.5, ours=outcomes(0, 0, 0, invalid=3), plain=outcomes(1, 1, 1))], seed=0)
 
 
 @pytest.mark.parametrize(

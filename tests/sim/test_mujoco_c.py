@@ -6,10 +6,10 @@ import pytest
 from kernels import oracle
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.crosscheck import run_plain
 from sim.crossing import CrossingCfg
 from sim.mujoco_c import crossing_model, goal_commands, observations, step_penalties, surface_heights
 from sim.plain_crossing import cross, draw_starts, join, to_mujoco
+from sim.plain_processes import run_plain
 from sim.policy import load_policy
 from sim.rollout import Rollout
 from sim.simulation import GROUND_FRICTION
@@ -81,6 +81,9 @@ def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_c
     assert model.geom_solmix[ground] == 0.0
     assert model.geom_friction[ground, 0] == GROUND_FRICTION
     assert model.opt.iterations == 100
+    assert model.opt.timestep == anymal.physics_dt
+    fine = crossing_model(anymal, heights, time_constant_s=0.003)
+    assert (fine.geom_solref == [0.003, 1.0]).all() and not (model.geom_solref == [0.003, 1.0]).any()
     # The surface, edge heights continued beyond it: what a ray from above meets.
     import mujoco
 
