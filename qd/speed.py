@@ -41,7 +41,7 @@ class Arguments:
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     run: Path | None = None
-    """Time the last iterations of this run, made on this machine, instead of running a search for it."""
+    """Time the last iterations of this run, made on this GPU, instead of running a search for it."""
     iterations: int = 20
     """Iterations timed, after two that are not."""
     steps: int = 1000
@@ -140,6 +140,8 @@ def measure(args: Arguments) -> dict[str, Any]:
     robot, device = get_robot(args.robot), resolve_device(args.device)
     training = training_rates(args.train_speed)
     if args.run is not None:
+        if not device.startswith("cuda"):
+            raise ValueError(f"--run needs a CUDA device, got {device}: a run on the CPU has several workers")
         cfg, metrics, terrains = read_iterations(args.run, args.iterations)
     else:
         cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})

@@ -59,8 +59,8 @@ class CrosscheckCfg:
     plain_episodes: int = 200
     """Episodes a terrain of plain MuJoCo; the first of them begin exactly as the fresh ones do."""
     fine: bool = False
-    """Let plain MuJoCo resolve its contacts: steps of 1 ms, a time constant of 3 ms, five times the work. With the robot
-    file's own 5 and 10 ms, feet sink so far into steep ground that the prisms of its heightfield hold them."""
+    """Let plain MuJoCo resolve its contacts: steps of 1 ms, a time constant of 3 ms, five times the work. With the
+    robot file's own 5 and 10 ms, feet sink so far into steep ground that the prisms of its heightfield hold them."""
     processes: int | None = None
     """Processes of plain MuJoCo; one a core."""
     seed: int = 0
