@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive train calibrate replay evaluate bench test lint clean
+.PHONY: help setup archive train calibrate replay evaluate crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -19,6 +19,7 @@ FLAG_RESUME := resume
 FLAG_RUN := run
 FLAG_ELITE := elite
 FLAG_OUT := out
+FLAG_GENES := genes
 
 help: ## This list
 	@echo 'faultline: find the terrains that break a legged robot. Targets:'
@@ -26,15 +27,17 @@ help: ## This list
 	@echo
 	@echo 'Variables (left out: the default of the command):'
 	@echo '  ROBOT=anymal     which robot'
-	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive train calibrate replay evaluate bench'
+	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive train calibrate replay evaluate'
+	@echo '                                                   crosscheck bench'
 	@echo '  PRESET=small     size of the search: paper, small  archive'
 	@echo '  ITERATIONS=N     stop after N iterations           archive train'
 	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, or'
-	@echo '                   module:callable                   archive calibrate replay evaluate'
-	@echo '  SEED=N           seed of everything drawn          archive train calibrate evaluate bench'
+	@echo '                   module:callable                   archive calibrate replay evaluate crosscheck'
+	@echo '  SEED=N           seed of everything drawn          archive train calibrate evaluate crosscheck bench'
 	@echo '  RESUME=DIR       go on with this run               archive train'
 	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
-	@echo '  OUT=FILE         where to write the numbers        calibrate evaluate bench'
+	@echo '  OUT=FILE         where to write the numbers        calibrate evaluate crosscheck bench'
+	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
 	@echo '  TORCH=SPEC       torch other than the pinned one, e.g. a build for your GPU driver: a requirement or a wheel'
 	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.replay, train.base, ...)'
@@ -66,6 +69,9 @@ replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the
 
 evaluate: setup ## Success and goal rates of the controller of ROBOT
 	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT)
+
+crosscheck: setup ## Hold the crossings of ROBOT against the same in plain MuJoCo C
+	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES OUT)
 
 bench: setup ## Time every kernel against torch and against what the device can do at best
 	$(BIN)/python -m sim.bench --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE SEED OUT)

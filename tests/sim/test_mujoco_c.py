@@ -83,7 +83,7 @@ def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_c
     assert model.opt.iterations == 100
     assert model.opt.timestep == anymal.physics_dt
     fine = crossing_model(anymal, heights, time_constant_s=0.003)
-    assert (fine.geom_solref == [0.003, 1.0]).all() and not (model.geom_solref == [0.003, 1.0]).any()
+    assert (fine.geom_solref == [0.003, 1.0]).all() and (model.geom_solref[:, 0] > 0.003).all()
     # The surface, edge heights continued beyond it: what a ray from above meets.
     import mujoco
 
