@@ -104,9 +104,10 @@ class RunDirectory:
         if not os.path.lexists(file):
             raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
         config = read_json(file)
-        if not isinstance(config.get("settings"), dict) or type(config.get("iterations")) is not int:
+        kinds = {"settings": dict, "iterations": int, "device": str}
+        if any(type(config.get(name)) is not kind for name, kind in kinds.items()):
             raise ValueError(
-                f"{file} must hold settings and iterations of a search, got {', '.join(config)}; {_REMEDY}"
+                f"{file} must hold settings, iterations and device of a search, got {', '.join(config)}; {_REMEDY}"
             )
         return config
 

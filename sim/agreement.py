@@ -54,11 +54,16 @@ def summarise(pairs: Sequence[Pair], seed: int) -> dict[str, Any]:
         seed: Of the bootstrap over terrains.
 
     Raises:
-        ValueError: If a terrain has no valid episode in one of the simulators.
+        ValueError: If no terrain has a valid episode in both; one that has none is left out and named.
     """
-    for k, pair in enumerate(pairs):
-        if not _hits(pair.ours, "goal")[1] or not _hits(pair.plain, "goal")[1]:
-            raise ValueError(f"terrain {k} has no valid episode in one of the simulators: nothing to compare")
+    left_out = [pair.index for pair in pairs if not _hits(pair.ours, "goal")[1] or not _hits(pair.plain, "goal")[1]]
+    invalid = {
+        "ours": int(sum((pair.ours == Outcome.INVALID).sum() for pair in pairs)),
+        "mujoco_c": int(sum((pair.plain == Outcome.INVALID).sum() for pair in pairs)),
+    }
+    pairs = [pair for pair in pairs if pair.index not in left_out]
+    if not pairs:
+        raise ValueError("no terrain has a valid episode in both simulators: nothing to compare")
     rows = [
         {
             "index": pair.index,
@@ -80,8 +85,4 @@ def summarise(pairs: Sequence[Pair], seed: int) -> dict[str, Any]:
             "bias": float((plain - ours).mean()),
             "bias_interval": bootstrap_interval(plain - ours, np.random.default_rng(seed)),
         }
-    invalid = {
-        "ours": int(sum((pair.ours == Outcome.INVALID).sum() for pair in pairs)),
-        "mujoco_c": int(sum((pair.plain == Outcome.INVALID).sum() for pair in pairs)),
-    }
-    return {**totals, "invalid": invalid, "terrains": rows}
+    return {**totals, "invalid": invalid, "left_out": left_out, "terrains": rows}

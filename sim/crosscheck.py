@@ -8,6 +8,7 @@ MuJoCo's own heightfield contact, a converged solver, and a second implementatio
 import json
 import os
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from tqdm import tqdm
 
 from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
-from sim.files import check_writable, to_json, write_atomically
+from sim.files import prepare_output, to_json, write_atomically
 from sim.plain_crossing import draw_starts
 from sim.plain_processes import run_plain
 from sim.provenance import provenance
@@ -80,12 +81,21 @@ def read_pool(path: Path) -> NDArray[np.float32]:
             genes = content["genes"]
     except Exception as error:  # a damaged zip archive can fail with anything
         raise ValueError(f"--genes {path}: expected an .npz file with an array 'genes', got: {error}") from error
-    if genes.ndim != 2 or genes.shape[1] != 64 or genes.dtype.kind != "f" or not np.isfinite(genes).all():
+    if genes.ndim == 2 and genes.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            genes = genes.astype(np.float32)
+    if (
+        genes.ndim != 2
+        or genes.shape[1] != 64
+        or not len(genes)
+        or genes.dtype.kind != "f"
+        or not np.isfinite(genes).all()
+    ):
         raise ValueError(
             f"--genes {path}: 'genes' must be finite floats of shape (num_terrains, 64), got {genes.dtype} of shape "
             f"{genes.shape}"
         )
-    return genes.astype(np.float32)
+    return genes
 
 
 def success_rates(result: RolloutResult) -> NDArray[np.float64]:
@@ -123,6 +133,8 @@ class Crosscheck:
                 "terrains, episodes and plain-episodes must be positive and between two rising rates, got "
                 f"{cfg.terrains}, {cfg.episodes}, {cfg.plain_episodes} and {cfg.between}"
             )
+        if (cfg.processes is not None and cfg.processes < 1) or cfg.seed < 0:
+            raise ValueError(f"processes must be at least 1 and seed at least 0, got {cfg.processes} and {cfg.seed}")
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)
         self.device = resolve_device(cfg.device)
@@ -241,14 +253,13 @@ def main() -> int:
     try:
         check = Crosscheck(cfg)
         if cfg.out is not None:
-            cfg.out.parent.mkdir(parents=True, exist_ok=True)
-            check_writable(cfg.out.parent)
+            prepare_output(cfg.out)
         report = check.run()
         _print_table(report)
         if cfg.out is not None:
             write_atomically(cfg.out, to_json(report))
             print(f"written to {cfg.out}")
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, BrokenProcessPool) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

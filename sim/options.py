@@ -1,7 +1,6 @@
 """What solver and capacity options cost and change: ``python -m sim.options --robot anymal``.
 
-The same crossings of hard-random terrains under each choice, in turns: wall time, rates, mean penalties. The shipped
-choice is the cheapest whose numbers are those of a solver without a cap.
+The same crossings of hard-random terrains under each choice: wall time, rates, mean penalties.
 """
 
 import statistics
@@ -14,10 +13,10 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from sim.files import check_writable, to_json, write_atomically
+from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
-from sim.rollout import Rollout
+from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device
 from sim.terrain import hard_random_genes
 
@@ -36,7 +35,7 @@ class OptionsCfg:
     """Hard-random terrains."""
     episodes: int = 20
     """Episodes a terrain."""
-    iterations: tuple[int, ...] = (4, 6, 8, 10, 50)
+    iterations: tuple[int, ...] = (3, 4, 5, 6, 8, 50)
     """Caps on the Newton iterations to try."""
     ls_iterations: tuple[int, ...] = (10,)
     """Caps on the line search to try with each."""
@@ -56,8 +55,11 @@ def choices(cfg: OptionsCfg, robot: RobotCfg) -> list[tuple[SolverCfg, RobotCfg]
     """Every choice of solver options, then of capacities.
 
     Raises:
-        ValueError: If capacities do not come in pairs.
+        ValueError: If capacities do not come in pairs, or a number is not positive.
     """
+    numbers = (*cfg.iterations, *cfg.ls_iterations, *cfg.njmax, *cfg.nconmax, cfg.rounds, cfg.terrains, cfg.episodes)
+    if min(numbers) < 1 or not ((cfg.iterations and cfg.ls_iterations) or cfg.njmax):
+        raise ValueError(f"all numbers must be positive, and there must be a choice to try, got {cfg}")
     if len(cfg.njmax) != len(cfg.nconmax):
         raise ValueError(f"--nconmax needs as many numbers as --njmax, got {cfg.nconmax} and {cfg.njmax}")
     found = [
@@ -67,6 +69,23 @@ def choices(cfg: OptionsCfg, robot: RobotCfg) -> list[tuple[SolverCfg, RobotCfg]
     ]
     capacities = zip(cfg.njmax, cfg.nconmax, strict=True)
     return found + [(SolverCfg(), replace(robot, njmax=rows, nconmax=contacts)) for rows, contacts in capacities]
+
+
+def _means(result: RolloutResult) -> dict[str, Any]:
+    """Rates and mean penalties of the valid episodes, None where there are none."""
+    valid = ~result.invalid
+    means = result.penalties[valid].mean(axis=0).tolist() if valid.any() else [None] * len(result.penalty_names)
+    return {
+        "success_rate": float(1.0 - result.base_collision[valid].mean()) if valid.any() else None,
+        "goal_rate": float(result.reached_goal[valid].mean()) if valid.any() else None,
+        "invalid": int(result.invalid.sum()),
+        "penalties": dict(zip(result.penalty_names, means, strict=True)),
+    }
+
+
+def _cell(value: float | None, form: str) -> str:
+    width = form.partition(".")[0]
+    return format("-", f">{width}") if value is None else format(value, form)
 
 
 def measure(cfg: OptionsCfg) -> dict[str, Any]:
@@ -101,12 +120,7 @@ def measure(cfg: OptionsCfg) -> dict[str, Any]:
                 "nconmax": sized.nconmax,
                 "wall_s": wall_s,
                 "world_steps_per_s": last.outcome.size * last.physics_steps / wall_s,
-                "success_rate": float(1.0 - last.base_collision[~last.invalid].mean()),
-                "goal_rate": float(last.reached_goal[~last.invalid].mean()),
-                "invalid": int(last.invalid.sum()),
-                "penalties": dict(
-                    zip(last.penalty_names, np.nanmean(last.penalties, axis=(0, 1)).tolist(), strict=True)
-                ),
+                **_means(last),
             }
         )
         del rollout
@@ -120,9 +134,9 @@ def _print_table(report: dict[str, Any]) -> None:
     for row in report["rows"]:
         print(
             f"{row['iterations']:>10} {row['ls_iterations']:>6} {row['njmax']:>5} {row['nconmax']:>8} "
-            f"{row['wall_s']:>7.2f} {row['world_steps_per_s'] / 1e6:>9.3f} {row['success_rate']:>7.4f} "
-            f"{row['goal_rate']:>6.4f} {row['invalid']:>7} "
-            + " ".join(f"{row['penalties'][name]:>13.4f}" for name in names)
+            f"{row['wall_s']:>7.2f} {row['world_steps_per_s'] / 1e6:>9.3f} "
+            f"{_cell(row['success_rate'], '7.4f')} {_cell(row['goal_rate'], '6.4f')} {row['invalid']:>7} "
+            + " ".join(_cell(row["penalties"][name], "13.4f") for name in names)
         )
 
 
@@ -131,8 +145,7 @@ def main() -> int:
     cfg = tyro.cli(OptionsCfg, description=__doc__)
     try:
         if cfg.out is not None:
-            cfg.out.parent.mkdir(parents=True, exist_ok=True)
-            check_writable(cfg.out.parent)
+            prepare_output(cfg.out)
         report = measure(cfg)
         _print_table(report)
         if cfg.out is not None:

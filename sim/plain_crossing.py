@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels.episode import EpisodeState, Outcome, start_episodes
+from kernels.observation import ACTION_LIMIT
 from kernels.penalties import BASE, PENALTIES
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
@@ -25,6 +26,7 @@ _WARNINGS = [
     _mj.mjtWarning.mjWARN_BADQPOS,
     _mj.mjtWarning.mjWARN_BADQVEL,
     _mj.mjtWarning.mjWARN_BADQACC,
+    _mj.mjtWarning.mjWARN_BADCTRL,
 ]
 
 
@@ -194,6 +196,7 @@ def cross(
             command[running] = goal_commands(qpos, cfg)
             rows = observations(robot, heights, qpos, qvel, command[running], last_action[running])
             action = policy(torch.as_tensor(rows, dtype=torch.float32)).numpy().astype(np.float64)
+            action = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
             last_action[running] = action
             episodes.hold(running, np.array(robot.default_joint_pos) + robot.action_scale * action)
         episodes.step(running)

@@ -1,6 +1,10 @@
 """Crossings in plain MuJoCo C shared out over processes."""
 
 import multiprocessing
+import os
+import signal
+import threading
+import time
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import replace
 from typing import Any
@@ -18,7 +22,16 @@ _CHUNK = 25  # episodes at a time: enough for the policy's batch, few enough to 
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(robot: RobotCfg, policy: str) -> None:
+def _end_with(parent: int) -> None:
+    """Ends this process once its parent is gone, which a pool's workers would otherwise outlive."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+def _start_worker(robot: RobotCfg, policy: str, parent: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its workers
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     prepare_torch("cpu")
     _worker.update(robot=robot, policy=load_policy(policy, robot, "cpu"))
 
@@ -48,7 +61,9 @@ def run_plain(
     """
     context = multiprocessing.get_context("spawn")
     parts: list[list[PlainCrossings | None]] = []
-    pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker, initargs=(robot, policy))
+    pool = ProcessPoolExecutor(
+        processes, mp_context=context, initializer=_start_worker, initargs=(robot, policy, os.getpid())
+    )
     try:
         place: dict[Future[PlainCrossings], tuple[int, int]] = {}
         for terrain, start in enumerate(starts):

@@ -1,5 +1,6 @@
 """What the kernels are timed on: robots that the shipped controller has walked into the middle of gene terrains."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,7 +34,7 @@ class SceneCfg:
                 f"num_terrains must lie in 1..num_envs, got {self.num_terrains} terrains for {self.num_envs} envs: "
                 "each terrain needs a robot"
             )
-        if not 0 < self.walk_s <= self.duration_s:
+        if not 0 < self.walk_s <= self.duration_s < math.inf:
             raise ValueError(f"walk_s must lie in 0..{self.duration_s} s, got {self.walk_s}")
 
 

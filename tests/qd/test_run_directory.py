@@ -47,7 +47,7 @@ def test_a_claim_ends_with_its_context(tmp_path):
     [
         ("{", "must be a JSON file"),
         ("[]", "must hold a JSON object, got list"),
-        ('{"seed": 1}', "must hold settings and iterations of a search, got seed"),
+        ('{"seed": 1}', "must hold settings, iterations and device of a search, got seed"),
     ],
 )
 def test_damaged_config(tmp_path, content, message):

@@ -55,9 +55,13 @@ def test_rates_and_bias_by_hand():
     json.dumps(report, allow_nan=False)
 
 
-def test_nothing_valid_is_an_error():
-    with pytest.raises(ValueError, match="terrain 0 has no valid episode"):
-        summarise([Pair(index=3, first=0.5, ours=outcomes(0, 0, 0, invalid=3), plain=outcomes(1, 1, 1))], seed=0)
+def test_a_terrain_without_valid_episodes_is_left_out_and_named():
+    lost = Pair(index=7, first=0.5, ours=outcomes(0, 0, 0, invalid=3), plain=outcomes(1, 1, 1))
+    with pytest.raises(ValueError, match="no terrain has a valid episode"):
+        summarise([lost], seed=0)
+    fine = Pair(index=3, first=0.5, ours=outcomes(1, 1, 0), plain=outcomes(1, 1, 0))
+    report = summarise([lost, fine], seed=0)
+    assert report["left_out"] == [7] and len(report["terrains"]) == 1 and report["invalid"]["ours"] == 3
 
 
 @pytest.mark.parametrize(
@@ -66,9 +70,11 @@ def test_nothing_valid_is_an_error():
         {"other": np.zeros((3, 64))},
         {"genes": np.zeros((3, 63))},
         {"genes": np.full((3, 64), np.nan)},
+        {"genes": np.full((3, 64), 1e300)},
+        {"genes": np.zeros((0, 64))},
         {"genes": np.array([[None]], dtype=object)},
     ],
-    ids=["no genes", "shape", "not finite", "objects"],
+    ids=["no genes", "shape", "not finite", "too large", "empty", "objects"],
 )
 def test_a_pool_that_is_none_is_refused(tmp_path, content):
     file = tmp_path / "pool.npz"
@@ -85,10 +91,18 @@ def test_a_pool_that_is_no_file_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"terrains": 0}, {"episodes": 0}, {"between": (0.9, 0.3)}, {"between": (0.0, 1.5)}]
+    "settings",
+    [
+        {"terrains": 0},
+        {"episodes": 0},
+        {"between": (0.9, 0.3)},
+        {"between": (0.0, 1.5)},
+        {"processes": -1},
+        {"seed": -1},
+    ],
 )
 def test_numbers_without_sense_are_refused(settings):
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match=r"positive|at least"):
         Crosscheck(CrosscheckCfg(device="cpu", **settings))
 
 
