@@ -33,8 +33,8 @@ class SolverCfg:
     """
 
     iterations: int = 5
-    """Newton iterations a step at most. A walking robot takes 1.4 on average and one step in a hundred more than 5, but
-    all worlds wait for the slowest: caps of 4 to 50 gave the same rates and penalties, 50 costs 15 % of the speed."""
+    """Newton iterations a step at most; all worlds wait for the slowest. Caps of 4 to 50 gave the same rates, each
+    iteration more costs about 5 % of the speed (results/bench/options-*.json)."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
 

@@ -44,7 +44,7 @@ class BaseCfg:
     num_envs: int | None = None
     """Robots trained at once; 8192 on CUDA, 32 on the CPU."""
     iterations: int | None = None
-    """Iterations in all, those before a resume included; 2500 on CUDA, 20 on the CPU."""
+    """Iterations in all, those before a resume included; 2240 on CUDA, 20 on the CPU."""
     max_seconds: float | None = None
     """Save and stop in time to be done this many seconds after the start."""
     run_dir: Path | None = None
@@ -93,7 +93,7 @@ def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
             "or use --device cpu"
         )
     num_envs = cfg.num_envs or (8192 if on_cuda else 32)
-    iterations = cfg.iterations or (2500 if on_cuda else 20)
+    iterations = cfg.iterations or (2240 if on_cuda else 20)
     if not on_cuda and cfg.num_envs is None and cfg.iterations is None:
         print(
             f"No GPU: a small training of {num_envs} robots and {iterations} iterations, enough to see that it runs. "
