@@ -251,7 +251,7 @@ def test_a_directory_that_cannot_be_written_to(target):
 
 
 SLOW_SEARCH = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from qd.cli import run_command
 from qd.search import run_search
@@ -270,6 +270,7 @@ def slow(cfg):
 class Arguments:
     path: Path
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored
 run_command(Arguments, lambda args: run_search(test_search.make_job(args.path, iterations=500), open_evaluator=slow))
 """
 
