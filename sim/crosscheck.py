@@ -8,7 +8,6 @@ MuJoCo's own heightfield contact, a converged solver, and a second implementatio
 import json
 import os
 import sys
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from tqdm import tqdm
 
 from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
+from sim.command import exit_code_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.plain_crossing import draw_starts
 from sim.plain_processes import run_plain
@@ -247,25 +247,23 @@ def _print_table(report: dict[str, Any]) -> None:
     print("mean penalties: " + json.dumps(report["penalties"]))
 
 
+def run(cfg: CrosscheckCfg) -> int:
+    """Compare, print the table, write the file; returns the exit status."""
+    check = Crosscheck(cfg)
+    if cfg.out is not None:
+        prepare_output(cfg.out)
+    report = check.run()
+    _print_table(report)
+    if cfg.out is not None:
+        write_atomically(cfg.out, to_json(report))
+        print(f"written to {cfg.out}")
+    return 0
+
+
 def main() -> int:
     """Command line; returns the exit status."""
     cfg = tyro.cli(CrosscheckCfg, description=__doc__)
-    try:
-        check = Crosscheck(cfg)
-        if cfg.out is not None:
-            prepare_output(cfg.out)
-        report = check.run()
-        _print_table(report)
-        if cfg.out is not None:
-            write_atomically(cfg.out, to_json(report))
-            print(f"written to {cfg.out}")
-    except (ValueError, OSError, BrokenProcessPool) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\nStopped.", file=sys.stderr)
-        return 130
-    return 0
+    return exit_code_of(lambda: run(cfg))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from sim.command import exit_code_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
@@ -140,24 +141,22 @@ def _print_table(report: dict[str, Any]) -> None:
         )
 
 
+def run(cfg: OptionsCfg) -> int:
+    """Measure, print the table, write the file; returns the exit status."""
+    if cfg.out is not None:
+        prepare_output(cfg.out)
+    report = measure(cfg)
+    _print_table(report)
+    if cfg.out is not None:
+        write_atomically(cfg.out, to_json(report))
+        print(f"written to {cfg.out}")
+    return 0
+
+
 def main() -> int:
     """Command line; returns the exit status."""
     cfg = tyro.cli(OptionsCfg, description=__doc__)
-    try:
-        if cfg.out is not None:
-            prepare_output(cfg.out)
-        report = measure(cfg)
-        _print_table(report)
-        if cfg.out is not None:
-            write_atomically(cfg.out, to_json(report))
-            print(f"written to {cfg.out}")
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\nStopped.", file=sys.stderr)
-        return 130
-    return 0
+    return exit_code_of(lambda: run(cfg))
 
 
 if __name__ == "__main__":

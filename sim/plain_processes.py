@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from typing import Any
 
@@ -80,6 +81,8 @@ def run_plain(
                     terrain, k = place[future]
                     parts[terrain][k] = future.result()
                     bar.update(len(future.result().outcome))
+    except BrokenProcessPool as error:
+        raise OSError(f"a process of plain MuJoCo died: {error}") from None
     finally:
         pool.shutdown(cancel_futures=True)
     return [join([part for part in terrain if part is not None]) for terrain in parts]

@@ -77,6 +77,9 @@ class Simulation:
         column_of_geom: Column in ``geom_force`` of each solver geom, -1 for none.
     """
 
+    solver_collides = False
+    """Whether the solver finds the contacts itself; here kernels.contact does."""
+
     def __init__(
         self,
         robot: RobotCfg,
@@ -153,7 +156,7 @@ class Simulation:
             ls_iterations=cfg.ls_iterations,
             cone="elliptic",
             integrator="implicitfast",
-            use_mujoco_contacts=False,
+            use_mujoco_contacts=self.solver_collides,
             kinematic_switchable_roots=False,
         )
         self.solver.mjw_model.opt.warn_overflow = 0

@@ -15,11 +15,11 @@ from typing import Any
 import torch
 import tyro
 
+from sim.command import exit_code_of
 from sim.files import check_writable, read_json, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
-from train.command import exit_code_of
 from train.learner import Learner, check_entries, read_checkpoint
 from train.ppo import PpoCfg
 from train.progress import STATE, Progress

@@ -14,6 +14,7 @@ import tyro
 from tqdm import tqdm
 
 from kernels.episode import Outcome
+from sim.command import exit_code_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.intervals import bootstrap_interval
 from sim.provenance import provenance
@@ -21,7 +22,6 @@ from sim.robot import get_robot
 from sim.rollout import CrossingCfg, Rollout, RolloutResult
 from sim.simulation import resolve_device
 from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
-from train.command import exit_code_of
 
 FULL = (300, 20)
 """Terrains a set and episodes a terrain of the published tables."""

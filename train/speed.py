@@ -10,11 +10,11 @@ from typing import Any
 import torch
 import tyro
 
+from sim.command import exit_code_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
-from train.command import exit_code_of
 from train.learner import Learner
 from train.ppo import PpoCfg
 from train.task import CommandTask

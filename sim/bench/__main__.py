@@ -10,6 +10,7 @@ from pathlib import Path
 import tyro
 
 from sim.bench.report import file_of, measure, preset, table
+from sim.command import exit_code_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
@@ -44,8 +45,8 @@ class Arguments:
     """Seed of terrains and starts."""
 
 
-def run(args: Arguments) -> None:
-    """Measure, print the table, write the file.
+def run(args: Arguments) -> int:
+    """Measure, print the table, write the file; returns the exit status.
 
     Raises:
         ValueError: If something asked for cannot be had, or an output is not what the oracle says.
@@ -67,20 +68,13 @@ def run(args: Arguments) -> None:
     print(table(report))
     write_atomically(out, to_json(report))
     print(f"written to {out}")
+    return 0
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit status."""
     args = tyro.cli(Arguments, args=argv)
-    try:
-        run(args)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\nStopped; nothing was written.", file=sys.stderr)
-        return 130
-    return 0
+    return exit_code_of(lambda: run(args), stopped="Stopped; nothing was written.")
 
 
 if __name__ == "__main__":

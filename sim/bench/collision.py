@@ -10,7 +10,7 @@ import warp as wp
 
 from sim.bank import TerrainBank
 from sim.bare import Segment, replay_segments
-from sim.simulation import CAPACITY_OVERFLOWS, GROUND_FRICTION, Simulation, SolverCfg
+from sim.simulation import CAPACITY_OVERFLOWS, GROUND_FRICTION, Simulation
 from sim.terrain import SPACING
 
 _LOST_M = 1.0
@@ -38,6 +38,8 @@ class HeightfieldSimulation(Simulation):
     Attributes:
         offset: Where each environment's tile begins [m], shape (num_envs, 2).
     """
+
+    solver_collides = True
 
     def __init__(self, sim: Simulation) -> None:
         """The robots, terrains and step of another simulation, whose bank holds its terrains already."""
@@ -72,20 +74,6 @@ class HeightfieldSimulation(Simulation):
         )
         scene.replicate(builder, self.num_envs)
         self.model = scene.finalize()
-
-    def _build_solver(self, cfg: SolverCfg) -> None:
-        self.solver = newton.solvers.SolverMuJoCo(
-            self.model,
-            njmax=self.robot.njmax,
-            nconmax=self.robot.nconmax,
-            iterations=cfg.iterations,
-            ls_iterations=cfg.ls_iterations,
-            cone="elliptic",
-            integrator="implicitfast",
-            use_mujoco_contacts=True,
-            kinematic_switchable_roots=False,
-        )
-        self.solver.mjw_model.opt.warn_overflow = 0
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:
         """Nothing: the solver collides, and no contact force is read."""

@@ -14,11 +14,11 @@ from kernels.episode import Outcome
 from qd import calibrate, replay
 from qd.cli import run_command
 from sim import rollout
+from sim.command import exit_code_of
 from sim.policy import load_policy
 from tests.faults import searches, trainings
 from tests.qd import stand_in
 from train import evaluate
-from train.command import exit_code_of
 
 SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import torch
 
+from sim.command import exit_code_of
 from sim.robot import get_robot
 from tests.faults.steps import Steps
 from train import base
-from train.command import exit_code_of
 from train.curriculum import CurriculumCfg
 from train.learner import read_checkpoint
 from train.ppo import PpoCfg

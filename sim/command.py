@@ -1,14 +1,15 @@
-"""How every command of this room ends: an exit code, and one line on stderr for what a user can mend."""
+"""How every command of sim and train ends: an exit code, and one line on stderr for what a user can mend."""
 
 import sys
 from collections.abc import Callable
 
 
-def exit_code_of(command: Callable[[], int]) -> int:
+def exit_code_of(command: Callable[[], int], *, stopped: str = "Stopped.") -> int:
     """Runs a command.
 
     Args:
         command: Returns its exit code.
+        stopped: What Ctrl-C makes it say.
 
     Returns:
         That code; 2 for anything a user can mend (ValueError, OSError, FloatingPointError) and 130 for Ctrl-C, after a
@@ -20,5 +21,5 @@ def exit_code_of(command: Callable[[], int]) -> int:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\nStopped.", file=sys.stderr)
+        print(f"\n{stopped}", file=sys.stderr)
         return 130

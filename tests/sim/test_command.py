@@ -6,8 +6,8 @@ import pytest
 
 from qd import speed as search_speed
 from qd.cli import run_command
+from sim.command import exit_code_of
 from train import evaluate, speed
-from train.command import exit_code_of
 
 
 def fail(error: BaseException) -> int:
