@@ -53,7 +53,11 @@ def search_terrains(
         found = archive_of(settings, search, iteration)
         timing = {"wall_s": ended - began}  # from the end of the iteration before, so saving counts
         timing["episodes_per_s"] = evaluation.episodes.sum().item() / timing["wall_s"]
-        physics = {"physics_steps": int(result.physics_steps), "rollout_s": float(result.wall_s)}
+        physics = {
+            "physics_steps": int(result.physics_steps),
+            "rollout_s": float(result.wall_s),
+            "mean_duration_s": float(result.duration_s.mean()),
+        }
         metrics.append({"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics, **timing})
         began = ended
         run.save(settings, search, metrics, found)

@@ -80,18 +80,21 @@ def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, N
     return metrics, recorder.terrains
 
 
-def read_iterations(folder: Path, count: int) -> tuple[SearchCfg, Metrics, NDArray[Any]]:
+def read_iterations(folder: Path, count: int, device_name: str) -> tuple[SearchCfg, Metrics, NDArray[Any]]:
     """Settings of a run, metrics rows of its last iterations, and the terrains it would ask for next.
 
     Args:
         folder: Run directory.
         count: Iterations wanted.
+        device_name: What the run must have been made on.
 
     Raises:
-        ValueError: If the run is damaged or too short.
+        ValueError: If the run is damaged, too short, or of another device.
     """
     run = RunDirectory(folder)
-    cfg = run.read_cfg()
+    cfg, made_on = run.read_cfg(), run.read_config()["device"]
+    if made_on != device_name:
+        raise ValueError(f"--run {folder} was made on {made_on}, the bare rate would be that of {device_name}")
     search, metrics = run.load(as_settings(cfg)) or (None, [])
     if search is None or len(metrics) < count + _WARM_UP:
         raise ValueError(f"--run {folder} must have at least {count + _WARM_UP} iterations, got {len(metrics)}")
@@ -137,12 +140,18 @@ def measure(args: Arguments) -> dict[str, Any]:
     from sim.bare import measure_bare_physics
     from sim.robot import get_robot
 
+    if min(args.iterations, args.steps) < 1 or any(count < 1 or count % _CURVE_REPLICAS for count in args.curve):
+        raise ValueError(
+            f"iterations and steps must be positive and --curve multiples of {_CURVE_REPLICAS}, got {args.iterations}, "
+            f"{args.steps} and {args.curve}"
+        )
     robot, device = get_robot(args.robot), resolve_device(args.device)
     training = training_rates(args.train_speed)
     if args.run is not None:
         if not device.startswith("cuda"):
             raise ValueError(f"--run needs a CUDA device, got {device}: a run on the CPU has several workers")
-        cfg, metrics, terrains = read_iterations(args.run, args.iterations)
+        cfg, metrics, terrains = read_iterations(args.run, args.iterations, provenance(device, 0)["device"])
+        robot = get_robot(cfg.robot)
     else:
         cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
         metrics, terrains = [], None
@@ -163,6 +172,7 @@ def measure(args: Arguments) -> dict[str, Any]:
     bare = measure_bare_physics(rollout, terrains, seeds, steps=args.steps)
     del rollout
     rates = [num_envs * row["physics_steps"] / row["wall_s"] for row in metrics]
+    running = [num_envs * row["mean_duration_s"] / robot.physics_dt / row["wall_s"] for row in metrics]
     return {
         **provenance(device, cfg.seed),
         "robot": robot.name,
@@ -173,6 +183,7 @@ def measure(args: Arguments) -> dict[str, Any]:
         "bare_physics_ratio": float(np.median(rates)) / bare.walking,
         "bare_physics_ratio_standing": float(np.median(rates)) / bare.standing,
         "world_steps_per_s": float(np.median(rates)),
+        "running_world_steps_per_s": float(np.median(running)),
         "bare_world_steps_per_s": bare.walking,
         "bare_world_steps_per_s_standing": bare.standing,
         **training,

@@ -87,9 +87,11 @@ def record_segments(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -
 
 def replay_segments(sim: Simulation, graph: Any, segments: list[Segment]) -> None:
     """Play segments back: ``graph`` is launched once a control step."""
+    everyone = wp.ones(sim.num_envs, dtype=int, device=sim.device)
     for segment in segments:
         wp.copy(sim.joint_q, segment.joint_q)
         wp.copy(sim.joint_qd, segment.joint_qd)
+        sim.clear_solver(everyone)
         sim.refresh()
         for targets in segment.targets:
             wp.copy(sim.targets, targets)

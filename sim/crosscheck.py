@@ -30,7 +30,7 @@ from sim.simulation import resolve_device
 from sim.terrain import hard_random_genes
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
-_MAX_POOL = 2000
+_MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
 _FINE_DT = 0.001
 _FINE_TIME_CONSTANT_S = 0.003
 

@@ -22,6 +22,7 @@ class Result:
     reached_goal: np.ndarray
     fallen: np.ndarray
     invalid: np.ndarray
+    duration_s: np.ndarray
     physics_steps: int = 4000
     wall_s: float = 0.5
 
@@ -37,6 +38,7 @@ def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES
         reached_goal=~never,
         fallen=never,
         invalid=never if invalid is None else np.asarray(invalid, dtype=bool),
+        duration_s=np.full(never.shape, 15.0, dtype=np.float32),
     )
 
 

@@ -1,6 +1,7 @@
 """How the commands end: exit codes, one line for what a user can mend, and files tried before the work."""
 
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -8,6 +9,11 @@ from qd import speed as search_speed
 from qd.cli import run_command
 from sim.command import exit_code_of
 from train import evaluate, speed
+
+
+@pytest.fixture
+def shipped_search() -> Path:
+    return Path(__file__).parents[2] / "results" / "anymal" / "search50"
 
 
 def fail(error: BaseException) -> int:
@@ -52,3 +58,20 @@ def test_where_to_write_is_tried_before_the_timing(tmp_path, monkeypatch, capsys
     assert exit.value.code == 2
     for line in [line for line in capsys.readouterr().err.splitlines() if "Warp" not in line]:
         assert line.startswith("error: ") and ("cannot write to" in line or "is a directory" in line)
+
+
+@pytest.mark.parametrize(
+    "flags", [["--iterations", "0"], ["--steps", "0"], ["--curve", "1000"], ["--curve", "0"]], ids=" ".join
+)
+def test_numbers_that_make_no_sense_are_refused_before_the_timing(capsys, flags):
+    with pytest.raises(SystemExit) as exit:
+        run_command(search_speed.Arguments, search_speed.main, ["--device", "cpu", *flags])
+    assert exit.value.code == 2
+    assert "must be positive and --curve multiples of 16" in capsys.readouterr().err
+
+
+def test_a_run_of_another_device_is_not_timed_against_this_one(shipped_search):
+    with pytest.raises(ValueError, match="was made on NVIDIA H200, the bare rate would be that of NVIDIA H100"):
+        search_speed.read_iterations(shipped_search, 20, "NVIDIA H100")
+    cfg, metrics, terrains = search_speed.read_iterations(shipped_search, 20, "NVIDIA H200")
+    assert (cfg.robot, len(metrics), terrains.shape) == ("anymal", 20, (200, 64))
