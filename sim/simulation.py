@@ -148,6 +148,8 @@ class Simulation:
             model.body_inv_mass.assign(1.0 / mass)
 
     def _build_solver(self, cfg: SolverCfg) -> None:
+        # Newton gives friction a time constant of its own, by the material's gain kf; a negative one leaves it MuJoCo's.
+        self.model.shape_material_kf.fill_(-1.0)
         self.solver = newton.solvers.SolverMuJoCo(
             self.model,
             njmax=self.robot.njmax,
