@@ -20,6 +20,7 @@ FLAG_RUN := run
 FLAG_ELITE := elite
 FLAG_OUT := out
 FLAG_GENES := genes
+FLAG_WORKERS := workers
 
 help: ## This list
 	@echo 'faultline: find the terrains that break a legged robot. Targets:'
@@ -38,6 +39,8 @@ help: ## This list
 	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
 	@echo '  OUT=FILE         where to write the numbers        calibrate evaluate crosscheck bench'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
+	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
+	@echo '                   joined by RAY_ADDRESS             archive calibrate evaluate'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
 	@echo '  TORCH=SPEC       torch other than the pinned one, e.g. a build for your GPU driver: a requirement or a wheel'
 	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.replay, train.base, ...)'
@@ -52,23 +55,23 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	grep -v $(if $(TORCH),'^torch==','^$$') constraints.txt > .venv/constraints.txt
 	$(if $(TORCH),$(BIN)/python -m pip install '$(TORCH)')
-	$(BIN)/python -m pip install --quiet -e '.[dev]' -c .venv/constraints.txt
+	$(BIN)/python -m pip install --quiet -e '.[dev,cluster]' -c .venv/constraints.txt
 	@touch $@
 
 archive: setup ## Search the terrains on which the controller of ROBOT fails; writes a run under runs/
-	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME)
+	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS)
 
 train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
-	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT)
+	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT WORKERS)
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
 	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
 
 evaluate: setup ## Success and goal rates of the controller of ROBOT
-	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT)
+	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT WORKERS)
 
 crosscheck: setup ## Hold the crossings of ROBOT against the same in plain MuJoCo C
 	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES OUT)

@@ -59,13 +59,18 @@ class Arguments:
     """Weight of the standard deviations in the fitness."""
     lam: float | None = None
     """Weight of the share of episodes without collision in the fitness."""
-    workers: int | None = None
-    """Processes on the CPU; one a core."""
+    processes: int | None = None
+    """Processes on the CPU, without Ray; one a core."""
+    workers: int | Literal["auto"] | None = None
+    """Search on so many Ray workers, a GPU or a CPU core each; auto: as many as there are. RAY_ADDRESS names a running
+    cluster; without it they are this machine's."""
+    worker_limit_s: float = 300.0
+    """A Ray worker that gets no further for so many seconds is given up, and its terrains go to another."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
     """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
 
 
-_NOT_SETTINGS = ("device", "resume", "run_dir", "workers", "reproduce")
+_NOT_SETTINGS = ("device", "resume", "run_dir", "processes", "workers", "worker_limit_s", "reproduce")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +109,7 @@ def job_of(args: Arguments) -> Job:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
     there = RunDirectory(args.resume).read_cfg() if args.resume else None
     robot = get_robot(args.robot or (there.robot if there else "anymal"))
-    device = resolve_device(args.device)
+    device = resolve_device(args.device, args.workers)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
     moved = None
     if args.resume and there:
@@ -115,21 +120,31 @@ def job_of(args: Arguments) -> Job:
     else:
         name = args.preset or ("paper" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
-        path, origin = _free_path(args, cfg), provenance(device, cfg.seed)
+        path, origin = _free_path(args, cfg), _origin(device, cfg.seed, args)
     policy = moved or policy_spec(cfg, robot)
     check_policy(policy, cfg.robot, device)
     return Job(
         cfg=cfg,
         path=path,
         resumes=there is not None,
-        evaluator=_evaluator(cfg, policy, device, args.workers),
+        evaluator=_evaluator(cfg, policy, device, args),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
         origin=origin,
-        resume_command=_resume_command(cfg.robot, path, args.device, moved),
+        resume_command=_resume_command(cfg.robot, path, args, moved),
     )
 
 
-def _evaluator(cfg: SearchCfg, policy: str, device: str, workers: int | None) -> EvaluatorCfg:
+def _origin(device: str, seed: int, args: Arguments) -> dict[str, Any]:
+    """Provenance of a run that begins now."""
+    origin = provenance(device, seed)
+    if args.workers is not None:
+        from qd.cluster import name_of_device  # Ray is there: the device was found by it
+
+        origin["device"] = name_of_device(device)
+    return origin
+
+
+def _evaluator(cfg: SearchCfg, policy: str, device: str, args: Arguments) -> EvaluatorCfg:
     """What evaluates an iteration's terrains all at once."""
     return EvaluatorCfg(
         robot=cfg.robot,
@@ -137,7 +152,9 @@ def _evaluator(cfg: SearchCfg, policy: str, device: str, workers: int | None) ->
         num_terrains=cfg.cma.num_terrains,
         num_replicas=cfg.replicas,
         device=device,
-        num_workers=workers,
+        num_processes=args.processes,
+        workers=args.workers,
+        worker_limit_s=args.worker_limit_s,
     )
 
 
@@ -170,7 +187,7 @@ def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
     if args.run_dir is None:
         name = f"{cfg.robot}-{cfg.preset}-{cfg.seed}"
         path = next(path for path in numbered(_RUNS, name) if not path.exists())
-        _mention_unfinished(name, cfg, args.device)
+        _mention_unfinished(name, cfg, args)
         return path
     if (args.run_dir / CONFIG_FILE).exists():
         different = differences(RunDirectory(args.run_dir).read_config()["settings"], as_settings(cfg))
@@ -178,14 +195,14 @@ def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
             raise ValueError(
                 f"{args.run_dir} holds a run of other settings: {', '.join(different)}: give another --run-dir"
             )
-        command = _resume_command(cfg.robot, args.run_dir, args.device, None)
+        command = _resume_command(cfg.robot, args.run_dir, args, None)
         raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
     if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
         raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
     return args.run_dir
 
 
-def _mention_unfinished(name: str, cfg: SearchCfg, device: str | None) -> None:
+def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments) -> None:
     """Says so where the new run repeats one that was stopped; starting over is still the user's to choose."""
     for path in itertools.takewhile(Path.exists, numbered(_RUNS, name)):
         run = RunDirectory(path)
@@ -197,9 +214,10 @@ def _mention_unfinished(name: str, cfg: SearchCfg, device: str | None) -> None:
             print(
                 f"{path} holds the same search, stopped after {done} of {config['iterations']} iterations. Go on with:"
             )
-            print(f"  {_resume_command(cfg.robot, path, device, None)}")
+            print(f"  {_resume_command(cfg.robot, path, args, None)}")
 
 
-def _resume_command(robot: str, path: Path, device: str | None, moved_policy: str | None) -> str:
-    flags = {"ROBOT": robot, "RESUME": str(path), "DEVICE": device, "POLICY": moved_policy}
+def _resume_command(robot: str, path: Path, args: Arguments, moved_policy: str | None) -> str:
+    workers = None if args.workers is None else str(args.workers)
+    flags = {"ROBOT": robot, "RESUME": str(path), "DEVICE": args.device, "WORKERS": workers, "POLICY": moved_policy}
     return " ".join(["make archive", *(f"{name}={shlex.quote(value)}" for name, value in flags.items() if value)])

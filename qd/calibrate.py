@@ -6,7 +6,7 @@ Scales are measured once with the shipped controller, before any search, and nev
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,8 @@ class CalibrateCfg:
     """Episodes a terrain."""
     seed: int = 0
     """Draws terrains and starts."""
+    workers: int | Literal["auto"] | None = None
+    """Cross on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
     out: Path | None = None
     """Where to write; sim/robots/<robot>.scales.json."""
 
@@ -84,7 +86,7 @@ def calibrate(cfg: CalibrateCfg) -> Path:
             "name a file for its scales with --out"
         )
     robot = get_robot(cfg.robot)
-    device = resolve_device(cfg.device)
+    device = resolve_device(cfg.device, cfg.workers)
     policy = cfg.policy or str(robot.policy_file)
     check_policy(policy, cfg.robot, device)
     out = cfg.out or robot.scales_file
@@ -96,6 +98,7 @@ def calibrate(cfg: CalibrateCfg) -> Path:
         num_terrains=cfg.terrains if device.startswith("cuda") else min(cfg.terrains, _CPU_TERRAINS),
         num_replicas=cfg.replicas,
         device=device,
+        workers=cfg.workers,
     )
     genes = hard_random_genes(cfg.terrains, cfg.seed)
     seeds = np.random.SeedSequence(cfg.seed).generate_state(cfg.terrains, np.uint32)

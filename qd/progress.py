@@ -44,7 +44,9 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, processes: int) -> 
         processes: Processes that evaluate.
     """
     left = cfg.iterations - done
-    where = device if device.startswith("cuda") else f"{processes} process{'es' * (processes > 1)} on the CPU"
+    where = f"{processes} process{'es' * (processes > 1)} on the CPU"
+    if device.startswith("cuda"):
+        where = device if processes == 1 else f"{processes} GPUs"
     controller = "its shipped controller" if cfg.policy == SHIPPED else f"controller {cfg.policy}"
     if not left:
         return f"All {done} iterations of {path} are done; writing its figures and results again."
@@ -94,11 +96,12 @@ class ProgressBar:
         """A function that moves the bar to a share of an iteration, counted from 1."""
         return lambda share: self._move_to(iteration - 1 + share)
 
-    def show(self, row: dict[str, Any]) -> None:
+    def show(self, row: dict[str, Any], staff: str | None = None) -> None:
         """Shows where the search stands after an iteration.
 
         Args:
             row: The iteration's metrics.
+            staff: How the workers fare, where there are any.
         """
         self._move_to(row["iteration"])
         if row["iteration"] == self._first + 1:
@@ -107,7 +110,8 @@ class ProgressBar:
         self._describe(
             row["iteration"],
             f"{row['elites']} elites ({row['reachable_coverage']:.1%} of reachable), QD {row['qd_score']:.0f}, "
-            f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s",
+            f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s"
+            + (f" by {staff}" if staff else ""),
         )
 
     def _describe(self, done: int, state: str) -> None:

@@ -16,7 +16,7 @@ from qd.reevaluate import FRESH_EPISODES, reproduced
 from qd.report import summary, write_figures
 from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed
 from qd.settings import SearchCfg, as_settings
-from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
+from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, Staffed, episode_seeds, open_evaluator
 from sim.files import to_json, write_atomically
 from sim.provenance import provenance
 
@@ -58,10 +58,14 @@ def search_terrains(
             "rollout_s": float(result.wall_s),
             "mean_duration_s": float(result.duration_s.mean()),
         }
-        metrics.append({"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics, **timing})
+        crew = evaluate.status() if isinstance(evaluate, Staffed) else None
+        staff = {"workers": crew.workers, "retries": crew.retries} if crew else {}
+        metrics.append(
+            {"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics, **timing, **staff}
+        )
         began = ended
         run.save(settings, search, metrics, found)
-        bar.show(metrics[-1])
+        bar.show(metrics[-1], None if crew is None else str(crew))
 
 
 def _scores(archive: Archive) -> dict[str, Any]:
@@ -149,7 +153,7 @@ def _finish(job: Job, run: RunDirectory, search: "CmaMae", metrics: Metrics, ope
     numbers = summary(
         archive,
         metrics,
-        gpus=int(not job.origin["device"].startswith("CPU")),
+        gpus=0 if job.origin["device"].startswith("CPU") else max(row.get("workers", 1) for row in metrics),
         num_reproduced=count,
         origin={**job.origin, "reproduced_by": again},
     )

@@ -161,7 +161,7 @@ def measure(args: Arguments) -> dict[str, Any]:
         num_terrains=cfg.cma.num_terrains,
         num_replicas=cfg.replicas,
         device=device,
-        num_workers=1,  # bare physics is measured in one process too
+        num_processes=1,  # bare physics is measured in one process too
     )
     if terrains is None:
         metrics, terrains = time_iterations(cfg, evaluator)

@@ -1,29 +1,32 @@
-"""Evaluation of many terrains: in this process on a GPU, over several processes on a CPU.
+"""Evaluation of many terrains: in this process on a GPU, over several processes on a CPU, or by Ray workers.
 
 Whole terrains are handed out, and an episode depends on its terrain, seed and replica alone, so that how terrains are
 spread changes nothing in the result.
 """
 
-import dataclasses
+import importlib
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.shards import MIN_ROWS, merged, taken
 from qd.worker_process import Crosser, EvaluatorError, WorkerProcess
 
 if TYPE_CHECKING:
+    from qd.crew import CrewStatus
     from sim.rollout import RolloutResult
 
 __all__ = [
     "Evaluate",
     "EvaluatorCfg",
     "EvaluatorError",
+    "Staffed",
     "available_cores",
     "build_rollout",
     "check_policy",
@@ -31,8 +34,6 @@ __all__ = [
     "open_evaluator",
     "resolve_device",
 ]
-
-_MIN_ROWS = 4  # torch's linear layers give the same bits for batches of 4 rows and more, other ones for fewer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,16 +50,24 @@ class EvaluatorCfg:
     """Episodes a terrain."""
     device: str = "cpu"
     """Warp device name."""
-    num_workers: int | None = None
-    """Processes on the CPU; None: one a core."""
+    num_processes: int | None = None
+    """Processes on the CPU without Ray; None: one a core."""
+    workers: int | Literal["auto"] | None = None
+    """Ray actors, a GPU or a CPU core each; `auto`: as many as the cluster has; None: no Ray."""
+    worker_limit_s: float = 300.0
+    """A Ray actor that gets no further for so long [s] is given up."""
+    penalties_from_s: float = 0.0
+    """Penalties are summed from this time of an episode on [s]."""
 
     @property
     def processes(self) -> int:
-        """Processes that evaluate: this one on a GPU; on the CPU no more than there is work for."""
+        """Processes that evaluate: this one on a GPU; on the CPU no more than there is work for; or Ray's."""
+        if self.workers is not None:
+            return _cluster("cluster").num_devices(self.device) if self.workers == "auto" else self.workers
         if self.device.startswith("cuda"):
             return 1
-        by_rows = self.num_terrains * self.num_replicas // _MIN_ROWS
-        return max(1, min(self.num_workers or available_cores(), self.num_terrains, by_rows))
+        by_rows = self.num_terrains * self.num_replicas // MIN_ROWS
+        return max(1, min(self.num_processes or available_cores(), self.num_terrains, by_rows))
 
 
 class Evaluate(Protocol):
@@ -74,6 +83,15 @@ class Evaluate(Protocol):
             seeds: One a terrain, uint32.
             progress: Called now and then with the share that is done.
         """
+        ...
+
+
+@runtime_checkable
+class Staffed(Protocol):
+    """An :class:`Evaluate` that has workers to report on."""
+
+    def status(self) -> "CrewStatus":
+        """How they fare."""
         ...
 
 
@@ -98,12 +116,19 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def resolve_device(name: str | None) -> str:
+def resolve_device(name: str | None, workers: int | Literal["auto"] | None = None) -> str:
     """Warp device name; None means CUDA where it is there, else the CPU.
 
+    Args:
+        name: What the user asked for.
+        workers: Ray workers, whose devices are meant then; None without Ray.
+
     Raises:
-        ValueError: If the device is unknown or absent.
+        ValueError: If the device is unknown or absent, or there are not so many.
+        OSError: If there is no Ray cluster at RAY_ADDRESS.
     """
+    if workers is not None:
+        return _cluster("cluster").cluster_device(name, workers)
     from sim.simulation import resolve_device as resolve
 
     return resolve(name)
@@ -117,14 +142,16 @@ def check_policy(policy: str, robot: str, device: str) -> None:
     """
     from sim.policy import load_policy
     from sim.robot import get_robot
+    from sim.simulation import resolve_device as resolve
 
-    load_policy(policy, get_robot(robot), device)
+    here = resolve(None)  # a cluster's GPUs need not be this machine's
+    load_policy(policy, get_robot(robot), device if here.startswith("cuda") else "cpu")
 
 
 def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
     from sim.robot import get_robot
-    from sim.rollout import Rollout
+    from sim.rollout import CrossingCfg, Rollout
 
     return Rollout(
         get_robot(cfg.robot),
@@ -132,7 +159,22 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
         num_terrains=num_terrains,
         num_replicas=cfg.num_replicas,
         device=cfg.device,
+        cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s),
     )
+
+
+def _cluster(module: str) -> Any:
+    """A module of this room that needs Ray, which nothing else imports.
+
+    Raises:
+        ValueError: If Ray is not installed.
+    """
+    try:
+        return importlib.import_module(f"qd.{module}")
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise ValueError("workers need Ray, which is not installed: pip install -e '.[cluster]'") from None
 
 
 Build = Callable[[EvaluatorCfg, int], Crosser]
@@ -140,7 +182,7 @@ Build = Callable[[EvaluatorCfg, int], Crosser]
 
 @contextmanager
 def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterator[Evaluate]:
-    """Builds the simulation, in as many processes as pay, and keeps it until the end.
+    """Builds the simulation, in as many processes as pay or on a Ray cluster, and keeps it until the end.
 
     Args:
         cfg: What, with what, where.
@@ -151,8 +193,13 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
 
     Raises:
         ValueError: If the simulation cannot be built as asked for.
-        EvaluatorError: If a process dies.
+        EvaluatorError: If a process dies; of a Ray cluster, if no worker is left and none comes.
+        OSError: If there is no Ray cluster at RAY_ADDRESS.
     """
+    if cfg.workers is not None:
+        with _cluster("crew").open_crew(cfg, build) as crew:
+            yield crew
+        return
     if cfg.device.startswith("cuda"):
         crosser = build(cfg, cfg.num_terrains)
         yield _in_turns(_in_process(crosser), cfg.num_terrains)
@@ -200,7 +247,7 @@ def _over_workers(workers: list["WorkerProcess"]) -> Evaluate:
                 shares[index] = value if message == "progress" else 1.0
             if progress is not None:
                 progress(float(shares.mean()))
-        return _merge([results[index] for index in range(len(workers))], join=0)
+        return merged([results[index] for index in range(len(workers))], join=0)
 
     return evaluate
 
@@ -223,36 +270,11 @@ def _in_turns(evaluate: Evaluate, at_once: int) -> Evaluate:
             turn = np.arange(first, first + at_once) % count
             report = None if progress is None else _share_of(progress, first / count, at_once / count)
             result = evaluate(terrains[turn], seeds[turn], report)
-            parts.append(_take(result, min(at_once, count - first)))
-        return _merge(parts, join=1)
+            parts.append(taken(result, min(at_once, count - first)))
+        return merged(parts, join=1)
 
     return in_turns
 
 
 def _share_of(progress: Callable[[float], None], start: float, share: float) -> Callable[[float], None]:
     return lambda done: progress(min(1.0, start + share * done))
-
-
-def _take(result: Any, count: int) -> Any:
-    """The first terrains of a result."""
-    arrays = {name: value[:count] for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(result, **arrays)
-
-
-def _merge(results: list[Any], *, join: int) -> Any:
-    """Results side by side (``join`` 0: they ran at the same time) or one after the other (1)."""
-    if len(results) == 1:
-        return results[0]
-    combine = (max, sum)[join]
-    merged: dict[str, Any] = {
-        name: np.concatenate([getattr(result, name) for result in results])
-        for name, value in _fields(results[0]).items()
-        if isinstance(value, np.ndarray)
-    }
-    for name in ("physics_steps", "wall_s"):
-        merged[name] = combine(getattr(result, name) for result in results)
-    return dataclasses.replace(results[0], **merged)
-
-
-def _fields(result: Any) -> dict[str, Any]:
-    return {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}

@@ -4,12 +4,15 @@ import sys
 from collections.abc import Callable
 
 
-def exit_code_of(command: Callable[[], int], *, stopped: str = "Stopped.") -> int:
+def exit_code_of(
+    command: Callable[[], int], *, stopped: str = "Stopped.", also: tuple[type[Exception], ...] = ()
+) -> int:
     """Runs a command.
 
     Args:
         command: Returns its exit code.
         stopped: What Ctrl-C makes it say.
+        also: Errors of other rooms that end it in a line too.
 
     Returns:
         That code; 2 for anything a user can mend (ValueError, OSError, FloatingPointError) and 130 for Ctrl-C, after a
@@ -17,7 +20,7 @@ def exit_code_of(command: Callable[[], int], *, stopped: str = "Stopped.") -> in
     """
     try:
         return command()
-    except (ValueError, OSError, FloatingPointError) as error:
+    except (ValueError, OSError, FloatingPointError, *also) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

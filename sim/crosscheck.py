@@ -10,7 +10,7 @@ import os
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -26,7 +26,7 @@ from sim.plain_processes import run_plain
 from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
-from sim.simulation import resolve_device
+from sim.simulation import SolverCfg, resolve_device
 from sim.terrain import hard_random_genes
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
@@ -59,9 +59,10 @@ class CrosscheckCfg:
     """Episodes a terrain of the parallel simulation, in the first set and in the fresh one."""
     plain_episodes: int = 200
     """Episodes a terrain of plain MuJoCo; the first of them begin exactly as the fresh ones do."""
-    fine: bool = False
-    """Let plain MuJoCo resolve its contacts: steps of 1 ms, a time constant of 3 ms, five times the work. With the
-    robot file's own 5 and 10 ms, feet sink so far into steep ground that the prisms of its heightfield hold them."""
+    fine: Literal["neither", "mujoco", "both"] = "neither"
+    """Who resolves its contacts: steps of 1 ms, a time constant of 3 ms, five times the work. With the file's own 5
+    and 10 ms, feet sink into the ground and MuJoCo's heightfield holds them by the facets beside. `both` compares the
+    simulators, `mujoco` what the file's settings come to."""
     processes: int | None = None
     """Processes of plain MuJoCo; one a core."""
     seed: int = 0
@@ -176,9 +177,9 @@ class Crosscheck:
     def _seeds(self, count: int) -> NDArray[np.uint32]:
         return self.rng.integers(2**32, size=count, dtype=np.uint32)
 
-    def _plain_robot(self) -> tuple[RobotCfg, float | None]:
-        """The robot as plain MuJoCo steps it, and its contact time constant [s], None for the file's."""
-        if not self.cfg.fine:
+    def _resolved(self, fine: bool) -> tuple[RobotCfg, float | None]:
+        """The robot as a simulator steps it, and its contact time constant [s], None for the file's."""
+        if not fine:
             return self.robot, None
         decimation = round(self.robot.control_dt / _FINE_DT)
         return replace(self.robot, physics_dt=_FINE_DT, decimation=decimation), _FINE_TIME_CONSTANT_S
@@ -188,8 +189,14 @@ class Crosscheck:
         cfg = self.cfg
         choice = self.choose()
         genes, seeds = choice.genes, self._seeds(cfg.terrains)
+        robot, time_constant_s = self._resolved(cfg.fine == "both")
         rollout = Rollout(
-            self.robot, self.policy, num_terrains=cfg.terrains, num_replicas=cfg.episodes, device=self.device
+            robot,
+            self.policy,
+            num_terrains=cfg.terrains,
+            num_replicas=cfg.episodes,
+            device=self.device,
+            solver=SolverCfg(time_constant_s=time_constant_s),
         )
         ours = rollout.evaluate(genes, seeds)
         bank = TerrainBank(cfg.terrains, device=self.device)
@@ -199,10 +206,10 @@ class Crosscheck:
             draw_starts(self.robot, grid, int(seed), cfg.plain_episodes, self.device)
             for grid, seed in zip(heights, seeds, strict=True)
         ]
-        simulated, time_constant_s = self._plain_robot()
+        simulated, plain_time_constant_s = self._resolved(cfg.fine != "neither")
         processes = cfg.processes or os.cpu_count() or 1
         plain = run_plain(
-            simulated, str(self.policy), heights, starts, processes=processes, time_constant_s=time_constant_s
+            simulated, str(self.policy), heights, starts, processes=processes, time_constant_s=plain_time_constant_s
         )
         pairs = [
             Pair(index=choice.index[k], first=rate, ours=ours.outcome[k], plain=plain[k].outcome)
@@ -214,10 +221,8 @@ class Crosscheck:
             "policy": Path(str(self.policy)).name,
             "pool": "hard_random" if cfg.genes is None else str(cfg.genes),
             "looked_at": choice.looked_at,
-            "mujoco_c": {
-                "physics_dt": simulated.physics_dt,
-                "time_constant_s": "of the robot's file" if time_constant_s is None else time_constant_s,
-            },
+            "ours": _settings(robot, time_constant_s),
+            "mujoco_c": _settings(simulated, plain_time_constant_s),
             **summarise(pairs, cfg.seed),
             "penalties": {
                 name: {"ours": float(np.nanmean(ours.penalties[..., k])), "mujoco_c": float(np.nanmean(column))}
@@ -225,6 +230,10 @@ class Crosscheck:
                 for column in [np.concatenate([crossings.penalties[:, k] for crossings in plain])]
             },
         }
+
+
+def _settings(robot: RobotCfg, time_constant_s: float | None) -> dict[str, Any]:
+    return {"physics_dt": robot.physics_dt, "time_constant_s": time_constant_s or "of the robot's file"}
 
 
 def _print_table(report: dict[str, Any]) -> None:

@@ -23,11 +23,16 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
     return {
         "command": shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
         "commit": os.environ.get("FAULTLINE_COMMIT") or _output(["git", "rev-parse", "HEAD"]),
-        "device": _device_name(device),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
+        "device": device_name(device),
+        "versions": versions(),
         "seed": seed,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python and of the packages that results depend on; None of one that is not installed."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
 
 
 def _module() -> str:
@@ -43,7 +48,8 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _device_name(device: str) -> str:
+def device_name(device: str) -> str:
+    """What a Warp device is, in words; its own name where this machine cannot tell."""
     if not device.startswith("cuda"):
         return f"CPU ({platform.machine()}, {os.cpu_count()} cores)"
     index = device.partition(":")[2] or "0"

@@ -37,6 +37,8 @@ class SolverCfg:
     iteration more costs about 5 % of the speed (results/bench/options-*.json)."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
+    time_constant_s: float | None = None
+    """Contact time constant [s] at critical damping; that of the robot's file if None."""
 
 
 def resolve_device(name: str | None) -> str:
@@ -148,7 +150,7 @@ class Simulation:
             model.body_inv_mass.assign(1.0 / mass)
 
     def _build_solver(self, cfg: SolverCfg) -> None:
-        # Newton gives friction a time constant of its own, by the material's gain kf; a negative one leaves it MuJoCo's.
+        # By the material's gain kf Newton gives friction a time constant of its own; a negative one leaves it MuJoCo's.
         self.model.shape_material_kf.fill_(-1.0)
         self.solver = newton.solvers.SolverMuJoCo(
             self.model,
@@ -162,6 +164,8 @@ class Simulation:
             kinematic_switchable_roots=False,
         )
         self.solver.mjw_model.opt.warn_overflow = 0
+        if cfg.time_constant_s is not None:
+            self.solver.mjw_model.geom_solref.fill_(wp.vec2(cfg.time_constant_s, 1.0))
         self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:

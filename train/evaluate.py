@@ -7,20 +7,20 @@ nowhere else: not in training, calibration or search.
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
 from tqdm import tqdm
 
 from kernels.episode import Outcome
+from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, check_policy, open_evaluator, resolve_device
 from sim.command import exit_code_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.intervals import bootstrap_interval
 from sim.provenance import provenance
 from sim.robot import get_robot
-from sim.rollout import CrossingCfg, Rollout, RolloutResult
-from sim.simulation import resolve_device
+from sim.rollout import RolloutResult
 from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
 
 FULL = (300, 20)
@@ -49,6 +49,8 @@ class EvaluateCfg:
     """Episodes a terrain; 20 on CUDA, 4 on the CPU."""
     seed: int = 0
     """Draws other test sets."""
+    workers: int | Literal["auto"] | None = None
+    """Cross on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
     out: Path | None = None
     """Where to write the numbers; of the shipped controller and 300 x 20 results/<robot>/base.json, else nowhere."""
 
@@ -129,14 +131,14 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
     }
 
 
-def evaluate_sets(rollout: Rollout, seed: int) -> dict[str, Any]:
+def evaluate_sets(evaluate: Evaluate, count: int, seed: int) -> dict[str, Any]:
     """The three sets of ``base.json``: ``hand_crafted``, ``hard_random`` and ``flat``.
 
     Args:
-        rollout: Crossings whose penalties count from :data:`VELOCITY_FROM_S` on.
+        evaluate: Crosses terrains; its penalties count from :data:`VELOCITY_FROM_S` on.
+        count: Terrains a set.
         seed: Draws the test sets.
     """
-    count = rollout.num_terrains
     rngs = [set_rng(number, seed) for number in range(3)]
     crossings, types, levels = hand_crafted_crossings(count, rngs[0])
     sets = {
@@ -146,14 +148,13 @@ def evaluate_sets(rollout: Rollout, seed: int) -> dict[str, Any]:
     }
     results = {}
     for (name, terrains), rng in zip(sets.items(), rngs, strict=True):
-        with tqdm(desc=name, unit="step", disable=None) as bar:
+        with tqdm(desc=name, total=100, unit="%", disable=None) as bar:
 
-            def show(done: int, most: int, bar: tqdm = bar) -> None:
-                bar.total = most
-                bar.update(done - bar.n)
+            def show(share: float, bar: tqdm = bar) -> None:
+                bar.update(round(100 * share) - bar.n)
 
             starts = rng.integers(2**32, size=count, dtype=np.uint32)
-            results[name] = rollout.evaluate(terrains, starts, progress=show)
+            results[name] = evaluate(terrains, starts, show)
     return {
         "hand_crafted": summarise(results["hand_crafted"], seed, types=types, levels=levels),
         "hard_random": summarise(results["hard_random"], seed),
@@ -190,31 +191,30 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
         ValueError: If something asked for cannot be had; raised before any long work.
     """
     robot = get_robot(cfg.robot)
-    device = resolve_device(cfg.device)
+    device = resolve_device(cfg.device, cfg.workers)
     small = not device.startswith("cuda")
     terrains, episodes = SMALL if small else FULL
     terrains, episodes = cfg.terrains or terrains, cfg.episodes or episodes
     if small and cfg.terrains is None and cfg.episodes is None:
         print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {FULL[0]} x {FULL[1]}.")
-    policy = cfg.policy or robot.policy_file
+    policy = str(cfg.policy or robot.policy_file)
     published = cfg.policy is None and (terrains, episodes) == FULL
     out = cfg.out or (Path("results") / robot.name / "base.json" if published else None)
     if out is not None:
         prepare_output(out)
-    rollout = Rollout(
-        robot,
-        policy,
+    check_policy(policy, robot.name, device)
+    evaluator = EvaluatorCfg(
+        robot=robot.name,
+        policy=policy,
         num_terrains=terrains,
         num_replicas=episodes,
         device=device,
-        cfg=CrossingCfg(penalties_from_s=VELOCITY_FROM_S),
+        workers=cfg.workers,
+        penalties_from_s=VELOCITY_FROM_S,
     )
-    report = {
-        **provenance(device, cfg.seed),
-        "robot": robot.name,
-        "policy": Path(str(policy)).name,
-        **evaluate_sets(rollout, cfg.seed),
-    }
+    with open_evaluator(evaluator) as crossings:
+        sets = evaluate_sets(crossings, terrains, cfg.seed)
+    report = {**provenance(device, cfg.seed), "robot": robot.name, "policy": Path(policy).name, **sets}
     _print_table(report)
     if out is not None:
         write_atomically(out, to_json(report))
@@ -225,7 +225,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
 def main() -> int:
     """Command line; returns the exit status."""
     cfg = tyro.cli(EvaluateCfg, description=__doc__)
-    return exit_code_of(lambda: int(evaluate(cfg) is None))
+    return exit_code_of(lambda: int(evaluate(cfg) is None), also=(EvaluatorError,))
 
 
 if __name__ == "__main__":

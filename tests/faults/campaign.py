@@ -113,7 +113,7 @@ class RealSearch:
         self._whole_group = whole_group
         self._log = path.with_name(f"{path.name}.log")
         place = ["--resume", str(path)] if (path / CONFIG_FILE).exists() else ["--run-dir", str(path), *REAL_SIZE]
-        size = ["--device", "cpu", "--iterations", str(iterations), "--workers", str(workers)]
+        size = ["--device", "cpu", "--iterations", str(iterations), "--processes", str(workers)]
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "qd.search", *place, *size],

@@ -15,7 +15,6 @@ from qd import calibrate, replay
 from qd.cli import run_command
 from sim import rollout
 from sim.command import exit_code_of
-from sim.policy import load_policy
 from tests.faults import searches, trainings
 from tests.qd import stand_in
 from train import evaluate
@@ -51,8 +50,8 @@ def calibrate_with(policy: Path) -> None:
 
 def evaluate_with(policy: Path) -> int:
     """Crossings with a controller, up to where the simulation would be built."""
-    evaluate.Rollout = lambda robot, spec, **_: load_policy(spec, robot, "cpu")
-    evaluate.evaluate_sets = lambda loaded, seed: (_ for _ in ()).throw(SystemExit(0))
+    evaluate.open_evaluator = stand_in.open_stand_in
+    evaluate.evaluate_sets = lambda crossings, count, seed: (_ for _ in ()).throw(SystemExit(0))
     cfg = evaluate.EvaluateCfg(policy=str(policy), device="cpu", terrains=2, episodes=1)
     return exit_code_of(lambda: int(evaluate.evaluate(cfg) is None))
 

@@ -31,13 +31,15 @@ def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES
     """A result with given penalties, shape (T, R, P); nothing else happened unless said."""
     penalties = np.asarray(penalties, dtype=np.float64)
     never = np.zeros(penalties.shape[:2], dtype=bool)
+    collided = never if base_collision is None else np.asarray(base_collision, dtype=bool)
+    excluded = never if invalid is None else np.asarray(invalid, dtype=bool)
     return Result(
         penalties=penalties,
         penalty_names=tuple(names[: penalties.shape[2]]),
-        base_collision=never if base_collision is None else np.asarray(base_collision, dtype=bool),
-        reached_goal=~never,
+        base_collision=collided,
+        reached_goal=~collided & ~excluded,
         fallen=never,
-        invalid=never if invalid is None else np.asarray(invalid, dtype=bool),
+        invalid=excluded,
         duration_s=np.full(never.shape, 15.0, dtype=np.float32),
     )
 

@@ -45,7 +45,7 @@ KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.
 def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
     cfg = dataclasses.replace(CFG, **changes)
     evaluator = EvaluatorCfg(
-        robot="anymal", policy="p", num_terrains=cfg.cma.num_terrains, num_replicas=cfg.replicas, num_workers=1
+        robot="anymal", policy="p", num_terrains=cfg.cma.num_terrains, num_replicas=cfg.replicas, num_processes=1
     )
     return Job(
         cfg=cfg,

@@ -40,7 +40,7 @@ def test_a_bug_keeps_its_traceback():
 
 
 def test_ctrl_c_ends_an_evaluation_in_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(evaluate, "Rollout", lambda *_, **__: fail(KeyboardInterrupt()))
+    monkeypatch.setattr(evaluate, "open_evaluator", lambda *_, **__: fail(KeyboardInterrupt()))
     monkeypatch.setattr(sys, "argv", ["train.evaluate", "--device", "cpu", "--terrains", "2", "--episodes", "1"])
     assert evaluate.main() == 130
     assert capsys.readouterr().err.endswith("\nStopped.\n")

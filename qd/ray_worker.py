@@ -1,0 +1,119 @@
+"""What lives in a Ray actor: one simulation on one device, which crosses shards of terrains."""
+
+import hashlib
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import ray
+from numpy.typing import NDArray
+
+from qd.worker_process import Crosser
+from sim.provenance import versions
+
+if TYPE_CHECKING:
+    from sim.rollout import RolloutResult
+
+_ROOT = Path(__file__).resolve().parents[1]
+_ROOMS = ("kernels", "sim", "qd")
+_WATCH = "watch"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Controller:
+    """A controller on its way to other machines, which need not have its file."""
+
+    name: str
+    """File name, or ``module:callable``."""
+    content: bytes | None
+    """Of the file; None for ``module:callable``."""
+
+    @classmethod
+    def of(cls, policy: str) -> "Controller":
+        """What ``policy`` names."""
+        path = Path(policy)
+        return cls(name=path.name, content=path.read_bytes()) if path.is_file() else cls(name=policy, content=None)
+
+    def unpacked(self, folder: str) -> str:
+        """A policy as :func:`sim.policy.load_policy` takes it; the file is put into ``folder``."""
+        if self.content is None:
+            return self.name
+        path = Path(folder) / self.name
+        path.write_bytes(self.content)
+        return str(path)
+
+
+def build_of_code() -> str:
+    """A fingerprint of sources, robot files and package versions: two that agree compute the same."""
+    digest = hashlib.sha256(repr(sorted(versions().items())).encode())
+    for room in _ROOMS:
+        for path in sorted((_ROOT / room).rglob("*")):
+            if path.suffix in (".py", ".xml"):
+                digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+_ray: Any = ray  # its annotations leave out what it documents
+
+
+@_ray.remote(concurrency_groups={_WATCH: 1}, max_restarts=0)
+class RayWorker:
+    """One device's simulation, built when it is first needed and again when shards change their size.
+
+    Args:
+        cfg: An evaluator's settings; its device is the one Ray gave to this process.
+        controller: The policy.
+        build: Makes the simulation of ``cfg`` for a number of terrains.
+    """
+
+    def __init__(self, cfg: Any, controller: Controller, build: Callable[[Any, int], Crosser]) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="faultline-")
+        self._cfg, self._controller, self._build = cfg, controller, build
+        self._crosser: Crosser | None = None
+        self._num_terrains = 0
+        self._share = 0.0
+
+    def introduce(self) -> tuple[str, int, str]:
+        """Host, process id and fingerprint of the code."""
+        return socket.gethostname(), os.getpid(), build_of_code()
+
+    def prepare(self, num_terrains: int) -> None:
+        """Builds the simulation for shards of this size.
+
+        Raises:
+            ValueError: If it cannot be built as asked for.
+        """
+        if num_terrains == self._num_terrains:
+            return
+        self._crosser, self._num_terrains = None, 0  # its memory, before the next one's is asked for
+        policy = self._controller.unpacked(self._folder.name)
+        self._crosser = self._build(replace(self._cfg, policy=policy), num_terrains)
+        self._num_terrains = num_terrains
+
+    def cross(self, terrains: NDArray, seeds: NDArray, num_terrains: int) -> tuple["RolloutResult", float]:
+        """Crosses up to ``num_terrains`` terrains; what fills up the simulation is crossed in vain.
+
+        Returns:
+            Their result, and the seconds it took, building excluded.
+        """
+        self._share = 0.0
+        self.prepare(num_terrains)
+        assert self._crosser is not None
+        filled = np.arange(num_terrains) % len(terrains)
+        began = time.perf_counter()
+        result = self._crosser.evaluate(terrains[filled], seeds[filled], progress=self._note)
+        return result, time.perf_counter() - began
+
+    @_ray.method(concurrency_group=_WATCH)
+    def share(self) -> float:
+        """Share of the present shard that is done; answered while it is crossed."""
+        return self._share
+
+    def _note(self, done: int, most: int) -> None:
+        self._share = done / most

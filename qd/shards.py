@@ -1,0 +1,60 @@
+"""Results of whole terrains taken apart, put together, and looked at before they are believed."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+MIN_ROWS = 4
+"""Fewest robots of a simulation: torch's linear layers give the same bits for batches of 4 rows and more only."""
+
+
+def taken(result: Any, count: int) -> Any:
+    """The first terrains of a result."""
+    arrays = {name: value[:count] for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
+    return dataclasses.replace(result, **arrays)
+
+
+def merged(results: list[Any], *, join: int) -> Any:
+    """Results side by side (``join`` 0: they ran at the same time) or one after the other (1)."""
+    if len(results) == 1:
+        return results[0]
+    combine = (max, sum)[join]
+    fields: dict[str, Any] = {
+        name: np.concatenate([getattr(result, name) for result in results])
+        for name, value in _fields(results[0]).items()
+        if isinstance(value, np.ndarray)
+    }
+    for name in ("physics_steps", "wall_s"):
+        fields[name] = combine(getattr(result, name) for result in results)
+    return dataclasses.replace(results[0], **fields)
+
+
+def flaw_of(result: Any, count: int, num_replicas: int) -> str | None:
+    """Why a result cannot be one of ``count`` terrains, in words; None if it can.
+
+    Memory gone bad on another machine must not become a number in an archive: shapes, finite penalties of every valid
+    episode and none of an invalid one, and times that can be.
+    """
+    try:
+        shape = (count, num_replicas)
+        arrays = {name: value for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
+        wrong = [f"{name} of shape {value.shape}" for name, value in arrays.items() if value.shape[:2] != shape]
+        if wrong:
+            return f"{', '.join(wrong)} for {count} terrains of {num_replicas} episodes"
+        penalties, invalid = result.penalties, result.invalid
+        if penalties.shape != (*shape, len(result.penalty_names)) or penalties.dtype.kind != "f":
+            return f"penalties of shape {penalties.shape} and type {penalties.dtype}"
+        if not (np.isfinite(penalties[~invalid]).all() and (penalties[~invalid] >= 0.0).all()):
+            return "valid episodes with penalties that are negative or not finite"
+        if (np.asarray(result.base_collision) & (np.asarray(result.reached_goal) | invalid)).any():
+            return "episodes of several outcomes"
+        if not (result.duration_s > 0.0).all() or not result.physics_steps > 0:
+            return "episodes that took no time"
+    except (AttributeError, IndexError, TypeError, ValueError) as error:
+        return f"no result: {type(error).__name__}: {error}"
+    return None
+
+
+def _fields(result: Any) -> dict[str, Any]:
+    return {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}

@@ -1,0 +1,65 @@
+"""Simulations for Ray workers, over the stand-in: good ones, and one that fails once in each way there is."""
+
+import dataclasses
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+from tests.qd import stand_in
+
+
+class Crosser:
+    """Evaluates by the stand-in."""
+
+    def __init__(self, cfg, num_terrains: int) -> None:
+        self.cfg, self.num_terrains = cfg, num_terrains
+
+    def evaluate(self, terrains, seeds, *, progress=None):
+        assert len(terrains) == len(seeds) == self.num_terrains
+        if progress is not None:
+            progress(1, 2)
+        return stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
+
+
+class Failing(Crosser):
+    """Fails as the policy's name says: ``<how>:<folder>:<times>``, so often in all, counted by files in the folder."""
+
+    def evaluate(self, terrains, seeds, *, progress=None):
+        how, folder, times = self.cfg.policy.split(":")
+        for number in range(int(times)):
+            try:
+                (Path(folder) / str(number)).touch(exist_ok=False)
+            except FileExistsError:
+                continue
+            return self._fail(how, terrains, seeds)
+        return super().evaluate(terrains, seeds, progress=progress)
+
+    def _fail(self, how, terrains, seeds):
+        if how == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if how == "hang":
+            time.sleep(600)
+        if how == "stop":
+            os.kill(os.getpid(), signal.SIGSTOP)
+        if how == "raise":
+            raise RuntimeError("the solver is broken")
+        if how == "refuse":
+            raise ValueError("terrains of another kind")
+        result = stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
+        if how == "nan":
+            result.penalties[0, 0, 0] = np.nan
+        if how == "short":
+            return dataclasses.replace(result, penalties=result.penalties[:-1])
+        if how == "nonsense":
+            return "all went well"
+        return result
+
+
+class Refusing(Crosser):
+    """Cannot be built."""
+
+    def __init__(self, cfg, num_terrains: int) -> None:
+        raise ValueError("policy 'x' does not fit:\nuse another")
