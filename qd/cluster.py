@@ -2,11 +2,14 @@
 
 import logging
 import os
+import socket
 from typing import Any
 
 import ray
 
 from sim.provenance import device_name
+
+_KNOCK_S = 10.0
 
 
 def connect(wanted: int | str) -> None:
@@ -26,9 +29,15 @@ def connect(wanted: int | str) -> None:
     address = os.environ.get("RAY_ADDRESS")
     if address:
         try:
+            _knock(address)
             ray.init(address=address, **quiet)
         except Exception as error:  # of many types: no such host, another version of Ray, a cluster that went away
             reason = " ".join(str(error).split())[:300]
+            if "AuthenticationError" in str(error.__cause__):
+                raise OSError(
+                    f"the Ray cluster at RAY_ADDRESS={address} wants its token: set RAY_AUTH_MODE=token and put the "
+                    "token where Ray looks for it (RAY_AUTH_TOKEN or ~/.ray/auth_token), here as on its nodes"
+                ) from None
             raise OSError(
                 f"no Ray cluster at RAY_ADDRESS={address}: {reason}: start one with `ray start --head`, or unset "
                 "RAY_ADDRESS to use this machine alone"
@@ -44,6 +53,17 @@ def connect(wanted: int | str) -> None:
         object_store_memory=256 << 20,
         **quiet,
     )
+
+
+def _knock(address: str) -> None:
+    """Tries whether anybody listens at ``host:port``: Ray itself would try for minutes.
+
+    Raises:
+        OSError: If nobody does.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S).close()
 
 
 def cluster_device(name: str | None, wanted: int | str) -> str:

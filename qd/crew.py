@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
 _GATHER_S = 60.0  # how long an evaluator that opens waits for the other workers once one is there
-_MOST_TRIES = 3
+_MOST_TRIES = 5  # of which three may be bad luck
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,8 +102,8 @@ class Crew:
         """Cross each terrain once a replica.
 
         Raises:
-            ValueError: If the arguments do not fit, or a shard is refused by three workers.
-            EvaluatorError: If a shard fails on three workers, or none is left and none comes.
+            ValueError: If the arguments do not fit, or a shard is refused by five workers.
+            EvaluatorError: If a shard fails on five workers, or none is left and none comes.
         """
         count = len(terrains)
         if seeds.shape != (count,) or count == 0:
@@ -153,8 +153,8 @@ class Crew:
         """Takes a worker's result if it is there; False if the shard must be crossed by another.
 
         Raises:
-            ValueError: If three workers refused the shard.
-            EvaluatorError: If it failed on three.
+            ValueError: If five workers refused the shard.
+            EvaluatorError: If it failed on five.
         """
         replicas = self._cfg.num_replicas
         error: BaseException | None = None

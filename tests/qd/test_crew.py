@@ -87,7 +87,7 @@ def test_a_shard_that_fails_everywhere_ends_the_evaluation(tmp_path, how, error)
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:99")
     with (
         open_evaluator(cfg, build=crossers.Failing) as evaluate,
-        pytest.raises(error, match=r"terrains \d to \d failed on 3 workers; the last, worker \d"),
+        pytest.raises(error, match=r"terrains \d to \d failed on 5 workers; the last, worker \d"),
     ):
         evaluate(GENES[:8], SEEDS[:8])
 
