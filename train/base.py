@@ -4,9 +4,12 @@ Ctrl-C or ``--max-seconds`` saves and stops; ``--resume RUN_DIR`` goes on where 
 """
 
 import io
+import os
 import signal
 import sys
+import tempfile
 import time
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +26,7 @@ from sim.simulation import resolve_device
 from train.learner import Learner, check_entries, read_checkpoint
 from train.ppo import PpoCfg
 from train.progress import STATE, Progress
+from train.ranks import Ranks
 from train.task import CommandTask
 from train.task_cfg import TaskCfg
 from train.vec_env import CommandVecEnv
@@ -35,7 +39,10 @@ _RESERVE_S = 10.0  # kept back of --max-seconds for the last save
 
 @dataclass(frozen=True, kw_only=True)
 class BaseCfg:
-    """Train a base controller from scratch: PPO on legged_gym's rough-terrain task."""
+    """Train a base controller from scratch: PPO on legged_gym's rough-terrain task.
+
+    On several GPUs: torchrun --nproc-per-node 4 -m train.base ..., each of which trains --num-envs robots.
+    """
 
     robot: str = "anymal"
     """Which robot."""
@@ -85,7 +92,7 @@ class StopRequest:
 
 def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
     """Device, number of environments and iterations."""
-    device = resolve_device(cfg.device)
+    device = Ranks.of_environment().device(resolve_device(cfg.device))
     on_cuda = device.startswith("cuda")
     if on_cuda and not torch.cuda.is_available():
         raise ValueError(
@@ -164,6 +171,15 @@ def train(cfg: BaseCfg) -> int:
     Raises:
         ValueError: If something asked for cannot be had; raised before any long work.
     """
+    ranks = Ranks.of_environment()
+    if ranks.is_first:
+        return _train(cfg, ranks)
+    with tempfile.TemporaryDirectory() as folder, Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+        return _train(replace(cfg, run_dir=Path(folder), export=None), ranks)
+
+
+def _train(cfg: BaseCfg, ranks: Ranks) -> int:
+    """What one process of a training does; only the first one's files are kept."""
     began = time.monotonic()
     robot = get_robot(cfg.robot)
     device, num_envs, iterations = _resolve_size(cfg)
@@ -171,12 +187,19 @@ def train(cfg: BaseCfg) -> int:
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
     run_dir = _prepare_run_dir(cfg)
-    settings = {"seed": seed, "num_envs": num_envs, "task": asdict(cfg.task), "ppo": asdict(cfg.ppo)}
+    settings = {
+        "seed": seed,
+        "num_envs": num_envs,
+        "processes": ranks.size,
+        "task": asdict(cfg.task),
+        "ppo": asdict(cfg.ppo),
+    }
     for change in changes(saved["extra"]["settings"], settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     print(f"Training '{robot.name}': {num_envs} robots on {device}, {iterations} iterations, in {run_dir}", flush=True)
     with StopRequest() as stop:
-        env = CommandVecEnv(CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=seed))
+        task = CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=seed + 1_000_003 * ranks.rank)
+        env = CommandVecEnv(task)
         learner = Learner(env, cfg.ppo, seed=seed)
         if saved is not None:
             learner.resume(saved)
@@ -198,6 +221,7 @@ def train(cfg: BaseCfg) -> int:
 
 def _finish(learner: Learner, progress: Progress, cfg: BaseCfg, run_dir: Path) -> None:
     """The last checkpoint, the controller and its record."""
+    learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
     progress.close()
     learner.save(run_dir / CHECKPOINT, progress.state())
     record = progress.record()
@@ -214,7 +238,12 @@ def _iterate(
     iterations = progress.iterations
     slowest = 0.0
     last_save = time.monotonic()
-    while learner.iteration < iterations and not stop.requested and time.monotonic() + slowest < deadline:
+    ranks, device = learner.ranks, learner.env.device
+
+    def wanted() -> bool:
+        return learner.iteration < iterations and not stop.requested and time.monotonic() + slowest < deadline
+
+    while ranks.all_want(wanted(), device):
         step = learner.iterate()
         if progress.warm:  # the first iteration compiles and is no measure
             slowest = max(slowest, step.collection_s + step.learning_s)

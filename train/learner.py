@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rsl_rl.runners import OnPolicyRunner
 
 from sim.files import write_atomically
 from sim.policy import read_weights, reason_of
 from train.ppo import PpoCfg, runner_settings
+from train.ranks import Ranks, Runner
 from train.vec_env import CommandVecEnv
 
 CHECKPOINT_FORMAT = "faultline training checkpoint 1"
@@ -43,7 +43,8 @@ class Learner:
 
     Attributes:
         iteration: Iterations done, those before a resume included.
-        steps_per_iteration: Environment steps of an iteration.
+        steps_per_iteration: Environment steps of an iteration, of all processes.
+        ranks: Which process of a training this is.
     """
 
     def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int) -> None:
@@ -53,11 +54,19 @@ class Learner:
         self.env = env
         self.cfg = cfg
         self.iteration = 0
-        self.steps_per_iteration = env.num_envs * cfg.steps_per_env
+        self.ranks = Ranks.of_environment()
+        self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
-            self.runner = OnPolicyRunner(env, runner_settings(cfg), log_dir=None, device=str(env.device))
+            self.runner = Runner(env, runner_settings(cfg), log_dir=None, device=str(env.device))
         self.alg = self.runner.alg
+        if self.ranks.size > 1:
+            self.alg.broadcast_parameters()
+            self._draw_apart(seed)
         self._begin()
+
+    def _draw_apart(self, seed: int) -> None:
+        """Other random numbers from here on than the other processes draw."""
+        torch.manual_seed((seed + 1) * 1_000_003 + self.iteration * 1009 + self.ranks.rank)
 
     def _begin(self) -> None:
         ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
@@ -155,6 +164,8 @@ class Learner:
         torch.set_rng_state(content["rng_cpu"])
         if content["rng_cuda"] is not None and task.observation.is_cuda:
             torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)
+        if self.ranks.size > 1:  # the state is the first process's
+            self._draw_apart(int(torch.initial_seed()) % 2**31)
 
 
 def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:

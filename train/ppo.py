@@ -84,10 +84,10 @@ class CapturedPPO(PPO):
             ValueError: If a feature of rsl_rl's PPO is asked for that this update does not compute.
         """
         super().__init__(*args, **kwargs)
-        if self.rnd or self.symmetry or self.is_multi_gpu or self.actor.is_recurrent or self.use_mixed_precision:
+        if self.rnd or self.symmetry or self.actor.is_recurrent or self.use_mixed_precision:
             raise ValueError(
-                "CapturedPPO computes the plain feed-forward update, got RND, symmetry, several GPUs, a recurrent "
-                'actor or mixed precision: use rsl_rl\'s own ("class_name": "PPO") for these'
+                "CapturedPPO computes the plain feed-forward update, got RND, symmetry, a recurrent actor or mixed "
+                'precision: use rsl_rl\'s own ("class_name": "PPO") for these'
             )
         if self.schedule != "adaptive" or self.normalize_advantage_per_mini_batch or not self.use_clipped_value_loss:
             raise ValueError(
@@ -152,7 +152,8 @@ class CapturedPPO(PPO):
                 self._run_minibatch()
 
     def _run_minibatch(self) -> None:
-        if self._stream is None or self._eager_steps < _EAGER_STEPS:
+        # A collective is not captured: processes would have to capture and replay in step.
+        if self._stream is None or self._eager_steps < _EAGER_STEPS or self.is_multi_gpu:
             self._learn_minibatch()
             self._eager_steps += 1
             return
@@ -181,6 +182,8 @@ class CapturedPPO(PPO):
         loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        if self.is_multi_gpu:
+            self.reduce_parameters()
         nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
         nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
         self.optimizer.step()
@@ -196,6 +199,9 @@ class CapturedPPO(PPO):
     @torch.no_grad()
     def _adapt_learning_rate(self, old_mean_std: tuple[torch.Tensor, ...]) -> None:
         kl = self.actor.get_kl_divergence(old_mean_std, self.actor.output_distribution_params).mean()
+        if self.is_multi_gpu:
+            torch.distributed.all_reduce(kl)
+            kl = kl / self.gpu_world_size
         lower = torch.where(kl > 2.0 * self.desired_kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
         higher = (self._lr * 1.5).clamp(max=1e-2)
         self._lr.copy_(torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), higher, lower))
