@@ -65,7 +65,8 @@ class Arguments:
     """Search on so many Ray workers, a GPU or a CPU core each; auto: as many as there are. RAY_ADDRESS names a running
     cluster; without it they are this machine's."""
     worker_limit_s: float = 300.0
-    """A Ray worker that gets no further for so many seconds is given up, and its terrains go to another."""
+    """A Ray worker that gets no further for so many seconds is given up, and its terrains go to another; building its
+    simulation has a limit of its own."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
     """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
 

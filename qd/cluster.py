@@ -6,6 +6,7 @@ import socket
 from typing import Any
 
 import ray
+from ray.exceptions import RayError
 
 from sim.provenance import device_name
 
@@ -84,7 +85,7 @@ def cluster_device(name: str | None, wanted: int | str) -> str:
     device = name or ("cuda" if gpus else "cpu")
     most = num_devices(device)
     if isinstance(wanted, int) and not os.environ.get("RAY_ADDRESS") and wanted > most:
-        raise ValueError(f"workers must be at most {most}, the number of this machine's GPUs, got {wanted}")
+        raise ValueError(f"workers must be at most {most}, as many as this machine has GPUs, got {wanted}")
     return device
 
 
@@ -103,4 +104,7 @@ def name_of_device(device: str) -> str:
     name = device_name(device)
     if name != device:
         return name
-    return ray.get(ray.remote(num_gpus=1)(device_name).remote("cuda:0"), timeout=120)
+    try:
+        return ray.get(ray.remote(num_gpus=1)(device_name).remote("cuda:0"), timeout=120)
+    except RayError:  # a name is not worth a search
+        return device

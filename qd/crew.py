@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ray.exceptions import RayError, RayTaskError
 
 from qd.cluster import connect
-from qd.roster import Member, Roster, nobody_came, reason_of, tell
+from qd.roster import COMING_S, Member, Roster, nobody_came, reason_of, tell
 from qd.shards import MIN_ROWS, flaw_of, merged, taken
 from qd.worker_process import Crosser, EvaluatorError
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
 _GATHER_S = 60.0  # how long an evaluator that opens waits for the other workers once one is there
+_BUILD_LIMIT_S = 900.0  # with a cold kernel cache
+_UNSEEN_S = 10.0
 _MOST_TRIES = 5  # of which three may be bad luck
 
 
@@ -76,15 +78,22 @@ class Crew:
             EvaluatorError: If no worker comes, or none that can be used.
         """
         limit_s = self._cfg.worker_limit_s
-        self._roster.recruit()
-        if not self._roster.gather(1, limit_s):
-            raise nobody_came(limit_s)
-        self._roster.gather(len(self._roster.members), _GATHER_S)
-        first = self._roster.joined[0]
-        try:
-            ray.get(first.actor.prepare.remote(self._shard_size(self._cfg.num_terrains)), timeout=limit_s)
-        except RayError as error:
-            raise _as_raised(error, f"{first} cannot build its simulation: {reason_of(error)}") from None
+        for tries in range(1, _MOST_TRIES + 1):
+            self._roster.recruit()
+            if not self._roster.gather(1, max(COMING_S, limit_s)):
+                raise nobody_came(max(COMING_S, limit_s))
+            self._roster.gather(len(self._roster.members), _GATHER_S)
+            first = self._roster.joined[0]
+            try:
+                size = self._shard_size(self._cfg.num_terrains)
+                ray.get(first.actor.prepare.remote(size), timeout=max(_BUILD_LIMIT_S, limit_s))
+                return
+            except RayError as error:
+                failed = _as_raised(error, f"{first} cannot build its simulation: {reason_of(error)}")
+            if isinstance(failed, ValueError) or tries == _MOST_TRIES:
+                raise failed
+            tell(f"{failed}; another tries")
+            self._roster.dismiss(first)
 
     def close(self) -> None:
         """Ends the workers, whatever they do."""
@@ -108,6 +117,14 @@ class Crew:
         count = len(terrains)
         if seeds.shape != (count,) or count == 0:
             raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
+        try:
+            return self._cross(terrains, seeds, progress)
+        except BaseException:  # Ctrl-C too: what is under way is of no later call
+            self._roster.dismiss_busy()
+            raise
+
+    def _cross(self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None) -> "RolloutResult":
+        count = len(terrains)
         began = busy_at = time.monotonic()
         size = self._shard_size(min(count, self._cfg.num_terrains))
         shards = [_Shard(slice(first, min(first + size, count)), size) for first in range(0, count, size)]
@@ -120,13 +137,13 @@ class Crew:
                     self._assign(member, waiting.popleft(), terrains[part], seeds[part], size)
             busy = [member for member in self._roster.joined if member.task is not None]
             busy_at = time.monotonic() if busy else busy_at
-            if time.monotonic() - busy_at > self._cfg.worker_limit_s:
-                raise nobody_came(self._cfg.worker_limit_s)
+            if time.monotonic() - busy_at > max(COMING_S, self._cfg.worker_limit_s):
+                raise nobody_came(max(COMING_S, self._cfg.worker_limit_s))
             self._roster.wait([member.task for member in busy])
             waiting.extendleft(member.shard for member in busy if not self._look_after(member, shards[member.shard]))
             if progress is not None:
                 done = sum(shard.result is not None for shard in shards)
-                done += sum(member.share for member in self._roster.joined if member.task is not None)
+                done += sum(max(0.0, member.share) for member in self._roster.joined if member.task is not None)
                 shown = max(shown, min(1.0, done / len(shards)))
                 progress(shown)
         whole = merged([shard.result for shard in shards], join=0)
@@ -146,7 +163,8 @@ class Crew:
 
     @staticmethod
     def _assign(member: Member, number: int, terrains: NDArray, seeds: NDArray, size: int) -> None:
-        member.shard, member.share, member.alive_at = number, 0.0, time.monotonic()
+        member.shard, member.share, member.question = number, 0.0, None
+        member.alive_at = member.looked_at = time.monotonic()
         member.task = member.actor.cross.remote(terrains, seeds, size)
 
     def _look_after(self, member: Member, shard: _Shard) -> bool:
@@ -183,7 +201,15 @@ class Crew:
         return False
 
     def _gets_on(self, member: Member) -> bool:
-        """Whether a busy worker has moved within the limit; asks it how far it is, without waiting for the answer."""
+        """Whether a busy worker has moved within the limit; asks it how far it is, without waiting for the answer.
+
+        One that builds its simulation says so and has a limit of its own for that. Time in which nobody looked, since
+        this process itself was stopped, is nobody's fault.
+        """
+        now = time.monotonic()
+        if now - member.looked_at > _UNSEEN_S:
+            member.alive_at += now - member.looked_at
+        member.looked_at = now
         if member.question is None:
             member.question = member.actor.share.remote()
         elif ray.wait([member.question], timeout=0)[0]:
@@ -191,10 +217,10 @@ class Crew:
                 share: Any = ray.get(member.question)
             except RayError:  # it died: its task says so too, and why
                 share = member.share
-            if share != member.share:
-                member.share, member.alive_at = share, time.monotonic()
+            if share != member.share and -share < max(_BUILD_LIMIT_S, self._cfg.worker_limit_s):
+                member.share, member.alive_at = share, now
             member.question = None
-        return time.monotonic() - member.alive_at < self._cfg.worker_limit_s
+        return now - member.alive_at < self._cfg.worker_limit_s
 
 
 def _as_raised(error: BaseException | None, message: str) -> Exception:
@@ -212,5 +238,7 @@ def open_crew(cfg: "EvaluatorCfg", build: Callable[[Any, int], Crosser]) -> Iter
     try:
         crew.open()
         yield crew
+    except RayError as error:
+        raise EvaluatorError(f"the Ray cluster failed: {reason_of(error)}") from error
     finally:
         crew.close()

@@ -73,11 +73,11 @@ class RayWorker:
     """
 
     def __init__(self, cfg: Any, controller: Controller, build: Callable[[Any, int], Crosser]) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="faultline-")
         self._cfg, self._controller, self._build = cfg, controller, build
         self._crosser: Crosser | None = None
         self._num_terrains = 0
         self._share = 0.0
+        self._building_since: float | None = None
 
     def introduce(self) -> tuple[str, int, str]:
         """Host, process id and fingerprint of the code."""
@@ -92,9 +92,12 @@ class RayWorker:
         if num_terrains == self._num_terrains:
             return
         self._crosser, self._num_terrains = None, 0  # its memory, before the next one's is asked for
-        policy = self._controller.unpacked(self._folder.name)
-        self._crosser = self._build(replace(self._cfg, policy=policy), num_terrains)
-        self._num_terrains = num_terrains
+        self._building_since = time.monotonic()
+        # A worker is killed when it is no longer wanted: a folder that lived as long would be left behind.
+        with tempfile.TemporaryDirectory(prefix="faultline-") as folder:
+            policy = self._controller.unpacked(folder)
+            self._crosser = self._build(replace(self._cfg, policy=policy), num_terrains)
+        self._building_since, self._num_terrains = None, num_terrains
 
     def cross(self, terrains: NDArray, seeds: NDArray, num_terrains: int) -> tuple["RolloutResult", float]:
         """Crosses up to ``num_terrains`` terrains; what fills up the simulation is crossed in vain.
@@ -112,8 +115,9 @@ class RayWorker:
 
     @_ray.method(concurrency_group=_WATCH)
     def share(self) -> float:
-        """Share of the present shard that is done; answered while it is crossed."""
-        return self._share
+        """Share of the present shard that is done; minus the seconds it has taken so far while it builds."""
+        since = self._building_since
+        return self._share if since is None else since - time.monotonic()
 
     def _note(self, done: int, most: int) -> None:
         self._share = done / most

@@ -3,7 +3,8 @@
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 _POLL_S = 0.25
 _RECRUIT_EVERY_S = 2.0
+COMING_S = 60.0
+"""Least time in which a worker may come [s]."""
+_SILENT_S = 5.0
+_REFUSED_PAUSE_S = 60.0
 _MOST_REFUSALS = 5  # workers in a row that came and could not be used
 
 
@@ -39,9 +44,12 @@ class Member:
     shard: int = -1
     """Number of that shard."""
     share: float = 0.0
-    """How much of it is done."""
+    """How much of it is done; below 0 the seconds it has been building."""
     alive_at: float = 0.0
     """When it last got on."""
+    looked_at: float = 0.0
+    """When it was last looked after."""
+    hired_at: float = field(default_factory=time.monotonic)
     question: Any = None
     """The share to come that it was asked for."""
 
@@ -83,6 +91,9 @@ class Roster:
             self._recruited_at = now
             wanted = self._cfg.workers
             wanted = wanted if isinstance(wanted, int) else num_devices(self._cfg.device)
+            for member in [m for m in self.members if m.introduction is not None]:
+                if now - member.hired_at > max(COMING_S, self._cfg.worker_limit_s):  # it hangs, or has no place yet
+                    self.dismiss(member)
             for _ in range(wanted - len(self.members)):
                 self._hire()
         coming = {member.introduction: member for member in self.members if member.introduction is not None}
@@ -92,14 +103,24 @@ class Roster:
     def dismiss(self, member: Member) -> None:
         """Ends a worker, whatever it does."""
         self.members.remove(member)
-        ray.kill(member.actor)
+        with suppress(RayError):  # the whole cluster may be gone
+            ray.kill(member.actor)
+
+    def dismiss_busy(self) -> None:
+        """Ends those that are at something."""
+        for member in [member for member in self.members if member.task is not None]:
+            self.dismiss(member)
 
     def gather(self, count: int, limit_s: float) -> int:
         """Waits for so many workers, or so long; returns how many are there."""
-        end = time.monotonic() + limit_s
+        began = time.monotonic()
+        end, told = began + limit_s, False
         while len(self.joined) < count and time.monotonic() < end:
             self.wait([])
             self.recruit()
+            if not told and time.monotonic() - began > _SILENT_S:
+                tell(f"{len(self.joined)} of {len(self.members)} workers have come; waiting for more")
+                told = True
         return len(self.joined)
 
     def wait(self, tasks: list[Any]) -> None:
@@ -138,9 +159,12 @@ class Roster:
     def _refuse(self, member: Member, reason: str) -> None:
         self.dismiss(member)
         self._refusals += 1
-        if self._refusals >= _MOST_REFUSALS:
+        if self._refusals >= _MOST_REFUSALS and not self.joined:
             raise EvaluatorError(f"{member} {reason}; so it was with the {self._refusals - 1} before it")
-        tell(f"{member} {reason}")
+        if self._refusals <= _MOST_REFUSALS:
+            tell(f"{member} {reason}")
+        if self._refusals >= _MOST_REFUSALS:
+            self._recruited_at = time.monotonic() + _REFUSED_PAUSE_S  # those that are there do without
 
 
 def nobody_came(limit_s: float) -> EvaluatorError:

@@ -13,7 +13,7 @@ import numpy as np
 
 from qd.cli import run_command
 from qd.settings import preset
-from qd.workers import EvaluatorCfg, open_evaluator, resolve_device
+from qd.workers import EvaluatorCfg, EvaluatorError, Staffed, open_evaluator, resolve_device
 from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 
@@ -45,13 +45,20 @@ class Arguments:
 
 
 def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
-    """Seconds of one evaluation of ``cfg.num_terrains`` hard-random terrains, by whoever ``cfg`` says; the median."""
+    """Seconds of one evaluation of ``cfg.num_terrains`` hard-random terrains, by whoever ``cfg`` says; the median.
+
+    Raises:
+        EvaluatorError: If fewer workers than wanted took part, or one had to be replaced.
+    """
     from sim.terrain import hard_random_genes
 
     genes = hard_random_genes(cfg.num_terrains, seed)
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
     with open_evaluator(cfg) as evaluate:
         seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]
+        crew = evaluate.status() if isinstance(evaluate, Staffed) else None
+    if crew is not None and (crew.workers != cfg.workers or crew.retries):
+        raise EvaluatorError(f"expected {cfg.workers} workers throughout, got {crew}: nothing was measured")
     return statistics.median(seconds[1:])
 
 

@@ -11,8 +11,8 @@ MIN_ROWS = 4
 
 def taken(result: Any, count: int) -> Any:
     """The first terrains of a result."""
-    arrays = {name: value[:count] for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(result, **arrays)
+    arrays = {name: value[:count].copy() for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
+    return dataclasses.replace(result, **arrays)  # copies, since what Ray delivers can only be read
 
 
 def merged(results: list[Any], *, join: int) -> Any:

@@ -59,6 +59,10 @@ class EvaluatorCfg:
     penalties_from_s: float = 0.0
     """Penalties are summed from this time of an episode on [s]."""
 
+    def __post_init__(self) -> None:
+        if not 0.0 < self.worker_limit_s < 1e6:
+            raise ValueError(f"worker_limit_s must be a positive number of seconds, got {self.worker_limit_s}")
+
     @property
     def processes(self) -> int:
         """Processes that evaluate: this one on a GPU; on the CPU no more than there is work for; or Ray's."""

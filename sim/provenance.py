@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("newton", "mujoco-warp", "warp-lang", "torch", "ribs", "rsl-rl-lib", "numpy")
+_PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "ribs", "rsl-rl-lib", "numpy")
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:

@@ -58,6 +58,14 @@ class Failing(Crosser):
         return result
 
 
+class Slow(Crosser):
+    """Takes three seconds to be built."""
+
+    def __init__(self, cfg, num_terrains: int) -> None:
+        time.sleep(3.0)
+        super().__init__(cfg, num_terrains)
+
+
 class Refusing(Crosser):
     """Cannot be built."""
 

@@ -102,6 +102,44 @@ def test_a_refusal_to_build_comes_before_any_work():
         pass
 
 
+def test_building_is_no_hanging():
+    with open_evaluator(dataclasses.replace(CFG, worker_limit_s=1.0), build=crossers.Slow) as evaluate:
+        assert same(evaluate(GENES[:8], SEEDS[:8]), expected(8))
+        assert evaluate.status().retries == 0
+
+
+@pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_limit_without_sense_is_refused(limit_s):
+    with pytest.raises(ValueError, match="worker_limit_s must be a positive number"):
+        dataclasses.replace(CFG, worker_limit_s=limit_s)
+
+
+def test_what_an_interrupted_evaluation_had_under_way_is_of_no_later_one():
+    def interrupt(share: float) -> None:
+        raise KeyboardInterrupt
+
+    with open_evaluator(CFG, build=crossers.Crosser) as evaluate:
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(GENES[:8], SEEDS[:8], interrupt)
+        for first in (8, 13):
+            part = slice(first, first + 8)
+            assert same(evaluate(GENES[part], SEEDS[part]), stand_in.evaluate(GENES[part], SEEDS[part], 4))
+
+
+def test_newcomers_of_other_code_are_refused_and_those_at_hand_go_on(monkeypatch, capsys):
+    with open_evaluator(CFG, build=crossers.Crosser) as evaluate:
+        roster = evaluate._roster
+        roster.dismiss(roster.joined[0])
+        roster._code = "another"
+        monkeypatch.setattr("qd.roster._RECRUIT_EVERY_S", 0.0)
+        end = time.monotonic() + 60
+        while roster._refusals < 5:
+            assert time.monotonic() < end
+            assert same(evaluate(GENES[:8], SEEDS[:8]), expected(8))
+        assert same(evaluate(GENES[:8], SEEDS[:8]), expected(8))
+        assert "has other code or packages than this machine" in capsys.readouterr().err
+
+
 def test_leaving_ends_the_workers():
     with open_evaluator(CFG, build=crossers.Crosser) as evaluate:
         evaluate(GENES[:2], SEEDS[:2])
