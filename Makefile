@@ -21,6 +21,7 @@ FLAG_ELITE := elite
 FLAG_OUT := out
 FLAG_GENES := genes
 FLAG_WORKERS := workers
+FLAG_FINE := fine
 
 help: ## This list
 	@echo 'faultline: find the terrains that break a legged robot. Targets:'
@@ -39,6 +40,7 @@ help: ## This list
 	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
 	@echo '  OUT=FILE         where to write the numbers        calibrate evaluate crosscheck bench'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
+	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
 	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
 	@echo '                   joined by RAY_ADDRESS             archive calibrate evaluate'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
@@ -74,7 +76,7 @@ evaluate: setup ## Success and goal rates of the controller of ROBOT
 	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT WORKERS)
 
 crosscheck: setup ## Hold the crossings of ROBOT against the same in plain MuJoCo C
-	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES OUT)
+	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES FINE OUT)
 
 bench: setup ## Time every kernel against torch and against what the device can do at best
 	$(BIN)/python -m sim.bench --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE SEED OUT)

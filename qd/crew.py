@@ -85,8 +85,7 @@ class Crew:
             self._roster.gather(len(self._roster.members), _GATHER_S)
             first = self._roster.joined[0]
             try:
-                size = self._shard_size(self._cfg.num_terrains)
-                ray.get(first.actor.prepare.remote(size), timeout=max(_BUILD_LIMIT_S, limit_s))
+                ray.get(first.actor.prepare.remote(self._shard_size()), timeout=max(_BUILD_LIMIT_S, limit_s))
                 return
             except RayError as error:
                 failed = _as_raised(error, f"{first} cannot build its simulation: {reason_of(error)}")
@@ -126,7 +125,7 @@ class Crew:
     def _cross(self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None) -> "RolloutResult":
         count = len(terrains)
         began = busy_at = time.monotonic()
-        size = self._shard_size(min(count, self._cfg.num_terrains))
+        size = self._shard_size()
         shards = [_Shard(slice(first, min(first + size, count)), size) for first in range(0, count, size)]
         waiting, shown = deque(range(len(shards))), 0.0
         while any(shard.result is None for shard in shards):
@@ -149,8 +148,8 @@ class Crew:
         whole = merged([shard.result for shard in shards], join=0)
         return replace(whole, wall_s=time.monotonic() - began)
 
-    def _shard_size(self, count: int) -> int:
-        """Terrains of a shard: an equal part of ``count`` for each worker.
+    def _shard_size(self) -> int:
+        """Terrains of a shard: for each worker an equal part of those that are crossed at once.
 
         A simulation is built for one size, so a change in the number of workers counts once it has lasted from one
         evaluation to the next: the place of a worker that died is mostly taken again by then.
@@ -159,7 +158,7 @@ class Crew:
         if joined and (not self._planned or joined == self._seen):
             self._planned = joined
         self._seen = joined
-        return max(-(-count // max(1, self._planned)), -(-MIN_ROWS // self._cfg.num_replicas))
+        return max(-(-self._cfg.num_terrains // max(1, self._planned)), -(-MIN_ROWS // self._cfg.num_replicas))
 
     @staticmethod
     def _assign(member: Member, number: int, terrains: NDArray, seeds: NDArray, size: int) -> None:

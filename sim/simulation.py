@@ -27,14 +27,13 @@ class SolverCfg:
     """Options of the physics solver, chosen by measurement (``python -m sim.options``).
 
     The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that a physics step
-    of 0.005 s allows. At MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius, where what
-    happens next is the simulator's invention. Friction cones are elliptic, the same in every direction: a pyramid gives
-    way at 0.7 of the friction across its axes, and robots fail on slopes that would hold them (``sim.crosscheck``).
+    of 0.005 s allows. At MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius. Friction cones
+    are elliptic, the same in every direction: a pyramid gives way at 0.7 of the friction across its axes, and robots fail
+    on slopes that would hold them (``sim.crosscheck``).
     """
 
     iterations: int = 5
-    """Newton iterations a step at most; all worlds wait for the slowest. Caps of 4 to 50 gave the same rates, each
-    iteration more costs about 5 % of the speed (results/bench/options-*.json)."""
+    """Newton iterations a step at most; caps of 3 to 50 gave the same rates (results/bench/options-*.json)."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
     time_constant_s: float | None = None
