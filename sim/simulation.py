@@ -27,9 +27,9 @@ class SolverCfg:
     """Options of the physics solver, chosen by measurement (``python -m sim.options``).
 
     The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that a physics step
-    of 0.005 s allows. At MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius. Friction cones
-    are elliptic, the same in every direction: a pyramid gives way at 0.7 of the friction across its axes, and robots fail
-    on slopes that would hold them (``sim.crosscheck``).
+    of 0.005 s allows; at MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius. Friction
+    cones are elliptic: a pyramid gives way at 0.7 of the friction across its axes, and robots fail on slopes that would
+    hold them (``sim.crosscheck``).
     """
 
     iterations: int = 5
