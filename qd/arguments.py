@@ -8,9 +8,8 @@ from typing import Any, Literal
 
 from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
 from qd.settings import SearchCfg, as_settings, changed, file_hash, measured_now, policy_spec, preset
-from qd.workers import EvaluatorCfg, check_policy, resolve_device
+from qd.workers import EvaluatorCfg, check_policy, origin_of, resolve_device
 from sim.files import is_leftover
-from sim.provenance import provenance
 
 _RUNS = Path("runs")
 
@@ -121,7 +120,7 @@ def job_of(args: Arguments) -> Job:
     else:
         name = args.preset or ("paper" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
-        path, origin = _free_path(args, cfg), _origin(device, cfg.seed, args)
+        path, origin = _free_path(args, cfg), origin_of(device, cfg.seed, args.workers)
     policy = moved or policy_spec(cfg, robot)
     check_policy(policy, cfg.robot, device)
     return Job(
@@ -133,16 +132,6 @@ def job_of(args: Arguments) -> Job:
         origin=origin,
         resume_command=_resume_command(cfg.robot, path, args, moved),
     )
-
-
-def _origin(device: str, seed: int, args: Arguments) -> dict[str, Any]:
-    """Provenance of a run that begins now."""
-    origin = provenance(device, seed)
-    if args.workers is not None:
-        from qd.cluster import name_of_device  # Ray is there: the device was found by it
-
-        origin["device"] = name_of_device(device)
-    return origin
 
 
 def _evaluator(cfg: SearchCfg, policy: str, device: str, args: Arguments) -> EvaluatorCfg:

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.cli import run_command
-from qd.workers import EvaluatorCfg, check_policy, open_evaluator, resolve_device
+from qd.workers import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 from sim.files import prepare_output, to_json, write_atomically
-from sim.provenance import provenance
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
@@ -104,7 +103,12 @@ def calibrate(cfg: CalibrateCfg) -> Path:
     seeds = np.random.SeedSequence(cfg.seed).generate_state(cfg.terrains, np.uint32)
     with open_evaluator(evaluator) as evaluate, tqdm(total=100, unit="%", desc="calibrate", disable=None) as bar:
         result = evaluate(genes, seeds, lambda share: _move(bar, share))
-    report = {**provenance(device, cfg.seed), "robot": cfg.robot, "policy": Path(policy).name, **_measured(result)}
+    report = {
+        **origin_of(device, cfg.seed, cfg.workers),
+        "robot": cfg.robot,
+        "policy": Path(policy).name,
+        **_measured(result),
+    }
     write_atomically(out, to_json(report))
     print("\n".join(f"  {name:<14}{scale:12.4f}" for name, scale in report["scales"].items()))
     print(f"Written to {out}")

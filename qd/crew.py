@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ray.exceptions import RayError, RayTaskError
 
 from qd.cluster import connect
-from qd.roster import COMING_S, Member, Roster, nobody_came, reason_of, tell
-from qd.shards import MIN_ROWS, flaw_of, merged, taken
+from qd.roster import Member, Roster, nobody_came, reason_of, tell
+from qd.shards import MIN_ROWS, checked_count, flaw_of, merged, taken
 from qd.worker_process import Crosser, EvaluatorError
 
 if TYPE_CHECKING:
@@ -80,8 +80,8 @@ class Crew:
         limit_s = self._cfg.worker_limit_s
         for tries in range(1, _MOST_TRIES + 1):
             self._roster.recruit()
-            if not self._roster.gather(1, max(COMING_S, limit_s)):
-                raise nobody_came(max(COMING_S, limit_s))
+            if not self._roster.gather(1, self._roster.patience_s):
+                raise nobody_came(self._roster.patience_s)
             self._roster.gather(len(self._roster.members), _GATHER_S)
             first = self._roster.joined[0]
             try:
@@ -113,9 +113,7 @@ class Crew:
             ValueError: If the arguments do not fit, or a shard is refused by five workers.
             EvaluatorError: If a shard fails on five workers, or none is left and none comes.
         """
-        count = len(terrains)
-        if seeds.shape != (count,) or count == 0:
-            raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
+        checked_count(terrains, seeds)
         try:
             return self._cross(terrains, seeds, progress)
         except BaseException:  # Ctrl-C too: what is under way is of no later call
@@ -136,8 +134,8 @@ class Crew:
                     self._assign(member, waiting.popleft(), terrains[part], seeds[part], size)
             busy = [member for member in self._roster.joined if member.task is not None]
             busy_at = time.monotonic() if busy else busy_at
-            if time.monotonic() - busy_at > max(COMING_S, self._cfg.worker_limit_s):
-                raise nobody_came(max(COMING_S, self._cfg.worker_limit_s))
+            if time.monotonic() - busy_at > self._roster.patience_s:
+                raise nobody_came(self._roster.patience_s)
             self._roster.wait([member.task for member in busy])
             waiting.extendleft(member.shard for member in busy if not self._look_after(member, shards[member.shard]))
             if progress is not None:

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 _POLL_S = 0.25
 _RECRUIT_EVERY_S = 2.0
-COMING_S = 60.0
-"""Least time in which a worker may come [s]."""
+_COMING_S = 60.0  # least time in which a worker may come
 _SILENT_S = 5.0
 _REFUSED_PAUSE_S = 60.0
 _MOST_REFUSALS = 5  # workers in a row that came and could not be used
@@ -76,6 +75,11 @@ class Roster:
         self._recruited_at = -np.inf
 
     @property
+    def patience_s(self) -> float:
+        """How long a worker may take to come [s]."""
+        return max(_COMING_S, self._cfg.worker_limit_s)
+
+    @property
     def joined(self) -> list[Member]:
         """Those that have come."""
         return [member for member in self.members if member.introduction is None]
@@ -92,7 +96,7 @@ class Roster:
             wanted = self._cfg.workers
             wanted = wanted if isinstance(wanted, int) else num_devices(self._cfg.device)
             for member in [m for m in self.members if m.introduction is not None]:
-                if now - member.hired_at > max(COMING_S, self._cfg.worker_limit_s):  # it hangs, or has no place yet
+                if now - member.hired_at > self.patience_s:  # it hangs, or has no place yet
                     self.dismiss(member)
             for _ in range(wanted - len(self.members)):
                 self._hire()

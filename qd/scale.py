@@ -13,8 +13,8 @@ import numpy as np
 
 from qd.cli import run_command
 from qd.settings import preset
-from qd.workers import EvaluatorCfg, EvaluatorError, Staffed, open_evaluator, resolve_device
-from sim.files import prepare_output, to_json, write_atomically
+from qd.workers import EvaluatorCfg, EvaluatorError, crew_status, open_evaluator, resolve_device
+from sim.command import publish, show_json
 from sim.provenance import provenance
 
 _PAPER_ITERATIONS = 1000
@@ -56,7 +56,7 @@ def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
     with open_evaluator(cfg) as evaluate:
         seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]
-        crew = evaluate.status() if isinstance(evaluate, Staffed) else None
+        crew = crew_status(evaluate)
     if crew is not None and (crew.workers != cfg.workers or crew.retries):
         raise EvaluatorError(f"expected {cfg.workers} workers throughout, got {crew}: nothing was measured")
     return statistics.median(seconds[1:])
@@ -93,12 +93,11 @@ def measure(args: Arguments) -> dict[str, Any]:
     one = terrains * replicas / alone_s
     print(f"without Ray: {one:,.1f} episodes/s; {shared_alone_s:.2f} s an iteration of {search.preset}", flush=True)
     rows = []
+    dealt = "cuda" if on_gpu else "cpu"  # which GPU is Ray's to say
     for count in args.workers:
-        crew = replace(alone, num_terrains=terrains * count, workers=count, device="cuda" if on_gpu else "cpu")
+        crew = replace(alone, num_terrains=terrains * count, workers=count, device=dealt)
         rate = terrains * count * replicas / time_evaluation(crew, args.rounds, args.seed)
-        iteration_s = time_evaluation(
-            replace(shared, workers=count, device="cuda" if on_gpu else "cpu"), args.rounds, args.seed
-        )
+        iteration_s = time_evaluation(replace(shared, workers=count, device=dealt), args.rounds, args.seed)
         rows.append(
             {
                 "workers": count,
@@ -138,13 +137,7 @@ def measure(args: Arguments) -> dict[str, Any]:
 
 def main(args: Arguments) -> None:
     """The command."""
-    if args.out is not None:
-        prepare_output(args.out)
-    report = measure(args)
-    print(to_json(report).decode())
-    if args.out is not None:
-        write_atomically(args.out, to_json(report))
-        print(f"written to {args.out}")
+    publish(args.out, lambda: measure(args), show_json)
 
 
 if __name__ == "__main__":

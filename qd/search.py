@@ -16,9 +16,8 @@ from qd.reevaluate import FRESH_EPISODES, reproduced
 from qd.report import summary, write_figures
 from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed
 from qd.settings import SearchCfg, as_settings
-from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, Staffed, episode_seeds, open_evaluator
+from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, crew_status, episode_seeds, open_evaluator, origin_of
 from sim.files import to_json, write_atomically
-from sim.provenance import provenance
 
 if TYPE_CHECKING:
     from qd.cma_mae import CmaMae
@@ -58,7 +57,7 @@ def search_terrains(
             "rollout_s": float(result.wall_s),
             "mean_duration_s": float(result.duration_s.mean()),
         }
-        crew = evaluate.status() if isinstance(evaluate, Staffed) else None
+        crew = crew_status(evaluate)
         staff = {"workers": crew.workers, "retries": crew.retries} if crew else {}
         metrics.append(
             {"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics, **timing, **staff}
@@ -149,7 +148,7 @@ def _finish(job: Job, run: RunDirectory, search: "CmaMae", metrics: Metrics, ope
     figures = write_figures(job.path, archive, metrics)
     count = _count_reproduced(job, archive, open_evaluator) if job.reproduce else None
     # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
-    again = provenance(job.device, job.cfg.seed) if count is not None else None
+    again = origin_of(job.device, job.cfg.seed, job.evaluator.workers) if count is not None else None
     numbers = summary(
         archive,
         metrics,

@@ -4,9 +4,22 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 MIN_ROWS = 4
 """Fewest robots of a simulation: torch's linear layers give the same bits for batches of 4 rows and more only."""
+
+
+def checked_count(terrains: NDArray, seeds: NDArray) -> int:
+    """Number of terrains to evaluate.
+
+    Raises:
+        ValueError: If there is none, or not one seed for each.
+    """
+    count = len(terrains)
+    if seeds.shape != (count,) or count == 0:
+        raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
+    return count
 
 
 def taken(result: Any, count: int) -> Any:

@@ -19,7 +19,8 @@ from qd.run_directory import Metrics, RunDirectory
 from qd.search import search_terrains
 from qd.settings import SearchCfg, as_settings, changed, policy_spec, preset
 from qd.workers import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
-from sim.files import prepare_output, read_json, to_json, write_atomically
+from sim.command import publish, show_json
+from sim.files import read_json
 from sim.provenance import provenance
 
 _WARM_UP = 2
@@ -193,13 +194,7 @@ def measure(args: Arguments) -> dict[str, Any]:
 
 def main(args: Arguments) -> None:
     """The command."""
-    if args.out is not None:
-        prepare_output(args.out)
-    report = measure(args)
-    print(to_json(report).decode())
-    if args.out is not None:
-        write_atomically(args.out, to_json(report))
-        print(f"written to {args.out}")
+    publish(args.out, lambda: measure(args), show_json)
 
 
 if __name__ == "__main__":

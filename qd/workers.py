@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.shards import MIN_ROWS, merged, taken
+from qd.shards import MIN_ROWS, checked_count, merged, taken
 from qd.worker_process import Crosser, EvaluatorError, WorkerProcess
+from sim.provenance import provenance
 
 if TYPE_CHECKING:
     from qd.crew import CrewStatus
@@ -26,12 +27,13 @@ __all__ = [
     "Evaluate",
     "EvaluatorCfg",
     "EvaluatorError",
-    "Staffed",
     "available_cores",
     "build_rollout",
     "check_policy",
+    "crew_status",
     "episode_seeds",
     "open_evaluator",
+    "origin_of",
     "resolve_device",
 ]
 
@@ -91,12 +93,17 @@ class Evaluate(Protocol):
 
 
 @runtime_checkable
-class Staffed(Protocol):
+class _Staffed(Protocol):
     """An :class:`Evaluate` that has workers to report on."""
 
     def status(self) -> "CrewStatus":
         """How they fare."""
         ...
+
+
+def crew_status(evaluate: Evaluate) -> "CrewStatus | None":
+    """How the Ray workers of an evaluator fare; None if it has none."""
+    return evaluate.status() if isinstance(evaluate, _Staffed) else None
 
 
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = 0) -> NDArray[np.uint32]:
@@ -136,6 +143,12 @@ def resolve_device(name: str | None, workers: int | Literal["auto"] | None = Non
     from sim.simulation import resolve_device as resolve
 
     return resolve(name)
+
+
+def origin_of(device: str, seed: int, workers: int | Literal["auto"] | None) -> dict[str, Any]:
+    """Provenance of what Ray workers, or this machine without them, evaluate on a device."""
+    origin = provenance(device, seed)
+    return origin if workers is None else {**origin, "device": _cluster("cluster").name_of_device(device)}
 
 
 def check_policy(policy: str, robot: str, device: str) -> None:
@@ -266,9 +279,7 @@ def _in_turns(evaluate: Evaluate, at_once: int) -> Evaluate:
     """Any number of terrains, ``at_once`` at a time; the last turn is filled up and what fills it is dropped."""
 
     def in_turns(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
-        count = len(terrains)
-        if seeds.shape != (count,) or count == 0:
-            raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
+        count = checked_count(terrains, seeds)
         parts = []
         for first in range(0, count, at_once):
             turn = np.arange(first, first + at_once) % count

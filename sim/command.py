@@ -1,7 +1,11 @@
-"""How every command of sim and train ends: an exit code, and one line on stderr for what a user can mend."""
+"""How commands end: an exit code, one line on stderr for what a user can mend, and a results file."""
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sim.files import prepare_output, to_json, write_atomically
 
 
 def exit_code_of(
@@ -26,3 +30,31 @@ def exit_code_of(
     except KeyboardInterrupt:
         print(f"\n{stopped}", file=sys.stderr)
         return 130
+
+
+def publish(
+    out: Path | None, measure: Callable[[], dict[str, Any]], show: Callable[[dict[str, Any]], None]
+) -> dict[str, Any]:
+    """Measures, shows and writes a report, which is returned; where to write is tried before the work.
+
+    Args:
+        out: File to write; None for none.
+        measure: Makes the report.
+        show: Prints it.
+
+    Raises:
+        ValueError: If the file cannot be written to.
+    """
+    if out is not None:
+        prepare_output(out)
+    report = measure()
+    show(report)
+    if out is not None:
+        write_atomically(out, to_json(report))
+        print(f"written to {out}")
+    return report
+
+
+def show_json(report: dict[str, Any]) -> None:
+    """Prints a report as its file has it."""
+    print(to_json(report).decode())

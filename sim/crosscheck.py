@@ -19,8 +19,7 @@ from tqdm import tqdm
 
 from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
-from sim.command import exit_code_of
-from sim.files import prepare_output, to_json, write_atomically
+from sim.command import exit_code_of, publish
 from sim.plain_crossing import draw_starts
 from sim.plain_processes import run_plain
 from sim.provenance import provenance
@@ -259,13 +258,7 @@ def _print_table(report: dict[str, Any]) -> None:
 def run(cfg: CrosscheckCfg) -> int:
     """Compare, print the table, write the file; returns the exit status."""
     check = Crosscheck(cfg)
-    if cfg.out is not None:
-        prepare_output(cfg.out)
-    report = check.run()
-    _print_table(report)
-    if cfg.out is not None:
-        write_atomically(cfg.out, to_json(report))
-        print(f"written to {cfg.out}")
+    publish(cfg.out, check.run, _print_table)
     return 0
 
 

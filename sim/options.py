@@ -13,8 +13,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from sim.command import exit_code_of
-from sim.files import prepare_output, to_json, write_atomically
+from sim.command import exit_code_of, publish
 from sim.provenance import provenance
 from sim.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
@@ -143,13 +142,7 @@ def _print_table(report: dict[str, Any]) -> None:
 
 def run(cfg: OptionsCfg) -> int:
     """Measure, print the table, write the file; returns the exit status."""
-    if cfg.out is not None:
-        prepare_output(cfg.out)
-    report = measure(cfg)
-    _print_table(report)
-    if cfg.out is not None:
-        write_atomically(cfg.out, to_json(report))
-        print(f"written to {cfg.out}")
+    publish(cfg.out, lambda: measure(cfg), _print_table)
     return 0
 
 

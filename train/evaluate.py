@@ -14,11 +14,10 @@ import tyro
 from tqdm import tqdm
 
 from kernels.episode import Outcome
-from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, check_policy, open_evaluator, resolve_device
+from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, check_policy, open_evaluator, origin_of, resolve_device
 from sim.command import exit_code_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.intervals import bootstrap_interval
-from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.rollout import RolloutResult
 from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
@@ -214,7 +213,7 @@ def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
     )
     with open_evaluator(evaluator) as crossings:
         sets = evaluate_sets(crossings, terrains, cfg.seed)
-    report = {**provenance(device, cfg.seed), "robot": robot.name, "policy": Path(policy).name, **sets}
+    report = {**origin_of(device, cfg.seed, cfg.workers), "robot": robot.name, "policy": Path(policy).name, **sets}
     _print_table(report)
     if out is not None:
         write_atomically(out, to_json(report))

@@ -21,6 +21,7 @@ class Crosser:
         assert len(terrains) == len(seeds) == self.num_terrains
         if progress is not None:
             progress(1, 2)
+            progress(2, 2)
         return stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
 
 

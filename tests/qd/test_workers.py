@@ -11,33 +11,29 @@ import pytest
 from qd import workers
 from qd.worker_process import _serve
 from qd.workers import EvaluatorCfg, EvaluatorError, open_evaluator
-from tests.qd import stand_in
+from tests.qd import crossers, stand_in
 
 CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", num_processes=1)
 GENES = np.random.default_rng(0).uniform(-1, 1, (15, 64)).astype(np.float32)
 SEEDS = np.arange(100, 115, dtype=np.uint32)
 
 
-class Crosser:
+class Crosser(crossers.Crosser):
     """Evaluates by the stand-in, and does what the policy's name says."""
 
     def __init__(self, cfg: EvaluatorCfg, num_terrains: int) -> None:
         if cfg.policy == "refuse to build":
             raise ValueError("policy 'x' does not fit:\nuse another")
-        self.cfg, self.num_terrains = cfg, num_terrains
+        super().__init__(cfg, num_terrains)
 
     def evaluate(self, terrains, seeds, *, progress=None):
-        assert len(terrains) == len(seeds) == self.num_terrains
         if self.cfg.policy == "die":
             os.kill(os.getpid(), signal.SIGKILL)
         if self.cfg.policy == "fail":
             raise RuntimeError("the solver is broken")
         if self.cfg.policy == "sleep":
             time.sleep(60)
-        if progress is not None:
-            progress(1, 2)
-            progress(2, 2)
-        result = stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
+        result = super().evaluate(terrains, seeds, progress=progress)
         return dataclasses.replace(result, wall_s=float(seeds[0]), physics_steps=int(seeds[0]))
 
 
