@@ -25,7 +25,7 @@ def main() -> None:
                     break
                 result = evaluate(GENES, SEEDS)
                 evaluate._roster.wait([])
-            print(evaluate.status().workers, repr(float(result.penalties.sum())), flush=True)
+            print("found", evaluate.status().workers, repr(float(result.penalties.sum())), flush=True)
 
 
 if __name__ == "__main__":
