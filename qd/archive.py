@@ -6,7 +6,7 @@ Reading an archive needs NumPy alone, so that training and figures do not depend
 import io
 import os
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +88,11 @@ class Archive:
     def mean_fitness(self) -> float:
         """Mean fitness of the elites; 0 without any."""
         return float(self.fitness.mean()) if len(self) else 0.0
+
+
+    def rows(self, chosen: NDArray[np.int64]) -> "Archive":
+        """The archive with some of its elites alone, in the order given."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in PER_ELITE})
 
 
 _SETTINGS = ("robot", "penalties", "scales", "intervals", "collision_bit", "iterations")

@@ -40,6 +40,8 @@ class Arguments:
     """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
     replicas: int | None = None
     """Episodes a terrain."""
+    method: str | None = None
+    """Where new terrains come from: cma_mae, cma_me, map_elites, mixed, hard_random or uniform_random."""
     emitters: int | None = None
     """Emitters."""
     batch_size: int | None = None
@@ -58,6 +60,8 @@ class Arguments:
     """Weight of the standard deviations in the fitness."""
     lam: float | None = None
     """Weight of the share of episodes without collision in the fitness."""
+    reevaluate_every: int | None = None
+    """Every so many iterations, look at up to 200 elites again in 40 fresh episodes; 0: never."""
     processes: int | None = None
     """Processes on the CPU, without Ray; one a core."""
     workers: int | Literal["auto"] | None = None
@@ -139,7 +143,7 @@ def _evaluator(cfg: SearchCfg, policy: str, device: str, args: Arguments) -> Eva
     return EvaluatorCfg(
         robot=cfg.robot,
         policy=policy,
-        num_terrains=cfg.cma.num_terrains,
+        num_terrains=cfg.scheduler.num_terrains,
         num_replicas=cfg.replicas,
         device=device,
         num_processes=args.processes,

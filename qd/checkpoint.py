@@ -38,11 +38,14 @@ _ADMITTED = frozenset(
         ("ribs.archives._array_store", "ArrayStore"),
         ("ribs.archives._grid_archive", "GridArchive"),
         ("ribs.emitters._evolution_strategy_emitter", "EvolutionStrategyEmitter"),
+        ("ribs.emitters._iso_line_emitter", "IsoLineEmitter"),
         ("ribs.emitters.opt._cma_es", "CMAEvolutionStrategy"),
         ("ribs.emitters.opt._cma_es", "DecompMatrix"),
         ("ribs.emitters.opt._sep_cma_es", "DiagonalMatrix"),
         ("ribs.emitters.opt._sep_cma_es", "SeparableCMAEvolutionStrategy"),
         ("ribs.emitters.rankers", "ImprovementRanker"),
+        ("ribs.emitters.rankers", "TwoStageImprovementRanker"),
+        ("qd.scheduler", "RandomEmitter"),
     }
 )
 

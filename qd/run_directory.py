@@ -19,7 +19,7 @@ from qd.settings import SearchCfg, Settings, from_settings
 from sim.files import check_writable, read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
-    from qd.cma_mae import CmaMae
+    from qd.scheduler import Scheduler
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
@@ -37,7 +37,7 @@ def numbered(root: Path, name: str) -> Iterator[Path]:
 
 
 def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:
-    """Settings that differ, each as ``cma.sigma0 (0.5 there, 0.2 wanted)``."""
+    """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
     found = []
     for key in sorted(there.keys() | wanted.keys()):
         a, b = there.get(key), wanted.get(key)
@@ -135,7 +135,7 @@ class RunDirectory:
         content = {"settings": settings, "iterations": iterations, **origin}
         write_atomically(self.path / CONFIG_FILE, to_json(content))
 
-    def save(self, settings: Settings, search: "CmaMae", metrics: Metrics, archive: Archive) -> None:
+    def save(self, settings: Settings, search: "Scheduler", metrics: Metrics, archive: Archive) -> None:
         """Saves an iteration; killed anywhere in here, the run is either before or after it.
 
         Args:
@@ -158,7 +158,7 @@ class RunDirectory:
         file = self.path / METRICS_FILE
         return len(file.read_text(encoding="utf-8").splitlines()) if file.exists() else 0
 
-    def load(self, settings: Settings) -> tuple["CmaMae", Metrics] | None:
+    def load(self, settings: Settings) -> tuple["Scheduler", Metrics] | None:
         """The search as its checkpoint has it.
 
         Args:
@@ -180,7 +180,7 @@ class RunDirectory:
             if lost:
                 raise ValueError(f"{file} is lost: expected it beside {' and '.join(lost)}; {_REMEDY}")
             return None
-        from qd.cma_mae import CmaMae  # pyribs takes two seconds to import: not for `--help`
+        from qd.scheduler import Scheduler  # pyribs takes two seconds to import: not for `--help`
 
         state = load_checkpoint(file)
         there, metrics = state.get("settings"), state.get("metrics")
@@ -190,12 +190,12 @@ class RunDirectory:
         if different:
             raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}; {_REMEDY}")
         try:
-            return CmaMae.from_state(state), metrics
+            return Scheduler.from_state(state), metrics
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{file} is no checkpoint of a search: {error}; {_REMEDY}") from None
 
 
-def archive_of(settings: Settings, search: "CmaMae", iterations: int) -> Archive:
+def archive_of(settings: Settings, search: "Scheduler", iterations: int) -> Archive:
     """What a search has found so far.
 
     Args:

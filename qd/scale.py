@@ -88,7 +88,7 @@ def measure(args: Arguments) -> dict[str, Any]:
         device=device,
         num_processes=1,
     )
-    shared = replace(alone, num_terrains=search.cma.num_terrains, num_replicas=search.replicas)
+    shared = replace(alone, num_terrains=search.scheduler.num_terrains, num_replicas=search.replicas)
     alone_s, shared_alone_s = (time_evaluation(cfg, args.rounds, args.seed) for cfg in (alone, shared))
     one = terrains * replicas / alone_s
     print(f"without Ray: {one:,.1f} episodes/s; {shared_alone_s:.2f} s an iteration of {search.preset}", flush=True)

@@ -12,7 +12,7 @@ from qd.arguments import Arguments, Job, job_of
 from qd.cli import Interrupted, run_command
 from qd.fitness import Evaluation, evaluation_of
 from qd.progress import ProgressBar, clock, plan
-from qd.reevaluate import FRESH_EPISODES, reproduced
+from qd.reevaluate import FRESH_EPISODES, drawn_elites, numbers_of, reevaluate
 from qd.report import summary, write_figures
 from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed
 from qd.settings import SearchCfg, as_settings
@@ -20,15 +20,18 @@ from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, crew_status, epis
 from sim.files import to_json, write_atomically
 
 if TYPE_CHECKING:
-    from qd.cma_mae import CmaMae
+    from qd.scheduler import Scheduler
+    from sim.rollout import RolloutResult
 
 SUMMARY_FILE = "archive.json"
+MOST_DRAWN = 200
+"""Elites drawn for a look at them in the middle of a search (the paper's figure of mean STD)."""
 
 Open = Callable[[EvaluatorCfg], AbstractContextManager[Evaluate]]
 
 
 def search_terrains(
-    cfg: SearchCfg, run: RunDirectory, search: "CmaMae", metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
+    cfg: SearchCfg, run: RunDirectory, search: "Scheduler", metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
 ) -> None:
     """The loop: runs the iterations that are left, each saved before the next begins.
 
@@ -40,31 +43,54 @@ def search_terrains(
         evaluate: Crosses terrains.
         bar: Shows progress.
     """
-    settings, cells = as_settings(cfg), cfg.cells
     began = time.perf_counter()
     for iteration in range(len(metrics) + 1, cfg.iterations + 1):
         genes = search.ask()
         seeds = episode_seeds(cfg.seed, iteration, len(genes))
         result = evaluate(genes, seeds, bar.within(iteration))
-        evaluation = evaluation_of(result, cells, cfg.fitness)
-        search.tell(evaluation, iteration)
+        found, row = take_in(cfg, search, result, iteration)
+        if cfg.reevaluate_every and iteration % cfg.reevaluate_every == 0:
+            row |= _look_again(cfg, found, evaluate)
         ended = time.perf_counter()
-        found = archive_of(settings, search, iteration)
-        timing = {"wall_s": ended - began}  # from the end of the iteration before, so saving counts
-        timing["episodes_per_s"] = evaluation.episodes.sum().item() / timing["wall_s"]
-        physics = {
-            "physics_steps": int(result.physics_steps),
-            "rollout_s": float(result.wall_s),
-            "mean_duration_s": float(result.duration_s.mean()),
-        }
+        wall_s = ended - began  # from the end of the iteration before, so saving counts
         crew = crew_status(evaluate)
         staff = {"workers": crew.workers, "retries": crew.retries} if crew else {}
-        metrics.append(
-            {"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics, **timing, **staff}
-        )
+        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **staff})
         began = ended
-        run.save(settings, search, metrics, found)
+        run.save(as_settings(cfg), search, metrics, found)
         bar.show(metrics[-1], None if crew is None else str(crew))
+
+
+def take_in(
+    cfg: SearchCfg, search: "Scheduler", result: "RolloutResult", iteration: int
+) -> tuple[Archive, dict[str, Any]]:
+    """Tells a search what became of the terrains it asked for.
+
+    Args:
+        cfg: The search.
+        search: Has asked; is told.
+        result: The crossings.
+        iteration: Number of the iteration, from 1.
+
+    Returns:
+        What the search has found, and the iteration's row of metrics but for its timing.
+    """
+    evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
+    search.tell(evaluation, iteration)
+    found = archive_of(as_settings(cfg), search, iteration)
+    physics = {
+        "physics_steps": int(result.physics_steps),
+        "rollout_s": float(result.wall_s),
+        "mean_duration_s": float(result.duration_s.mean()),
+    }
+    return found, {"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics}
+
+
+def _look_again(cfg: SearchCfg, found: Archive, evaluate: Evaluate) -> dict[str, Any]:
+    """How reliable some elites of this iteration are, in fresh episodes (the paper's mean STD over iterations)."""
+    some = drawn_elites(found, MOST_DRAWN, cfg.seed)
+    again = reevaluate([some], evaluate, cfg.fitness, num_replicas=cfg.replicas, seeds=[cfg.seed])[0]
+    return numbers_of(again, cfg.cells, sampled=True)
 
 
 def _scores(archive: Archive) -> dict[str, Any]:
@@ -116,7 +142,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
         print(plan(cfg, job.path, done, job.device, job.evaluator.processes), flush=True)
         try:
             with open_evaluator(job.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
-                search, metrics = loaded or _begin(cfg)
+                search, metrics = loaded or (begin(cfg), [])
                 run.write_config(as_settings(cfg), cfg.iterations, job.origin)
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:
@@ -134,14 +160,15 @@ def _how_to_go_on(job: Job) -> str:
     return f"Go on with:  {job.resume_command}"
 
 
-def _begin(cfg: SearchCfg) -> tuple["CmaMae", Metrics]:
-    from qd.cma_mae import CmaMae
+def begin(cfg: SearchCfg) -> "Scheduler":
+    """A search that has asked for nothing yet."""
+    from qd.scheduler import Scheduler
 
     num_ratios = len(cfg.fitness.penalties)
-    return CmaMae(cfg.cma, num_cells=cfg.cells.num_cells, num_ratios=num_ratios, seed=cfg.seed), []
+    return Scheduler(cfg.scheduler, num_cells=cfg.cells.num_cells, num_ratios=num_ratios, seed=cfg.seed)
 
 
-def _finish(job: Job, run: RunDirectory, search: "CmaMae", metrics: Metrics, open_evaluator: Open) -> Archive:
+def _finish(job: Job, run: RunDirectory, search: "Scheduler", metrics: Metrics, open_evaluator: Open) -> Archive:
     """Figures and numbers of a search that reached its iterations."""
     archive = archive_of(as_settings(job.cfg), search, len(metrics))
     run.write_derived(metrics, archive)
@@ -171,7 +198,10 @@ def _count_reproduced(job: Job, archive: Archive, open_evaluator: Open) -> int:
     print(f"Evaluating {len(archive):,} elites again with {FRESH_EPISODES} fresh episodes each.", flush=True)
     at_once = max(1, job.cfg.episodes_per_iteration // FRESH_EPISODES)
     with open_evaluator(replace(job.evaluator, num_terrains=at_once, num_replicas=FRESH_EPISODES)) as evaluate:
-        return int(reproduced(archive, evaluate, seed=job.cfg.seed).sum())
+        again = reevaluate(
+            [archive], evaluate, job.cfg.fitness, num_replicas=FRESH_EPISODES, seeds=[job.cfg.seed]
+        )[0]
+        return int(again.reproduced.sum())
 
 
 def main(args: Arguments) -> None:

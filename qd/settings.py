@@ -16,6 +16,7 @@ from qd.fitness import FitnessCfg
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
 
+METHODS = ("cma_mae", "cma_me", "map_elites", "mixed", "hard_random", "uniform_random")
 ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
 _MAX_WHOLE = 1 << 53  # up to which whole numbers are floats too
@@ -30,11 +31,15 @@ Settings = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CmaMaeCfg:
-    """Settings of CMA-MAE."""
+class SchedulerCfg:
+    """How terrains are asked for."""
 
+    method: str = "cma_mae"
+    """Where new terrains come from: `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
+    `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `mixed`, emitters of `cma_mae` and iso+line
+    in turn; or none is learned from: `hard_random` (the paper's: every height at its limit) and `uniform_random`."""
     emitters: int = 10
-    """Emitters, each with an evolution strategy of its own."""
+    """Emitters, each with an evolution strategy or a stream of its own."""
     batch_size: int = 20
     """Terrains an emitter asks for in an iteration."""
     learning_rate: float = 0.09
@@ -47,8 +52,17 @@ class CmaMaeCfg:
     """When an emitter restarts at an elite: every so many iterations, or one of `basic` and `no_improvement`."""
     es: str = "cma_es"
     """Evolution strategy: `cma_es` adapts all covariances, `sep_cma_es` the variances alone."""
+    iso_sigma: float = 0.02
+    """Iso+line: standard deviation of each gene's own change (published: .01 of the genes' range)."""
+    line_sigma: float = 0.2
+    """Iso+line: standard deviation of the step along the line to another elite, in its length (published: .2)."""
 
     def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"method must be one of {', '.join(METHODS)}, got {self.method}")
+        for name in ("iso_sigma", "line_sigma"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} must be a number of at least 0, got {getattr(self, name)}")
         if self.emitters < 1 or self.batch_size < 2:
             raise ValueError(
                 f"emitters must be at least 1 and batch_size at least 2, got {self.emitters} and {self.batch_size}"
@@ -91,13 +105,17 @@ class SearchCfg:
     collision_bit: bool
     """Whether base collision is a descriptor of its own."""
     fitness: FitnessCfg
-    cma: CmaMaeCfg
+    scheduler: SchedulerCfg
+    reevaluate_every: int = 50
+    """Every so many iterations, up to 200 elites are looked at again in 40 fresh episodes each; 0: never."""
 
     def __post_init__(self) -> None:
         for name in ("iterations", "replicas", "intervals"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
+        if self.reevaluate_every < 0:
+            raise ValueError(f"reevaluate_every must not be negative, got {self.reevaluate_every}")
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
 
@@ -109,7 +127,7 @@ class SearchCfg:
     @property
     def episodes_per_iteration(self) -> int:
         """Episodes of one iteration."""
-        return self.cma.num_terrains * self.replicas
+        return self.scheduler.num_terrains * self.replicas
 
 
 def paper(robot: "RobotCfg") -> SearchCfg:
@@ -125,13 +143,15 @@ def paper(robot: "RobotCfg") -> SearchCfg:
         intervals=10,
         collision_bit=robot.collision_bit,
         fitness=FitnessCfg(penalties=robot.penalties, scales=robot.read_penalty_scales()),
-        cma=CmaMaeCfg(),
+        scheduler=SchedulerCfg(),
     )
 
 
 def small(robot: "RobotCfg") -> SearchCfg:
     """A search that a laptop finishes while one waits: 4 emitters x 8 terrains x 4 episodes, 20 iterations."""
-    return replace(paper(robot), preset="small", iterations=20, replicas=4, cma=CmaMaeCfg(emitters=4, batch_size=8))
+    return replace(
+        paper(robot), preset="small", iterations=20, replicas=4, scheduler=SchedulerCfg(emitters=4, batch_size=8)
+    )
 
 
 PRESETS = {"paper": paper, "small": small}
@@ -153,13 +173,13 @@ def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:
 
     Args:
         cfg: Settings.
-        changes: New values by the names of fields of this class, its fitness or its CMA-MAE; None changes nothing.
+        changes: New values by the names of fields of this class, its fitness or its scheduler; None changes nothing.
 
     Raises:
         ValueError: If a value is out of range.
     """
     given = {name: value for name, value in changes.items() if value is not None}
-    for part in ("fitness", "cma"):
+    for part in ("fitness", "scheduler"):
         current = getattr(cfg, part)
         names = {field.name for field in fields(current)} & given.keys()
         cfg = replace(cfg, **{part: replace(current, **{name: given.pop(name) for name in names})})

@@ -22,9 +22,10 @@ def checked_count(terrains: NDArray, seeds: NDArray) -> int:
     return count
 
 
-def taken(result: Any, count: int) -> Any:
-    """The first terrains of a result."""
-    arrays = {name: value[:count].copy() for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
+def taken(result: Any, count: int, *, first: int = 0) -> Any:
+    """Some of a result's terrains: ``count`` from ``first`` on."""
+    own = slice(first, first + count)
+    arrays = {name: value[own].copy() for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
     return dataclasses.replace(result, **arrays)  # copies, since what Ray delivers can only be read
 
 

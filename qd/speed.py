@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.cli import run_command
-from qd.cma_mae import CmaMae
 from qd.progress import ProgressBar
 from qd.run_directory import Metrics, RunDirectory
+from qd.scheduler import Scheduler
 from qd.search import search_terrains
 from qd.settings import SearchCfg, as_settings, changed, policy_spec, preset
 from qd.workers import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
@@ -69,7 +69,9 @@ class _Recorder:
 
 def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, NDArray[Any]]:
     """Runs a search from the start; its metrics rows, and the terrains of its last iteration."""
-    search = CmaMae(cfg.cma, num_cells=cfg.cells.num_cells, num_ratios=len(cfg.fitness.penalties), seed=cfg.seed)
+    search = Scheduler(
+        cfg.scheduler, num_cells=cfg.cells.num_cells, num_ratios=len(cfg.fitness.penalties), seed=cfg.seed
+    )
     metrics: Metrics = []
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -159,7 +161,7 @@ def measure(args: Arguments) -> dict[str, Any]:
     evaluator = EvaluatorCfg(
         robot=robot.name,
         policy=policy_spec(cfg, robot),
-        num_terrains=cfg.cma.num_terrains,
+        num_terrains=cfg.scheduler.num_terrains,
         num_replicas=cfg.replicas,
         device=device,
         num_processes=1,  # bare physics is measured in one process too

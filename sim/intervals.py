@@ -30,3 +30,22 @@ def bootstrap_interval(values: NDArray[np.floating], rng: np.random.Generator) -
         return None
     means = values[rng.integers(len(values), size=(_BOOTSTRAP_DRAWS, len(values)))].mean(axis=1)
     return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
+
+
+_T_QUANTILES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)  # 97.5 %, of 1 to 9 degrees of freedom
+
+
+def t_interval(values: NDArray[np.floating]) -> list[float] | None:
+    """95 % interval of the mean of a few independent measurements (Student 1908), such as one a training or search.
+
+    Args:
+        values: Shape (count,); at most 10.
+
+    Returns:
+        Lower and upper limit; None for a single one, which says nothing of its spread.
+    """
+    count = len(values)
+    if count < 2:
+        return None
+    half = _T_QUANTILES[count - 2] * float(values.std(ddof=1)) / math.sqrt(count)
+    return [float(values.mean()) - half, float(values.mean()) + half]

@@ -9,7 +9,7 @@ from qd.archive import ARCHIVE_FILE, read_archive
 from qd.arguments import Arguments, job_of
 from qd.checkpoint import load_checkpoint
 from qd.cli import run_command
-from qd.cma_mae import CmaMae
+from qd.scheduler import Scheduler
 from qd.run_directory import CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE
 from sim.files import write_atomically
 from tests.faults.steps import Steps
@@ -71,7 +71,7 @@ def saved_iterations(path: Path) -> int:
 def outcome(path: Path) -> tuple[bytes, list[dict[str, Any]], bytes]:
     """What a search comes to: the archive's bytes, its metrics, and what it would ask next."""
     state = load_checkpoint(path / CHECKPOINT_FILE)
-    asked = CmaMae.from_state(state).ask()
+    asked = Scheduler.from_state(state).ask()
     rows = rows_of(path)
     assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
     assert [row["iteration"] for row in state["metrics"]] == [row["iteration"] for row in rows]

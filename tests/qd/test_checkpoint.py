@@ -8,10 +8,10 @@ import pytest
 
 from qd import checkpoint
 from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.cma_mae import CmaMae
+from qd.scheduler import Scheduler
 from qd.descriptors import Cells
-from qd.settings import CmaMaeCfg
-from tests.qd.test_cma_mae import advance, make_search
+from qd.settings import SchedulerCfg
+from tests.qd.test_scheduler import advance, make_search
 
 
 def wrap(payload: bytes) -> bytes:
@@ -31,17 +31,17 @@ def saved(tmp_path):
 
 @pytest.mark.parametrize("es", ["cma_es", "sep_cma_es"])
 def test_round_trip(tmp_path, es):
-    search = make_search(CmaMaeCfg(emitters=2, batch_size=6, es=es))
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, es=es))
     advance(search, 1, 8)
     path = tmp_path / "checkpoint.bin"
     save_checkpoint(path, search.state())
-    back = CmaMae.from_state(load_checkpoint(path))
+    back = Scheduler.from_state(load_checkpoint(path))
     assert np.array_equal(back.ask(), search.ask())
     assert path.stat().st_size < 16 << 20
 
 
 def test_what_a_full_search_needs_fits(tmp_path):
-    cfg = CmaMaeCfg()
+    cfg = SchedulerCfg()
     search = make_search(cfg)
     rng = np.random.default_rng(0)
     archive_rows = {"solution": rng.normal(size=(4795, 64)), "objective": rng.normal(size=4795)}
@@ -86,7 +86,7 @@ def test_damage_behind_a_right_hash_is_one_clear_error(saved):
         bad = state[:position] + bytes([rng.integers(256)]) + state[position + 1 :]
         saved.write_bytes(wrap(zlib.compress(bad, 1)))
         try:
-            CmaMae.from_state(load_checkpoint(saved))
+            Scheduler.from_state(load_checkpoint(saved))
         except ValueError as error:
             assert "\n" not in str(error)
 

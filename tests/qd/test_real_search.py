@@ -8,7 +8,7 @@ import pytest
 
 from qd.fitness import FitnessCfg
 from qd.search import run_search
-from qd.settings import CmaMaeCfg
+from qd.settings import SchedulerCfg
 from qd.space import random
 from qd.workers import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
 from sim.robot import get_robot
@@ -23,7 +23,7 @@ CFG = EvaluatorCfg(
 SETTINGS = {
     "replicas": 2,
     "fitness": FitnessCfg(penalties=ROBOT.penalties, scales=(1.0, 2.0, 1.0, 300.0, 0.05, 0.3)),
-    "cma": CmaMaeCfg(emitters=1, batch_size=4, sigma0=1.0),
+    "scheduler": SchedulerCfg(emitters=1, batch_size=4, sigma0=1.0),
 }
 
 

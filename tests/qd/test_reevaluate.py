@@ -3,7 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qd.reevaluate import reproduced
+from qd.fitness import FitnessCfg
+from qd.reevaluate import drawn_elites, numbers_of, reevaluate
 from tests.qd.stand_in import make_result
 from tests.qd.test_archive import small_archive
 
@@ -22,18 +23,34 @@ def evaluator(ratios, **kwargs):
     return lambda genes, seeds, progress=None: make_result(penalties, **kwargs)
 
 
+def again_of(archive, evaluate, num_replicas=40):
+    fitness = FitnessCfg(penalties=archive.penalties, scales=archive.scales)
+    return reevaluate([archive], evaluate, fitness, num_replicas=num_replicas, seeds=[0])[0]
+
+
+def reproduced(archive, evaluate):
+    return again_of(archive, evaluate).reproduced.tolist()
+
+
 def test_the_same_cell_and_its_neighbours_count():
     # cells of two ratios: [.3, .4) x [.6, .7) has index 3; .45 is one interval further, .55 two
     found = archive_of([0.35, 0.35, 0.35, 0.35])
-    again = evaluator([0.38, 0.45, 0.55, 0.25])
-    assert reproduced(found, again, seed=0).tolist() == [True, True, False, True]
+    assert reproduced(found, evaluator([0.38, 0.45, 0.55, 0.25])) == [True, True, False, True]
 
 
-def test_an_invalid_terrain_is_not_reproduced():
+def test_an_invalid_terrain_is_not_reproduced_and_counts_in_no_mean():
     invalid = np.zeros((2, 40), bool)
     invalid[1, :11] = True  # 11 of 40 is more than a quarter
-    again = evaluator([0.45, 0.45], invalid=invalid)
-    assert reproduced(archive_of([0.45, 0.45]), again, seed=0).tolist() == [True, False]
+    archive = archive_of([0.45, 0.45])
+    again = again_of(archive, evaluator([0.45, 0.45], invalid=invalid))
+    assert again.reproduced.tolist() == [True, False]
+    assert again.corrected_elites().tolist() == [0]
+    # mean 1 of the two penalties together, no deviation, no collision: fitness 1
+    assert numbers_of(again, archive.cells) == {
+        "reevaluated": 2, "reproduced": 1, "mean_std": 0.0, "mean_std_interval": [0.0, 0.0],
+        "corrected_mean_fitness": 1.0, "corrected_elites": 1, "corrected_coverage": 1 / archive.cells.num_cells,
+        "corrected_qd_score": 21.0,
+    }  # fmt: skip
 
 
 def test_the_collision_bit_is_taken_over_the_first_twenty():
@@ -41,14 +58,54 @@ def test_the_collision_bit_is_taken_over_the_first_twenty():
     collides[1, 19] = True
     collides[2, 20] = True
     again = evaluator([0.35] * 3, base_collision=collides)
-    assert reproduced(archive_of([0.35] * 3, collided=[False] * 3), again, seed=0).tolist() == [True, False, True]
-    assert reproduced(archive_of([0.35] * 3, collided=[True] * 3), again, seed=0).tolist() == [False, True, False]
+    assert reproduced(archive_of([0.35] * 3, collided=[False] * 3), again) == [True, False, True]
+    assert reproduced(archive_of([0.35] * 3, collided=[True] * 3), again) == [False, True, False]
+
+
+def test_elites_that_land_in_one_cell_are_one_corrected_elite_the_fittest():
+    columns = np.repeat(np.array([[1.0, 3.0], [2.0, 6.0], [3.0, 1.0]])[:, None], 40, axis=1)
+    again = again_of(archive_of([0.25, 0.35, 0.75]), lambda *_: make_result(columns))
+    assert again.corrected_elites().tolist() == [1, 2]
+    assert numbers_of(again, small_archive(1).cells)["corrected_qd_score"] == (8 + 20) + (4 + 20)
+
+
+def test_several_archives_at_once_by_few_replicas_make_forty_episodes_each():
+    seen = []
+
+    def evaluate(genes, seeds, progress=None):
+        seen.append((genes, seeds))
+        marks = np.arange(len(genes) * 12, dtype=float).reshape(len(genes), 12)
+        return make_result(np.stack([marks, marks + 1.0], axis=2))
+
+    one, two = archive_of([0.25, 0.35]), archive_of([0.45])
+    fitness = FitnessCfg(penalties=one.penalties, scales=one.scales)
+    first, second = reevaluate([one, two], evaluate, fitness, num_replicas=12, seeds=[0, 1])
+    genes, seeds = seen[0]
+    # 4 times 12 episodes, of which 40 count
+    assert np.array_equal(genes, np.concatenate([one.genes, two.genes]).repeat(4, axis=0))
+    assert len(set(seeds.tolist())) == 12
+    assert first.fresh.episodes.tolist() == [40, 40]
+    assert first.fresh.penalty_mean[:, 0].tolist() == [19.5, 48 + 19.5]
+    assert second.fresh.penalty_mean[:, 0].tolist() == [96 + 19.5]
+    alone = reevaluate([two], evaluate, fitness, num_replicas=12, seeds=[1])
+    assert np.array_equal(seen[1][1], seeds[8:])
+    assert len(alone) == 1
 
 
 def test_an_empty_archive_has_none():
-    assert len(reproduced(small_archive(0), evaluator([0.5]), seed=0)) == 0
+    again = again_of(small_archive(0), evaluator([0.5]))
+    assert len(again.reproduced) == 0
+    assert numbers_of(again, small_archive(0).cells)["mean_std"] is None
 
 
-def test_forty_episodes_are_needed():
+def test_episodes_of_another_number_than_said_are_refused():
     with pytest.raises(ValueError, match="evaluate must give 40 episodes, got 4"):
-        reproduced(archive_of([0.5]), lambda *_: make_result([[[1.0, 1.0]] * 4]), seed=0)
+        again_of(archive_of([0.5]), lambda *_: make_result([[[1.0, 1.0]] * 4]))
+
+
+def test_drawn_elites_are_some_of_them_each_once():
+    archive = small_archive(3)
+    assert drawn_elites(archive, 3, seed=0) is archive
+    drawn = drawn_elites(archive, 2, seed=0)
+    assert len(drawn) == 2
+    assert set(drawn.cell.tolist()) < set(archive.cell.tolist())

@@ -6,12 +6,12 @@ from qd.run_directory import RunDirectory, claimed, differences, numbered
 
 
 def test_differences_name_every_key():
-    there = {"seed": 0, "cma": {"sigma0": 0.5, "es": "cma_es"}, "old": 1, "same": [1, 2]}
-    wanted = {"seed": 0, "cma": {"sigma0": 0.2, "es": "cma_es"}, "new": "x", "same": [1, 2]}
+    there = {"seed": 0, "scheduler": {"sigma0": 0.5, "es": "cma_es"}, "old": 1, "same": [1, 2]}
+    wanted = {"seed": 0, "scheduler": {"sigma0": 0.2, "es": "cma_es"}, "new": "x", "same": [1, 2]}
     assert differences(there, wanted) == [
-        "cma.sigma0 (0.5 there, 0.2 wanted)",
         'new (null there, "x" wanted)',
         "old (1 there, null wanted)",
+        "scheduler.sigma0 (0.5 there, 0.2 wanted)",
     ]
     assert differences(there, there) == []
 

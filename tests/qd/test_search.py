@@ -19,7 +19,7 @@ from qd.arguments import Job
 from qd.cli import Interrupted
 from qd.fitness import FitnessCfg
 from qd.search import run_search
-from qd.settings import CmaMaeCfg, SearchCfg
+from qd.settings import SchedulerCfg, SearchCfg
 from qd.workers import EvaluatorCfg, EvaluatorError
 from sim import files
 from sim.provenance import provenance
@@ -37,7 +37,7 @@ CFG = SearchCfg(
     intervals=10,
     collision_bit=False,
     fitness=FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES),
-    cma=CmaMaeCfg(emitters=2, batch_size=6, sigma0=0.5, restart_rule="3"),
+    scheduler=SchedulerCfg(emitters=2, batch_size=6, sigma0=0.5, restart_rule="3"),
 )
 KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.json", "curves.png", "metrics.jsonl")
 
@@ -45,7 +45,7 @@ KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.
 def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
     cfg = dataclasses.replace(CFG, **changes)
     evaluator = EvaluatorCfg(
-        robot="anymal", policy="p", num_terrains=cfg.cma.num_terrains, num_replicas=cfg.replicas, num_processes=1
+        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, num_processes=1
     )
     return Job(
         cfg=cfg,
@@ -220,12 +220,12 @@ def test_a_simulation_that_cannot_be_built_leaves_no_directory(tmp_path):
 
 def test_a_checkpoint_of_another_run_is_refused_and_left_alone(tmp_path, plain_figures):
     run(tmp_path / "a")
-    run(tmp_path / "b", seed=4, cma=dataclasses.replace(CFG.cma, sigma0=0.25))
+    run(tmp_path / "b", seed=4, scheduler=dataclasses.replace(CFG.scheduler, sigma0=0.25))
     strayed = (tmp_path / "b/checkpoint.bin").read_bytes()
     (tmp_path / "a/checkpoint.bin").write_bytes(strayed)
     before = {name: (tmp_path / "a" / name).read_bytes() for name in os.listdir(tmp_path / "a")}
     with pytest.raises(
-        ValueError, match=r"other settings: cma\.sigma0 \(0\.25 there, 0\.5 wanted\), seed \(4 there, 3"
+        ValueError, match=r"other settings: scheduler\.sigma0 \(0\.25 there, 0\.5 wanted\), seed \(4 there, 3"
     ):
         run(tmp_path / "a", resumes=True, iterations=5)
     assert {name: (tmp_path / "a" / name).read_bytes() for name in os.listdir(tmp_path / "a")} == before

@@ -23,7 +23,7 @@ def robot(policy_file: Path = Path("missing.pt"), scales=stand_in.SCALES):
 
 def test_paper_has_the_papers_numbers():
     cfg = paper(robot())
-    assert (cfg.cma.emitters, cfg.cma.batch_size, cfg.replicas, cfg.iterations) == (10, 20, 20, 1000)
+    assert (cfg.scheduler.emitters, cfg.scheduler.batch_size, cfg.replicas, cfg.iterations) == (10, 20, 20, 1000)
     assert cfg.episodes_per_iteration == 4000
     assert (cfg.fitness.alpha, cfg.fitness.lam, cfg.intervals) == (1.0, 2.0, 10)
 
@@ -41,8 +41,8 @@ def test_unknown_preset():
 
 def test_changes_land_where_the_setting_stands():
     cfg = changed(paper(robot()), {"sigma0": 0.25, "alpha": 0.0, "replicas": 8, "seed": None, "iterations": 5})
-    assert (cfg.cma.sigma0, cfg.fitness.alpha, cfg.replicas, cfg.iterations, cfg.seed) == (0.25, 0.0, 8, 5, 0)
-    assert cfg.cma.emitters == 10
+    assert (cfg.scheduler.sigma0, cfg.fitness.alpha, cfg.replicas, cfg.iterations, cfg.seed) == (0.25, 0.0, 8, 5, 0)
+    assert cfg.scheduler.emitters == 10
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_settings_survive_json():
 
 
 @pytest.mark.parametrize(
-    "bad", [{}, {"fitness": {}, "cma": {}}, {"fitness": {"penalties": [], "scales": []}, "cma": {}}]
+    "bad", [{}, {"fitness": {}, "scheduler": {}}, {"fitness": {"penalties": [], "scales": []}, "scheduler": {}}]
 )
 def test_settings_of_something_else(bad):
     with pytest.raises(ValueError, match="settings must be those of a search of this version"):

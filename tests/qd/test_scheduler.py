@@ -1,24 +1,23 @@
-import pickle
-
 import numpy as np
 import pytest
 
-from qd.cma_mae import CmaMae
+from qd.scheduler import Scheduler
+from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
-from qd.settings import CmaMaeCfg
+from qd.settings import ES_KINDS, METHODS, SchedulerCfg
 from tests.qd import stand_in
 
 CELLS = Cells(6)
 FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
-SMALL = CmaMaeCfg(emitters=2, batch_size=6, restart_rule="4")
+SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4")
 
 
-def make_search(cfg: CmaMaeCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> CmaMae:
-    return CmaMae(cfg, num_cells=cells.num_cells, num_ratios=6, seed=seed)
+def make_search(cfg: SchedulerCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> Scheduler:
+    return Scheduler(cfg, num_cells=cells.num_cells, num_ratios=6, seed=seed)
 
 
-def advance(search: CmaMae, first: int, last: int, cells: Cells = CELLS) -> None:
+def advance(search: Scheduler, first: int, last: int, cells: Cells = CELLS) -> None:
     for iteration in range(first, last + 1):
         genes = search.ask()
         seeds = np.random.SeedSequence([0, iteration]).generate_state(len(genes))
@@ -39,7 +38,7 @@ def told(cell, fitness, invalid=None) -> Evaluation:
 
 
 def test_asks_for_clipped_genes_of_every_emitter():
-    genes = make_search(CmaMaeCfg(emitters=3, batch_size=5, sigma0=2.0)).ask()
+    genes = make_search(SchedulerCfg(emitters=3, batch_size=5, sigma0=2.0)).ask()
     assert genes.shape == (15, 64)
     assert genes.min() == -1.0
     assert genes.max() == 1.0
@@ -68,7 +67,7 @@ def test_an_invalid_terrain_is_never_an_elite():
 
 
 def test_iterations_without_a_valid_terrain_are_survived():
-    search = make_search(CmaMaeCfg(emitters=2, batch_size=6, restart_rule="1"))
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1"))
     for iteration in (1, 2):
         search.ask()
         search.tell(told([0] * 12, [FITNESS_FLOOR] * 12, invalid=[4] * 12), iteration)
@@ -87,14 +86,15 @@ def test_cell_of_an_elite_is_the_cell_of_its_ratios():
     assert np.abs(elites["genes"]).max() <= 1.0
 
 
-@pytest.mark.parametrize("es", ["cma_es", "sep_cma_es"])
-def test_a_pickled_search_goes_on_bit_for_bit(es):
+@pytest.mark.parametrize("changes", [{"es": kind} for kind in ES_KINDS] + [{"method": name} for name in METHODS])
+def test_a_saved_search_goes_on_bit_for_bit(changes, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut
-    cfg = CmaMaeCfg(emitters=2, batch_size=6, restart_rule="5", es=es)
+    cfg = SchedulerCfg(emitters=2, batch_size=6, restart_rule="5", **changes)
     straight, cut = make_search(cfg), make_search(cfg)
     advance(straight, 1, 16)
     advance(cut, 1, 7)
-    cut = CmaMae.from_state(pickle.loads(pickle.dumps(cut.state())))
+    save_checkpoint(tmp_path / "saved", cut.state())
+    cut = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
     advance(cut, 8, 16)
     for name, rows in straight.elites().items():
         assert np.array_equal(rows, cut.elites()[name]), name
@@ -115,19 +115,59 @@ def test_tell_answers_ask():
         search.tell(told([0] * 3, [0.0] * 3), 1)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_valid_terrain(method):
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1", method=method))
+    for iteration in (1, 2):
+        genes = search.ask()
+        assert genes.shape == (12, 64)
+        assert np.abs(genes).max() <= 1.0
+        assert len(np.unique(genes, axis=0)) == 12
+        search.tell(told([0] * 12, [FITNESS_FLOOR] * 12, invalid=[4] * 12), iteration)
+    assert len(search.elites()["fitness"]) == 0
+    advance(search, 3, 6)
+    assert len(search.elites()["fitness"]) > 0
+
+
+def test_random_terrains_are_new_each_time_and_hard_ones_have_their_heights_at_the_limits():
+    hard, uniform = (make_search(SchedulerCfg(emitters=2, method=f"{kind}_random")) for kind in ("hard", "uniform"))
+    first = hard.ask()
+    assert (np.abs(first[:, 7::8]) == 1.0).all()
+    assert not (np.abs(uniform.ask()[:, 7::8]) == 1.0).any()
+    hard.tell(told([0] * 40, [1.0] * 40), 1)
+    assert not np.isin(hard.ask(), first).all(axis=1).any()
+
+
+def test_map_elites_varies_its_elites():
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, method="map_elites", iso_sigma=0.0, line_sigma=0.0))
+    first = search.ask()
+    search.tell(told(np.arange(12), np.arange(12.0)), 1)
+    assert all(any(np.array_equal(row, elite) for elite in first) for row in search.ask())
+
+
+def test_cma_me_is_judged_by_the_archive_it_fills():
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, method="cma_me"))
+    search.ask()
+    search.tell(told(np.arange(12), [1.0] * 12), 1)
+    before = [emitter.restarts for emitter in search.emitters]
+    search.ask()
+    search.tell(told(np.arange(12), [0.5] * 12), 2)  # nothing new: both start again at an elite
+    assert [emitter.restarts - old for emitter, old in zip(search.emitters, before, strict=True)] == [1, 1]
+
+
 @pytest.mark.parametrize("state", [{}, {"archive": 1, "result": 2, "emitters": []}])
 def test_a_state_of_something_else_is_refused(state):
     with pytest.raises(ValueError, match="two archives and a list of emitters"):
-        CmaMae.from_state(state)
+        Scheduler.from_state(state)
 
 
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
         ("emitters", 0), ("batch_size", 1), ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
-        ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
+        ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")), ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(setting, value):
     with pytest.raises(ValueError, match=f"{setting} must|{setting} at least"):
-        CmaMaeCfg(**{setting: value})
+        SchedulerCfg(**{setting: value})

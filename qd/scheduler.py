@@ -1,8 +1,8 @@
-"""CMA-MAE over the reachable cells: emitters that ask for terrains, and the two archives that they are told into.
+"""Quality-Diversity over the reachable cells: emitters that ask for terrains, and the archives they are told into.
 
 The cells are numbered, so a pyribs archive has one dimension with one unit a cell, and a terrain's measure is the
-middle of its cell. The search is unbounded; archives hold the unclipped solutions for the emitters, and the clipped
-genes as data.
+middle of its cell. Evolution strategies search unbounded; archives hold the unclipped solutions for them, and the
+clipped genes as data.
 """
 
 from typing import Any
@@ -10,18 +10,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from ribs.archives import GridArchive
-from ribs.emitters import EvolutionStrategyEmitter
+from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd import space
 from qd.fitness import FITNESS_FLOOR, Evaluation
-from qd.settings import CmaMaeCfg
+from qd.settings import SchedulerCfg
+from sim.terrain import hard_random_genes
+
+_LEARNED = ("cma_mae", "mixed")  # methods with an archive whose thresholds lag behind
+_INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
 
 
-class CmaMae:
+class RandomEmitter:
+    """Asks for terrains drawn anew each time, whatever it is told.
+
+    Args:
+        method: ``uniform_random`` or ``hard_random``.
+        batch_size: Terrains asked for at once.
+        stream: Seed.
+    """
+
+    def __init__(self, method: str, batch_size: int, stream: np.random.SeedSequence) -> None:
+        self.method, self.batch_size = method, batch_size
+        self._rng = np.random.default_rng(stream)
+
+    def ask(self) -> NDArray[np.float32]:
+        """Genes, shape (batch_size, 64)."""
+        draw = space.random if self.method == "uniform_random" else hard_random_genes
+        return draw(self.batch_size, self._rng)
+
+    def tell(self, **told: Any) -> None:
+        """Learns nothing."""
+
+
+Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter
+
+
+class Scheduler:
     """The state of a search: ask for genes, tell what became of them.
 
-    ``archive`` is CMA-MAE's own, with thresholds that lag behind; ``result`` keeps the best terrain ever found in each
-    cell and is what a search is run for.
+    ``result`` keeps the best terrain ever found in each cell and is what a search is run for. ``archive`` is what the
+    emitters are judged by: CMA-MAE's own, with thresholds that lag behind; for all other methods it is ``result``.
 
     Args:
         cfg: Settings.
@@ -30,29 +59,44 @@ class CmaMae:
         seed: Seed of emitters and archives.
     """
 
-    def __init__(self, cfg: CmaMaeCfg, *, num_cells: int, num_ratios: int, seed: int) -> None:
+    def __init__(self, cfg: SchedulerCfg, *, num_cells: int, num_ratios: int, seed: int) -> None:
         streams = np.random.SeedSequence(seed).spawn(cfg.emitters + 2)
         learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
-        self.archive = _make_archive(num_cells, num_ratios, streams[0], learning)
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
         self.result = _make_archive(num_cells, num_ratios, streams[1], {})
-        restart_rule: Any = int(cfg.restart_rule) if cfg.restart_rule.isdecimal() else cfg.restart_rule
-        self.emitters = [
-            EvolutionStrategyEmitter(
-                self.archive,
-                x0=np.zeros(space.NUM_GENES),
-                sigma0=cfg.sigma0,
-                ranker="imp",
-                es=cfg.es,
-                selection_rule="mu",
-                restart_rule=restart_rule,
-                batch_size=cfg.batch_size,
-                seed=stream,  # pyright: ignore[reportArgumentType] - pyribs takes a SeedSequence, its hint does not say so
-            )
-            for stream in streams[2:]
-        ]
+        learns = cfg.method in _LEARNED
+        self.archive = _make_archive(num_cells, num_ratios, streams[0], learning) if learns else self.result
+        self.emitters: list[Emitter] = [self._emitter(cfg, k, stream) for k, stream in enumerate(streams[2:])]
         self._asked: NDArray[np.float32] | None = None
+
+    def _emitter(self, cfg: SchedulerCfg, number: int, stream: Any) -> Emitter:
+        if cfg.method.endswith("random"):
+            return RandomEmitter(cfg.method, cfg.batch_size, stream)
+        if cfg.method == "map_elites" or (cfg.method == "mixed" and number % 2):
+            first, later = stream.spawn(2)
+            return IsoLineEmitter(
+                self.result,
+                iso_sigma=cfg.iso_sigma,
+                line_sigma=cfg.line_sigma,
+                initial_solutions=hard_random_genes(cfg.batch_size, np.random.default_rng(first)),
+                bounds=[(-1.0, 1.0)] * space.NUM_GENES,
+                batch_size=cfg.batch_size,
+                seed=later,
+            )
+        restart_rule: Any = int(cfg.restart_rule) if cfg.restart_rule.isdecimal() else cfg.restart_rule
+        improves = cfg.method == "cma_me"  # ranks and selects by what is new in the archive, and restarts without it
+        return EvolutionStrategyEmitter(
+            self.archive,
+            x0=np.zeros(space.NUM_GENES),
+            sigma0=cfg.sigma0,
+            ranker="2imp" if improves else "imp",
+            es=cfg.es,
+            selection_rule="filter" if improves else "mu",
+            restart_rule="no_improvement" if improves else restart_rule,
+            batch_size=cfg.batch_size,
+            seed=stream,
+        )
 
     def ask(self) -> NDArray[np.float32]:
         """The next terrains to evaluate.
@@ -80,10 +124,8 @@ class CmaMae:
             raise ValueError(f"evaluation must have {len(self._asked)} rows, got {len(evaluation.fitness)}")
         told = _rows(self._asked, evaluation, iteration)
         self._asked = None
-        added = self.archive.add(**told)
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
-        if accepted.any():
-            self.result.add(**{name: rows[accepted] for name, rows in told.items()})
+        added = self._add(told, accepted)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
@@ -94,6 +136,19 @@ class CmaMae:
                 add_info={name: rows[own] for name, rows in added.items()},
             )
             first = own.stop
+
+    def _add(self, told: dict[str, NDArray[Any]], accepted: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+        """Fills the archives; status and value of each terrain as pyribs gives them to its emitters."""
+        kept = {name: rows[accepted] for name, rows in told.items()}
+        if self.archive is not self.result:
+            if accepted.any():
+                self.result.add(**kept)
+            return self.archive.add(**told)
+        added = {"status": np.zeros(len(accepted), np.int32), "value": np.full(len(accepted), _INVALID_VALUE)}
+        if accepted.any():
+            for name, rows in self.result.add(**kept).items():
+                added[name][accepted] = rows
+        return added
 
     def elites(self) -> dict[str, NDArray[Any]]:
         """The elites in order of descending fitness, as the arrays of an :class:`qd.archive.Archive`."""
@@ -107,7 +162,7 @@ class CmaMae:
         return {"archive": self.archive, "result": self.result, "emitters": self.emitters}
 
     @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "CmaMae":
+    def from_state(cls, state: dict[str, Any]) -> "Scheduler":
         """A search that goes on where another stood.
 
         Raises:
@@ -119,7 +174,7 @@ class CmaMae:
             and isinstance(result, GridArchive)
             and isinstance(emitters, list)
             and emitters
-            and all(isinstance(emitter, EvolutionStrategyEmitter) for emitter in emitters)
+            and all(isinstance(emitter, Emitter) for emitter in emitters)
         ):
             raise ValueError("a search has two archives and a list of emitters, got something else")
         search = cls.__new__(cls)
