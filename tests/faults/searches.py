@@ -9,8 +9,8 @@ from qd.archive import ARCHIVE_FILE, read_archive
 from qd.arguments import Arguments, job_of
 from qd.checkpoint import load_checkpoint
 from qd.cli import run_command
-from qd.scheduler import Scheduler
 from qd.run_directory import CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE
+from qd.scheduler import Scheduler
 from sim.files import write_atomically
 from tests.faults.steps import Steps
 from tests.qd.stand_in import open_stand_in

@@ -8,8 +8,8 @@ import pytest
 
 from qd import checkpoint
 from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.scheduler import Scheduler
 from qd.descriptors import Cells
+from qd.scheduler import Scheduler
 from qd.settings import SchedulerCfg
 from tests.qd.test_scheduler import advance, make_search
 

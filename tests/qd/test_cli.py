@@ -124,7 +124,8 @@ def test_a_run_is_never_overwritten(capsys):
     assert "a holds a run of other settings: seed (0 there, 1 wanted)" in fails(
         capsys, *TINY, "--run-dir", "a", "--seed", "1"
     )
-    assert "scheduler.learning_rate (0.09 there, 0.5 wanted)" in fails(capsys, "--resume", "a", "--learning-rate", "0.5")
+    other = fails(capsys, "--resume", "a", "--learning-rate", "0.5")
+    assert "scheduler.learning_rate (0.09 there, 0.5 wanted)" in other
     assert 'preset ("small" there, "paper" wanted)' in fails(capsys, "--resume", "a", "--preset", "paper")
     assert everything_in("a") == before
 

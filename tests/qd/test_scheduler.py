@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from qd.scheduler import Scheduler
 from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
+from qd.scheduler import Scheduler
 from qd.settings import ES_KINDS, METHODS, SchedulerCfg
 from tests.qd import stand_in
 
@@ -165,7 +165,8 @@ def test_a_state_of_something_else_is_refused(state):
     ("setting", "value"),
     [
         ("emitters", 0), ("batch_size", 1), ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
-        ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")), ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
+        ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")),
+        ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(setting, value):
