@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive train calibrate replay evaluate crosscheck bench test lint clean
+.PHONY: help setup archive compare train calibrate replay evaluate crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -22,6 +22,9 @@ FLAG_OUT := out
 FLAG_GENES := genes
 FLAG_WORKERS := workers
 FLAG_FINE := fine
+FLAG_METHOD := method
+FLAG_INTERVALS := intervals
+FLAG_WITHOUT := without
 
 help: ## This list
 	@echo 'faultline: find the terrains that break a legged robot. Targets:'
@@ -29,20 +32,26 @@ help: ## This list
 	@echo
 	@echo 'Variables (left out: the default of the command):'
 	@echo '  ROBOT=anymal     which robot'
-	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive train calibrate replay evaluate'
+	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare train calibrate replay evaluate'
 	@echo '                                                   crosscheck bench'
-	@echo '  PRESET=small     size of the search: paper, small  archive'
-	@echo '  ITERATIONS=N     stop after N iterations           archive train'
+	@echo '  PRESET=small     size of the search: paper, small  archive compare'
+	@echo '  ITERATIONS=N     stop after N iterations           archive compare train'
 	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, or'
-	@echo '                   module:callable                   archive calibrate replay evaluate crosscheck'
-	@echo '  SEED=N           seed of everything drawn          archive train calibrate evaluate crosscheck bench'
-	@echo '  RESUME=DIR       go on with this run               archive train'
+	@echo '                   module:callable                   archive compare calibrate replay evaluate'
+	@echo '                                                   crosscheck'
+	@echo '  SEED=N           seed of everything drawn          archive compare train calibrate evaluate'
+	@echo '                                                   crosscheck bench'
+	@echo '  RESUME=DIR       go on with this run               archive compare train'
+	@echo '  METHOD=NAME      where terrains come from: cma_mae, cma_me, map_elites, mixed, hard_random or'
+	@echo '                   uniform_random                    archive'
+	@echo '  INTERVALS=N      intervals of each ratio           archive'
+	@echo '  WITHOUT="A B"    penalties to leave out            archive'
 	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
-	@echo '  OUT=FILE         where to write the numbers        calibrate evaluate crosscheck bench'
+	@echo '  OUT=FILE         where to write the numbers        compare calibrate evaluate crosscheck bench'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
 	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
-	@echo '                   joined by RAY_ADDRESS             archive calibrate evaluate'
+	@echo '                   joined by RAY_ADDRESS             archive compare calibrate evaluate'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
 	@echo '  TORCH=SPEC       torch other than the pinned one, e.g. a build for your GPU driver: a requirement or a wheel'
 	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.replay, train.base, ...)'
@@ -61,7 +70,10 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 archive: setup ## Search the terrains on which the controller of ROBOT fails; writes a run under runs/
-	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS)
+	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS METHOD INTERVALS WITHOUT)
+
+compare: setup ## Let the search and its baselines loose on the same number of terrains
+	$(BIN)/python -m qd.compare --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS OUT)
 
 train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)

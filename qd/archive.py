@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.descriptors import Cells
-from qd.fitness import FITNESS_FLOOR
+from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.space import NUM_GENES
 from sim.files import write_atomically
 
@@ -23,8 +23,42 @@ ARCHIVE_FILE = "archive.npz"
 
 
 @dataclass(frozen=True, kw_only=True)
+class FreshValues(Evaluation):
+    """What fresh episodes say of N elites, free of the luck that made them elites; a collision bit as searched."""
+
+    collision_low: NDArray[np.float64]
+    """Lower limit of the 95 % interval of the collision rate, shape (N,); 0 of an invalid elite."""
+    collision_high: NDArray[np.float64]
+    """Upper limit, shape (N,); 1 of an invalid elite."""
+    reproduced: NDArray[np.bool_]
+    """Whether an elite lands in its cell or a neighbour of it again, shape (N,)."""
+
+    def std(self) -> NDArray[np.float64]:
+        """Sum over penalties of the standard deviation over the episodes, of the valid elites, shape (num_valid,)."""
+        return self.penalty_std[self.valid].sum(axis=1)
+
+    def corrected_elites(self) -> NDArray[np.int64]:
+        """The archive that fresh episodes alone would make: of each cell that an elite lands in, its fittest.
+
+        Returns:
+            Indices into the elites, one a filled cell (the "corrected archive" of Flageat and Cully 2023).
+        """
+        valid = np.flatnonzero(self.valid & (self.fitness > FITNESS_FLOOR))
+        order = valid[np.lexsort((-self.fitness[valid], self.cell[valid]))]
+        return order[np.unique(self.cell[order], return_index=True)[1]]
+
+    def rows(self, chosen: NDArray[np.int64]) -> "FreshValues":
+        """Those of some of the elites alone, in the order given."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in FRESH})
+
+
+FRESH = tuple(field.name for field in fields(FreshValues))
+"""Names of the arrays of fresh values; in the file ``fresh_`` goes before them."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Archive:
-    """Elites in order of descending fitness: elite 0 is the worst terrain for the robot.
+    """Elites by descending fitness, the corrected one if there are fresh values: elite 0 is the worst for the robot.
 
     Statistics are over the valid episodes of the evaluation that found the elite; penalties are scaled.
     """
@@ -64,6 +98,8 @@ class Archive:
     """Episodes run, the invalid ones included, shape (N,)."""
     iteration: NDArray[np.int64]
     """Iteration that found the elite, from 1, shape (N,)."""
+    fresh: FreshValues | None = None
+    """What fresh episodes say of the elites; None if nobody looked."""
 
     def __len__(self) -> int:
         """Number of elites."""
@@ -89,18 +125,31 @@ class Archive:
         """Mean fitness of the elites; 0 without any."""
         return float(self.fitness.mean()) if len(self) else 0.0
 
+    @property
+    def collided(self) -> NDArray[np.bool_]:
+        """Whether an elite has a base collision among its fresh episodes, or without valid ones its own, shape (N,)."""
+        rate = self.collision_rate
+        if self.fresh is not None:
+            rate = np.where(self.fresh.valid, self.fresh.collision_rate, rate)
+        return rate > 0.0
 
     def rows(self, chosen: NDArray[np.int64]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in PER_ELITE})
+        fresh = None if self.fresh is None else self.fresh.rows(chosen)
+        return replace(self, fresh=fresh, **{name: getattr(self, name)[chosen] for name in PER_ELITE})
+
+    def corrected_by(self, fresh: FreshValues) -> "Archive":
+        """The archive with what fresh episodes say, by descending corrected fitness, the invalid elites last."""
+        return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
 
 _SETTINGS = ("robot", "penalties", "scales", "intervals", "collision_bit", "iterations")
-_KINDS = {"robot": "U", "penalties": "U", "collision_bit": "b"} | dict.fromkeys(
+_PREFIX = "fresh_"
+_KINDS = {"robot": "U", "penalties": "U", "collision_bit": "b", "reproduced": "b"} | dict.fromkeys(
     ("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"
 )
 _MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
-PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in _SETTINGS)
+PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, "fresh"))
 """Names of the arrays that have one row an elite."""
 
 
@@ -112,9 +161,17 @@ def write_archive(path: Path, archive: Archive) -> None:
         archive: What to write.
     """
     buffer = io.BytesIO()
-    content: dict[str, Any] = {field.name: np.asarray(getattr(archive, field.name)) for field in fields(Archive)}
+    content: dict[str, Any] = {name: np.asarray(getattr(archive, name)) for name in _SETTINGS} | _arrays(archive)
     np.savez_compressed(buffer, **content)
     write_atomically(path, buffer.getvalue())
+
+
+def _arrays(archive: Archive) -> dict[str, NDArray[Any]]:
+    """All that has one row an elite, by its name in the file."""
+    arrays = {name: np.asarray(getattr(archive, name)) for name in PER_ELITE}
+    if archive.fresh is None:
+        return arrays
+    return arrays | {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -136,14 +193,19 @@ def read_archive(path: str | Path) -> Archive:
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
         with zipfile.ZipFile(file) as members:  # np.load would leave some checksums unread
-            content = {field.name: _read_array(members.read(f"{field.name}.npy")) for field in fields(Archive)}
+            names = [*_SETTINGS, *PER_ELITE]
+            if any(name.startswith(_PREFIX) for name in members.namelist()):  # then all of them, or it is damage
+                names += [_PREFIX + name for name in FRESH]
+            content = {name: _read_array(members.read(f"{name}.npy")) for name in names}
         _check_kinds(content)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         raise ValueError(
             f"{file} must be the archive of a search, but it is damaged or another file: {error}: going on with its "
             "run (--resume) writes it again"
         ) from None
-    archive = Archive(**{name: _from_array(name, value) for name, value in content.items()})
+    fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
+    found = {name: _from_array(name, value) for name, value in content.items()}
+    archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
     _check_shapes(archive, file)
     _check_values(archive, file)
     return archive
@@ -163,7 +225,7 @@ def _from_array(name: str, value: NDArray) -> Any:
 def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
     """That every field holds numbers, strings or flags as it should, and every setting one or a row of them."""
     for name, value in content.items():
-        expected = _KINDS.get(name, "f")
+        expected = _KINDS.get(name.removeprefix(_PREFIX), "f")
         if value.dtype.kind != expected or value.dtype.itemsize > _MAX_ITEM_BYTES:
             raise ValueError(f"{name} must be of kind '{expected}', got {value.dtype}")
         if name in _SETTINGS and value.ndim != int(name in ("penalties", "scales")):
@@ -173,18 +235,18 @@ def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
 def _check_shapes(archive: Archive, file: Path) -> None:
     num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
     columns = {"genes": NUM_GENES, "ratios": num_penalties, "penalty_mean": num_penalties, "penalty_std": num_penalties}
-    for name in PER_ELITE:
-        expected = (num_elites, columns[name]) if name in columns else (num_elites,)
-        actual = getattr(archive, name).shape
-        if actual != expected:
+    for name, array in _arrays(archive).items():
+        column = columns.get(name.removeprefix(_PREFIX))
+        expected = (num_elites,) if column is None else (num_elites, column)
+        if array.shape != expected:
             raise ValueError(
-                f"{file}: {name} must have shape {expected}, got {actual}: the file is no archive of a search"
+                f"{file}: {name} must have shape {expected}, got {array.shape}: the file is no archive of a search"
             )
 
 
 def _check_values(archive: Archive, file: Path) -> None:
     """That the numbers are such as a search finds."""
-    finite = all(np.isfinite(getattr(archive, name)).all() for name in PER_ELITE)
+    finite = all(np.isfinite(array).all() for array in _arrays(archive).values())
     if not finite or not (np.abs(archive.genes) <= 1.0).all():
         raise ValueError(f"{file} must hold finite numbers, and genes in [-1, 1]: it is no archive of a search")
     if len(archive.scales) != len(archive.penalties) or not all(0.0 < scale < np.inf for scale in archive.scales):
@@ -193,5 +255,6 @@ def _check_values(archive: Archive, file: Path) -> None:
         num_cells = archive.cells.num_cells
     except ValueError as error:
         raise ValueError(f"{file} is no archive of a search: {error}") from None
-    if not ((archive.cell >= 0) & (archive.cell < num_cells)).all():
+    cells = [archive.cell] if archive.fresh is None else [archive.cell, archive.fresh.cell]
+    if not all(((cell >= 0) & (cell < num_cells)).all() for cell in cells):
         raise ValueError(f"{file}: cell must lie in 0 to {num_cells - 1}: the file is no archive of a search")

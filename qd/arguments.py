@@ -4,12 +4,25 @@ import itertools
 import shlex
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
-from qd.settings import SearchCfg, as_settings, changed, file_hash, measured_now, policy_spec, preset
+from qd.settings import (
+    SearchCfg,
+    Settings,
+    as_settings,
+    changed,
+    file_hash,
+    kept_penalties,
+    measured_now,
+    policy_spec,
+    preset,
+)
 from qd.workers import EvaluatorCfg, check_policy, origin_of, resolve_device
 from sim.files import is_leftover
+
+if TYPE_CHECKING:
+    from sim.robot import RobotCfg
 
 _RUNS = Path("runs")
 
@@ -56,6 +69,8 @@ class Arguments:
     """Evolution strategy: cma_es or sep_cma_es."""
     intervals: int | None = None
     """Intervals of each ratio."""
+    without: tuple[str, ...] | None = None
+    """Penalties to leave out of fitness, ratios and cells, such as stumble collision."""
     alpha: float | None = None
     """Weight of the standard deviations in the fitness."""
     lam: float | None = None
@@ -74,7 +89,7 @@ class Arguments:
     """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
 
 
-_NOT_SETTINGS = ("device", "resume", "run_dir", "processes", "workers", "worker_limit_s", "reproduce")
+_NOT_SETTINGS = ("device", "resume", "run_dir", "without", "processes", "workers", "worker_limit_s", "reproduce")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,12 +130,14 @@ def job_of(args: Arguments) -> Job:
     robot = get_robot(args.robot or (there.robot if there else "anymal"))
     device = resolve_device(args.device, args.workers)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
+    if args.without is not None:
+        changes["penalties"] = kept_penalties(robot, args.without)
     moved = None
     if args.resume and there:
-        moved = _moved_policy(there, args.policy)
-        path, cfg = args.resume, _resumed(args.resume, there, robot, changes, moved)
-        config = RunDirectory(path).read_config()
-        origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
+        moved = moved_policy(there, args.policy)
+        path, cfg = args.resume, resumed(args.resume, there, robot, changes, moved)
+        refuse_changes(path, "run", as_settings(there), as_settings(cfg))
+        origin = origin_in(RunDirectory(path).read_config())
     else:
         name = args.preset or ("paper" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
@@ -134,7 +151,7 @@ def job_of(args: Arguments) -> Job:
         evaluator=_evaluator(cfg, policy, device, args),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
         origin=origin,
-        resume_command=_resume_command(cfg.robot, path, args, moved),
+        resume_command=resume_command("archive", cfg.robot, path, args, moved),
     )
 
 
@@ -152,28 +169,54 @@ def _evaluator(cfg: SearchCfg, policy: str, device: str, args: Arguments) -> Eva
     )
 
 
-def _moved_policy(there: SearchCfg, given: str | None) -> str | None:
+def origin_in(config: dict[str, Any]) -> dict[str, Any]:
+    """Where a run comes from, as its config has it."""
+    return {name: value for name, value in config.items() if name not in ("settings", "iterations")}
+
+
+def moved_policy(there: SearchCfg, given: str | None) -> str | None:
     """The file given for a run's controller, if it is the run's own in another place."""
     same = given is not None and there.policy_sha256 is not None and file_hash(Path(given)) == there.policy_sha256
     return given if same else None
 
 
-def _resumed(path: Path, there: SearchCfg, robot: Any, changes: dict[str, Any], moved: str | None) -> SearchCfg:
-    """The settings of a run that goes on; nothing but its number of iterations may change."""
+def resumed(path: Path, there: SearchCfg, robot: "RobotCfg", changes: Settings, moved: str | None) -> SearchCfg:
+    """The settings that a run would go on with.
+
+    Args:
+        path: Its directory.
+        there: Its settings.
+        robot: Its robot as it is now.
+        changes: What the command line gives, as :func:`qd.settings.changed` takes it.
+        moved: Where the run's controller is now, if elsewhere.
+
+    Raises:
+        ValueError: If its controller is lost, or a setting is out of range.
+    """
     if moved is not None:
         changes = {**changes, "policy": None}
     wanted = measured_now(changed(there, changes), robot)
     if moved is not None:
-        wanted = replace(wanted, policy_sha256=there.policy_sha256)
-    elif wanted.policy == there.policy and there.policy_sha256 is not None and wanted.policy_sha256 is None:
+        return replace(wanted, policy_sha256=there.policy_sha256)
+    if wanted.policy == there.policy and there.policy_sha256 is not None and wanted.policy_sha256 is None:
         raise ValueError(
             f"{path} was searched with the controller in {policy_spec(there, robot)}, got no such file now: put it "
             "back, or say where it is now with --policy"
         )
-    different = differences(as_settings(there), as_settings(wanted))
-    if different:
-        raise ValueError(f"{path} holds a run of other settings: {', '.join(different)}: start a new run for those")
     return wanted
+
+
+def refuse_changes(path: Path, what: str, there: Settings, wanted: Settings) -> None:
+    """Nothing but its number of iterations may change where something goes on.
+
+    Raises:
+        ValueError: If a setting differs.
+    """
+    different = differences(there, wanted)
+    if different:
+        raise ValueError(
+            f"{path} holds a {what} of other settings: {', '.join(different)}: start a new {what} for those"
+        )
 
 
 def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
@@ -189,7 +232,7 @@ def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
             raise ValueError(
                 f"{args.run_dir} holds a run of other settings: {', '.join(different)}: give another --run-dir"
             )
-        command = _resume_command(cfg.robot, args.run_dir, args, None)
+        command = resume_command("archive", cfg.robot, args.run_dir, args, None)
         raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
     if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
         raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
@@ -208,10 +251,33 @@ def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments) -> None:
             print(
                 f"{path} holds the same search, stopped after {done} of {config['iterations']} iterations. Go on with:"
             )
-            print(f"  {_resume_command(cfg.robot, path, args, None)}")
+            print(f"  {resume_command('archive', cfg.robot, path, args, None)}")
 
 
-def _resume_command(robot: str, path: Path, args: Arguments, moved_policy: str | None) -> str:
+class Placed(Protocol):
+    """The arguments that say where a command works."""
+
+    @property
+    def device(self) -> str | None:
+        """Warp device name."""
+        ...
+
+    @property
+    def workers(self) -> int | Literal["auto"] | None:
+        """Ray workers."""
+        ...
+
+
+def resume_command(target: str, robot: str, path: Path, args: Placed, moved: str | None) -> str:
+    """How to go on, as one types it: ``make archive ROBOT=anymal RESUME=runs/x DEVICE=cpu``.
+
+    Args:
+        target: Of the Makefile.
+        robot: Name of the robot.
+        path: What to resume.
+        args: Where it worked.
+        moved: Where the controller is now, if elsewhere than the settings say.
+    """
     workers = None if args.workers is None else str(args.workers)
-    flags = {"ROBOT": robot, "RESUME": str(path), "DEVICE": args.device, "WORKERS": workers, "POLICY": moved_policy}
-    return " ".join(["make archive", *(f"{name}={shlex.quote(value)}" for name, value in flags.items() if value)])
+    flags = {"ROBOT": robot, "RESUME": str(path), "DEVICE": args.device, "WORKERS": workers, "POLICY": moved}
+    return " ".join([f"make {target}", *(f"{name}={shlex.quote(value)}" for name, value in flags.items() if value)])

@@ -7,92 +7,29 @@ in lock-step: each iteration's terrains of all runs are crossed together, so tha
 import itertools
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from qd.archive import Archive
 from qd.cli import Interrupted, run_command
+from qd.compare_arguments import Arguments, Comparison, comparison_of
 from qd.comparison import draw_comparison, report_of
 from qd.fitness import FITNESS_FLOOR
+from qd.fresh import Open, numbers_of, reevaluate
 from qd.progress import ProgressBar
-from qd.reevaluate import numbers_of, reevaluate
 from qd.report import save_figure
-from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, numbered
+from qd.run_directory import Metrics, RunDirectory, archive_of, claimed
 from qd.search import begin, take_in
-from qd.settings import SearchCfg, as_settings, changed, measured_now, policy_spec, preset
+from qd.settings import SearchCfg, as_settings
 from qd.shards import taken
-from qd.workers import (
-    Evaluate,
-    EvaluatorCfg,
-    EvaluatorError,
-    check_policy,
-    crew_status,
-    episode_seeds,
-    open_evaluator,
-    origin_of,
-    resolve_device,
-)
-from sim.files import prepare_output, to_json, write_atomically
+from qd.workers import Evaluate, EvaluatorError, crew_status, episode_seeds, open_evaluator
+from sim.files import to_json, write_atomically
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
-
-METHODS: dict[str, dict[str, Any]] = {
-    "uniform_random": {"method": "uniform_random"},
-    "hard_random": {"method": "hard_random"},
-    "map_elites": {"method": "map_elites"},
-    "cma_me": {"method": "cma_me"},
-    "cma_mae": {"method": "cma_mae", "es": "cma_es"},
-    "cma_mae_sep": {"method": "cma_mae", "es": "sep_cma_es"},
-    "cma_mae_narrow": {"method": "cma_mae", "es": "cma_es", "sigma0": 0.5},
-    "mixed": {"method": "mixed", "es": "cma_es"},
-}
-"""What is compared: changes of the search's settings."""
-
-_RUNS = Path("runs")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Arguments:
-    """Compare ways to search on the same number of terrains, several seeds each, all in lock-step.
-
-    State is saved after every iteration: stop with Ctrl-C whenever you like and go on with --resume.
-    """
-
-    robot: str = "anymal"
-    """Which robot."""
-    preset: str | None = None
-    """Size of an iteration: paper (a GPU's work) or small."""
-    methods: tuple[str, ...] = tuple(METHODS)
-    """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
-    size .5), mixed."""
-    seeds: int = 3
-    """Runs of each method, with seeds from --seed on."""
-    seed: int = 0
-    """The first seed."""
-    iterations: int = 33
-    """Iterations of every run."""
-    reevaluate_every: int = 11
-    """Every so many iterations, and at the end, all elites are evaluated again with 40 fresh episodes."""
-    policy: str | None = None
-    """Controller other than the shipped one."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
-    processes: int | None = None
-    """Processes on the CPU, without Ray; one a core."""
-    workers: int | Literal["auto"] | None = None
-    """Ray workers, a GPU or CPU core each; auto: all there are."""
-    worker_limit_s: float = 900.0
-    """A Ray worker that gets no further for so many seconds is given up."""
-    resume: Path | None = None
-    """Go on with the comparison in this directory; give the other flags again as they were."""
-    run_dir: Path | None = None
-    """Directory of a new comparison; runs/<robot>-compare, numbered if that exists."""
-    out: Path | None = None
-    """Where to write the numbers, with a figure beside them; compare.json in the run directory if left out."""
 
 
 @dataclass(kw_only=True)
@@ -112,16 +49,16 @@ class Entrant:
         return len(self.metrics)
 
 
-def lock_step(entrants: Sequence[Entrant], evaluate: Evaluate, args: Arguments, bar: ProgressBar) -> None:
+def lock_step(entrants: Sequence[Entrant], evaluate: Evaluate, cfg: SearchCfg, bar: ProgressBar) -> None:
     """Runs the iterations that are left; runs behind the others, as after a kill, catch up first.
 
     Args:
         entrants: The runs.
         evaluate: Crosses the terrains of all of them.
-        args: Iterations, and how often to evaluate elites again.
+        cfg: Iterations, and how often to evaluate elites again.
         bar: Shows progress.
     """
-    while (done := min(entrant.done for entrant in entrants)) < args.iterations:
+    while (done := min(entrant.done for entrant in entrants)) < cfg.iterations:
         began, iteration = time.perf_counter(), done + 1
         active = [entrant for entrant in entrants if entrant.done == done]
         asked = [entrant.search.ask() for entrant in active]
@@ -133,7 +70,7 @@ def lock_step(entrants: Sequence[Entrant], evaluate: Evaluate, args: Arguments, 
             entrant.found, row = take_in(entrant.cfg, entrant.search, part, iteration)
             rows.append(row)
             first += len(genes)
-        if iteration % args.reevaluate_every == 0 or iteration == args.iterations:
+        if iteration % cfg.reevaluate_every == 0 or iteration == cfg.iterations:
             rows = [row | again for row, again in zip(rows, _again(active, evaluate), strict=True)]
         wall_s = time.perf_counter() - began
         for entrant, row in zip(active, rows, strict=True):
@@ -141,7 +78,7 @@ def lock_step(entrants: Sequence[Entrant], evaluate: Evaluate, args: Arguments, 
             assert entrant.found is not None
             entrant.run.save(as_settings(entrant.cfg), entrant.search, entrant.metrics, entrant.found)
         crew = crew_status(evaluate)
-        bar.show(_shown(entrants, wall_s), None if crew is None else str(crew))
+        bar.show(_shown(active, wall_s), None if crew is None else str(crew))
 
 
 def _again(active: Sequence[Entrant], evaluate: Evaluate) -> list[dict[str, Any]]:
@@ -153,125 +90,103 @@ def _again(active: Sequence[Entrant], evaluate: Evaluate) -> list[dict[str, Any]
     return [numbers_of(again, cfg.cells) for again in found]
 
 
-def _shown(entrants: Sequence[Entrant], wall_s: float) -> dict[str, Any]:
+def _shown(active: Sequence[Entrant], wall_s: float) -> dict[str, Any]:
     """A row for the progress bar: of the run with most elites, at the speed of all."""
-    best = max(entrants, key=lambda entrant: entrant.metrics[-1]["elites"])
-    episodes = sum(entrant.metrics[-1]["episodes"] for entrant in entrants)
+    best = max(active, key=lambda entrant: entrant.metrics[-1]["elites"])
+    episodes = sum(entrant.metrics[-1]["episodes"] for entrant in active)
     return {**best.metrics[-1], "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
 
 
-def entrants_of(args: Arguments, cfg: SearchCfg, path: Path, origin: dict[str, Any]) -> Iterator[Entrant]:
+def entrants_of(asked: Comparison) -> Iterator[Entrant]:
     """The runs of a comparison, new or as far as they are.
 
     Raises:
-        ValueError: If a run that is there has other settings, or is damaged.
+        ValueError: If a run that is there has other settings, is damaged, or has gone further than asked.
     """
-    for method, seed in itertools.product(args.methods, range(args.seed, args.seed + args.seeds)):
-        one = changed(replace(cfg, seed=seed, iterations=args.iterations), METHODS[method])
-        run = RunDirectory(path / f"{method}-{seed}")
-        there = (run.path / CONFIG_FILE).exists()
-        if not there:
-            run.path.mkdir(exist_ok=True)
-            run.write_config(as_settings(one), args.iterations, {**origin, "seed": seed})
-        search, metrics = (run.load(as_settings(one)) if there else None) or (begin(one), [])
-        if len(metrics) > args.iterations:
-            raise ValueError(f"{run.path} has {len(metrics)} iterations, got --iterations {args.iterations}: give more")
-        yield Entrant(method=method, cfg=one, run=run, search=search, metrics=metrics)
+    first, iterations = asked.cfg.seed, asked.cfg.iterations
+    for method, seed in itertools.product(asked.methods, range(first, first + asked.seeds)):
+        cfg, run = asked.cfg_of(method, seed), RunDirectory(asked.path / f"{method}-{seed}")
+        search, metrics = run.load(as_settings(cfg)) or (begin(cfg), [])
+        if len(metrics) > iterations:
+            raise ValueError(
+                f"iterations must be at least {len(metrics)}, as many as {run.path} has done, got {iterations}"
+            )
+        yield Entrant(method=method, cfg=cfg, run=run, search=search, metrics=metrics)
 
 
-def checked(args: Arguments) -> tuple[SearchCfg, EvaluatorCfg]:
-    """The settings that all methods share, and what crosses their terrains; everything a user may get wrong is seen.
-
-    Raises:
-        ValueError: If a method is unknown or named twice, or another argument is not as it must be.
-    """
-    from sim.robot import get_robot
-
-    unknown = [name for name in args.methods if name not in METHODS]
-    if unknown or not args.methods or len(set(args.methods)) < len(args.methods):
-        raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(args.methods)}")
-    for name in ("seeds", "iterations", "reevaluate_every"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(args, name)}")
-    if args.resume and args.run_dir:
-        raise ValueError("give --resume for a comparison that is there or --run-dir for a new one, not both")
-    if args.resume and not args.resume.is_dir():
-        raise FileNotFoundError(f"no comparison at {args.resume}: give the directory of one")
-    robot = get_robot(args.robot)
-    device = resolve_device(args.device, args.workers)
-    on_gpu = device.startswith("cuda")
-    changes = {"seed": args.seed, "policy": args.policy, "reevaluate_every": 0}
-    cfg = measured_now(changed(preset(args.preset or ("paper" if on_gpu else "small"), robot), changes), robot)
-    policy = policy_spec(cfg, robot)
-    check_policy(policy, cfg.robot, device)
-    runs = len(args.methods) * args.seeds
-    evaluator = EvaluatorCfg(
-        robot=cfg.robot,
-        policy=policy,
-        num_terrains=cfg.scheduler.num_terrains * (runs if on_gpu else 1),  # a CPU is full with one run's
-        num_replicas=cfg.replicas,
-        device=device,
-        num_processes=args.processes,
-        workers=args.workers,
-        worker_limit_s=args.worker_limit_s,
-    )
-    return cfg, evaluator
-
-
-def compare(args: Arguments) -> None:
+def compare(args: Arguments, *, open_evaluator: Open = open_evaluator) -> None:
     """The command.
 
+    Args:
+        args: What to compare.
+        open_evaluator: Opens what crosses the terrains.
+
     Raises:
+        FileNotFoundError: If there is no comparison to resume.
         ValueError: If something asked for cannot be.
         Interrupted: On Ctrl-C; all iterations that ended are saved.
         EvaluatorError: If a worker is lost; likewise.
     """
-    cfg, evaluator = checked(args)
-    name = f"{cfg.robot}-compare"
-    path = args.resume or args.run_dir or next(path for path in numbered(_RUNS, name) if not path.exists())
-    if args.out is not None:
-        prepare_output(args.out)
-    with claimed(path):
-        origin = origin_of(evaluator.device, args.seed, args.workers)
-        entrants = list(entrants_of(args, cfg, path, origin))
-        episodes = sum(args.iterations - entrant.done for entrant in entrants) * cfg.episodes_per_iteration
+    asked = comparison_of(args)
+    cfg = asked.cfg
+    with claimed(asked.path):
+        entrants = list(entrants_of(asked))
+        done = min(entrant.done for entrant in entrants)
+        episodes = sum(cfg.iterations - entrant.done for entrant in entrants) * cfg.episodes_per_iteration
         print(
-            f"Comparing {len(args.methods)} methods, {args.seeds} seeds each, {args.iterations} iterations of preset "
-            f"{cfg.preset}: {episodes:,} episodes, and those of the elites evaluated again; runs in {path}",
+            f"Comparing {len(asked.methods)} methods, {asked.seeds} seeds each, {cfg.iterations} iterations of preset "
+            f"{cfg.preset}: {episodes:,} episodes, and those of the elites evaluated again; runs in {asked.path}",
             flush=True,
         )
         try:
-            done = min(entrant.done for entrant in entrants)
-            if done < args.iterations:
-                with open_evaluator(evaluator) as evaluate, ProgressBar(args.iterations, done) as bar:
-                    lock_step(entrants, evaluate, args, bar)
+            with open_evaluator(asked.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
+                _write_configs(asked, entrants)
+                if evaluate is not None:
+                    with ProgressBar(cfg.iterations, done) as bar:
+                        lock_step(entrants, evaluate, cfg, bar)
+            _finish(asked, entrants)
         except KeyboardInterrupt:
-            raise Interrupted(f"Stopped; finished iterations are saved. Go on with --resume {path}") from None
+            raise Interrupted(f"Stopped; finished iterations are saved. {_how_to_go_on(asked)}") from None
         except (EvaluatorError, OSError) as error:
-            raise EvaluatorError(f"{error}. Go on with --resume {path}") from None
-        _finish(args, cfg, path, entrants, origin)
+            raise type(error)(f"{error}. {_how_to_go_on(asked)}") from None
 
 
-def _finish(args: Arguments, cfg: SearchCfg, path: Path, entrants: Sequence[Entrant], origin: dict[str, Any]) -> None:
-    runs: dict[str, list[Metrics]] = {method: [] for method in args.methods}
+def _how_to_go_on(asked: Comparison) -> str:
+    if not asked.has_config:
+        return "No iteration is finished: start it again"
+    return f"Go on with:  {asked.resume_command}"
+
+
+def _write_configs(asked: Comparison, entrants: Sequence[Entrant]) -> None:
+    asked.write_config()
+    for entrant in entrants:
+        entrant.run.path.mkdir(exist_ok=True)
+        origin = {**asked.origin, "seed": entrant.cfg.seed}
+        entrant.run.write_config(as_settings(entrant.cfg), asked.cfg.iterations, origin)
+
+
+def _finish(asked: Comparison, entrants: Sequence[Entrant]) -> None:
+    """Archives, numbers and figure of a comparison that reached its iterations."""
+    runs: dict[str, list[Metrics]] = {method: [] for method in asked.methods}
     for entrant in entrants:
         found = archive_of(as_settings(entrant.cfg), entrant.search, entrant.done)
         entrant.run.write_derived(entrant.metrics, found)
         runs[entrant.method].append(entrant.metrics)
-    settings = {name: as_settings(changed(cfg, METHODS[name]))["scheduler"] for name in args.methods}
+    cfg = asked.cfg
+    settings = {name: as_settings(asked.cfg_of(name, cfg.seed))["scheduler"] for name in asked.methods}
     report = {
-        **origin,
+        **asked.origin,
         "robot": cfg.robot,
         "preset": cfg.preset,
-        "seeds": list(range(args.seed, args.seed + args.seeds)),
+        "seeds": list(range(cfg.seed, cfg.seed + asked.seeds)),
         "reachable_cells": cfg.cells.num_cells,
         "qd_score_offset": -FITNESS_FLOOR,
         **report_of(runs, settings),
     }
-    out = args.out or path / "compare.json"
-    write_atomically(out, to_json(report))
-    save_figure(out.with_suffix(".png"), draw_comparison(report))
-    print(f"written to {out} and {out.with_suffix('.png')}")
+    figure = asked.out.with_suffix(".png")
+    write_atomically(asked.out, to_json(report))
+    save_figure(figure, draw_comparison(report))
+    print(f"written to {asked.out} and {figure}")
 
 
 if __name__ == "__main__":

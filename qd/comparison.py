@@ -52,7 +52,9 @@ def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[
     """
     first = next(iter(runs.values()))[0]
     terrains = np.cumsum([row["terrains"] for row in first])
-    at = [k for k, row in enumerate(first) if "corrected_qd_score" in row]
+    every = [rows for seeds in runs.values() for rows in seeds]
+    # The last iteration of a comparison that was stopped in it and then extended has them in some runs only.
+    at = [k for k in range(len(first)) if all("corrected_qd_score" in rows[k] for rows in every)]
     methods = {}
     for name, seeds in runs.items():
         methods[name] = {

@@ -1,7 +1,8 @@
 """What a search tells its user: what it will do, how long that should take, and how far it is."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from qd.settings import SHIPPED, SearchCfg
 
 _EPISODE_STEPS = 4000  # 20 s at 200 Hz
 _STEPS_PER_S = {"cpu": 15_000.0, "cuda": 3_500_000.0}  # of one process on one core, and of a large GPU
+_FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
 
 
 def clock(seconds: float) -> str:
@@ -64,6 +66,24 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, processes: int) -> 
     )
 
 
+@contextmanager
+def share_bar(what: str) -> Iterator[Callable[[float], None]]:
+    """A bar over one piece of work.
+
+    Args:
+        what: Name of the work.
+
+    Yields:
+        A function that moves the bar to the share that is done.
+    """
+    with tqdm(total=1.0, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=0.5, bar_format=_FORMAT) as bar:
+
+        def move_to(share: float) -> None:
+            bar.update(share - bar.n)
+
+        yield move_to
+
+
 class ProgressBar:
     """A bar over iterations that moves within them; closes on leaving its context.
 
@@ -80,7 +100,7 @@ class ProgressBar:
             file=sys.stderr,
             dynamic_ncols=True,
             mininterval=0.5,
-            bar_format="{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]",
+            bar_format=_FORMAT,
         )
         self._describe(done, "compiling and evaluating")
 

@@ -1,165 +1,128 @@
-"""Elites again with fresh episodes: what they are worth, free of the luck that made them elites.
+"""All elites of a run again: its archive, numbers and figures as 40 fresh episodes of each elite correct them."""
 
-An elite is the best of many noisy evaluations and flatters itself; its 40 fresh episodes do not. Which episodes those
-are follows from the run's seed and from what names an elite, its cell and the iteration that found it, so that on the
-CPU they give the same numbers whenever they are run.
-"""
-
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from qd.archive import Archive
-from qd.descriptors import Cells
-from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
-from qd.shards import taken
-from qd.workers import Evaluate
-from sim.intervals import bootstrap_interval
+from qd.arguments import origin_in
+from qd.cli import Interrupted, run_command
+from qd.fresh import Open, corrected, numbers_of, reevaluate
+from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed
+from qd.search import write_results
+from qd.settings import SHIPPED, SearchCfg, as_settings, file_hash, policy_spec
+from qd.workers import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 
-FRESH_EPISODES = 40
-_BIT_EPISODES = 20  # the collision bit is "any collision", which more episodes than the search's would bias
+if TYPE_CHECKING:
+    from sim.robot import RobotCfg
 
-_FRESH_STREAM = 1
-_DRAW_STREAM = 3
+__all__ = ["ReevaluateCfg", "numbers_of", "reevaluate", "reevaluate_run"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reevaluation:
-    """What 40 fresh episodes say of N elites."""
+class ReevaluateCfg:
+    """Evaluate every elite of a run again with 40 fresh episodes.
 
-    fresh: Evaluation
-    """The episodes' own fitness, ratios, cell and rates; a collision bit is taken over the first 20."""
-    reproduced: NDArray[np.bool_]
-    """Whether an elite lands in its cell or a neighbour of it, shape (N,)."""
+    An elite is the best of many noisy evaluations; its fresh episodes say what it is worth. The run's archive, numbers
+    and figures are written again with them, elites by descending corrected fitness.
+    """
 
-    def std(self) -> NDArray[np.float64]:
-        """Sum over penalties of the standard deviation over the episodes, of the valid elites, shape (num_valid,)."""
-        return self.fresh.penalty_std[self.fresh.valid].sum(axis=1)
+    run: Path
+    """Run directory."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    workers: int | Literal["auto"] | None = None
+    """Evaluate on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
+    processes: int | None = None
+    """Processes on the CPU, without Ray; one a core."""
+    policy: str | None = None
+    """Controller to evaluate with, even another than the run's; by default the run's, unless its file has changed."""
+    seed: int | None = None
+    """Seed of the fresh episodes; the run's."""
+    worker_limit_s: float = 300.0
+    """A Ray worker that gets no further for so many seconds is given up."""
 
-    def corrected_elites(self) -> NDArray[np.int64]:
-        """The archive that fresh episodes alone would make: of each cell that an elite lands in, its fittest.
 
-        Returns:
-            Indices into the elites, one a filled cell (the "corrected archive" of Flageat and Cully 2023).
-        """
-        fresh, valid = self.fresh, np.flatnonzero(self.fresh.valid & (self.fresh.fitness > FITNESS_FLOOR))
-        order = valid[np.lexsort((-fresh.fitness[valid], fresh.cell[valid]))]
-        return order[np.unique(fresh.cell[order], return_index=True)[1]]
-
-
-def reevaluate(
-    archives: Sequence[Archive],
-    evaluate: Evaluate,
-    fitness: FitnessCfg,
-    *,
-    num_replicas: int,
-    seeds: Sequence[int],
-    progress: Callable[[float], None] | None = None,
-) -> list[Reevaluation]:
-    """Evaluates every elite of some archives again with 40 fresh episodes, all of them together.
+def reevaluate_run(args: ReevaluateCfg, *, open_evaluator: Open = open_evaluator) -> Archive:
+    """The command.
 
     Args:
-        archives: The elites.
-        evaluate: Crosses terrains.
-        fitness: Weights of the fitness, with the archives' penalties.
-        num_replicas: Episodes a terrain that ``evaluate`` gives; terrains are crossed as often as makes 40.
-        seeds: The search's seed, one an archive; the episodes are drawn apart from the search's own.
-        progress: Called with the share done.
+        args: What to evaluate again, and where.
+        open_evaluator: Opens what crosses the terrains.
 
     Returns:
-        One an archive.
+        The corrected archive.
 
     Raises:
-        ValueError: If ``evaluate`` gives another number of episodes.
+        FileNotFoundError: If there is no run.
+        ValueError: If the run is damaged or empty, its controller is another now, or an argument is not as it must be.
+        Interrupted: On Ctrl-C; the run is as it was.
+        EvaluatorError: If a worker is lost; likewise.
     """
-    times = -(-FRESH_EPISODES // num_replicas)
-    counts = [len(archive) for archive in archives]
-    if not sum(counts):
-        return [_nothing(archive.cells) for archive in archives]
-    genes = np.concatenate([archive.genes for archive in archives]).repeat(times, axis=0)
-    drawn = [_elite_seeds(archive, seed, times) for archive, seed in zip(archives, seeds, strict=True)]
-    result = evaluate(genes, np.concatenate(drawn), progress)
-    if result.base_collision.shape[1] != num_replicas:
-        raise ValueError(f"evaluate must give {num_replicas} episodes, got {result.base_collision.shape[1]}")
-    found, first = [], 0
-    for archive, count in zip(archives, counts, strict=True):
-        own = _regrouped(taken(result, count * times, first=first * times), times) if count else None
-        found.append(_nothing(archive.cells) if own is None else _held_against(archive, own, fitness))
-        first += count
-    return found
+    from sim.robot import get_robot
+
+    run = RunDirectory(args.run)
+    config, cfg = run.read_config(), run.read_cfg()
+    seed = cfg.seed if args.seed is None else args.seed
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    device = resolve_device(args.device, args.workers)
+    policy = args.policy or _own_policy(args.run, cfg, get_robot(cfg.robot))
+    evaluator = _evaluator(args, cfg, policy, device)
+    with claimed(args.run):
+        loaded = run.load(as_settings(cfg))
+        if loaded is None:
+            raise ValueError(f"{args.run} has no finished iteration, expected at least one: go on with it (--resume)")
+        search, metrics = loaded
+        found = archive_of(as_settings(cfg), search, len(metrics))
+        try:
+            archive = corrected(found, cfg, evaluator, open_evaluator, seed)
+        except KeyboardInterrupt:
+            raise Interrupted(f"Stopped; {args.run} is as it was: start again") from None
+        again = origin_of(device, seed, args.workers) | _given_policy(args)
+        write_results(run, archive, metrics, {**origin_in(config), "reproduced_by": again})
+    return archive
 
 
-def _elite_seeds(archive: Archive, seed: int, times: int) -> NDArray[np.uint32]:
-    names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
-    rows = [np.random.SeedSequence([seed, *name], spawn_key=(_FRESH_STREAM,)).generate_state(times) for name in names]
-    return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
+def _own_policy(path: Path, cfg: SearchCfg, robot: "RobotCfg") -> str:
+    """The run's own controller, which must be what it was."""
+    policy = policy_spec(cfg, robot)
+    digest = file_hash(Path(policy))
+    if digest != cfg.policy_sha256:
+        what = "the shipped controller" if cfg.policy == SHIPPED else f"the controller in {policy}"
+        state = "lost" if digest is None else "another one now"
+        raise ValueError(
+            f"{path / CONFIG_FILE}: the run was searched with {what}, which is {state} (expected SHA-256 "
+            f"{cfg.policy_sha256}, got {digest}): put it back, or say with --policy which one to evaluate with"
+        )
+    return policy
 
 
-def _regrouped(result: Any, times: int) -> Any:
-    """A result whose terrains come ``times`` times in succession as one of 40 episodes a terrain."""
-    arrays = {}
-    for name, value in vars(result).items():
-        if isinstance(value, np.ndarray):
-            grouped = value.reshape(-1, times * value.shape[1], *value.shape[2:])
-            arrays[name] = grouped[:, :FRESH_EPISODES]
-    return replace(result, **arrays)
+def _evaluator(args: ReevaluateCfg, cfg: SearchCfg, policy: str, device: str) -> EvaluatorCfg:
+    check_policy(policy, cfg.robot, device)
+    return EvaluatorCfg(
+        robot=cfg.robot,
+        policy=policy,
+        num_terrains=cfg.scheduler.num_terrains,
+        num_replicas=cfg.replicas,
+        device=device,
+        num_processes=args.processes,
+        workers=args.workers,
+        worker_limit_s=args.worker_limit_s,
+    )
 
 
-def _held_against(archive: Archive, result: Any, fitness: FitnessCfg) -> Reevaluation:
-    cells = archive.cells
-    fresh = evaluation_of(result, cells, fitness)
-    collided = (result.base_collision & ~result.invalid)[:, :_BIT_EPISODES].any(axis=1)
-    fresh = replace(fresh, cell=cells.cell_of(fresh.ratios, collided))
-    return Reevaluation(fresh=fresh, reproduced=fresh.valid & cells.are_neighbours(archive.cell, fresh.cell))
+def _given_policy(args: ReevaluateCfg) -> dict[str, Any]:
+    """For the results: the controller, where it was given."""
+    if args.policy is None:
+        return {}
+    return {"policy": args.policy, "policy_sha256": file_hash(Path(args.policy))}
 
 
-def _nothing(cells: Cells) -> Reevaluation:
-    rates, counts, columns = np.zeros(0), np.zeros(0, np.int64), np.zeros((0, cells.num_ratios))
-    fresh = Evaluation(
-        fitness=rates, ratios=columns, cell=counts, penalty_mean=columns, penalty_std=columns, collision_rate=rates,
-        goal_rate=rates, fallen_rate=rates, invalid_episodes=counts, episodes=counts,
-    )  # fmt: skip
-    return Reevaluation(fresh=fresh, reproduced=np.zeros(0, dtype=bool))
+def main(args: ReevaluateCfg) -> None:
+    """The command."""
+    reevaluate_run(args)
 
 
-def drawn_elites(archive: Archive, most: int, seed: int) -> Archive:
-    """An archive of some elites, drawn at random without replacement; all of them where there are no more than wanted.
-
-    Args:
-        archive: The elites.
-        most: How many to draw.
-        seed: The search's seed; the iterations done are drawn with too.
-    """
-    if len(archive) <= most:
-        return archive
-    rng = np.random.default_rng(np.random.SeedSequence([seed, archive.iterations], spawn_key=(_DRAW_STREAM,)))
-    return archive.rows(np.sort(rng.choice(len(archive), most, replace=False)))
-
-
-def numbers_of(again: Reevaluation, cells: Cells, *, sampled: bool = False) -> dict[str, Any]:
-    """The numbers of a re-evaluation, as metrics and reports have them.
-
-    Args:
-        again: The re-evaluation.
-        cells: The archive's cells.
-        sampled: Whether it is of some elites only: what sums over all of them is left out then.
-    """
-    std = again.std()
-    numbers = {
-        "reevaluated": len(again.reproduced),
-        "reproduced": int(again.reproduced.sum()),
-        "mean_std": float(std.mean()) if len(std) else None,
-        "mean_std_interval": bootstrap_interval(std, np.random.default_rng(0)),
-        "corrected_mean_fitness": float(again.fresh.fitness[again.fresh.valid].mean()) if len(std) else None,
-    }
-    if sampled:
-        return numbers
-    kept = again.corrected_elites()
-    return numbers | {
-        "corrected_elites": len(kept),
-        "corrected_coverage": len(kept) / cells.num_cells,
-        "corrected_qd_score": float((again.fresh.fitness[kept] - FITNESS_FLOOR).sum()),
-    }
+if __name__ == "__main__":
+    run_command(ReevaluateCfg, main)

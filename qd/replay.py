@@ -30,7 +30,7 @@ _LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
 class ReplayCfg:
     """Print one elite of an archive and draw its terrain with the robots' paths.
 
-    Elites are numbered by descending fitness: 0 is the worst terrain for the robot.
+    Elites are numbered by descending fitness, the corrected one where all were evaluated again: 0 is the worst.
     """
 
     robot: str = "anymal"
@@ -135,30 +135,37 @@ def _as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:
 
 
 def describe(replay: Replay) -> str:
-    """An elite's numbers as they were found, beside those of the fresh episodes."""
+    """An elite's numbers as they were found, those that 40 fresh episodes corrected, if any did, and those of now."""
     archive, n, fresh = replay.archive, replay.elite, replay.fresh
     cells = archive.cells
-    episodes = int(archive.episodes[n]), int(fresh.episodes[0])
     near = bool(fresh.valid[0]) and bool(cells.are_neighbours(archive.cell[n : n + 1], fresh.cell)[0])
-    lines = [
-        f"Elite {n} of {len(archive):,} of {archive.robot}, found in iteration {archive.iteration[n]}, with ratios in "
-        f"{cells.describe(int(archive.cell[n]))}",
-        f"  {'':22}{f'found ({episodes[0]} episodes)':>34}{f'now ({episodes[1]} episodes)':>34}",
-        f"  {'fitness':22}{archive.fitness[n]:>34.2f}{fresh.fitness[0]:>34.2f}",
-    ]
-    for k, name in enumerate(archive.penalties):
-        unit = _UNITS.get(name, "")
-        found = _penalty(archive.penalty_mean[n, k], archive.penalty_std[n, k], archive.scales[k], archive.ratios[n, k])
-        again = _penalty(fresh.penalty_mean[0, k], fresh.penalty_std[0, k], archive.scales[k], fresh.ratios[0, k])
-        lines.append(f"  {f'{name} [{unit}]':22}{found:>34}{again:>34}")
+    columns: list[tuple[str, Archive | Evaluation, int]] = [("found", archive, n), ("now", fresh, 0)]
+    if archive.fresh is not None:
+        columns.insert(1, ("corrected", archive.fresh, n))
+    rows = {
+        "": [f"{label} ({values.episodes[k]} episodes)" for label, values, k in columns],
+        "fitness": [f"{values.fitness[k]:.2f}" for _, values, k in columns],
+    }
+    for p, name in enumerate(archive.penalties):
+        rows[f"{name} [{_UNITS.get(name, '')}]"] = [
+            _penalty(values.penalty_mean[k, p], values.penalty_std[k, p], archive.scales[p], values.ratios[k, p])
+            for _, values, k in columns
+        ]
     for label, name in (("base collision", "collision_rate"), ("goal reached", "goal_rate"), ("fallen", "fallen_rate")):
-        old = _rate(getattr(archive, name)[n], episodes[0] - int(archive.invalid_episodes[n]))
-        new = _rate(getattr(fresh, name)[0], episodes[1] - int(fresh.invalid_episodes[0]))
-        lines.append(f"  {label:22}{old:>34}{new:>34}")
-    lines.append(
-        f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} again."
+        rows[label] = [
+            _rate(getattr(values, name)[k], int(values.episodes[k] - values.invalid_episodes[k]))
+            for _, values, k in columns
+        ]
+    table = [f"  {label:22}" + "".join(f"{cell:>34}" for cell in row) for label, row in rows.items()]
+    return "\n".join(
+        [
+            f"Elite {n} of {len(archive):,} of {archive.robot}, found in iteration {archive.iteration[n]}, with ratios "
+            f"in {cells.describe(int(archive.cell[n]))}",
+            *table,
+            f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} "
+            "again.",
+        ]
     )
-    return "\n".join(lines)
 
 
 def _penalty(mean: float, std: float, scale: float, ratio: float) -> str:
@@ -187,9 +194,11 @@ def draw(replay: Replay) -> "Figure":
     axes.plot(2.0, 4.0, marker=">", color="white", markeredgecolor="black", markersize=11, linestyle="", label="start")
     axes.plot(14.0, 4.0, marker="*", color="white", markeredgecolor="black", markersize=16, linestyle="", label="goal")
     archive, n = replay.archive, replay.elite
+    corrected = "" if archive.fresh is None else f"{archive.fresh.fitness[n]:.2f} corrected, "
     axes.set_title(
         f"{archive.robot}, elite {n} of {len(archive):,} after {archive.iterations:,} iterations: fitness "
-        f"{archive.fitness[n]:.2f} as found, {replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
+        f"{archive.fitness[n]:.2f} as found, {corrected}"
+        f"{replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
     )
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")

@@ -203,6 +203,7 @@ def archive_of(settings: Settings, search: "Scheduler", iterations: int) -> Arch
         search: The search.
         iterations: Iterations done.
     """
+    elites: dict[str, Any] = search.elites()
     return Archive(
         robot=settings["robot"],
         penalties=tuple(settings["fitness"]["penalties"]),
@@ -210,5 +211,5 @@ def archive_of(settings: Settings, search: "Scheduler", iterations: int) -> Arch
         intervals=settings["intervals"],
         collision_bit=settings["collision_bit"],
         iterations=iterations,
-        **search.elites(),
+        **elites,
     )

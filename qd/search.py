@@ -2,21 +2,19 @@
 
 import shlex
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import Archive
 from qd.arguments import Arguments, Job, job_of
 from qd.cli import Interrupted, run_command
 from qd.fitness import Evaluation, evaluation_of
+from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
 from qd.progress import ProgressBar, clock, plan
-from qd.reevaluate import FRESH_EPISODES, drawn_elites, numbers_of, reevaluate
 from qd.report import summary, write_figures
 from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed
-from qd.settings import SearchCfg, as_settings
-from qd.workers import Evaluate, EvaluatorCfg, EvaluatorError, crew_status, episode_seeds, open_evaluator, origin_of
+from qd.settings import SearchCfg, as_settings, policy_spec
+from qd.workers import Evaluate, EvaluatorError, crew_status, episode_seeds, open_evaluator, origin_of
 from sim.files import to_json, write_atomically
 
 if TYPE_CHECKING:
@@ -26,8 +24,6 @@ if TYPE_CHECKING:
 SUMMARY_FILE = "archive.json"
 MOST_DRAWN = 200
 """Elites drawn for a look at them in the middle of a search (the paper's figure of mean STD)."""
-
-Open = Callable[[EvaluatorCfg], AbstractContextManager[Evaluate]]
 
 
 def search_terrains(
@@ -148,6 +144,8 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                     with ProgressBar(cfg.iterations, done) as bar:
                         search_terrains(cfg, run, search, metrics, evaluate, bar)
             return _finish(job, run, search, metrics, open_evaluator)
+        except Interrupted:
+            raise
         except KeyboardInterrupt:
             raise Interrupted(f"Stopped; finished iterations are saved. {_how_to_go_on(job)}") from None
         except (EvaluatorError, OSError) as error:
@@ -169,39 +167,63 @@ def begin(cfg: SearchCfg) -> "Scheduler":
 
 
 def _finish(job: Job, run: RunDirectory, search: "Scheduler", metrics: Metrics, open_evaluator: Open) -> Archive:
-    """Figures and numbers of a search that reached its iterations."""
+    """Figures and numbers of a search that reached its iterations: as found, then as fresh episodes correct it."""
     archive = archive_of(as_settings(job.cfg), search, len(metrics))
-    run.write_derived(metrics, archive)
-    figures = write_figures(job.path, archive, metrics)
-    count = _count_reproduced(job, archive, open_evaluator) if job.reproduce else None
-    # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
-    again = origin_of(job.device, job.cfg.seed, job.evaluator.workers) if count is not None else None
-    numbers = summary(
-        archive,
-        metrics,
-        gpus=0 if job.origin["device"].startswith("CPU") else max(row.get("workers", 1) for row in metrics),
-        num_reproduced=count,
-        origin={**job.origin, "reproduced_by": again},
-    )
-    write_atomically(job.path / SUMMARY_FILE, to_json(numbers))
-    print(
-        f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
-        f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes in "
-        f"{clock(numbers['wall_s'])}" + (f"; {count:,} elites reproduced" if count is not None else "")
-    )
-    print(f"Figures: {', '.join(map(str, figures))}")
+    write_results(run, archive, metrics, {**job.origin, "reproduced_by": None})
+    if job.reproduce:
+        try:
+            archive = corrected(archive, job.cfg, job.evaluator, open_evaluator, job.cfg.seed)
+        except KeyboardInterrupt:
+            raise Interrupted(f"Stopped; the archive is saved as found. Go on with:  {_again_command(job)}") from None
+        # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
+        again = origin_of(job.device, job.cfg.seed, job.evaluator.workers)
+        write_results(run, archive, metrics, {**job.origin, "reproduced_by": again})
     print(f"Next, see the worst terrain:  make replay ROBOT={job.cfg.robot} RUN={shlex.quote(str(job.path))} ELITE=0")
     return archive
 
 
-def _count_reproduced(job: Job, archive: Archive, open_evaluator: Open) -> int:
-    print(f"Evaluating {len(archive):,} elites again with {FRESH_EPISODES} fresh episodes each.", flush=True)
-    at_once = max(1, job.cfg.episodes_per_iteration // FRESH_EPISODES)
-    with open_evaluator(replace(job.evaluator, num_terrains=at_once, num_replicas=FRESH_EPISODES)) as evaluate:
-        again = reevaluate(
-            [archive], evaluate, job.cfg.fitness, num_replicas=FRESH_EPISODES, seeds=[job.cfg.seed]
-        )[0]
-        return int(again.reproduced.sum())
+def _again_command(job: Job) -> str:
+    """How to evaluate the elites of a finished search again."""
+    from sim.robot import get_robot
+
+    moved = job.evaluator.policy != policy_spec(job.cfg, get_robot(job.cfg.robot))
+    flags = {
+        "run": job.path,
+        "device": job.device,
+        "workers": job.evaluator.workers,
+        "policy": job.evaluator.policy if moved else None,
+    }
+    given = [f"--{name} {shlex.quote(str(value))}" for name, value in flags.items() if value is not None]
+    return " ".join([".venv/bin/python -m qd.reevaluate", *given])
+
+
+def write_results(run: RunDirectory, archive: Archive, metrics: Metrics, origin: dict[str, Any]) -> None:
+    """Writes what a search leaves to look at, and says what it is.
+
+    Args:
+        run: The run directory, claimed.
+        archive: What was found; with fresh values its numbers and figures have them.
+        metrics: One row an iteration.
+        origin: Provenance.
+    """
+    run.write_derived(metrics, archive)
+    figures = write_figures(run.path, archive, metrics)
+    gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
+    numbers = summary(archive, metrics, gpus=gpus, origin=origin)
+    write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
+    if archive.fresh is None:
+        print(
+            f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
+            f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
+            f"in {clock(numbers['wall_s'])}"
+        )
+        print(f"Figures: {', '.join(map(str, figures))}")
+        return
+    print(
+        f"Corrected by fresh episodes: {numbers['elites_reproduced']:,} of {len(archive):,} elites reproduced, "
+        f"{numbers['corrected_coverage']:.1%} of the reachable cells, QD score {numbers['corrected_qd_score']:.0f}; "
+        f"in {run.path / SUMMARY_FILE} and the figures"
+    )
 
 
 def main(args: Arguments) -> None:

@@ -6,6 +6,7 @@ Nothing here imports pyribs, which takes seconds: `--help` and the worker proces
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -244,8 +245,42 @@ def file_hash(file: Path) -> str | None:
     return hashlib.sha256(file.read_bytes()).hexdigest() if os.path.isfile(file) else None
 
 
+def kept_penalties(robot: "RobotCfg", without: Sequence[str]) -> tuple[str, ...]:
+    """The robot's penalties but for some.
+
+    Args:
+        robot: The robot.
+        without: Names to leave out; several may stand in one, apart by spaces or commas, as make hands them over.
+
+    Raises:
+        ValueError: If a name is unknown, or fewer than 2 penalties are left.
+    """
+    names = " ".join(without).replace(",", " ").split()
+    _check_known(names, robot)
+    kept = tuple(name for name in robot.penalties if name not in names)
+    if len(kept) < 2:
+        raise ValueError(
+            f"without must leave at least 2 of {', '.join(robot.penalties)}, got {', '.join(names)}: a single ratio is "
+            "always 1"
+        )
+    return kept
+
+
+def _check_known(names: Sequence[str], robot: "RobotCfg") -> None:
+    unknown = [name for name in names if name not in robot.penalties]
+    if unknown:
+        raise ValueError(f"no penalty named {', '.join(unknown)}: {robot.name} has {', '.join(robot.penalties)}")
+
+
 def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
-    """Settings with the robot's present penalties and scales and the present hash of the controller's file."""
+    """Settings with the present scales of their penalties and the present hash of the controller's file.
+
+    Raises:
+        ValueError: If the robot lacks one of the penalties, or their scales were never measured.
+    """
     digest = file_hash(Path(policy_spec(cfg, robot)))
-    fitness = replace(cfg.fitness, penalties=robot.penalties, scales=robot.read_penalty_scales())
+    penalties = cfg.fitness.penalties
+    _check_known(penalties, robot)
+    scales = dict(zip(robot.penalties, robot.read_penalty_scales(), strict=True))
+    fitness = replace(cfg.fitness, scales=tuple(scales[name] for name in penalties))
     return replace(cfg, policy_sha256=digest, fitness=fitness, collision_bit=robot.collision_bit)

@@ -33,6 +33,8 @@ def bootstrap_interval(values: NDArray[np.floating], rng: np.random.Generator) -
 
 
 _T_QUANTILES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)  # 97.5 %, of 1 to 9 degrees of freedom
+MAX_T_VALUES = len(_T_QUANTILES) + 1
+"""Most measurements that :func:`t_interval` takes."""
 
 
 def t_interval(values: NDArray[np.floating]) -> list[float] | None:
@@ -43,8 +45,13 @@ def t_interval(values: NDArray[np.floating]) -> list[float] | None:
 
     Returns:
         Lower and upper limit; None for a single one, which says nothing of its spread.
+
+    Raises:
+        ValueError: If there are more.
     """
     count = len(values)
+    if count > MAX_T_VALUES:
+        raise ValueError(f"a t interval is of at most {MAX_T_VALUES} values, got {count}")
     if count < 2:
         return None
     half = _T_QUANTILES[count - 2] * float(values.std(ddof=1)) / math.sqrt(count)

@@ -4,6 +4,7 @@ import dataclasses
 import os
 import resource
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from kernels.episode import Outcome
-from qd import calibrate, replay
+from qd import calibrate, reevaluate, replay
 from qd.cli import run_command
 from sim import rollout
 from sim.command import exit_code_of
@@ -25,6 +26,13 @@ SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
 def resume_search(path: Path) -> None:
     """One iteration more than the search had."""
     searches.run(["--resume", str(path), "--device", "cpu", "--iterations", "3"])
+
+
+def reevaluate_search(path: Path) -> None:
+    """All elites again."""
+    searches.without_figures()
+    main = partial(reevaluate.reevaluate_run, open_evaluator=stand_in.open_stand_in)
+    run_command(reevaluate.ReevaluateCfg, main, ["--run", str(path), "--device", "cpu"])
 
 
 def replay_elite(path: Path) -> None:

@@ -42,8 +42,13 @@ def search_watched(path: Path, *, iterations: int, **watched: Any) -> None:
 
 def run(argv: list[str]) -> None:
     """The search's command over the stand-in evaluator, with figures that take no time to draw."""
-    search_module.write_figures = _write_plain_figures
+    without_figures()
     run_command(Arguments, lambda args: search_module.run_search(job_of(args), open_evaluator=open_stand_in), argv)
+
+
+def without_figures() -> None:
+    """From now on figures take no time to draw."""
+    search_module.write_figures = _write_plain_figures
 
 
 def _write_plain_figures(folder: Path, archive: Any, metrics: Any) -> list[Path]:

@@ -133,10 +133,12 @@ def test_damaged_files_of_a_training_and_going_on_with_it(folder, training_run):
     [
         ("config.json", commands.resume_search),
         ("checkpoint.bin", commands.resume_search),
+        ("checkpoint.bin", commands.reevaluate_search),
         ("config.json", commands.replay_elite),
         ("archive.npz", commands.replay_elite),
         ("checkpoint.pt", commands.resume_training),
         ("", commands.resume_search),
+        ("", commands.reevaluate_search),
         ("", commands.resume_training),
     ],
 )

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qd.archive import Archive, read_archive, write_archive
+from qd.archive import FRESH, Archive, FreshValues, read_archive, write_archive
 
 
 def small_archive(num_elites: int = 3) -> Archive:
@@ -32,6 +32,14 @@ def small_archive(num_elites: int = 3) -> Archive:
     )
 
 
+def fresh_values(archive: Archive) -> FreshValues:
+    """Forty fresh episodes that say half the fitness, and otherwise what the elites had."""
+    same = {name: getattr(archive, name) for name in FRESH if hasattr(archive, name)}
+    changed = {"fitness": archive.fitness / 2, "episodes": np.full(len(archive), 40)}
+    limits = {"collision_low": archive.collision_rate / 2, "collision_high": np.ones(len(archive))}
+    return FreshValues(**same | changed | limits, reproduced=np.arange(len(archive)) % 2 == 0)
+
+
 @pytest.mark.parametrize("num_elites", [0, 3])
 def test_round_trip(tmp_path, num_elites):
     archive = small_archive(num_elites)
@@ -52,6 +60,42 @@ def test_equal_archives_are_equal_bytes(tmp_path):
     write_archive(tmp_path / "a.npz", small_archive())
     write_archive(tmp_path / "b.npz", small_archive())
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+@pytest.mark.parametrize("num_elites", [0, 3])
+def test_fresh_values_come_back_too(tmp_path, num_elites):
+    archive = dataclasses.replace(small_archive(num_elites), fresh=fresh_values(small_archive(num_elites)))
+    for name in ("a.npz", "b.npz"):
+        write_archive(tmp_path / name, archive)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    back = read_archive(tmp_path / "a.npz")
+    for name in FRESH:
+        assert np.array_equal(getattr(back.fresh, name), getattr(archive.fresh, name)), name
+    assert np.array_equal(back.fitness, archive.fitness)
+
+
+def test_corrected_elites_are_in_order_of_fresh_fitness_and_the_invalid_last():
+    archive = small_archive(4)
+    # 11 invalid of 40 are more than a quarter, and -20 is what an invalid terrain has; -30 is worse, but valid
+    fresh = dataclasses.replace(
+        fresh_values(archive), fitness=np.array([1.0, -20.0, 5.0, -30.0]), invalid_episodes=np.array([0, 11, 10, 0])
+    )
+    corrected = archive.corrected_by(fresh)
+    order = [2, 0, 3, 1]
+    assert corrected.cell.tolist() == order
+    assert np.array_equal(corrected.genes, archive.genes[order])
+    assert corrected.fresh.fitness.tolist() == [5.0, 1.0, -30.0, -20.0]
+    assert corrected.fresh.reproduced.tolist() == [True, True, False, False]
+    assert corrected.rows(np.array([3, 0])).fresh.fitness.tolist() == [-20.0, 5.0]
+
+
+def test_fresh_episodes_say_which_elites_collide_and_where_they_are_invalid_the_found_do():
+    archive = dataclasses.replace(small_archive(4), collision_rate=np.array([0.0, 0.5, 0.0, 0.5]))
+    assert archive.collided.tolist() == [False, True, False, True]
+    fresh = dataclasses.replace(
+        fresh_values(archive), collision_rate=np.array([0.1, 0.0, 0.0, 0.0]), invalid_episodes=np.array([0, 0, 40, 40])
+    )
+    assert dataclasses.replace(archive, fresh=fresh).collided.tolist() == [True, False, False, True]
 
 
 def test_scores_by_hand():
@@ -86,9 +130,10 @@ def test_damage_is_reported_not_raised_raw(tmp_path):
             read_archive(file)
 
 
-def test_flipped_bytes_never_raise_anything_but_a_value_error(tmp_path):
-    file = tmp_path / "archive.npz"
-    write_archive(file, small_archive(5))
+@pytest.mark.parametrize("fresh", [False, True])
+def test_flipped_bytes_never_raise_anything_but_a_value_error(tmp_path, fresh):
+    file, archive = tmp_path / "archive.npz", small_archive(5)
+    write_archive(file, dataclasses.replace(archive, fresh=fresh_values(archive) if fresh else None))
     whole = file.read_bytes()
     rng = np.random.default_rng(1)
     refused = 0
@@ -111,3 +156,24 @@ def test_another_npz_is_refused(tmp_path):
     np.savez(tmp_path / "archive.npz", allow_pickle=True, genes=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match="damaged or another file"):
         read_archive(tmp_path)
+
+
+def test_fresh_values_are_all_there_or_none_and_such_as_episodes_give(tmp_path):
+    file, archive = tmp_path / "archive.npz", small_archive()
+    fresh = fresh_values(archive)
+    write_archive(file, dataclasses.replace(archive, fresh=fresh))
+    with np.load(file) as data:
+        arrays = dict(data)
+    for name in FRESH:
+        np.savez(file, **{key: value for key, value in arrays.items() if key != f"fresh_{name}"})
+        with pytest.raises(ValueError, match=f"damaged or another file.*fresh_{name}"):
+            read_archive(file)
+    for changes, message in (
+        ({"reproduced": np.ones(3)}, "fresh_reproduced must be of kind 'b'"),
+        ({"ratios": np.ones((3, 5))}, r"fresh_ratios must have shape \(3, 2\), got \(3, 5\)"),
+        ({"fitness": np.array([1.0, np.nan, 0.0])}, "must hold finite numbers"),
+        ({"cell": np.array([0, 1, 10])}, "cell must lie in 0 to 9"),  # two ratios have 10 reachable cells
+    ):
+        write_archive(file, dataclasses.replace(archive, fresh=dataclasses.replace(fresh, **changes)))
+        with pytest.raises(ValueError, match=message):
+            read_archive(file)

@@ -266,7 +266,7 @@ def test_sigterm_is_an_interrupt(capsys):
     assert exit.value.code == 130
 
 
-@pytest.mark.parametrize("module", ["qd.search", "qd.calibrate", "qd.replay"])
+@pytest.mark.parametrize("module", ["qd.search", "qd.compare", "qd.calibrate", "qd.replay"])
 def test_help_teaches_and_is_fast(module):
     code = f"""
 import runpy, sys

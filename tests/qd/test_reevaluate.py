@@ -1,111 +1,149 @@
-import dataclasses
+"""A run's elites again: at the end of its search, and by the command, over the stand-in evaluator."""
+
+import json
+import re
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
-from qd.fitness import FitnessCfg
-from qd.reevaluate import drawn_elites, numbers_of, reevaluate
-from tests.qd.stand_in import make_result
-from tests.qd.test_archive import small_archive
+from qd import search
+from qd.archive import read_archive
+from qd.cli import Interrupted
+from qd.reevaluate import ReevaluateCfg, reevaluate_run
+from qd.search import run_search
+from tests.qd import stand_in
+from tests.qd.stand_in import open_stand_in
+from tests.qd.test_search import make_job, rows_of, run
+
+POLICY = "tests.sim.policies:stand"
 
 
-def archive_of(ratios, *, collided=None):
-    """An archive whose elites have given first ratios of two, found with or without a collision."""
-    archive = small_archive(len(ratios))
-    columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
-    archive = dataclasses.replace(archive, ratios=columns, scales=(1.0, 1.0), collision_bit=collided is not None)
-    return dataclasses.replace(archive, cell=archive.cells.cell_of(columns, collided))
+@pytest.fixture(autouse=True)
+def no_figures(monkeypatch):
+    monkeypatch.setattr(search, "write_figures", lambda folder, archive, metrics: [])
 
 
-def evaluator(ratios, **kwargs):
-    columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
-    penalties = np.repeat(columns[:, None], 40, axis=1)
-    return lambda genes, seeds, progress=None: make_result(penalties, **kwargs)
+def again(path, **arguments):
+    return reevaluate_run(ReevaluateCfg(run=path, device="cpu", **arguments), open_evaluator=open_stand_in)
 
 
-def again_of(archive, evaluate, num_replicas=40):
-    fitness = FitnessCfg(penalties=archive.penalties, scales=archive.scales)
-    return reevaluate([archive], evaluate, fitness, num_replicas=num_replicas, seeds=[0])[0]
+def numbers_in(path):
+    return json.loads((path / "archive.json").read_text())
 
 
-def reproduced(archive, evaluate):
-    return again_of(archive, evaluate).reproduced.tolist()
+def watching(configs, seeds_seen):
+    """The stand-in, noting how it was opened and what seeds it got."""
+
+    @contextmanager
+    def opened(cfg):
+        configs.append(cfg)
+
+        def evaluate(genes, seeds, progress=None):
+            seeds_seen.append(seeds)
+            return stand_in.evaluate(genes, seeds, cfg.num_replicas)
+
+        yield evaluate
+
+    return opened
 
 
-def test_the_same_cell_and_its_neighbours_count():
-    # cells of two ratios: [.3, .4) x [.6, .7) has index 3; .45 is one interval further, .55 two
-    found = archive_of([0.35, 0.35, 0.35, 0.35])
-    assert reproduced(found, evaluator([0.38, 0.45, 0.55, 0.25])) == [True, True, False, True]
+def stopped_in_fresh_episodes(cfg):
+    @contextmanager
+    def opened(cfg):
+        def evaluate(genes, seeds, progress=None):
+            if cfg.num_replicas == 40:
+                progress(0.5)
+                raise KeyboardInterrupt
+            return stand_in.evaluate(genes, seeds, cfg.num_replicas)
+
+        yield evaluate
+
+    return opened(cfg)
 
 
-def test_an_invalid_terrain_is_not_reproduced_and_counts_in_no_mean():
-    invalid = np.zeros((2, 40), bool)
-    invalid[1, :11] = True  # 11 of 40 is more than a quarter
-    archive = archive_of([0.45, 0.45])
-    again = again_of(archive, evaluator([0.45, 0.45], invalid=invalid))
-    assert again.reproduced.tolist() == [True, False]
-    assert again.corrected_elites().tolist() == [0]
-    # mean 1 of the two penalties together, no deviation, no collision: fitness 1
-    assert numbers_of(again, archive.cells) == {
-        "reevaluated": 2, "reproduced": 1, "mean_std": 0.0, "mean_std_interval": [0.0, 0.0],
-        "corrected_mean_fitness": 1.0, "corrected_elites": 1, "corrected_coverage": 1 / archive.cells.num_cells,
-        "corrected_qd_score": 21.0,
-    }  # fmt: skip
+def test_a_search_ends_with_forty_fresh_episodes_of_each_elite(tmp_path, capsys):
+    configs, seeds_seen, path = [], [], tmp_path / "run"
+    archive = run_search(make_job(path, reproduce=True), open_evaluator=watching(configs, seeds_seen))
+    found = run(tmp_path / "found")
+    assert [cfg.num_replicas for cfg in configs] == [4, 40]
+    assert len(seeds_seen[-1]) == len(archive)
+    assert not set(seeds_seen[-1].tolist()) & set(np.concatenate(seeds_seen[:-1]).tolist())
+    # The same elites, in the order of what is confirmed.
+    assert sorted(archive.cell.tolist()) == sorted(found.cell.tolist())
+    assert (np.diff(archive.fresh.fitness) <= 0).all() and (np.diff(archive.fitness) > 0).any()
+    assert archive.fresh.episodes.tolist() == [40] * len(archive)
+    assert np.array_equal(read_archive(path).fresh.fitness, archive.fresh.fitness)
+    numbers = numbers_in(path)
+    # The stand-in's noise of 10 % moves a mean of 40 episodes by under 2 %: all land in their cell or beside it.
+    assert numbers["elites_reproduced"] == numbers["reevaluated"] == len(archive)
+    assert numbers["corrected_mean_fitness"] == pytest.approx(archive.fresh.fitness.mean())
+    assert numbers["qd_score"] == pytest.approx(found.qd_score)
+    assert numbers["reproduced_by"]["seed"] == 3
+    output = capsys.readouterr()
+    assert "fresh episodes [" in output.err and "ETA" in output.err
 
 
-def test_the_collision_bit_is_taken_over_the_first_twenty():
-    collides = np.zeros((3, 40), bool)
-    collides[1, 19] = True
-    collides[2, 20] = True
-    again = evaluator([0.35] * 3, base_collision=collides)
-    assert reproduced(archive_of([0.35] * 3, collided=[False] * 3), again) == [True, False, True]
-    assert reproduced(archive_of([0.35] * 3, collided=[True] * 3), again) == [False, True, False]
+def test_stopped_in_the_fresh_episodes_a_search_leaves_what_it_found_and_the_command_goes_on(tmp_path):
+    path = tmp_path / "run"
+    with pytest.raises(Interrupted, match=re.escape(f"Go on with:  .venv/bin/python -m qd.reevaluate --run {path}")):
+        run_search(make_job(path, reproduce=True, policy=POLICY), open_evaluator=stopped_in_fresh_episodes)
+    found = run(tmp_path / "found", policy=POLICY)
+    assert (path / "archive.npz").read_bytes() == (tmp_path / "found/archive.npz").read_bytes()
+    assert numbers_in(path)["elites_reproduced"] is None
+    again(path)
+    run_search(make_job(tmp_path / "whole", reproduce=True, policy=POLICY), open_evaluator=open_stand_in)
+    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
+    assert numbers_in(path)["elites_reproduced"] == len(found)
 
 
-def test_elites_that_land_in_one_cell_are_one_corrected_elite_the_fittest():
-    columns = np.repeat(np.array([[1.0, 3.0], [2.0, 6.0], [3.0, 1.0]])[:, None], 40, axis=1)
-    again = again_of(archive_of([0.25, 0.35, 0.75]), lambda *_: make_result(columns))
-    assert again.corrected_elites().tolist() == [1, 2]
-    assert numbers_of(again, small_archive(1).cells)["corrected_qd_score"] == (8 + 20) + (4 + 20)
+def test_the_command_adds_fresh_values_to_a_run_and_another_seed_gives_others(tmp_path):
+    path = tmp_path / "run"
+    found = run(path, policy=POLICY)
+    metrics = rows_of(path, timed=True)
+    first = again(path)
+    assert first.fresh.fitness.tolist() != found.fitness.tolist()
+    assert numbers_in(path)["reproduced_by"]["seed"] == 3
+    assert numbers_in(path)["elites"] == len(found)
+    before = (path / "archive.npz").read_bytes()
+    again(path)  # from the checkpoint, so that fresh values never add up
+    assert (path / "archive.npz").read_bytes() == before
+    other = again(path, seed=7)
+    assert numbers_in(path)["reproduced_by"]["seed"] == 7
+    assert set(other.fresh.fitness.tolist()).isdisjoint(first.fresh.fitness.tolist())
+    assert rows_of(path, timed=True) == metrics
 
 
-def test_several_archives_at_once_by_few_replicas_make_forty_episodes_each():
-    seen = []
-
-    def evaluate(genes, seeds, progress=None):
-        seen.append((genes, seeds))
-        marks = np.arange(len(genes) * 12, dtype=float).reshape(len(genes), 12)
-        return make_result(np.stack([marks, marks + 1.0], axis=2))
-
-    one, two = archive_of([0.25, 0.35]), archive_of([0.45])
-    fitness = FitnessCfg(penalties=one.penalties, scales=one.scales)
-    first, second = reevaluate([one, two], evaluate, fitness, num_replicas=12, seeds=[0, 1])
-    genes, seeds = seen[0]
-    # 4 times 12 episodes, of which 40 count
-    assert np.array_equal(genes, np.concatenate([one.genes, two.genes]).repeat(4, axis=0))
-    assert len(set(seeds.tolist())) == 12
-    assert first.fresh.episodes.tolist() == [40, 40]
-    assert first.fresh.penalty_mean[:, 0].tolist() == [19.5, 48 + 19.5]
-    assert second.fresh.penalty_mean[:, 0].tolist() == [96 + 19.5]
-    alone = reevaluate([two], evaluate, fitness, num_replicas=12, seeds=[1])
-    assert np.array_equal(seen[1][1], seeds[8:])
-    assert len(alone) == 1
+def test_stopped_the_command_leaves_the_run_as_it_was(tmp_path):
+    path = tmp_path / "run"
+    run(path, policy=POLICY)
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    with pytest.raises(Interrupted, match="is as it was"):
+        reevaluate_run(ReevaluateCfg(run=path, device="cpu"), open_evaluator=stopped_in_fresh_episodes)
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
 
 
-def test_an_empty_archive_has_none():
-    again = again_of(small_archive(0), evaluator([0.5]))
-    assert len(again.reproduced) == 0
-    assert numbers_of(again, small_archive(0).cells)["mean_std"] is None
+def test_a_controller_that_is_another_now_is_refused_unless_it_is_given(tmp_path):
+    path, policy = tmp_path / "run", tmp_path / "policy.pt"
+    run(path, policy=str(policy), policy_sha256="0" * 64)
+    with pytest.raises(ValueError, match=rf"the controller in {policy}, which is lost .* with --policy"):
+        again(path)
+    policy.write_bytes(b"another")
+    with pytest.raises(ValueError, match=rf"the controller in {policy}, which is another one now"):
+        again(path)
+    assert numbers_in(path)["reproduced_by"] is None
+    again(path, policy=POLICY)
+    by = numbers_in(path)["reproduced_by"]
+    assert (by["policy"], by["policy_sha256"]) == (POLICY, None)  # code has no hash
 
 
-def test_episodes_of_another_number_than_said_are_refused():
-    with pytest.raises(ValueError, match="evaluate must give 40 episodes, got 4"):
-        again_of(archive_of([0.5]), lambda *_: make_result([[[1.0, 1.0]] * 4]))
-
-
-def test_drawn_elites_are_some_of_them_each_once():
-    archive = small_archive(3)
-    assert drawn_elites(archive, 3, seed=0) is archive
-    drawn = drawn_elites(archive, 2, seed=0)
-    assert len(drawn) == 2
-    assert set(drawn.cell.tolist()) < set(archive.cell.tolist())
+def test_what_is_no_run_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no run at .*: it has no config\.json"):
+        again(tmp_path)
+    run(tmp_path / "run", policy=POLICY)
+    with pytest.raises(ValueError, match="seed must not be negative, got -1"):
+        again(tmp_path / "run", seed=-1)
+    for name in ("checkpoint.bin", "metrics.jsonl", "archive.npz"):
+        (tmp_path / "run" / name).unlink()
+    with pytest.raises(ValueError, match="has no finished iteration"):
+        again(tmp_path / "run")

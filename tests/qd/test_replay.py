@@ -9,7 +9,7 @@ from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
 from qd.replay import Replay, ReplayCfg, describe, draw, newest_run
 from tests.qd.stand_in import make_result
-from tests.qd.test_archive import small_archive
+from tests.qd.test_archive import fresh_values, small_archive
 
 
 @pytest.fixture
@@ -50,6 +50,17 @@ def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
     # fresh: 4 + 8 - 0 - 2 * 3/4
     assert next(line for line in text.splitlines() if "fitness" in line).split() == ["fitness", "3.25", "10.50"]
     assert "lands in its cell or a neighbour of it again" in text
+
+
+def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
+    fresh = dataclasses.replace(fresh_values(done.archive), invalid_episodes=np.array([8]))
+    corrected = dataclasses.replace(done, archive=dataclasses.replace(done.archive, fresh=fresh))
+    lines = [" ".join(line.split()) for line in describe(corrected).splitlines()]
+    assert lines[1:3] == ["found (4 episodes) corrected (40 episodes) now (4 episodes)", "fitness 3.25 1.62 10.50"]
+    assert "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
+    assert "base collision 1 of 4 (25%) 8 of 32 (25%) 1 of 4 (25%)" in lines  # 8 of the 40 are invalid
+    title = draw(corrected).axes[0].get_title()
+    assert title.endswith("fitness 3.25 as found, 1.62 corrected, 10.50 in 4 fresh episodes")
 
 
 def test_the_drawing_has_all_paths_and_how_they_ended(done):

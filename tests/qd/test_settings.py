@@ -6,7 +6,17 @@ from types import SimpleNamespace
 import pytest
 
 from qd import settings
-from qd.settings import as_settings, changed, from_settings, measured_now, paper, policy_spec, preset, small
+from qd.settings import (
+    as_settings,
+    changed,
+    from_settings,
+    kept_penalties,
+    measured_now,
+    paper,
+    policy_spec,
+    preset,
+    small,
+)
 from tests.qd import stand_in
 
 
@@ -89,6 +99,28 @@ def test_the_controllers_file_is_part_of_the_settings(tmp_path):
     assert digests[3] is None
     assert policy_spec(cfg, robot(shipped)) == str(shipped)
     assert measured_now(cfg, robot(shipped, scales=(9.0,) * 6)).fitness.scales == (9.0,) * 6
+
+
+@pytest.mark.parametrize("names", [("stumble", "vel_x"), ("stumble vel_x",), ("vel_x,stumble",), ("vel_x, stumble",)])
+def test_penalties_left_out_by_name_in_any_way_of_listing_them(names):
+    assert kept_penalties(robot(), names) == ("yaw_rate", "vel_y", "contact_force", "collision")
+
+
+def test_nothing_left_out_leaves_all():
+    assert kept_penalties(robot(), ()) == stand_in.PENALTIES
+
+
+def test_scales_follow_the_penalties_that_are_kept():
+    cfg = measured_now(changed(paper(robot()), {"penalties": ("vel_x", "stumble", "contact_force")}), robot())
+    assert cfg.fitness.penalties == ("vel_x", "stumble", "contact_force")
+    assert cfg.fitness.scales == (2.0, 1.0, 4.0)
+    assert cfg.cells.num_ratios == 3
+
+
+def test_a_penalty_that_the_robot_has_no_more_is_named():
+    cfg = changed(paper(robot()), {"penalties": ("vel_x", "torque")})
+    with pytest.raises(ValueError, match="no penalty named torque: anymal has yaw_rate, vel_x, vel_y, contact_force"):
+        measured_now(cfg, robot())
 
 
 def test_nothing_slow_is_imported():

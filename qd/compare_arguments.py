@@ -1,0 +1,234 @@
+"""What a command line of a comparison means: a new one, or an old one that goes on."""
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from qd.arguments import moved_policy, origin_in, refuse_changes, resume_command, resumed
+from qd.run_directory import numbered
+from qd.settings import SearchCfg, Settings, as_settings, changed, from_settings, measured_now, policy_spec, preset
+from qd.workers import EvaluatorCfg, check_policy, origin_of, resolve_device
+from sim.files import is_leftover, prepare_output, read_json, to_json, write_atomically
+from sim.intervals import MAX_T_VALUES
+
+if TYPE_CHECKING:
+    from sim.robot import RobotCfg
+
+METHODS: dict[str, dict[str, Any]] = {
+    "uniform_random": {"method": "uniform_random"},
+    "hard_random": {"method": "hard_random"},
+    "map_elites": {"method": "map_elites"},
+    "cma_me": {"method": "cma_me"},
+    "cma_mae": {"method": "cma_mae", "es": "cma_es"},
+    "cma_mae_sep": {"method": "cma_mae", "es": "sep_cma_es"},
+    "cma_mae_narrow": {"method": "cma_mae", "es": "cma_es", "sigma0": 0.5},
+    "mixed": {"method": "mixed", "es": "cma_es"},
+}
+"""What is compared: changes of the search's settings."""
+
+COMPARE_CONFIG_FILE = "compare.config.json"
+_RUNS = Path("runs")
+_DEFAULTS = {"robot": "anymal", "methods": tuple(METHODS), "seeds": 3, "iterations": 33, "reevaluate_every": 11}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """Compare ways to search on the same number of terrains, several seeds each, all in lock-step.
+
+    State is saved after every iteration: stop with Ctrl-C whenever you like and go on with --resume.
+    """
+
+    robot: str | None = None
+    """Which robot: anymal, unless resuming."""
+    preset: str | None = None
+    """Size of an iteration: paper (a GPU's work) or small; by default what the device can do."""
+    methods: tuple[str, ...] | None = None
+    """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
+    size .5), mixed; all."""
+    seeds: int | None = None
+    """Runs of each method, with seeds from --seed on; 3."""
+    seed: int | None = None
+    """The first seed; 0."""
+    iterations: int | None = None
+    """Iterations of every run, 33; with --resume, more than before extend them."""
+    reevaluate_every: int | None = None
+    """Every so many iterations, 11, and at the end, all elites are evaluated again with 40 fresh episodes."""
+    policy: str | None = None
+    """Controller other than the shipped one."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    processes: int | None = None
+    """Processes on the CPU, without Ray; one a core."""
+    workers: int | Literal["auto"] | None = None
+    """Ray workers, a GPU or CPU core each; auto: all there are."""
+    worker_limit_s: float = 900.0
+    """A Ray worker that gets no further for so many seconds is given up."""
+    resume: Path | None = None
+    """Go on with the comparison in this directory, as it was asked for."""
+    run_dir: Path | None = None
+    """Directory of a new comparison; runs/<robot>-compare, numbered if that exists."""
+    out: Path | None = None
+    """Where to write the numbers, with a figure beside them; compare.json in the comparison's directory."""
+
+
+_OF_RUNS = ("robot", "preset", "seed", "iterations", "reevaluate_every", "policy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A comparison that can begin: everything a user may have got wrong has been looked at."""
+
+    cfg: SearchCfg
+    """What the runs share: the first one's seed, and how often all of them have their elites evaluated again."""
+    methods: tuple[str, ...]
+    seeds: int
+    """Runs of each method."""
+    path: Path
+    """The comparison's directory."""
+    evaluator: EvaluatorCfg
+    out: Path
+    """Where its numbers go."""
+    origin: dict[str, Any]
+    """Provenance of its beginning."""
+    resume_command: str
+    """How to go on with it."""
+
+    def cfg_of(self, method: str, seed: int) -> SearchCfg:
+        """Settings of one run, which looks at no elites on its own."""
+        return changed(replace(self.cfg, seed=seed, reevaluate_every=0), METHODS[method])
+
+    @property
+    def has_config(self) -> bool:
+        """Whether it has begun, so that it can be resumed."""
+        return (self.path / COMPARE_CONFIG_FILE).exists()
+
+    def write_config(self) -> None:
+        """Writes what was asked for, so that resuming needs no more than the directory."""
+        settings = _as_settings(self.cfg, self.methods, self.seeds)
+        content = {"settings": settings, "iterations": self.cfg.iterations, **self.origin}
+        write_atomically(self.path / COMPARE_CONFIG_FILE, to_json(content))
+
+
+def comparison_of(args: Arguments) -> Comparison:
+    """The comparison that a command line asks for.
+
+    Raises:
+        FileNotFoundError: If there is none to resume.
+        ValueError: If robot, methods, device, controller, another argument or the directory is not as it must be.
+    """
+    from sim.robot import get_robot
+
+    if args.resume and args.run_dir:
+        raise ValueError("give --resume for a comparison that is there or --run-dir for a new one, not both")
+    device = resolve_device(args.device, args.workers)
+    config = _read_config(args.resume) if args.resume else None
+    there = _asked_in(args.resume, config) if args.resume and config else None
+    robot = get_robot(args.robot or (there[0].robot if there else "anymal"))
+    if args.resume and config and there:
+        path, origin, moved = args.resume, origin_in(config), moved_policy(there[0], args.policy)
+        cfg, methods, seeds = _resumed(path, there, robot, args, moved)
+    else:
+        path, moved = _free_path(args.run_dir, robot.name), None
+        cfg, methods, seeds = _begun(robot, device, args)
+        origin = origin_of(device, cfg.seed, args.workers)
+    policy = moved or policy_spec(cfg, robot)
+    check_policy(policy, cfg.robot, device)
+    if args.out is not None:
+        prepare_output(args.out)
+    return Comparison(
+        cfg=cfg,
+        methods=methods,
+        seeds=seeds,
+        path=path,
+        evaluator=_evaluator(cfg, policy, device, len(methods) * seeds, args),
+        out=args.out or path / "compare.json",
+        origin=origin,
+        resume_command=resume_command("compare", cfg.robot, path, args, moved),
+    )
+
+
+_Asked = tuple[SearchCfg, tuple[str, ...], int]  # what the runs share, methods, seeds
+
+
+def _begun(robot: "RobotCfg", device: str, args: Arguments) -> _Asked:
+    given = {name: value for name, value in vars(args).items() if value is not None}
+    asked = {**_DEFAULTS, **given}
+    name = args.preset or ("paper" if device.startswith("cuda") else "small")
+    cfg = measured_now(changed(preset(name, robot), {key: asked.get(key) for key in _OF_RUNS}), robot)
+    return _checked(cfg, asked["methods"], asked["seeds"])
+
+
+def _resumed(path: Path, there: _Asked, robot: "RobotCfg", args: Arguments, moved: str | None) -> _Asked:
+    cfg, methods, seeds = there
+    wanted = resumed(path, cfg, robot, {key: getattr(args, key) for key in _OF_RUNS}, moved)
+    asked = (wanted, methods if args.methods is None else args.methods, seeds if args.seeds is None else args.seeds)
+    refuse_changes(path, "comparison", _as_settings(*there), _as_settings(*asked))
+    return _checked(*asked)
+
+
+def _checked(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> _Asked:
+    unknown = [name for name in methods if name not in METHODS]
+    if unknown or not methods or len(set(methods)) < len(methods):
+        raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(methods)}")
+    if not 1 <= seeds <= MAX_T_VALUES:
+        raise ValueError(f"seeds must be 1 to {MAX_T_VALUES}, got {seeds}")
+    if cfg.reevaluate_every < 1:
+        raise ValueError(f"reevaluate_every must be at least 1, got {cfg.reevaluate_every}")
+    return cfg, methods, seeds
+
+
+def _evaluator(cfg: SearchCfg, policy: str, device: str, runs: int, args: Arguments) -> EvaluatorCfg:
+    return EvaluatorCfg(
+        robot=cfg.robot,
+        policy=policy,
+        # A GPU takes all runs at once; a CPU is full with one's.
+        num_terrains=cfg.scheduler.num_terrains * (runs if device.startswith("cuda") else 1),
+        num_replicas=cfg.replicas,
+        device=device,
+        num_processes=args.processes,
+        workers=args.workers,
+        worker_limit_s=args.worker_limit_s,
+    )
+
+
+def _as_settings(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> Settings:
+    return {**as_settings(cfg), "methods": list(methods), "seeds": seeds}
+
+
+def _asked_in(path: Path, config: dict[str, Any]) -> _Asked:
+    """What a config holds, as the types it was written from."""
+    settings = dict(config["settings"])
+    methods, seeds = settings.pop("methods", None), settings.pop("seeds", None)
+    try:
+        if (
+            not isinstance(methods, list)
+            or not all(isinstance(name, str) for name in methods)
+            or type(seeds) is not int
+        ):
+            raise ValueError(f"methods and seeds must be names and a number, got {methods} and {seeds}")
+        return _checked(from_settings(settings, config["iterations"]), tuple(methods), seeds)
+    except ValueError as error:
+        raise ValueError(f"{path / COMPARE_CONFIG_FILE}: {error}; put a copy of it back") from None
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    """What was asked for in a comparison's directory."""
+    file = path / COMPARE_CONFIG_FILE
+    if not os.path.lexists(file):
+        raise FileNotFoundError(f"no comparison at {path}: it has no {COMPARE_CONFIG_FILE}; give the directory of one")
+    config = read_json(file)
+    if type(config.get("settings")) is not dict or type(config.get("iterations")) is not int:
+        raise ValueError(f"{file} must hold settings and iterations of a comparison, got {', '.join(config)}")
+    return config
+
+
+def _free_path(given: Path | None, robot: str) -> Path:
+    """Directory of a new comparison; never one that holds something."""
+    if given is None:
+        return next(path for path in numbered(_RUNS, f"{robot}-compare") if not path.exists())
+    if (given / COMPARE_CONFIG_FILE).exists():
+        raise ValueError(f"{given} holds a comparison already: go on with --resume {given}, or give another --run-dir")
+    if given.is_dir() and not all(map(is_leftover, given.iterdir())):
+        raise ValueError(f"{given} is not empty and holds no comparison: give another --run-dir")
+    return given
