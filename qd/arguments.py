@@ -143,24 +143,35 @@ def job_of(args: Arguments) -> Job:
         cfg = measured_now(changed(preset(name, robot), changes), robot)
         path, origin = _free_path(args, cfg), origin_of(device, cfg.seed, args.workers)
     policy = moved or policy_spec(cfg, robot)
-    check_policy(policy, cfg.robot, device)
     return Job(
         cfg=cfg,
         path=path,
         resumes=there is not None,
-        evaluator=_evaluator(cfg, policy, device, args),
+        evaluator=evaluator_of(cfg, policy, device, args),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
         origin=origin,
         resume_command=resume_command("archive", cfg.robot, path, args, moved),
     )
 
 
-def _evaluator(cfg: SearchCfg, policy: str, device: str, args: Arguments) -> EvaluatorCfg:
-    """What evaluates an iteration's terrains all at once."""
+def evaluator_of(cfg: SearchCfg, policy: str, device: str, args: "Placed", *, runs_on_gpu: int = 1) -> EvaluatorCfg:
+    """What evaluates an iteration's terrains all at once, with a controller that was tried.
+
+    Args:
+        cfg: The search.
+        policy: Controller.
+        device: Warp device name.
+        args: Where to work.
+        runs_on_gpu: Searches a GPU crosses the terrains of at once; a CPU is full with one's.
+
+    Raises:
+        ValueError: If the controller cannot be loaded or does not fit the robot.
+    """
+    check_policy(policy, cfg.robot, device)
     return EvaluatorCfg(
         robot=cfg.robot,
         policy=policy,
-        num_terrains=cfg.scheduler.num_terrains,
+        num_terrains=cfg.scheduler.num_terrains * (runs_on_gpu if device.startswith("cuda") else 1),
         num_replicas=cfg.replicas,
         device=device,
         num_processes=args.processes,
@@ -229,9 +240,8 @@ def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
     if (args.run_dir / CONFIG_FILE).exists():
         different = differences(RunDirectory(args.run_dir).read_config()["settings"], as_settings(cfg))
         if different:
-            raise ValueError(
-                f"{args.run_dir} holds a run of other settings: {', '.join(different)}: give another --run-dir"
-            )
+            found = f"{args.run_dir} holds a run of other settings"
+            raise ValueError(f"{found}: {', '.join(different)}: give another --run-dir")
         command = resume_command("archive", cfg.robot, args.run_dir, args, None)
         raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
     if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
@@ -248,9 +258,8 @@ def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments) -> None:
         except (OSError, ValueError):
             continue
         if done < config["iterations"] and not differences(config["settings"], as_settings(cfg)):
-            print(
-                f"{path} holds the same search, stopped after {done} of {config['iterations']} iterations. Go on with:"
-            )
+            state = f"stopped after {done} of {config['iterations']} iterations"
+            print(f"{path} holds the same search, {state}. Go on with:")
             print(f"  {resume_command('archive', cfg.robot, path, args, None)}")
 
 
@@ -260,11 +269,18 @@ class Placed(Protocol):
     @property
     def device(self) -> str | None:
         """Warp device name."""
-        ...
 
     @property
     def workers(self) -> int | Literal["auto"] | None:
         """Ray workers."""
+
+    @property
+    def processes(self) -> int | None:
+        """Processes without Ray."""
+
+    @property
+    def worker_limit_s(self) -> float:
+        """When a Ray worker is given up [s]."""
         ...
 
 

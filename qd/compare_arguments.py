@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from qd.arguments import moved_policy, origin_in, refuse_changes, resume_command, resumed
+from qd.arguments import evaluator_of, moved_policy, origin_in, refuse_changes, resume_command, resumed
 from qd.run_directory import numbered
 from qd.settings import SearchCfg, Settings, as_settings, changed, from_settings, measured_now, policy_spec, preset
-from qd.workers import EvaluatorCfg, check_policy, origin_of, resolve_device
+from qd.workers import EvaluatorCfg, origin_of, resolve_device
 from sim.files import is_leftover, prepare_output, read_json, to_json, write_atomically
 from sim.intervals import MAX_T_VALUES
 
@@ -133,7 +133,7 @@ def comparison_of(args: Arguments) -> Comparison:
         cfg, methods, seeds = _begun(robot, device, args)
         origin = origin_of(device, cfg.seed, args.workers)
     policy = moved or policy_spec(cfg, robot)
-    check_policy(policy, cfg.robot, device)
+    evaluator = evaluator_of(cfg, policy, device, args, runs_on_gpu=len(methods) * seeds)
     if args.out is not None:
         prepare_output(args.out)
     return Comparison(
@@ -141,7 +141,7 @@ def comparison_of(args: Arguments) -> Comparison:
         methods=methods,
         seeds=seeds,
         path=path,
-        evaluator=_evaluator(cfg, policy, device, len(methods) * seeds, args),
+        evaluator=evaluator,
         out=args.out or path / "compare.json",
         origin=origin,
         resume_command=resume_command("compare", cfg.robot, path, args, moved),
@@ -176,20 +176,6 @@ def _checked(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> _Asked:
     if cfg.reevaluate_every < 1:
         raise ValueError(f"reevaluate_every must be at least 1, got {cfg.reevaluate_every}")
     return cfg, methods, seeds
-
-
-def _evaluator(cfg: SearchCfg, policy: str, device: str, runs: int, args: Arguments) -> EvaluatorCfg:
-    return EvaluatorCfg(
-        robot=cfg.robot,
-        policy=policy,
-        # A GPU takes all runs at once; a CPU is full with one's.
-        num_terrains=cfg.scheduler.num_terrains * (runs if device.startswith("cuda") else 1),
-        num_replicas=cfg.replicas,
-        device=device,
-        num_processes=args.processes,
-        workers=args.workers,
-        worker_limit_s=args.worker_limit_s,
-    )
 
 
 def _as_settings(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> Settings:

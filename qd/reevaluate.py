@@ -5,18 +5,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qd.archive import Archive
-from qd.arguments import origin_in
+from qd.arguments import evaluator_of, origin_in
 from qd.cli import Interrupted, run_command
-from qd.fresh import Open, corrected, numbers_of, reevaluate
+from qd.fresh import Open, corrected
 from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed
 from qd.search import write_results
 from qd.settings import SHIPPED, SearchCfg, as_settings, file_hash, policy_spec
-from qd.workers import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
+from qd.workers import open_evaluator, origin_of, resolve_device
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
-
-__all__ = ["ReevaluateCfg", "numbers_of", "reevaluate", "reevaluate_run"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +66,7 @@ def reevaluate_run(args: ReevaluateCfg, *, open_evaluator: Open = open_evaluator
         raise ValueError(f"seed must not be negative, got {seed}")
     device = resolve_device(args.device, args.workers)
     policy = args.policy or _own_policy(args.run, cfg, get_robot(cfg.robot))
-    evaluator = _evaluator(args, cfg, policy, device)
+    evaluator = evaluator_of(cfg, policy, device, args)
     with claimed(args.run):
         loaded = run.load(as_settings(cfg))
         if loaded is None:
@@ -96,20 +94,6 @@ def _own_policy(path: Path, cfg: SearchCfg, robot: "RobotCfg") -> str:
             f"{cfg.policy_sha256}, got {digest}): put it back, or say with --policy which one to evaluate with"
         )
     return policy
-
-
-def _evaluator(args: ReevaluateCfg, cfg: SearchCfg, policy: str, device: str) -> EvaluatorCfg:
-    check_policy(policy, cfg.robot, device)
-    return EvaluatorCfg(
-        robot=cfg.robot,
-        policy=policy,
-        num_terrains=cfg.scheduler.num_terrains,
-        num_replicas=cfg.replicas,
-        device=device,
-        num_processes=args.processes,
-        workers=args.workers,
-        worker_limit_s=args.worker_limit_s,
-    )
 
 
 def _given_policy(args: ReevaluateCfg) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def search_terrains(
     Args:
         cfg: The search.
         run: Where it is saved.
-        search: State of CMA-MAE, told so far.
+        search: Its state, told so far.
         metrics: Rows so far; one more an iteration.
         evaluate: Crosses terrains.
         bar: Shows progress.
