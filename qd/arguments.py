@@ -54,7 +54,7 @@ class Arguments:
     replicas: int | None = None
     """Episodes a terrain."""
     method: str | None = None
-    """Where new terrains come from: cma_mae, cma_me, map_elites, mixed, hard_random or uniform_random."""
+    """Where terrains come from: cma_mae, cma_me, map_elites, directions, hard_random, uniform_random, joined by +."""
     emitters: int | None = None
     """Emitters."""
     batch_size: int | None = None

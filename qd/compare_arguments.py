@@ -1,12 +1,13 @@
 """What a command line of a comparison means: a new one, or an old one that goes on."""
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qd.arguments import evaluator_of, moved_policy, origin_in, refuse_changes, resume_command, resumed
 from qd.run_directory import numbered
+from qd.scheduler_cfg import SchedulerCfg
 from qd.settings import SearchCfg, Settings, as_settings, changed, from_settings, measured_now, policy_spec, preset
 from qd.workers import EvaluatorCfg, origin_of, resolve_device
 from sim.files import is_leftover, prepare_output, read_json, to_json, write_atomically
@@ -23,7 +24,9 @@ METHODS: dict[str, dict[str, Any]] = {
     "cma_mae": {"method": "cma_mae", "es": "cma_es"},
     "cma_mae_sep": {"method": "cma_mae", "es": "sep_cma_es"},
     "cma_mae_narrow": {"method": "cma_mae", "es": "cma_es", "sigma0": 0.5},
-    "mixed": {"method": "mixed", "es": "cma_es"},
+    "mixed": {"method": "cma_mae+map_elites", "es": "cma_es"},
+    "directions": {"method": "directions", "es": "cma_es"},
+    "trio": {"method": "cma_mae+map_elites+directions", "es": "cma_es"},
 }
 """What is compared: changes of the search's settings."""
 
@@ -45,7 +48,8 @@ class Arguments:
     """Size of an iteration: paper (a GPU's work) or small; by default what the device can do."""
     methods: tuple[str, ...] | None = None
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
-    size .5), mixed; all."""
+    size .5), mixed (cma_mae+map_elites), directions, trio (cma_mae+map_elites+directions); all. Settings of the search
+    after a colon make another one of it: cma_mae:restart-rule=20,learning-rate=0.3."""
     seeds: int | None = None
     """Runs of each method, with seeds from --seed on; 3."""
     seed: int | None = None
@@ -95,8 +99,8 @@ class Comparison:
     """How to go on with it."""
 
     def cfg_of(self, method: str, seed: int) -> SearchCfg:
-        """Settings of one run, which looks at no elites on its own."""
-        return changed(replace(self.cfg, seed=seed, reevaluate_every=0), METHODS[method])
+        """Settings of one run."""
+        return changed(replace(self.cfg, seed=seed), _changes(method))
 
     @property
     def has_config(self) -> bool:
@@ -168,14 +172,33 @@ def _resumed(path: Path, there: _Asked, robot: "RobotCfg", args: Arguments, move
 
 
 def _checked(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> _Asked:
-    unknown = [name for name in methods if name not in METHODS]
+    unknown = [name for name in methods if name.split(":")[0] not in METHODS]
     if unknown or not methods or len(set(methods)) < len(methods):
         raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(methods)}")
+    for name in methods:
+        changed(cfg, _changes(name))
     if not 1 <= seeds <= MAX_T_VALUES:
         raise ValueError(f"seeds must be 1 to {MAX_T_VALUES}, got {seeds}")
     if cfg.reevaluate_every < 1:
         raise ValueError(f"reevaluate_every must be at least 1, got {cfg.reevaluate_every}")
     return cfg, methods, seeds
+
+
+def _changes(method: str) -> dict[str, Any]:
+    """Changes of the search's settings that a method is, those behind its colon included."""
+    name, *given = method.split(":")
+    found = dict(METHODS[name])
+    kinds = {field.name: type(field.default) for field in fields(SchedulerCfg)}
+    for item in given[0].split(",") if given else ():
+        key, _, value = item.partition("=")
+        key = key.replace("-", "_")
+        if key not in kinds:
+            raise ValueError(f"methods: no setting named {key} in {method}: expected some of {', '.join(kinds)}")
+        try:
+            found[key] = kinds[key](value)
+        except ValueError:
+            raise ValueError(f"methods: {key} must be {kinds[key].__name__}, got '{value}' in {method}") from None
+    return found
 
 
 def _as_settings(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> Settings:

@@ -34,8 +34,11 @@ LABELS = {
     "cma_mae_sep": ("CMA-MAE, sep-CMA", "#cc79a7", "--"),
     "cma_mae_narrow": ("CMA-MAE, first step .5", "#e69f00", ":"),
     "mixed": ("CMA-MAE and iso+line", "#d55e00", "-"),
+    "directions": ("directions", "#000000", "-."),
+    "trio": ("CMA-MAE, iso+line, directions", "#d55e00", "--"),
 }
 """Name, colour and line of each method."""
+_OTHER_LOOKS = [(color, style) for style in ("-", "--", ":") for color in ("#0072b2", "#e69f00", "#cc79a7", "#009e73")]
 
 
 def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[str, Any]:
@@ -100,8 +103,9 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     )
     lines: dict[str, Any] = {}
     for axes, (key, label, factor, along) in zip(figure.subplots(1, 3), panels, strict=True):
+        others = iter(_OTHER_LOOKS * len(report["methods"]))
         for name, method in report["methods"].items():
-            title, color, style = LABELS[name]
+            title, color, style = LABELS.get(name) or (name.replace(":", ": "), *next(others))
             points = [point for point in zip(report[along], method[key], strict=True) if point[1]["mean"] is not None]
             x = [terrains for terrains, _ in points]
             mean = [factor * point["mean"] for _, point in points]

@@ -5,6 +5,7 @@ middle of its cell. Evolution strategies search unbounded; archives hold the unc
 clipped genes as data.
 """
 
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,11 @@ from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd import space
+from qd.directions import DirectionEmitter
 from qd.fitness import FITNESS_FLOOR, Evaluation
-from qd.settings import SchedulerCfg
+from qd.scheduler_cfg import SchedulerCfg
 from sim.terrain import hard_random_genes
 
-_LEARNED = ("cma_mae", "mixed")  # methods with an archive whose thresholds lag behind
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
 
 
@@ -25,13 +26,14 @@ class RandomEmitter:
     """Asks for terrains drawn anew each time, whatever it is told.
 
     Args:
+        archive: The elites, of which it learns nothing.
         method: ``uniform_random`` or ``hard_random``.
         batch_size: Terrains asked for at once.
         stream: Seed.
     """
 
-    def __init__(self, method: str, batch_size: int, stream: np.random.SeedSequence) -> None:
-        self.method, self.batch_size = method, batch_size
+    def __init__(self, archive: GridArchive, method: str, batch_size: int, stream: np.random.SeedSequence) -> None:
+        self.archive, self.method, self.batch_size = archive, method, batch_size
         self._rng = np.random.default_rng(stream)
 
     def ask(self) -> NDArray[np.float32]:
@@ -43,14 +45,15 @@ class RandomEmitter:
         """Learns nothing."""
 
 
-Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter
+Emitter = EvolutionStrategyEmitter | IsoLineEmitter | DirectionEmitter | RandomEmitter
 
 
 class Scheduler:
     """The state of a search: ask for genes, tell what became of them.
 
-    ``result`` keeps the best terrain ever found in each cell and is what a search is run for. ``archive`` is what the
-    emitters are judged by: CMA-MAE's own, with thresholds that lag behind; for all other methods it is ``result``.
+    ``result`` keeps the best terrain ever found in each cell and is what a search is run for. ``archive`` is what
+    CMA-MAE's emitters are judged by: their own, with thresholds that lag behind. All others go by ``result``, and where
+    there are none of CMA-MAE's, ``archive`` is ``result``.
 
     Args:
         cfg: Settings.
@@ -65,15 +68,26 @@ class Scheduler:
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
         self.result = _make_archive(num_cells, num_ratios, streams[1], {})
-        learns = cfg.method in _LEARNED
+        learns = "cma_mae" in cfg.methods
         self.archive = _make_archive(num_cells, num_ratios, streams[0], learning) if learns else self.result
-        self.emitters: list[Emitter] = [self._emitter(cfg, k, stream) for k, stream in enumerate(streams[2:])]
+        in_turn = zip(cycle(cfg.methods), streams[2:], strict=False)
+        self.emitters: list[Emitter] = [self._emitter(cfg, name, num_ratios, stream) for name, stream in in_turn]
         self._asked: NDArray[np.float32] | None = None
 
-    def _emitter(self, cfg: SchedulerCfg, number: int, stream: Any) -> Emitter:
-        if cfg.method.endswith("random"):
-            return RandomEmitter(cfg.method, cfg.batch_size, stream)
-        if cfg.method == "map_elites" or (cfg.method == "mixed" and number % 2):
+    def _emitter(self, cfg: SchedulerCfg, method: str, num_ratios: int, stream: Any) -> Emitter:
+        if method.endswith("random"):
+            return RandomEmitter(self.result, method, cfg.batch_size, stream)
+        if method == "directions":
+            return DirectionEmitter(
+                self.result,
+                num_ratios=num_ratios,
+                es=cfg.es,
+                sigma0=cfg.direction_sigma,
+                restart_every=cfg.direction_restart,
+                batch_size=cfg.batch_size,
+                stream=stream,
+            )
+        if method == "map_elites":
             first, later = stream.spawn(2)
             return IsoLineEmitter(
                 self.result,
@@ -85,9 +99,9 @@ class Scheduler:
                 seed=later,
             )
         restart_rule: Any = int(cfg.restart_rule) if cfg.restart_rule.isdecimal() else cfg.restart_rule
-        improves = cfg.method == "cma_me"  # ranks and selects by what is new in the archive, and restarts without it
+        improves = method == "cma_me"  # ranks and selects by what is new in the archive, and restarts without it
         return EvolutionStrategyEmitter(
-            self.archive,
+            self.result if improves else self.archive,
             x0=np.zeros(space.NUM_GENES),
             sigma0=cfg.sigma0,
             ranker="2imp" if improves else "imp",
@@ -125,12 +139,14 @@ class Scheduler:
         told = _rows(self._asked, evaluation, iteration)
         self._asked = None
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
-        added = self._add(told, accepted)
+        plain = self._add(told, accepted)
+        learned = plain if self.archive is self.result else self.archive.add(**told)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
         for emitter in self.emitters:
             own = slice(first, first + emitter.batch_size)
+            added = plain if emitter.archive is self.result else learned
             emitter.tell(
                 **{name: rows[own] for name, rows in told.items()},
                 add_info={name: rows[own] for name, rows in added.items()},
@@ -138,12 +154,8 @@ class Scheduler:
             first = own.stop
 
     def _add(self, told: dict[str, NDArray[Any]], accepted: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-        """Fills the archives; status and value of each terrain as pyribs gives them to its emitters."""
+        """Fills ``result``; status and value of each terrain as pyribs gives them to its emitters."""
         kept = {name: rows[accepted] for name, rows in told.items()}
-        if self.archive is not self.result:
-            if accepted.any():
-                self.result.add(**kept)
-            return self.archive.add(**told)
         added = {"status": np.zeros(len(accepted), np.int32), "value": np.full(len(accepted), _INVALID_VALUE)}
         if accepted.any():
             for name, rows in self.result.add(**kept).items():

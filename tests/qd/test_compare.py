@@ -178,6 +178,9 @@ def test_numbers_go_where_they_are_asked_for():
     ("changes", "message"),
     [
         ({"methods": ("cma_mae", "annealing")}, "methods must be some of .* each once, got cma_mae, annealing"),
+        ({"methods": ("cma_mae:colour=3",)}, "no setting named colour in cma_mae:colour=3: expected some of method"),
+        ({"methods": ("cma_mae:sigma0=wide",)}, "sigma0 must be float, got 'wide'"),
+        ({"methods": ("cma_mae:learning-rate=7",)}, "learning_rate must lie in"),
         ({"methods": ("mixed", "mixed")}, "each once, got mixed, mixed"),
         ({"methods": ()}, "methods must be some of"),
         ({"seeds": 0}, "seeds must be 1 to 10, got 0"),

@@ -1,15 +1,18 @@
 import numpy as np
 import pytest
+from ribs.emitters import EvolutionStrategyEmitter
 
 from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.descriptors import Cells
+from qd.directions import DirectionEmitter
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
 from qd.scheduler import Scheduler
-from qd.settings import ES_KINDS, METHODS, SchedulerCfg
+from qd.scheduler_cfg import ES_KINDS, METHODS, SchedulerCfg
 from tests.qd import stand_in
 
 CELLS = Cells(6)
 FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
+JOINED = ("cma_me+cma_mae", "map_elites+directions")
 SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4")
 
 
@@ -86,7 +89,9 @@ def test_cell_of_an_elite_is_the_cell_of_its_ratios():
     assert np.abs(elites["genes"]).max() <= 1.0
 
 
-@pytest.mark.parametrize("changes", [{"es": kind} for kind in ES_KINDS] + [{"method": name} for name in METHODS])
+@pytest.mark.parametrize(
+    "changes", [{"es": kind} for kind in ES_KINDS] + [{"method": name} for name in (*METHODS, *JOINED)]
+)
 def test_a_saved_search_goes_on_bit_for_bit(changes, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut
     cfg = SchedulerCfg(emitters=2, batch_size=6, restart_rule="5", **changes)
@@ -115,7 +120,7 @@ def test_tell_answers_ask():
         search.tell(told([0] * 3, [0.0] * 3), 1)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS, *JOINED])
 def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_valid_terrain(method):
     search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1", method=method))
     for iteration in (1, 2):
@@ -155,6 +160,19 @@ def test_cma_me_is_judged_by_the_archive_it_fills():
     assert [emitter.restarts - old for emitter, old in zip(search.emitters, before, strict=True)] == [1, 1]
 
 
+def test_joined_methods_take_turns_each_judged_by_its_own_archive():
+    search = make_search(SchedulerCfg(emitters=5, batch_size=2, method="cma_me+cma_mae+directions"))
+    assert [type(emitter) for emitter in search.emitters] == [
+        EvolutionStrategyEmitter, EvolutionStrategyEmitter, DirectionEmitter,
+        EvolutionStrategyEmitter, EvolutionStrategyEmitter,
+    ]  # fmt: skip
+    of_result = [emitter.archive is search.result for emitter in search.emitters]
+    assert of_result == [True, False, True, True, False]
+    assert search.archive is not search.result
+    with pytest.raises(ValueError, match="emitters must be at least 1, one a method"):
+        SchedulerCfg(emitters=2, method="cma_me+cma_mae+directions")
+
+
 @pytest.mark.parametrize("state", [{}, {"archive": 1, "result": 2, "emitters": []}])
 def test_a_state_of_something_else_is_refused(state):
     with pytest.raises(ValueError, match="two archives and a list of emitters"):
@@ -164,7 +182,8 @@ def test_a_state_of_something_else_is_refused(state):
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("emitters", 0), ("batch_size", 1), ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
+        ("emitters", 0), ("batch_size", 1), ("method", "cma_me+"), ("method", "cma_me+cma_me"),
+        ("direction_restart", 0), ("direction_sigma", 0.0), ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
         ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")),
         ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
