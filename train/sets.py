@@ -1,0 +1,233 @@
+"""The terrains that controllers are evaluated on, and which elites of an archive are held out of training for that.
+
+A test set is drawn from random numbers used nowhere else: not in training, calibration or search. All controllers meet
+the same terrains with the same episode seeds.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.archive import Archive
+from sim.bank import TerrainBank
+from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
+
+SETS = ("hand_crafted", "hard_random", "generated", "generated_far")
+"""Sets of the tables; the last two need an archive, and the last is a part of the third."""
+FROM_ARCHIVE = ("generated", "generated_far")
+"""Those made of elites."""
+PAPER_TERRAINS = {"anymal": 300, "cassie": 180}
+"""Terrains of each of the paper's test sets."""
+PAPER_TRAINING_ELITES = 750
+"""Elites that the paper trains on."""
+_OTHER_TERRAINS = 300  # of a robot that the paper does not have
+_HELD_OUT_SHARE = 0.2
+_MIN_ELITES = 5  # of which a fifth is one
+
+_TEST_KEY = 20250604  # with the set's number and the seed, the entropy of a test set
+_SPLIT_KEY = 20250605
+_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3}
+_BANK = 50  # height maps that are compared at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class EliteSplit:
+    """Elites to train on and elites held out; no elite is in both."""
+
+    train: NDArray[np.int64]
+    """Rows of the archive to train on, in the order drawn."""
+    test: NDArray[np.int64]
+    """Rows of the archive held out, in the order drawn: the first n are a random choice of n of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainSet:
+    """T terrains with the seeds of their episodes."""
+
+    name: str
+    terrains: NDArray[np.float32]
+    """Genes, shape (T, 64), or heights [m], shape (T, NUM_ROWS, NUM_COLS)."""
+    seeds: NDArray[np.uint32]
+    """Seed of each terrain's episodes, shape (T,)."""
+    numbers: NDArray[np.int64]
+    """Number of each terrain: of an elite its row in the archive, of others their place in the set; shape (T,)."""
+    types: NDArray[np.int64] | None = None
+    """Index into :data:`sim.terrain.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
+    levels: NDArray[np.int64] | None = None
+    """Level of each hand-crafted terrain, likewise."""
+
+    def __len__(self) -> int:
+        """Number of terrains."""
+        return len(self.seeds)
+
+
+def paper_terrains(robot: str) -> int:
+    """Terrains a set of the published tables of a robot; 300 of one that the paper does not have."""
+    return PAPER_TERRAINS.get(robot, _OTHER_TERRAINS)
+
+
+def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
+    """Draw at random which elites are trained on and which are held out.
+
+    The paper's numbers where the archive has so many: 750 to train on, 300 (ANYmal) or 180 (Cassie) held out; else
+    80 % and 20 %. The draw depends on the elites' genes and the seed alone, not on their order in the file: evaluating
+    an archive again, which reorders it, moves no elite from one part to the other.
+
+    Args:
+        archive: The elites.
+        robot: Name of the robot that is trained and evaluated.
+        seed: Of the draw; training and evaluation must name the same one.
+
+    Raises:
+        ValueError: If the archive is of another robot, has fewer than 5 elites, or the seed is negative.
+    """
+    if archive.robot != robot:
+        raise ValueError(
+            f"the archive must be of robot '{robot}', got one of '{archive.robot}': its terrains were found to break "
+            f"another body; give an archive of '{robot}' (make archive ROBOT={robot})"
+        )
+    if len(archive) < _MIN_ELITES:
+        raise ValueError(
+            f"an archive to be split into training and test terrains needs at least {_MIN_ELITES} elites, got "
+            f"{len(archive)}: let its search go on (make archive RESUME=... ITERATIONS=...)"
+        )
+    if seed < 0:
+        raise ValueError(f"the seed of the split must not be negative, got {seed}")
+    num_train, num_test = PAPER_TRAINING_ELITES, paper_terrains(robot)
+    if len(archive) < num_train + num_test:
+        num_test = round(_HELD_OUT_SHARE * len(archive))
+        num_train = len(archive) - num_test
+    by_genes = np.lexsort(archive.genes.T[::-1])
+    digest = hashlib.sha256(np.ascontiguousarray(archive.genes[by_genes]).tobytes()).digest()
+    rng = np.random.default_rng([_SPLIT_KEY, seed, int.from_bytes(digest[:8], "big")])
+    drawn = by_genes[rng.permutation(len(archive))]
+    return EliteSplit(train=drawn[num_test : num_test + num_train], test=drawn[:num_test])
+
+
+def set_rng(name: str, seed: int) -> np.random.Generator:
+    """Random numbers of a test set, shared with no other use of ``seed`` in the project."""
+    return np.random.default_rng([_TEST_KEY, _NUMBERS[name], seed])
+
+
+def plain_set(name: str, count: int, seed: int) -> TerrainSet:
+    """A set that needs no archive: ``hand_crafted``, ``hard_random`` or ``flat``.
+
+    Args:
+        name: Which.
+        count: Number of terrains.
+        seed: Of the draw.
+    """
+    rng = set_rng(name, seed)
+    types = levels = None
+    if name == "hand_crafted":
+        terrains, types, levels = hand_crafted_crossings(count, rng)
+    elif name == "hard_random":
+        terrains = hard_random_genes(count, rng)
+    else:
+        terrains = np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)
+    return TerrainSet(
+        name=name,
+        terrains=terrains,
+        seeds=rng.integers(2**32, size=count, dtype=np.uint32),
+        numbers=np.arange(count),
+        types=types,
+        levels=levels,
+    )
+
+
+def generated_set(archive: Archive, split: EliteSplit, count: int, seed: int) -> TerrainSet:
+    """Held-out elites: the first ``count`` drawn, all of them where there are no more.
+
+    Args:
+        archive: The elites.
+        split: Which are held out.
+        count: Most terrains.
+        seed: Of the episodes.
+    """
+    seeds = set_rng("generated", seed).integers(2**32, size=len(split.test), dtype=np.uint32)
+    rows = split.test[:count]
+    return TerrainSet(name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows)
+
+
+def far_part(generated: TerrainSet, training_genes: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Places in ``generated`` of the third that lies farthest from its nearest training terrain, ascending."""
+    distance = nearest_distance(generated.terrains, training_genes)
+    count = -(-len(generated) // 3)
+    return np.sort(np.argsort(-distance, kind="stable")[:count])
+
+
+def part_of(whole: TerrainSet, places: NDArray[np.int64], name: str) -> TerrainSet:
+    """Some of a set's terrains under a name of their own; their episodes are the same."""
+    return TerrainSet(
+        name=name, terrains=whole.terrains[places], seeds=whole.seeds[places], numbers=whole.numbers[places]
+    )
+
+
+def nearest_distance(genes: NDArray[np.float32], training_genes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Root mean square distance of height maps to the nearest of others.
+
+    Args:
+        genes: Terrains, shape (T, 64).
+        training_genes: Terrains to be far from, shape (N, 64).
+
+    Returns:
+        Distance to the nearest over all nodes [m], shape (T,). Computed on the CPU, so that it is the same everywhere.
+    """
+    maps = _heights(genes)
+    nearest = np.full(len(maps), np.inf)
+    for first in range(0, len(training_genes), _BANK):
+        others = _heights(training_genes[first : first + _BANK])
+        squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
+        nearest = np.minimum(nearest, squares.min(axis=1))
+    return np.sqrt(np.maximum(nearest, 0.0) / maps.shape[1])
+
+
+def _heights(genes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Height maps [m] as rows, float64 since their squares are subtracted from each other."""
+    bank = TerrainBank(len(genes), device="cpu")
+    bank.set_genes(genes)
+    return bank.heights.numpy().reshape(len(genes), -1).astype(np.float64)
+
+
+def make_sets(
+    names: Sequence[str], count: int, seed: int, *, archive: Archive | None = None, split: EliteSplit | None = None
+) -> dict[str, TerrainSet]:
+    """The sets of the tables by name, in the order of :data:`SETS`.
+
+    Args:
+        names: Some of :data:`SETS`.
+        count: Terrains a set; of generated ones fewer where the archive holds out fewer.
+        seed: Draws the test sets.
+        archive: Elites for ``generated`` and ``generated_far``.
+        split: Which of them are held out.
+
+    Raises:
+        ValueError: If a name is unknown or given twice, or a set is made of elites and there are none.
+    """
+    check_names(names, has_archive=archive is not None and split is not None)
+    sets = {name: plain_set(name, count, seed) for name in names if name not in FROM_ARCHIVE}
+    if archive is not None and split is not None:
+        sets["generated"] = whole = generated_set(archive, split, count, seed)
+        if "generated_far" in names:
+            far = far_part(whole, archive.genes[split.train])
+            sets["generated_far"] = part_of(whole, far, "generated_far")
+    return {name: sets[name] for name in SETS if name in names}
+
+
+def check_names(names: Sequence[str], *, has_archive: bool) -> None:
+    """Refuse names that are no sets, or sets that cannot be had.
+
+    Raises:
+        ValueError: If a name is unknown or given twice, or a set is made of elites and there is no archive.
+    """
+    unknown = [name for name in names if name not in SETS]
+    if unknown or not names:
+        raise ValueError(f"sets must be some of {', '.join(SETS)}, got {', '.join(unknown) or 'none'}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"each set may be named once, got {', '.join(names)}")
+    missing = [name for name in names if name in FROM_ARCHIVE and not has_archive]
+    if missing:
+        raise ValueError(f"set {', '.join(missing)} is made of elites: give the run that found them (--archive RUN)")
