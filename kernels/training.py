@@ -90,6 +90,8 @@ class Episodes:
     """How the episode ended in the step just made (:class:`End`)."""
     valid: wp.array[int]
     """0 where the step ended in a state not to be trusted."""
+    fallen: wp.array[int]
+    """1 where the step ended the episode by a base collision or by tilt."""
     steps: wp.array[int]
     """Control steps of the episode."""
     level: wp.array[int]
@@ -137,7 +139,7 @@ def make_episodes(
     episodes.column = wp.array(columns, dtype=int, device=device)
     episodes.level = wp.array(levels, dtype=int, device=device)
     episodes.start = wp.zeros(num_envs, dtype=wp.vec2, device=device)
-    for name in ("end", "valid", "steps"):
+    for name in ("end", "valid", "fallen", "steps"):
         setattr(episodes, name, wp.zeros(num_envs, dtype=int, device=device))
     for name in ("heading", "reward", "total_reward"):
         setattr(episodes, name, wp.zeros(num_envs, dtype=float, device=device))
@@ -181,6 +183,7 @@ def _judge_steps_kernel(
     episodes_out.steps[env] = steps
     episodes_out.end[env] = end
     episodes_out.valid[env] = wp.where(end == _INVALID, 0, 1)
+    episodes_out.fallen[env] = wp.where(end == _TILT, 1, wp.where(end == _BASE_COLLISION, 1, 0))
 
 
 def judge_steps(
@@ -194,7 +197,7 @@ def judge_steps(
         geom_force: Contact forces of the last physics step, world frame [N], shape (num_envs, num_geoms).
         geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
         rules: Limits.
-        episodes_out: Writes ``steps``, ``end`` and ``valid``.
+        episodes_out: Writes ``steps``, ``end``, ``valid`` and ``fallen``.
     """
     wp.launch(
         _judge_steps_kernel,

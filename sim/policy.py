@@ -140,6 +140,11 @@ def _import_callable(spec: str, module: str, name: str, *, robot: RobotCfg, devi
 
 
 def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
+    if path == robot.policy_file and not path.exists():
+        raise ValueError(
+            f"robot '{robot.name}' has no shipped controller yet, expected at {path}: train one with "
+            f"`make train ROBOT={robot.name}` and give its policy.pt as the policy"
+        )
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
     try:

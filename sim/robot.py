@@ -1,7 +1,7 @@
 """Robots: their settings, and their MJCF file as a Newton model."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import newton
@@ -10,6 +10,7 @@ import numpy as np
 from kernels.observation import NUM_BASE_COLUMNS
 from kernels.penalties import BASE, FOOT, LIMB, PENALTIES
 from sim.files import read_json
+from sim.training import RewardCfg, TrainingCfg
 
 _ROBOTS_DIR = Path(__file__).parent / "robots"
 
@@ -56,6 +57,8 @@ class RobotCfg:
     """Contacts an environment on average; the buffer is shared by all."""
     njmax: int = 100
     """Constraint rows an environment."""
+    training: TrainingCfg = field(default_factory=TrainingCfg)
+    """What the training of its controller takes of the robot."""
 
     @property
     def num_joints(self) -> int:
@@ -127,6 +130,7 @@ def _steps(low: int, high: int) -> tuple[float, ...]:
 
 
 _LEGS = ("LF", "RF", "LH", "RH")
+_SIDES = ("left", "right")
 
 ROBOTS = {
     "anymal": RobotCfg(
@@ -144,6 +148,45 @@ ROBOTS = {
         contact_force_limit=500.0,
         penalties=PENALTIES,
         collision_bit=False,
+    ),
+    "cassie": RobotCfg(
+        name="cassie",
+        model_file=_ROBOTS_DIR / "cassie.xml",
+        base_geoms=("pelvis",),
+        foot_geoms=tuple(f"{side}_toe" for side in _SIDES),
+        limb_geoms=(),
+        joint_names=tuple(
+            f"{joint}_{side}"
+            for side in _SIDES
+            for joint in ("hip_abduction", "hip_rotation", "hip_flexion", "thigh_joint", "ankle_joint", "toe_joint")
+        ),
+        default_joint_pos=(0.1, 0.0, 1.0, -1.8, 1.57, -1.57, -0.1, 0.0, 1.0, -1.8, 1.57, -1.57),
+        default_base_height=1.0,
+        footprint=(0.4, 0.3),
+        scan_x=_steps(-5, 5),
+        scan_y=_steps(-5, 5),
+        contact_force_limit=300.0,
+        penalties=tuple(name for name in PENALTIES if name != "collision"),
+        collision_bit=True,
+        nconmax=7,  # the most there can be: a sphere, and 3 on each toe
+        njmax=48,  # 3 rows a contact and 12 joint limits, in the solver's tiles of 16
+        training=TrainingCfg(  # legged_gym's for Cassie, and the paper's two penalties
+            rewards=RewardCfg(
+                tracking_ang_vel=1.0,
+                lin_vel_z=-0.5,
+                ang_vel_xy=0.0,
+                torques=-5e-6,
+                dof_acc=-2e-7,
+                feet_air_time=5.0,
+                dof_pos_limits=-1.0,
+                no_fly=0.25,
+                termination=-200.0,
+            ),
+            only_positive=False,
+            soft_joint_limit=0.95,
+            steady_joints=tuple(f"hip_{joint}_{side}" for side in _SIDES for joint in ("abduction", "rotation")),
+            added_base_mass=(0.0, 0.0),
+        ),
     ),
 }
 

@@ -3,12 +3,14 @@
 Ctrl-C or ``--max-seconds`` saves and stops; ``--resume RUN_DIR`` goes on where it stopped.
 """
 
+import argparse
 import io
 import os
 import signal
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
@@ -34,6 +36,7 @@ from train.vec_env import CommandVecEnv
 CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.pt"
 CONFIG = "config.json"
+_ROBOT = "anymal"
 _RESERVE_S = 10.0  # kept back of --max-seconds for the last save
 
 
@@ -44,8 +47,8 @@ class BaseCfg:
     On several GPUs: torchrun --nproc-per-node 4 -m train.base ..., each of which trains --num-envs robots.
     """
 
-    robot: str = "anymal"
-    """Which robot."""
+    robot: str = _ROBOT
+    """Which robot; its own settings are the defaults of task."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
@@ -66,7 +69,8 @@ class BaseCfg:
     """A checkpoint every so often [s]."""
     rows: int = 100
     """Progress rows over the whole training."""
-    task: TaskCfg = field(default_factory=TaskCfg)
+    task: TaskCfg
+    """The task: :meth:`TaskCfg.of` the robot, with what is to be otherwise."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
 
 
@@ -253,10 +257,22 @@ def _iterate(
             last_save = time.monotonic()
 
 
+def read_arguments(arguments: Sequence[str]) -> BaseCfg:
+    """The settings that a command line asks for, those of the named robot where it says nothing.
+
+    Raises:
+        ValueError: If there is no such robot.
+    """
+    named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    named.add_argument("--robot", default=_ROBOT)
+    name = named.parse_known_args(arguments)[0].robot
+    default = BaseCfg(robot=name, task=TaskCfg.of(get_robot(name)))
+    return tyro.cli(BaseCfg, args=arguments, default=default, description=__doc__)
+
+
 def main() -> int:
     """Command line; returns the exit status."""
-    cfg = tyro.cli(BaseCfg, description=__doc__)
-    return exit_code_of(lambda: train(cfg))
+    return exit_code_of(lambda: train(read_arguments(sys.argv[1:])))
 
 
 if __name__ == "__main__":

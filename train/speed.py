@@ -46,7 +46,7 @@ def time_training(robot: RobotCfg, num_envs: int, *, iterations: int, device: st
     The shipped controller, where there is one, walks the robots, so that contacts are those of the better part of a
     training; its weights go on being trained.
     """
-    task = CommandTask(robot, TaskCfg(), num_envs=num_envs, device=device, seed=seed)
+    task = CommandTask(robot, TaskCfg.of(robot), num_envs=num_envs, device=device, seed=seed)
     learner = Learner(CommandVecEnv(task), PpoCfg(init_noise_std=0.5), seed=seed)
     if robot.policy_file.exists():
         shipped = torch.load(robot.policy_file, map_location="cpu", weights_only=True)["actor_state_dict"]

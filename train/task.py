@@ -11,9 +11,10 @@ import torch
 
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.restart import command_episodes, promote_episodes, remember_steps, restart_episodes
-from kernels.rewards import REWARDS, Motion, RewardWeights, make_feet, reward_steps
+from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
 from kernels.training import STATISTICS, End, judge_steps, make_episodes, record_steps
 from sim.bank import TerrainBank
+from sim.motion import make_motion
 from sim.policy import prepare_torch
 from sim.robot import RobotCfg
 from sim.simulation import Simulation
@@ -90,22 +91,17 @@ class CommandTask:
         sim, robot, cfg = self.sim, self.robot, self.cfg
         self._noise = fill(Noise(), **asdict(cfg.noise))
         self._weights = fill(RewardWeights(), **asdict(cfg.rewards))
-        self._feet = make_feet(self.num_envs, len(robot.geom_names), self.device)
+        geoms, episodes = len(robot.geom_names), self._episodes
+        self._feet = make_feet(self.num_envs, geoms, self.device, min_air_time_s=cfg.min_air_time_s)
         self._ranges = make_start_ranges(cfg, robot)
-        self._motion = fill(
-            Motion(),
-            joint_q=sim.joint_q,
-            joint_qd=sim.joint_qd,
-            joint_torque=sim.joint_torque,
-            geom_force=sim.geom_force,
-            geom_role=sim.geom_role,
-            command=self._episodes.command,
-            action=self._episodes.last_action,
-            previous_action=self._episodes.previous_action,
-            previous_joint_vel=self._episodes.previous_joint_vel,
-            base_com=sim.sensors.base_com,
-            force_limit=robot.contact_force_limit,
-            dt=robot.control_dt,
+        self._motion = make_motion(
+            sim,
+            cfg,
+            command=episodes.command,
+            action=episodes.last_action,
+            previous_action=episodes.previous_action,
+            previous_joint_vel=episodes.previous_joint_vel,
+            fallen=episodes.fallen,
         )
 
     def _make_views(self) -> None:

@@ -1,6 +1,6 @@
 """Settings of the command-following task, and what the kernels take of them."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -9,28 +9,11 @@ from kernels.start import StartRanges
 from kernels.training import Rules
 from sim.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS
+from sim.training import TrainingCfg
 from train.curriculum import CurriculumCfg
 
 _TILE_SIDE = 8.0
 _TILE_CENTRE = (8.0, 4.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RewardCfg:
-    """Weight of each reward term per second: legged_gym's for ANYmal, and the paper's two."""
-
-    tracking_lin_vel: float = 1.0
-    tracking_ang_vel: float = 0.5
-    lin_vel_z: float = -2.0
-    ang_vel_xy: float = -0.05
-    torques: float = -1e-5
-    dof_acc: float = -2.5e-7
-    feet_air_time: float = 1.0
-    collision: float = -1.0
-    action_rate: float = -0.01
-    stumble: float = -0.1
-    feet_contact_forces: float = -2e-4
-    """Contacts are stiff and their peaks high: five times this drowns the tracking for half of a training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,14 +29,11 @@ class NoiseCfg:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskCfg:
-    """The task; the defaults are legged_gym's but for the start's yaw, which it leaves at 0."""
+class TaskCfg(TrainingCfg):
+    """The task; the defaults are legged_gym's for ANYmal but for the start's yaw, which it leaves at 0."""
 
-    rewards: RewardCfg = field(default_factory=RewardCfg)
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
-    only_positive: bool = True
-    """Clip the reward of a step at 0, so that ending early never pays."""
     episode_s: float = 20.0
     command_interval_s: float = 10.0
     """A new command every so often."""
@@ -69,18 +49,12 @@ class TaskCfg:
     """Largest commanded yaw rate [rad/s]."""
     push_interval_s: float = 15.0
     """A push every so often; 0 for none."""
-    push_speed: float = 1.0
-    """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
     friction: tuple[float, float] = (0.5, 1.25)
     """Range of the robots' friction coefficients."""
-    added_base_mass: tuple[float, float] = (-5.0, 5.0)
-    """Range of the mass added to the bases [kg]."""
     start_position_range: float = 1.0
     """Starts lie within this of the tile's centre along x and y [m]."""
     start_yaw_range: float = np.pi
     """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
-    start_joint_range: float = 0.5
-    """Joints start at the default pose times 1 +- this."""
     start_velocity_range: float = 0.5
     """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
     base_force: float = 1.0
@@ -89,6 +63,17 @@ class TaskCfg:
     """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
     max_speed: float = 100.0
     """Any velocity beyond makes the state invalid [m/s or rad/s]."""
+
+    @classmethod
+    def of(cls, robot: RobotCfg, **changes: Any) -> "TaskCfg":
+        """The task with a robot's own settings.
+
+        Args:
+            robot: Robot settings.
+            changes: Fields to set otherwise.
+        """
+        own = {setting.name: getattr(robot.training, setting.name) for setting in fields(TrainingCfg)}
+        return cls(**{**own, **changes})
 
 
 def fill(struct: Any, **values: Any) -> Any:

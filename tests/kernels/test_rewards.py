@@ -5,13 +5,17 @@ import pytest
 import warp as wp
 
 from kernels.penalties import BASE, FOOT, LIMB
-from kernels.rewards import REWARDS, Feet, Motion, RewardWeights, make_feet, reward_steps
+from kernels.reward_terms import Feet, Motion
+from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
 
 NUM_JOINTS = 3
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
 DT = 0.02
 FORCE_LIMIT = 500.0
 BASE_COM = (0.05, -0.02, 0.1)
+LOWER, UPPER = (-0.5, -1e10, 0.2), (0.5, 1e10, 0.8)
+DEFAULT_POSE = (0.1, -0.2, 0.3)
+STEADY = (1, 0, 1)
 STANDING = (0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -37,6 +41,7 @@ class Step:
         self.feet = make_feet(num_envs, geoms, "cpu")
         self.base_com = BASE_COM
         self.valid = np.ones(num_envs, np.int32)
+        self.fallen = np.zeros(num_envs, np.int32)
 
     def reward(self, *, only_positive: bool = False, **weights: float) -> tuple[np.ndarray, np.ndarray]:
         """Reward (num_envs,) and the terms per second (num_envs, len(REWARDS))."""
@@ -47,6 +52,11 @@ class Step:
         motion.base_com = self.base_com
         motion.force_limit = FORCE_LIMIT
         motion.dt = DT
+        motion.joint_lower, motion.joint_upper, motion.default_joint_pos = (
+            wp.array(row, dtype=float) for row in (LOWER, UPPER, DEFAULT_POSE)
+        )
+        motion.joint_is_steady = wp.array(STEADY, dtype=int)
+        motion.fallen = wp.array(self.fallen, dtype=int)
         packed = RewardWeights()
         for name, value in weights.items():
             setattr(packed, name, value)
@@ -77,7 +87,7 @@ def rotate_inverse(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def oracle(step: Step) -> dict[str, np.ndarray]:
-    """Every term but the air time in float64, after the formulas of legged_gym and the paper."""
+    """Every term but the air time in float64, after the formulas of legged_gym, Isaac Lab and the paper."""
     a = {name: value.astype(np.float64) for name, value in step.arrays.items()}
     rotation = a["joint_q"][:, 3:7]
     w = rotate_inverse(rotation, a["joint_qd"][:, 3:6])
@@ -85,6 +95,9 @@ def oracle(step: Step) -> dict[str, np.ndarray]:
     force = np.linalg.norm(a["geom_force"], axis=2)
     limb, foot = np.equal(ROLES, LIMB), np.equal(ROLES, FOOT)
     foot_force = a["geom_force"][:, foot]
+    gravity = rotate_inverse(rotation, np.tile([0.0, 0.0, -1.0], (step.num_envs, 1)))
+    angle = a["joint_q"][:, 7:]
+    commanded = np.linalg.norm(a["command"][:, :2], axis=1) > 0.1
     return {
         "tracking_lin_vel": np.exp(-((v[:, :2] - a["command"][:, :2]) ** 2).sum(1) / 0.25),
         "tracking_ang_vel": np.exp(-((w[:, 2] - a["command"][:, 2]) ** 2) / 0.25),
@@ -96,6 +109,11 @@ def oracle(step: Step) -> dict[str, np.ndarray]:
         "action_rate": ((a["action"] - a["previous_action"]) ** 2).sum(1),
         "stumble": (np.linalg.norm(foot_force[..., :2], axis=2) > 5 * np.abs(foot_force[..., 2])).any(1),
         "feet_contact_forces": np.maximum(0.0, force[:, foot] - FORCE_LIMIT).sum(1),
+        "dof_pos_limits": (np.maximum(LOWER - angle, 0.0) + np.maximum(angle - UPPER, 0.0)).sum(1),
+        "no_fly": ((foot_force[..., 2] > 0.1).sum(1) == 1) & commanded,
+        "orientation": (gravity[:, :2] ** 2).sum(1),
+        "joint_deviation": (np.abs(angle - DEFAULT_POSE) * STEADY).sum(1),
+        "termination": step.fallen,
     }
 
 
@@ -105,7 +123,7 @@ def random_step(num_envs: int) -> Step:
     joint_q[:, 3:7] /= np.linalg.norm(joint_q[:, 3:7], axis=1, keepdims=True)
     force = rng.normal(size=(num_envs, len(ROLES), 3)) * rng.choice([0.01, 1.0, 400.0], (num_envs, len(ROLES), 1))
     force[::3, :, 2] *= 0.05  # every third environment stumbles now and then
-    return Step(
+    step = Step(
         num_envs,
         joint_q=joint_q,
         joint_qd=rng.normal(size=(num_envs, 6 + NUM_JOINTS)),
@@ -116,6 +134,8 @@ def random_step(num_envs: int) -> Step:
         previous_action=rng.normal(size=(num_envs, NUM_JOINTS)),
         previous_joint_vel=rng.normal(size=(num_envs, NUM_JOINTS)),
     )
+    step.fallen = rng.integers(2, size=num_envs).astype(np.int32)
+    return step
 
 
 def test_terms_equal_the_oracle():
@@ -124,7 +144,8 @@ def test_terms_equal_the_oracle():
     _, terms = step.reward(**dict.fromkeys(REWARDS, 1.0))
     for name, values in expected.items():
         np.testing.assert_allclose(terms[:, REWARDS.index(name)], values, rtol=2e-5, atol=1e-6, err_msg=name)
-    assert 0 < expected["stumble"].sum() < 200
+    for name in ("stumble", "no_fly", "termination"):
+        assert 0 < expected[name].sum() < 200, name
     assert set(expected["collision"]) == {0, 1, 2}
     assert set(expected) | {"feet_air_time"} == set(REWARDS)
 
@@ -144,6 +165,16 @@ def test_clipping_at_zero():
     np.testing.assert_array_equal(step.reward(only_positive=True, **weights)[0], np.maximum(plain, 0.0))
 
 
+def test_a_fall_is_paid_for_even_where_rewards_are_clipped():
+    # As in legged_gym: max(0, -1 * 2^2) * .02 - 200 * .02 = -4; without a fall 0.
+    step = Step(2, joint_qd=np.tile(np.float32([0, 0, 2, 0, 0, 0, 0, 0, 0]), (2, 1)))
+    step.fallen = np.array([1, 0], np.int32)
+    reward, terms = step.reward(only_positive=True, lin_vel_z=-1.0, termination=-200.0)
+    np.testing.assert_allclose(reward, [-4.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(terms[:, REWARDS.index("termination")], [-200.0, 0.0], rtol=1e-6)
+    assert step.reward(termination=-200.0)[0].tolist() == pytest.approx([-4.0, 0.0])
+
+
 def test_hand_computed_numbers():
     standing = Step(command=[[0.3, 0.4, 0.5]])
     assert standing.term("tracking_lin_vel") == pytest.approx(np.exp(-1.0))  # (.3^2 + .4^2) / .25 = 1
@@ -160,6 +191,20 @@ def test_hand_computed_numbers():
     turning = Step(joint_qd=[[0, 0, 0, 0, 0, 2.0, 0, 0, 0]])
     # The mass centre stands still and the base turns round it at 2 rad/s: its origin moves at -2 z x (.05, -.02).
     assert turning.term("tracking_lin_vel") == pytest.approx(np.exp(-(0.04**2 + 0.1**2) / 0.25), rel=1e-5)
+
+
+def test_joints_by_hand():
+    q = [*STANDING, -0.7, 5.0, 0.9]
+    step = Step(joint_q=[q])
+    assert step.term("dof_pos_limits") == pytest.approx(0.3)  # .2 below the first's range, .1 above the third's
+    assert step.term("joint_deviation") == pytest.approx(1.4)  # |-.7 - .1| + |.9 - .3|; the second is not steady
+    assert Step(joint_q=[[*STANDING, -0.5, 0.0, 0.8]]).term("dof_pos_limits") == 0.0
+
+
+def test_tilt_by_hand():
+    rolled = [*STANDING[:3], np.sin(np.pi / 12), 0.0, 0.0, np.cos(np.pi / 12), 0, 0, 0]
+    assert Step(joint_q=[rolled]).term("orientation") == pytest.approx(0.25)  # sin(30 degrees)^2
+    assert Step().term("orientation") == 0.0
 
 
 def test_velocity_is_that_of_the_base_frame():
@@ -186,9 +231,26 @@ def test_contacts_count_by_role():
     assert Step(geom_force=forces(g1=(51, 0, 10))).term("stumble") == 0.0
 
 
-def air_times(pattern: list[bool], command: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> list[float]:
+@pytest.mark.parametrize(
+    ("up", "command", "expected"),
+    [
+        ((200, 0), (1, 0, 0), 1.0),
+        ((0, 0.2), (0, -0.2, 0), 1.0),
+        ((200, 0.05), (1, 0, 0), 1.0),  # 0.05 N is no contact
+        ((200, 300), (1, 0, 0), 0.0),
+        ((0, 0), (1, 0, 0), 0.0),
+        ((200, 0), (0.06, 0.06, 1), 0.0),  # told to stand: both feet may stay where they are
+    ],
+)
+def test_one_foot_alone_on_the_ground(up, command, expected):
+    loaded = forces(g0=(0, 0, 500), g1=(0, 0, 500), g3=(0, 0, up[0]), g4=(0, 0, up[1]))
+    assert Step(geom_force=loaded, command=[command]).term("no_fly") == expected
+
+
+def air_times(pattern: list[bool], command: tuple[float, float, float] = (1.0, 0.0, 0.0), **feet: float) -> list[float]:
     """The air-time term of each step of one foot that touches as told."""
     step = Step(command=[command])
+    step.feet = make_feet(1, len(ROLES), "cpu", **feet)
     found = []
     for touching in pattern:
         step.arrays["geom_force"] = forces(g3=(0, 0, 100.0 if touching else 0.0))
@@ -202,6 +264,12 @@ def test_air_time_counts_from_take_off_to_landing():
     assert found[:-2] == [0.0] * 34
     assert found[-2] == pytest.approx(0.12, abs=1e-5)
     assert found[-1] == 0.0
+
+
+def test_the_air_time_that_pays_is_a_setting():
+    # Landing after 31 * .02 = .62 s as above, of which .3 are asked for.
+    found = air_times([True] * 3 + [False] * 31 + [True], min_air_time_s=0.3)
+    assert found[-1] == pytest.approx(0.32, abs=1e-5)
 
 
 def test_one_missed_contact_is_no_take_off():

@@ -78,6 +78,15 @@ def test_steps_are_counted_and_validity_is_marked():
     assert episodes.valid.numpy().tolist() == [1, 0]
 
 
+def test_a_fall_is_a_collision_of_the_base_or_a_tilt():
+    rows = [UPRIGHT, UPRIGHT, tilted(np.pi), UPRIGHT, (*UPRIGHT[:7], np.nan)]
+    episodes = judge(rows, base_force=[0.0, 2.0, 0.0, 0.0, 2.0], steps=[3, 3, 3, 999, 3])
+    assert [End(end) for end in episodes.end.numpy()] == [
+        End.RUNNING, End.BASE_COLLISION, End.TILT, End.TIME_OUT, End.INVALID,
+    ]  # fmt: skip
+    assert episodes.fallen.numpy().tolist() == [0, 1, 1, 0, 0]
+
+
 def test_statistics_add_up():
     episodes = episodes_of(4)
     episodes.end.assign(np.array([End.RUNNING, End.TIME_OUT, End.TILT, End.INVALID], np.int32))

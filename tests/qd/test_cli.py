@@ -69,7 +69,7 @@ def fails(capsys, *argv: str, run=run_main) -> str:
 
 
 def test_unknown_robot_and_preset(capsys):
-    assert fails(capsys, "--robot", "dog") == "unknown robot 'dog': expected one of anymal"
+    assert fails(capsys, "--robot", "dog") == "unknown robot 'dog': expected one of anymal, cassie"
     assert fails(capsys, "--preset", "huge", *TINY) == "unknown preset 'huge': expected one of paper, small"
     assert not Path("runs").exists()
 

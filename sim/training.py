@@ -1,0 +1,52 @@
+"""What the training of a controller takes of its robot: the rewards, and how its starts and its body are varied."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardCfg:
+    """Weight of each reward term per second: legged_gym's for ANYmal, and the paper's two."""
+
+    tracking_lin_vel: float = 1.0
+    tracking_ang_vel: float = 0.5
+    lin_vel_z: float = -2.0
+    ang_vel_xy: float = -0.05
+    torques: float = -1e-5
+    dof_acc: float = -2.5e-7
+    feet_air_time: float = 1.0
+    collision: float = -1.0
+    action_rate: float = -0.01
+    stumble: float = -0.1
+    feet_contact_forces: float = -2e-4
+    """Contacts are stiff and their peaks high: five times this drowns the tracking for half of a training."""
+    dof_pos_limits: float = 0.0
+    """On the radians beyond the soft joint limits."""
+    no_fly: float = 0.0
+    """On one foot alone being on the ground."""
+    orientation: float = 0.0
+    """On the tilt of the base; Isaac Lab gives -2.5 to Cassie on flat ground, nothing on rough."""
+    joint_deviation: float = 0.0
+    """On the steady joints' distance from the default pose; Isaac Lab gives -.2 to Cassie's hips."""
+    termination: float = 0.0
+    """On a fall, in the control step that it ends the episode with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingCfg:
+    """The settings of the training task that belong to the robot; the defaults are legged_gym's for ANYmal."""
+
+    rewards: RewardCfg = field(default_factory=RewardCfg)
+    only_positive: bool = True
+    """Clip the reward of a step at 0, so that ending early never pays."""
+    min_air_time_s: float = 0.5
+    """Feet are to be in the air for longer than this in each step [s]."""
+    soft_joint_limit: float = 1.0
+    """Soft joint limits span this share of the range between the hard ones, about its middle."""
+    steady_joints: tuple[str, ...] = ()
+    """Joints that are to keep near their default angle."""
+    added_base_mass: tuple[float, float] = (-5.0, 5.0)
+    """Range of the mass added to the bases [kg]."""
+    push_speed: float = 1.0
+    """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
+    start_joint_range: float = 0.5
+    """Joints start at the default pose times 1 +- this."""
