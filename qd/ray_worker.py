@@ -1,6 +1,5 @@
 """What lives in a Ray actor: one simulation on one device, which crosses shards of terrains."""
 
-import hashlib
 import os
 import socket
 import tempfile
@@ -15,12 +14,11 @@ import ray
 from numpy.typing import NDArray
 
 from qd.worker_process import Crosser
-from sim.provenance import versions
+from sim.provenance import code_fingerprint
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
-_ROOT = Path(__file__).resolve().parents[1]
 _ROOMS = ("kernels", "sim", "qd")
 _WATCH = "watch"
 
@@ -50,13 +48,8 @@ class Controller:
 
 
 def build_of_code() -> str:
-    """A fingerprint of sources, robot files and package versions: two that agree compute the same."""
-    digest = hashlib.sha256(repr(sorted(versions().items())).encode())
-    for room in _ROOMS:
-        for path in sorted((_ROOT / room).rglob("*")):
-            if path.suffix in (".py", ".xml"):
-                digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
+    """A fingerprint of what a worker runs."""
+    return code_fingerprint(_ROOMS)
 
 
 _ray: Any = ray  # its annotations leave out what it documents

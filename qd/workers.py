@@ -60,6 +60,8 @@ class EvaluatorCfg:
     """A Ray actor that gets no further for so long [s] is given up."""
     penalties_from_s: float = 0.0
     """Penalties are summed from this time of an episode on [s]."""
+    reward: bool = False
+    """Whether the training task's reward is summed too, for which robots go on after the goal."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.worker_limit_s < 1e6:
@@ -176,7 +178,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
         num_terrains=num_terrains,
         num_replicas=cfg.num_replicas,
         device=cfg.device,
-        cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s),
+        cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
     )
 
 

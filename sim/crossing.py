@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from kernels.episode import Task
+from kernels.episode import EpisodeState, Task
 from kernels.start import StartRanges
 from sim.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS
@@ -36,6 +36,9 @@ class CrossingCfg:
     """Any velocity beyond makes the episode invalid [m/s or rad/s]."""
     poll_every_s: float = 1.0
     """How often the host asks whether any episode still runs, in simulated time."""
+    reward: bool = False
+    """Sum the robot's training reward too. For its sake alone a robot that reached the goal is told to stand and goes
+    on until the time is over or it ends otherwise; else robots stop at the goal."""
 
 
 def make_task(cfg: CrossingCfg, robot: RobotCfg) -> Task:
@@ -67,3 +70,13 @@ def make_start_ranges(cfg: CrossingCfg, robot: RobotCfg) -> StartRanges:
     ranges.base_height = robot.default_base_height
     ranges.footprint = wp.vec2(*robot.footprint)
     return ranges
+
+
+def make_episode_state(num_envs: int) -> EpisodeState:
+    """Episodes on the current device that have not begun."""
+    episode = EpisodeState()
+    for field in ("outcome", "steps", "counted"):
+        setattr(episode, field, wp.zeros(num_envs, dtype=int))
+    episode.final_pose = wp.zeros(num_envs, dtype=wp.transform)
+    episode.num_running = wp.zeros(1, dtype=int)
+    return episode

@@ -1,15 +1,18 @@
 """Where a result comes from: the keys that every results file carries."""
 
+import hashlib
 import os
 import platform
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+_ROOT = Path(__file__).resolve().parents[1]
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "ribs", "rsl-rl-lib", "numpy")
 
 
@@ -33,6 +36,20 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
 def versions() -> dict[str, str | None]:
     """Versions of Python and of the packages that results depend on; None of one that is not installed."""
     return {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
+
+
+def code_fingerprint(rooms: Sequence[str]) -> str:
+    """SHA-256 of the sources and robot files of rooms and of all package versions: two that agree compute the same.
+
+    Args:
+        rooms: Top-level folders.
+    """
+    digest = hashlib.sha256(repr(sorted(versions().items())).encode())
+    for room in rooms:
+        for path in sorted((_ROOT / room).rglob("*")):
+            if path.suffix in (".py", ".xml"):
+                digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _module() -> str:

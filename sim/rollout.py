@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from kernels.episode import EpisodeState, Outcome, command_goal, latch_outcomes, park_ended, start_episodes
+from kernels.episode import Outcome, command_goal, latch_outcomes, park_ended, start_episodes
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
 from sim.bank import TerrainBank
-from sim.crossing import CrossingCfg, make_start_ranges, make_task
+from sim.crossing import CrossingCfg, make_episode_state, make_start_ranges, make_task
 from sim.policy import PolicyRunner, PolicySpec, load_policy, prepare_torch
+from sim.reward import RewardSum
 from sim.robot import RobotCfg
 from sim.simulation import Simulation, SolverCfg
 
@@ -40,6 +41,8 @@ class RolloutResult:
     wall_s: float
     paths: np.ndarray | None = None
     """Base position at every control step [m], NaN after the end; (T, R, steps, 3) float32, or None."""
+    reward: np.ndarray | None = None
+    """Training reward summed to the end of the time, (T, R) float64, NaN where invalid; None unless asked for."""
 
     @property
     def base_collision(self) -> np.ndarray:
@@ -114,11 +117,12 @@ class Rollout:
         self._sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
         self._everyone = wp.ones(num_envs, dtype=int)
         self._seeds = wp.zeros(self.num_terrains, dtype=wp.uint32)
-        self._episode = EpisodeState()
-        for field in ("outcome", "steps", "counted"):
-            setattr(self._episode, field, wp.zeros(num_envs, dtype=int))
-        self._episode.final_pose = wp.zeros(num_envs, dtype=wp.transform)
-        self._episode.num_running = wp.zeros(1, dtype=int)
+        self._episode = self._stepped = make_episode_state(num_envs)
+        self._reward: RewardSum | None = None
+        if self.cfg.reward:
+            task = make_task(self.cfg, robot)
+            self._reward = RewardSum(self.sim, task, command=self._command, action=self._last_action)
+            self._stepped = self._reward.episode  # goes on when a crossing has ended at the goal
 
     def _start(self, seeds: np.ndarray) -> None:
         self._seeds.assign(seeds)
@@ -130,6 +134,8 @@ class Rollout:
         self.sim.clear_solver(self._everyone)
         self._sums.zero_()
         self._last_action.zero_()
+        if self._reward is not None:
+            self._reward.start()
         self.sim.refresh()
         self._observe()
 
@@ -144,7 +150,7 @@ class Rollout:
         sim, robot = self.sim, self.robot
         apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
         park_ended(
-            self._episode.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets,
+            self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets,
             sim.body_q.reshape((sim.num_envs, -1)),
         )  # fmt: skip
         for _ in range(robot.decimation):
@@ -154,10 +160,14 @@ class Rollout:
                 sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, sim.overflow, sim.contact_count,
                 sim.contact_capacity, self._task, self._episode,
             )  # fmt: skip
+            if self._reward is not None:
+                self._reward.latch()
             add_penalties(
                 sim.joint_q, sim.joint_qd, sim.sensors.base_com, self._command, sim.geom_force, sim.geom_role,
                 robot.contact_force_limit, robot.physics_dt, self._episode.counted, self._sums,
             )  # fmt: skip
+        if self._reward is not None:
+            self._reward.add()
         self._observe()
 
     def evaluate(
@@ -212,7 +222,7 @@ class Rollout:
                 paths.append(np.where(running[:, None], self.sim.joint_q.numpy()[:, :3], np.nan))
             self.control_step()
             if step % poll == 0 or step == most:
-                running_count = int(self._episode.num_running.numpy()[0])
+                running_count = int(self._stepped.num_running.numpy()[0])
                 if progress is not None:
                     progress(step, most)
                 if running_count == 0:
@@ -226,6 +236,9 @@ class Rollout:
         columns = [PENALTIES.index(name) for name in self.robot.penalties]
         penalties = self._sums.numpy().astype(np.float64)[:, columns].reshape(*shape, len(columns))
         penalties[outcome == Outcome.INVALID] = np.nan
+        reward = None if self._reward is None else self._reward.total().reshape(shape)
+        if reward is not None:
+            reward[outcome == Outcome.INVALID] = np.nan
         with np.errstate(invalid="ignore"):
             upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)
         return RolloutResult(
@@ -238,6 +251,7 @@ class Rollout:
             physics_steps=control_steps * self.robot.decimation,
             wall_s=time.perf_counter() - began,
             paths=None if paths is None else np.stack(paths, axis=1).reshape(*shape, -1, 3).astype(np.float32),
+            reward=reward,
         )
 
 

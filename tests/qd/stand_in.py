@@ -25,6 +25,7 @@ class Result:
     duration_s: np.ndarray
     physics_steps: int = 4000
     wall_s: float = 0.5
+    reward: np.ndarray | None = None
 
 
 def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES) -> Result:

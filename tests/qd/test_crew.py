@@ -176,5 +176,7 @@ def test_flaws_are_found():
         ({"base_collision": np.ones((3, 4), bool)}, "several outcomes"),
         ({"duration_s": np.zeros((3, 4), np.float32)}, "no time"),
         ({"physics_steps": 0}, "no time"),
+        ({"reward": np.full((3, 4), np.nan)}, "rewards that are not finite"),
+        ({"reward": np.zeros((3, 3))}, "reward of shape (3, 3)"),
     ]:
         assert says in flaw_of(dataclasses.replace(result, **change), 3, 4)

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from sim.files import to_json, write_atomically
-from sim.provenance import provenance
+from sim.provenance import code_fingerprint, provenance
 
 
 def test_provenance_has_its_keys(monkeypatch):
@@ -34,3 +34,18 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     with pytest.raises(OSError, match="absent"):
         write_atomically(tmp_path / "absent" / "a", b"")
     assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):
+    monkeypatch.setattr("sim.provenance._ROOT", tmp_path)
+    for room in ("one", "two"):
+        (tmp_path / room).mkdir()
+        (tmp_path / room / "a.py").write_text("x = 1")
+    before = code_fingerprint(["one"])
+    (tmp_path / "two" / "a.py").write_text("x = 2")
+    (tmp_path / "one" / "notes.txt").write_text("nothing that runs")
+    assert code_fingerprint(["one"]) == before != code_fingerprint(["one", "two"])
+    (tmp_path / "one" / "robot.xml").write_text("<mujoco/>")
+    with_robot = code_fingerprint(["one"])
+    monkeypatch.setattr("sim.provenance.versions", lambda: {"torch": "0"})
+    assert len({before, with_robot, code_fingerprint(["one"])}) == 3

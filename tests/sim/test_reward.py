@@ -1,0 +1,186 @@
+"""The reward of a crossing: what is paid for, until when, and that nothing else changes by asking for it."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from kernels.episode import Outcome
+from sim.crossing import CrossingCfg
+from sim.policy import load_policy
+from sim.rollout import Rollout
+from sim.training import RewardCfg, TrainingCfg
+from tests.sim.policies import stand
+from tests.sim.scenes import positions, put
+
+FLAT = np.zeros((161, 321), np.float32)
+NOTHING = {field.name: 0.0 for field in fields(RewardCfg)}
+DT = 0.02
+
+
+def paid_for(robot, only_positive=False, **weights):
+    """A robot whose training pays for some terms alone."""
+    return replace(robot, training=TrainingCfg(rewards=RewardCfg(**NOTHING | weights), only_positive=only_positive))
+
+
+@pytest.fixture(scope="module")
+def tracker(anymal):
+    """Paid for its velocity alone."""
+    return paid_for(anymal, tracking_lin_vel=1.0)
+
+
+def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
+    """By default robots that begin at rest."""
+    still = {"start_position_range": 0.0, "start_yaw_range": 0.0, "start_joint_range": 0.0, "start_velocity_range": 0.0}
+    settings = still | {"max_duration_s": 0.6, "poll_every_s": 0.1, "reward": True} | cfg
+    return Rollout(
+        robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=CrossingCfg(**settings)
+    )
+
+
+def spike(x=2.0):
+    """A needle of 1 m under (x, 4); a robot put over its tip falls on it."""
+    grid = FLAT.copy()
+    col = round(x / 0.05)
+    grid[79:82, col - 1 : col + 2] = 1.0
+    return grid
+
+
+def test_a_robot_that_stands_is_paid_for_standing(tracker, device):
+    # 120 control steps told to walk at .75 m/s: 120 * .02 s * exp(-.75^2 / .25) = 2.4 * exp(-2.25) = .253; and a little
+    # more, since its legs give way by a centimetre at first, which moves it forward.
+    result = crossing(tracker, device, max_duration_s=2.4).evaluate(FLAT[None], np.array([1]))
+    assert (result.outcome == Outcome.TIME_OUT).all()
+    assert result.reward.shape == (1, 4) and result.reward.dtype == np.float64
+    np.testing.assert_allclose(result.reward, 2.4 * math.exp(-2.25), rtol=0.04)
+
+
+def test_after_the_goal_it_is_told_to_stand_and_paid_on(tracker, device):
+    # At the goal with the first physics step; the first command was to walk, the 29 after it to stand:
+    # .02 s * (exp(-2.25) + 29) = .582.
+    rollout = crossing(tracker, device, start=(14.3, 4.0))
+    result = rollout.evaluate(FLAT[None], np.array([1]))
+    assert result.reached_goal.all()
+    np.testing.assert_allclose(result.duration_s, tracker.physics_dt, atol=1e-6)
+    assert result.physics_steps == 120
+    np.testing.assert_allclose(result.reward, DT * (math.exp(-2.25) + 29), rtol=0.01)
+    assert (positions(rollout.sim)[:, 2] < 1.0).all()  # it stands there, and is not parked
+
+
+@pytest.mark.parametrize("start", [2.0, 14.0])
+def test_after_a_base_collision_nothing_is_paid(tracker, device, start):
+    # The same robots with 0.8 s and with 1.6 s: all have fallen on the spike before, from the start and at the goal.
+    totals = []
+    for duration in (0.8, 1.6):
+        rollout = crossing(tracker, device, start=(start, 4.0), max_duration_s=duration)
+        result = rollout.evaluate(spike(start)[None], np.array([1]))
+        assert (result.base_collision if start == 2.0 else result.reached_goal).all()
+        assert result.physics_steps < 160  # it was noticed that nobody earns any more
+        totals.append(result.reward)
+    np.testing.assert_array_equal(totals[0], totals[1])
+    assert (totals[0] > 0.0).all()
+
+
+def test_the_step_of_a_collision_is_paid_as_in_training(tracker, device):
+    # Told to stand, it is paid close to 1 a second while it falls straight down: its reward counts the steps.
+    result = crossing(tracker, device, max_duration_s=1.0, speed=0.0).evaluate(spike()[None], np.array([1]))
+    assert result.base_collision.all()
+    paid = np.ceil(result.duration_s / DT - 1e-4)
+    np.testing.assert_allclose(result.reward, DT * paid, rtol=0.03)
+
+
+@pytest.mark.parametrize("start", [2.0, 14.0])
+def test_a_base_collision_costs_its_price_once(anymal, device, start):
+    # -200 a second for the one control step: -4; and nothing for the robot beside, which stands until time is up.
+    robot = paid_for(anymal, only_positive=True, termination=-200.0)
+    rollout = crossing(robot, device, num_terrains=2, start=(start, 4.0), max_duration_s=1.6)
+    result = rollout.evaluate(np.stack([spike(start), FLAT]), np.array([1, 1]))
+    assert not result.invalid.any()
+    np.testing.assert_allclose(result.reward, [[-4.0] * 4, [0.0] * 4], atol=1e-5)
+
+
+def test_out_of_the_world_nothing_is_paid(tracker, device):
+    result = crossing(tracker, device, start=(-2.5, 4.0)).evaluate(FLAT[None], np.array([1]))
+    assert (result.outcome == Outcome.OUT).all()
+    np.testing.assert_allclose(result.reward, DT * math.exp(-2.25), rtol=0.05)  # the step it was found out in
+
+
+def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker, device):
+    rollout = crossing(tracker, device, num_terrains=2, replicas=2)
+
+    def break_one(step, most):
+        q = np.array(rollout.sim.joint_q.numpy())
+        if step == 10:
+            q[0, 8] = np.nan  # still on its way
+            q[2, :2] = 14.0, 4.0  # at the goal from now on
+        if step == 20:
+            q[2, 8] = np.nan
+        put(rollout.sim, q)
+
+    result = rollout.evaluate(np.stack([FLAT, FLAT]), np.arange(2), progress=break_one)
+    assert result.outcome[:, 0].tolist() == [Outcome.INVALID, Outcome.GOAL]
+    assert np.isnan(result.reward[0, 0]) and np.isfinite(result.reward.ravel()[1:]).all()
+    # 11 steps told to walk, 9 told to stand, and then no more.
+    assert result.reward[1, 0] == pytest.approx(DT * (11 * math.exp(-2.25) + 9), rel=0.05)
+
+
+def test_rewards_may_be_clipped_at_zero(anymal, device):
+    def rewards(**weights):
+        for only_positive in (False, True):
+            robot = paid_for(anymal, only_positive, **weights)
+            yield crossing(robot, device).evaluate(FLAT[None], np.array([1])).reward
+
+    full, clipped = rewards(tracking_lin_vel=-1.0)
+    assert (full < -0.05).all()
+    np.testing.assert_array_equal(clipped, 0.0)
+    # Each step is clipped, not their sum: before its feet bear its weight, torques cost next to nothing.
+    full, clipped = rewards(tracking_lin_vel=1.0, torques=-1.0)
+    assert (full < -1.0).all() and (clipped > DT * math.exp(-2.25)).all() and (clipped < 0.1).all()
+
+
+def test_asking_for_the_reward_changes_nothing_else(anymal):
+    """Bit for bit on the CPU: one goes past the goal, one meets a spike, one walks, and so without the reward."""
+    walker = load_policy(anymal.policy_file, anymal, "cpu")
+    results = []
+    for reward in (False, True):
+        rollout = crossing(
+            anymal, "cpu", walker, num_terrains=2, replicas=3, start=(13.3, 4.0), start_position_range=0.1,
+            start_velocity_range=0.2, start_joint_range=0.2, max_duration_s=1.2, reward=reward,
+        )  # fmt: skip
+        results.append(rollout.evaluate(np.stack([FLAT, spike(13.3)]), np.array([5, 6])))
+    without, paid = results
+    assert len(np.unique(without.outcome)) >= 2 and without.reached_goal.any()
+    for field in ("penalties", "outcome", "fallen", "duration_s", "final_position"):
+        np.testing.assert_array_equal(getattr(without, field), getattr(paid, field))
+    assert without.reward is None and np.isfinite(paid.reward).all()
+
+
+def test_the_same_crossing_pays_the_same_again(anymal):
+    rollout = crossing(anymal, "cpu", start_velocity_range=0.2)
+    first = rollout.evaluate(FLAT[None], np.array([1])).reward
+    rollout.evaluate(spike()[None], np.array([9]))  # leaves other sums, feet and steps behind
+    np.testing.assert_array_equal(rollout.evaluate(FLAT[None], np.array([1])).reward, first)
+
+
+def test_a_reward_depends_on_nothing_but_its_episode(anymal):
+    grids, seeds = np.stack([FLAT, spike()]), np.array([5, 6])
+    cfg = {"start_velocity_range": 0.2, "start_position_range": 0.1}
+    together = crossing(anymal, "cpu", num_terrains=2, **cfg).evaluate(grids, seeds).reward
+    alone = crossing(anymal, "cpu", **cfg)
+    for t in range(2):
+        np.testing.assert_array_equal(alone.evaluate(grids[t : t + 1], seeds[t : t + 1]).reward[0], together[t])
+    assert len(np.unique(together)) == 8
+
+
+def test_the_policy_is_told_to_stand_after_the_goal(anymal, device):
+    seen = []
+
+    def watch(observation: torch.Tensor) -> torch.Tensor:
+        seen.append(observation[0, 9:12].clone())
+        return stand(observation)
+
+    crossing(anymal, device, watch, start=(14.3, 4.0), max_duration_s=0.1).evaluate(FLAT[None], np.array([1]))
+    commands = torch.stack(seen)[-5:].cpu()  # before these, the policy was tried
+    assert commands[0, :2].norm() > 1.0 and (commands[1:] == 0.0).all()
