@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sim.bank import TerrainBank
-from sim.robot import get_robot
+from sim.robot import ROBOTS, get_robot
 from sim.simulation import Simulation, resolve_device
 from tests.sim.scenes import Stepper
 
@@ -30,13 +30,24 @@ def anymal():
 
 
 @pytest.fixture(scope="session")
-def eight(anymal, device):
-    """Eight ANYmals, each on a grid of its own; a test puts ground and robots where it wants them."""
+def cassie():
+    return get_robot("cassie")
+
+
+@pytest.fixture(scope="session", params=sorted(ROBOTS))
+def robot(request):
+    """Every robot in turn; ``tests.sim.scenes.ONLY_ANYMAL`` marks what is of one alone."""
+    return get_robot(request.param)
+
+
+@pytest.fixture(scope="session")
+def eight(robot, device):
+    """Eight robots, each on a grid of its own; a test puts ground and robots where it wants them."""
     bank = TerrainBank(8, device=device)
-    return Simulation(anymal, bank, np.arange(8))
+    return Simulation(robot, bank, np.arange(8))
 
 
 @pytest.fixture(scope="session")
 def eight_stepper(eight):
-    """Steps the eight ANYmals by four physics steps at a time."""
+    """Steps the eight robots by four physics steps at a time."""
     return Stepper(eight)

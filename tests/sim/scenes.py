@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import warp as wp
 
 from sim.bank import TerrainBank
@@ -13,6 +14,18 @@ from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 NODE_X = np.arange(NUM_COLS) * SPACING
 NODE_Y = np.arange(NUM_ROWS) * SPACING
 PHYSICS_DT = 0.005
+GAINS = {
+    "anymal": ([80] * 12, [2] * 12, [80] * 12),
+    "cassie": (
+        [100, 100, 200, 200, 200, 40] * 2,
+        [3, 3, 6, 6, 6, 1] * 2,
+        [112, 112, 195, 195, 195, 45] * 2,
+    ),
+}
+"""Stiffness [N m/rad] and damping [N m s/rad] (legged_gym's), and limit of effort [N m] (published), joint by joint."""
+ONLY_ANYMAL = pytest.mark.parametrize("robot", ["anymal"], indirect=True)
+"""For tests of a robot that stands by itself, or of its own figures."""
+ONLY_CASSIE = pytest.mark.parametrize("robot", ["cassie"], indirect=True)
 
 
 def slope(angle_x: float = 0.0, angle_y: float = 0.0) -> np.ndarray:

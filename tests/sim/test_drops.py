@@ -114,13 +114,13 @@ def above_ground(sim, robot, rng):
 
 
 @pytest.fixture(scope="module")
-def dropped(anymal, device):
+def dropped(robot, device):
     """The simulation after all have fallen and come to rest, and what they went through."""
     grids, terrain_of_env = mixed_ground(NUM_DROPS, device)
     bank = TerrainBank(len(grids), device=device)
     bank.set_heights(grids)
-    sim = Simulation(anymal, bank, terrain_of_env)
-    put(sim, above_ground(sim, anymal, np.random.default_rng(23)))
+    sim = Simulation(robot, bank, terrain_of_env)
+    put(sim, above_ground(sim, robot, np.random.default_rng(23)))
     extremes = Extremes()
     for name in ("rows", "overflow", "not_finite"):
         setattr(extremes, name, wp.zeros(NUM_DROPS, dtype=int, device=device))
@@ -134,23 +134,23 @@ def dropped(anymal, device):
             wp.launch(_note_extremes_kernel, dim=NUM_DROPS, inputs=inputs, device=device)
 
     graph = sim.capture(launch)
-    for _ in range(round(SETTLE_S / anymal.control_dt)):
+    for _ in range(round(SETTLE_S / robot.control_dt)):
         sim.launch(graph)
     return sim, extremes
 
 
-def test_nothing_overflows(dropped, anymal, capsys):
+def test_nothing_overflows(dropped, robot, capsys):
     sim, extremes = dropped
     rows, contacts = extremes.rows.numpy(), int(extremes.contacts.numpy()[0])
     report = (
-        f"\n{NUM_DROPS} drops: at most {rows.max()} constraint rows a world (njmax {anymal.njmax}), "
-        f"{contacts / NUM_DROPS:.1f} contacts a world on average at most (nconmax {anymal.nconmax})"
+        f"\n{NUM_DROPS} drops of {robot.name}: at most {rows.max()} constraint rows a world (njmax {robot.njmax}), "
+        f"{contacts / NUM_DROPS:.1f} contacts a world on average at most (nconmax {robot.nconmax})"
     )
     with capsys.disabled():
         print(report)
-    capacity = make_task(CrossingCfg(), anymal).overflow_mask
+    capacity = make_task(CrossingCfg(), robot).overflow_mask
     assert not (extremes.overflow.numpy() & capacity).any()
-    assert rows.max() <= anymal.njmax
+    assert rows.max() <= robot.njmax
     assert contacts <= sim.contact_capacity
 
 
@@ -159,15 +159,16 @@ def test_every_state_stays_finite(dropped):
     assert not extremes.not_finite.numpy().any()
 
 
-def test_settled_robots_lie_on_the_surface(dropped):
+def test_fallen_robots_lie_on_the_surface(dropped, robot):
     sim, _ = dropped
     gap, _ = measure_gaps(sim)
     inside = np.abs(positions(sim)[:, :2] - [8, 4]) < [8, 4]
     settled = np.abs(velocities(sim)[:, :6]).max(axis=1) < 0.5
-    assert settled.mean() > 0.9
+    # On the sphere of its pelvis Cassie rolls on where the ground leans, and on its way takes off now and then.
+    assert settled.mean() > {"anymal": 0.9, "cassie": 0.3}[robot.name]
     assert inside.all(axis=1).mean() > 0.9
     # No probe is deeper than 2 cm, and something touches.
-    assert gap[settled].min() > -0.02
+    assert gap.min() > -0.02
     assert gap[settled].max() < 0.02
 
 

@@ -139,3 +139,23 @@ def test_probes_of_the_robot_stand_where_its_geoms_are(anymal):
     ends = probes.position.numpy()[[starts[strip], starts[strip + 1] - 1]]
     np.testing.assert_allclose(np.sort(ends[:, 0]), [-0.375, 0.375], atol=1e-6)
     assert MAX_EDGE_RADIUS < 0.03
+
+
+def test_probes_of_a_biped_are_a_sphere_and_two_strips(cassie):
+    builder = build_robot(cassie)
+    probes = make_probes(builder)
+    starts, shapes = probes.strip_start.numpy(), probes.strip_shape.numpy()
+    labels = [label.rsplit("/", 1)[-1] for label in builder.shape_label]
+    assert [labels[shape] for shape in shapes] == ["pelvis", "left_toe", "right_toe"]
+    np.testing.assert_allclose(probes.strip_radius.numpy(), [0.25, 0.02, 0.02], atol=1e-6)
+    # At r = .02 neighbours may be 2 sqrt(2 * .02 * .005 - .005^2) = .0265 m apart: six on a toe of .125 m.
+    assert np.diff(starts).tolist() == [1, 6, 6]
+    position = probes.position.numpy()
+    np.testing.assert_allclose(position[starts[0]], 0.0, atol=1e-6)
+    for strip in (1, 2):
+        toe = position[starts[strip] : starts[strip + 1]]
+        # From the heel to the tip, in the plane that the toe turns in: (.03, .03) -+ .0625 (sin .85, -cos .85).
+        np.testing.assert_allclose(np.sort(toe[[0, -1], 0]), [-0.01695, 0.07695], atol=1e-5)
+        np.testing.assert_allclose(np.sort(toe[[0, -1], 1]), [-0.01125, 0.07125], atol=1e-5)
+        np.testing.assert_allclose(toe[:, 2], 0.0, atol=1e-6)
+        assert builder.body_label[probes.strip_body.numpy()[strip]].endswith(labels[shapes[strip]])

@@ -10,7 +10,7 @@ from kernels import oracle
 from sim.bank import TerrainBank
 from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, resolve_device
 from sim.terrain import hard_random_genes
-from tests.sim.scenes import Stepper, lying, positions, put, velocities
+from tests.sim.scenes import GAINS, ONLY_ANYMAL, Stepper, lying, positions, put, velocities
 
 
 def standing(robot, num, z=0.6, x=8.0):
@@ -28,11 +28,12 @@ def step(sim, count=1):
         sim.read_geom_forces()
 
 
-def test_torque_is_the_pd_law_and_clamped(eight, anymal):
-    # In the air, at rest: 80 N m/rad * 0.5 rad = 40 N m; at 5 rad the 80 N m limit. Moving at 3 rad/s: 40 - 2 * 3 = 34,
-    # less what the joint gains in the step itself, since damping is implicit.
+def test_torque_is_the_pd_law_and_clamped(eight, robot):
+    # In the air, at rest, on ANYmal: 80 N m/rad * 0.5 rad = 40 N m; at 5 rad the 80 N m limit. Moving at 3 rad/s:
+    # 40 - 2 * 3 = 34.
     flatten(eight)
-    q, qd = standing(anymal, 8, z=3.0), np.zeros((8, 18))
+    kp, kd, limit = map(np.array, GAINS[robot.name])
+    q, qd = standing(robot, 8, z=3.0), np.zeros((8, 18))
     qd[2, 6:] = 3.0
     put(eight, q, qd)
     targets = q.copy()
@@ -42,23 +43,24 @@ def test_torque_is_the_pd_law_and_clamped(eight, anymal):
     eight.targets.assign(np.float32(targets))
     step(eight)
     torque = np.array(eight.joint_torque.numpy())
-    np.testing.assert_allclose(torque[0, 6:], 40, rtol=1e-4)
-    np.testing.assert_allclose(torque[1, 6:], -80, rtol=1e-4)
-    np.testing.assert_allclose(torque[2, 6:], 34, rtol=1e-3)
+    np.testing.assert_allclose(torque[0, 6:], 0.5 * kp, rtol=1e-4)
+    np.testing.assert_allclose(torque[1, 6:], -limit, rtol=1e-4)
+    np.testing.assert_allclose(torque[2, 6:], 0.5 * kp - 3.0 * kd, rtol=1e-3)
     np.testing.assert_allclose(torque[3, 6:], 0, atol=1e-3)
     assert not torque[:, :6].any()  # nothing drives the base
 
 
-def test_free_fall(eight, anymal):
+def test_free_fall(eight, robot):
     # v = g t after one step, for the base's mass centre; the air holds no contact.
     flatten(eight)
-    put(eight, standing(anymal, 8, z=3.0))
+    put(eight, standing(robot, 8, z=3.0))
     step(eight)
     np.testing.assert_allclose(velocities(eight)[:, :3], [[0, 0, -9.81 * 0.005]] * 8, atol=1e-4)
     assert eight.contact_count.numpy()[0] == 0
     assert not eight.geom_force.numpy().any()
 
 
+@ONLY_ANYMAL
 def test_forces_are_on_the_geoms_that_touch(eight, eight_stepper, anymal):
     # A robot lying on its side on flat ground: its legs and base carry it, and the columns say which.
     flatten(eight)
@@ -75,11 +77,11 @@ def test_forces_are_on_the_geoms_that_touch(eight, eight_stepper, anymal):
     assert forces["LF_FOOT"][2] == forces["LH_THIGH"][2] == 0
 
 
-def test_state_rows_are_what_they_say(eight, anymal):
+def test_state_rows_are_what_they_say(eight, robot):
     # joint_qd's first three are the velocity of the base's mass centre: turning about the base's origin moves it.
     flatten(eight)
     com = np.array(eight.sensors.base_com)
-    q, qd = standing(anymal, 8, z=3.0), np.zeros((8, 18))
+    q, qd = standing(robot, 8, z=3.0), np.zeros((8, 18))
     qd[:, 3:6] = [0, 0, 1.0]
     qd[:, :3] = np.cross([0, 0, 1.0], com)
     put(eight, q, qd)
@@ -97,9 +99,9 @@ def run_rough(sim, q, steps):
 
 
 @pytest.fixture
-def rough_start(eight, anymal):
+def rough_start(eight, robot):
     eight.bank.set_genes(hard_random_genes(8, 3))
-    return standing(anymal, 8, z=1.0, x=7.0)
+    return standing(robot, 8, z=robot.default_base_height + 0.4, x=7.0)
 
 
 @pytest.fixture
@@ -130,9 +132,9 @@ def test_permuting_environments(eight, rough_start):
 
 
 @pytest.mark.usefixtures("on_cpu")
-def test_a_reset_forgets_everything(eight, rough_start, anymal):
+def test_a_reset_forgets_everything(eight, rough_start, robot):
     expected = run_rough(eight, rough_start, 30)
-    run_rough(eight, standing(anymal, 8, z=0.45, x=9.0), 17)
+    run_rough(eight, standing(robot, 8, z=robot.default_base_height - 0.15, x=9.0), 17)
     for one, other in zip(expected, run_rough(eight, rough_start, 30), strict=True):
         np.testing.assert_array_equal(one, other)
 
