@@ -86,8 +86,7 @@ def _weighted_terms(motion: Motion, weights: RewardWeights, feet: Feet, env: int
     terms[12] = weights.no_fly * no_fly(motion, env)
     terms[13] = weights.orientation * orientation(motion, env)
     terms[14] = weights.joint_deviation * joint_deviation(motion, env)
-    if weights.termination != 0.0:
-        terms[_TERMINATION] = weights.termination * termination(motion, env)
+    terms[15] = weights.termination * termination(motion, env)
     return terms
 
 

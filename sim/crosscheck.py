@@ -17,6 +17,7 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from kernels.penalties import PENALTIES
 from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
 from sim.command import exit_code_of, publish
@@ -226,7 +227,7 @@ class Crosscheck:
             "penalties": {
                 name: {"ours": float(np.nanmean(ours.penalties[..., k])), "mujoco_c": float(np.nanmean(column))}
                 for k, name in enumerate(ours.penalty_names)
-                for column in [np.concatenate([crossings.penalties[:, k] for crossings in plain])]
+                for column in [np.concatenate([crossings.penalties[:, PENALTIES.index(name)] for crossings in plain])]
             },
         }
 

@@ -15,6 +15,11 @@ def stretch(observation):
     return 0.3 * torch.sin(observation[:, 12:24] * 3 + observation.sum(dim=1, keepdim=True))
 
 
+def sway(observation):
+    """Springs that overshoot, of the joint angles alone: two simulators that begin alike are told alike."""
+    return -0.5 * torch.sin(3.0 * observation[:, 12:24])
+
+
 def too_few_actions(observation):
     """Forgets the last joint."""
     return stand(observation)[:, :-1]
