@@ -51,10 +51,10 @@ def rollout(anymal, shipped, device):
     return Rollout(anymal, shipped, num_terrains=TERRAINS, num_replicas=REPLICAS, device=device, cfg=SHORT)
 
 
-def crossing(anymal, device, policy=stand, num_terrains=1, replicas=4, **cfg):
+def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
     settings = {"max_duration_s": 0.6, "poll_every_s": 0.1} | cfg
     return Rollout(
-        anymal, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=CrossingCfg(**settings)
+        robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=CrossingCfg(**settings)
     )
 
 
@@ -72,27 +72,29 @@ def test_a_robot_that_stands_times_out(anymal, device):
     np.testing.assert_allclose(result.penalties[0, :, PENALTIES.index("vel_x")], 0.45, atol=0.1)
 
 
-def test_a_base_on_a_spike_collides(anymal, device):
-    result = crossing(anymal, device, max_duration_s=2.0).evaluate(spike()[None], np.array([1]), record_paths=True)
+def test_a_base_on_a_spike_collides(robot, device):
+    result = crossing(robot, device, max_duration_s=2.0).evaluate(spike()[None], np.array([1]), record_paths=True)
     assert (result.outcome == Outcome.BASE_COLLISION).all()
     assert result.base_collision.all()
+    assert result.penalty_names == robot.penalties
+    assert result.penalties.shape == (1, 4, len(robot.penalties))
     assert (result.duration_s < 1.0).all()
     # The path ends with the episode, and all is over before the two seconds are.
-    steps = np.ceil(result.duration_s / anymal.control_dt - 1e-6).astype(int)
+    steps = np.ceil(result.duration_s / robot.control_dt - 1e-6).astype(int)
     np.testing.assert_array_equal(np.isfinite(result.paths[..., 0]).sum(axis=2), steps)
     assert result.physics_steps < 400
 
 
-def test_a_robot_beside_the_goal_reaches_it(anymal, device):
+def test_a_robot_beside_the_goal_reaches_it(robot, device):
     # From (13.45, 4) +- 0.1 m the goal's 0.5 m circle round (14, 4) is entered with 0.75 m/s at most 0.2 m later.
-    result = crossing(anymal, device, start=(13.8, 4.0)).evaluate(FLAT[None], np.array([1]))
+    result = crossing(robot, device, start=(13.8, 4.0)).evaluate(FLAT[None], np.array([1]))
     assert result.reached_goal.all()
-    np.testing.assert_allclose(result.duration_s, anymal.physics_dt, atol=1e-6)
+    np.testing.assert_allclose(result.duration_s, robot.physics_dt, atol=1e-6)
 
 
 @pytest.mark.parametrize("start", [(18.3, 4.0), (-2.3, 4.0), (9.0, 10.3), (9.0, -2.3)])
-def test_a_robot_out_of_bounds_is_out(anymal, device, start):
-    result = crossing(anymal, device, start=start, max_duration_s=0.1).evaluate(FLAT[None], np.array([1]))
+def test_a_robot_out_of_bounds_is_out(robot, device, start):
+    result = crossing(robot, device, start=start, max_duration_s=0.1).evaluate(FLAT[None], np.array([1]))
     assert (result.outcome == Outcome.OUT).all()
 
 
@@ -154,7 +156,7 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
         same(clean, again)
 
 
-def test_penalties_equal_a_replay_on_the_host(anymal, device):
+def test_penalties_equal_a_replay_on_the_host(robot, device):
     """The captured rollout against single eager steps of the same actions, summed by the float64 oracle."""
     rows, actions, starts = [], [], []
 
@@ -166,36 +168,46 @@ def test_penalties_equal_a_replay_on_the_host(anymal, device):
         actions.append(np.array(action.cpu().numpy(), dtype=np.float32))
         return action
 
-    cfg = CrossingCfg(max_duration_s=0.4)
-    recorder = Rollout(anymal, record, num_terrains=2, num_replicas=2, device=device, cfg=cfg)
+    cfg = CrossingCfg(max_duration_s=0.4 if robot.name == "anymal" else 0.7)  # Cassie's pelvis has farther to fall
+    recorder = Rollout(robot, record, num_terrains=2, num_replicas=2, device=device, cfg=cfg)
     sim = recorder.sim
     result = recorder.evaluate(np.stack([FLAT, spike()]), np.array([3, 4]))
     put(sim, *starts[0])
-    feet = [sim.geom_names.index(name) for name in anymal.foot_geoms]
-    touchy = [k for k, name in enumerate(sim.geom_names) if name not in anymal.foot_geoms]
-    bases = [sim.geom_names.index(name) for name in anymal.base_geoms]
-    sums, ended = np.zeros((4, 6)), np.zeros(4, bool)
+    feet = [sim.geom_names.index(name) for name in robot.foot_geoms]
+    touchy = [k for k, name in enumerate(sim.geom_names) if name not in robot.foot_geoms]
+    bases = [sim.geom_names.index(name) for name in robot.base_geoms]
+    sums, ended, limit = np.zeros((4, 6)), np.zeros(4, bool), robot.contact_force_limit
     with wp.ScopedDevice(device):
         for row, action in zip(rows, actions, strict=True):
             targets = np.zeros((4, 19), np.float32)
-            targets[:, 7:] = np.float32(anymal.default_joint_pos) + np.float32(anymal.action_scale) * action
+            targets[:, 7:] = np.float32(robot.default_joint_pos) + np.float32(robot.action_scale) * action
             sim.targets.assign(targets)
             command = row[:, 9:12] / [2, 2, 0.25]
-            for _ in range(anymal.decimation):
+            for _ in range(robot.decimation):
                 sim.physics_step()
                 sim.read_geom_forces()
                 q, qd = positions(sim), velocities(sim)
                 force = np.array(sim.geom_force.numpy(), dtype=np.float64)
                 for env in np.flatnonzero(~ended):
-                    sums[env] += anymal.physics_dt * oracle.penalties(
-                        q[env], qd[env], list(sim.sensors.base_com), command[env], force[env], feet, touchy, 500.0
+                    sums[env] += robot.physics_dt * oracle.penalties(
+                        q[env], qd[env], list(sim.sensors.base_com), command[env], force[env], feet, touchy, limit
                     )
                 ended |= np.linalg.norm(force[:, bases], axis=2).max(axis=1) > 1
     assert ended.tolist() == [False, False, True, True]
     np.testing.assert_array_equal(result.base_collision.ravel(), ended)
-    np.testing.assert_allclose(result.penalties.reshape(4, 6), sums, rtol=1e-4, atol=1e-6)
+    columns = [PENALTIES.index(name) for name in robot.penalties]
+    np.testing.assert_allclose(result.penalties.reshape(4, -1), sums[:, columns], rtol=1e-4, atol=1e-6)
     assert (sums[:, :3] > 0.01).all()
     assert sums[2:, 5].min() > 0  # the base's touch itself is counted
+
+
+def test_a_biped_that_nobody_balances_falls_onto_its_pelvis(cassie, device):
+    result = crossing(cassie, device, max_duration_s=4.0).evaluate(FLAT[None], np.array([1]))
+    assert result.base_collision.all() and not result.invalid.any()
+    assert ((result.duration_s > 0.5) & (result.duration_s < 3.5)).all()
+    # It ends with the pelvis, a sphere of .25 m, on the ground.
+    np.testing.assert_allclose(result.final_position[..., 2], 0.25, atol=0.01)
+    assert result.penalty_names == ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble")
 
 
 def test_penalties_may_start_late(anymal, device):

@@ -21,9 +21,9 @@ def _one_thread() -> None:
 
 @pytest.fixture
 def make_task() -> Callable[..., CommandTask]:
-    def make(seed: int = 0, num_envs: int = NUM_ENVS, **changes: object) -> CommandTask:
-        cfg = TaskCfg(curriculum=CURRICULUM, **changes)  # type: ignore[arg-type]
-        return CommandTask(get_robot("anymal"), cfg, num_envs=num_envs, device="cpu", seed=seed)
+    def make(seed: int = 0, num_envs: int = NUM_ENVS, robot: str = "anymal", **changes: object) -> CommandTask:
+        cfg = TaskCfg.of(get_robot(robot), curriculum=CURRICULUM, **changes)
+        return CommandTask(get_robot(robot), cfg, num_envs=num_envs, device="cpu", seed=seed)
 
     return make
 

@@ -1,0 +1,89 @@
+"""Training another robot: its own settings, on the command line too, its rewards, and a run from start to resume."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+
+from sim.policy import load_policy
+from sim.robot import get_robot
+from tests.train.conftest import CURRICULUM
+from train.base import BaseCfg, read_arguments, train
+from train.ppo import PpoCfg
+from train.task_cfg import TaskCfg
+
+CONTROL_DT = 0.02
+PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
+
+
+def test_the_defaults_are_anymals():
+    assert TaskCfg.of(get_robot("anymal")) == TaskCfg()
+
+
+def test_cassies_rewards_are_the_published_ones():
+    # legged_gym's for Cassie where it names one, else its common ones; stumble and foot forces as for ANYmal.
+    cfg = TaskCfg.of(get_robot("cassie"), push_speed=0.5)
+    assert asdict(cfg.rewards) == {
+        "tracking_lin_vel": 1.0, "tracking_ang_vel": 1.0, "lin_vel_z": -0.5, "ang_vel_xy": 0.0, "torques": -5e-6,
+        "dof_acc": -2e-7, "feet_air_time": 5.0, "collision": -1.0, "action_rate": -0.01, "stumble": -0.1,
+        "feet_contact_forces": -2e-4, "dof_pos_limits": -1.0, "no_fly": 0.25, "orientation": 0.0,
+        "joint_deviation": 0.0, "termination": -200.0,
+    }  # fmt: skip
+    assert not cfg.only_positive
+    assert (cfg.soft_joint_limit, cfg.min_air_time_s, cfg.added_base_mass) == (0.95, 0.5, (0.0, 0.0))
+    assert cfg.push_speed == 0.5
+
+
+@pytest.mark.parametrize("named", [["--robot", "cassie"], ["--robot=cassie"]])
+def test_the_command_line_begins_with_the_robots_settings(named):
+    cfg = read_arguments(["--task.rewards.no-fly", "0.5", *named, "--task.push-speed", "0.25", "--iterations", "7"])
+    own = TaskCfg.of(get_robot("cassie"))
+    assert (cfg.robot, cfg.iterations, cfg.task.push_speed) == ("cassie", 7, 0.25)
+    assert asdict(cfg.task.rewards) == asdict(own.rewards) | {"no_fly": 0.5}
+    assert not cfg.task.only_positive
+    assert read_arguments([]).task == TaskCfg()
+
+
+def test_falls_are_paid_for_and_clipped_nowhere(make_task):
+    # Nobody balances them: within two seconds all are down, each for -200 * .02 s = -4 in the step it ends with.
+    task = make_task(robot="cassie", start_joint_range=0.1, start_velocity_range=0.1, push_interval_s=0.0)
+    task.restart_all(torch.zeros(task.num_envs))
+    assert task.observation.shape == (task.num_envs, 169)
+    falls, rewards = 0, []
+    for _ in range(120):
+        task.step(torch.zeros(task.num_envs, 12))
+        fell = (task.end != 0).numpy()
+        assert (task.reward.numpy()[fell] < -3.5).all()
+        falls += int(fell.sum())
+        rewards.append(task.reward.numpy().copy())
+        assert task.observation.isfinite().all() and task.reward.isfinite().all()
+    sums = task.read_statistics()
+    assert falls >= task.num_envs
+    assert sums["base_collision"] + sums["tilt"] == falls
+    assert sums["termination"] == pytest.approx(-200.0 * CONTROL_DT * falls)
+    assert sums["collision"] == 0.0 and sums["joint_deviation"] == 0.0  # no limbs; no weight
+    assert sums["dof_pos_limits"] <= 0.0 < sums["no_fly"]
+    assert np.sum(rewards) == pytest.approx(sum(sums[name] for name in asdict(task.cfg.rewards)), rel=1e-4)
+    assert sums["overflow"] == sums["invalid"] == 0
+
+
+def config(run_dir, **changes):
+    values = {"num_envs": 6, "iterations": 2, "rows": 2, "device": "cpu", "ppo": PPO, **changes}
+    task = TaskCfg.of(get_robot("cassie"), curriculum=CURRICULUM)
+    return BaseCfg(robot="cassie", run_dir=run_dir, task=task, **values)
+
+
+def test_a_run_of_another_robot_is_saved_and_resumed(tmp_path, capsys):
+    assert train(config(tmp_path / "run")) == 0
+    assert train(config(None, resume=tmp_path / "run", iterations=3)) == 0
+    assert "Changed since the checkpoint" not in capsys.readouterr().out
+    record = json.loads((tmp_path / "run" / "policy.train.json").read_text())
+    assert (record["robot"], record["iterations"]) == ("cassie", 3)
+    assert record["settings"]["task"]["rewards"]["termination"] == -200.0
+    assert all(np.isfinite(list(row["terms"].values())).all() for row in record["curve"])
+    policy = load_policy(tmp_path / "run" / "policy.pt", get_robot("cassie"), "cpu")
+    assert policy(torch.randn(3, 169)).shape == (3, 12)
+    with pytest.raises(ValueError, match="is of robot 'cassie', expected 'anymal'"):
+        train(BaseCfg(resume=tmp_path / "run", task=TaskCfg(), device="cpu"))
