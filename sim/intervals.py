@@ -1,6 +1,7 @@
 """95 % intervals of measured rates and means."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,27 @@ def bootstrap_interval(values: NDArray[np.floating], rng: np.random.Generator) -
     if len(values) == 0:
         return None
     means = values[rng.integers(len(values), size=(_BOOTSTRAP_DRAWS, len(values)))].mean(axis=1)
+    return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
+
+
+@lru_cache(maxsize=4)  # of a few sizes of sets, some 25 MB each
+def _resamples(count: int, seed: int) -> NDArray[np.float64]:
+    """How often each of ``count`` terrains is drawn in each resample, shape (draws, count)."""
+    drawn = np.random.default_rng(seed).integers(count, size=(_BOOTSTRAP_DRAWS, count))
+    drawn += count * np.arange(_BOOTSTRAP_DRAWS)[:, None]
+    return np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape).astype(np.float64)
+
+
+def paired_interval(values: NDArray[np.floating], seed: int) -> list[float] | None:
+    """:func:`bootstrap_interval` with the same resamples for all values of equally many terrains, and a tenth the time.
+
+    Args:
+        values: One a terrain, shape (num_terrains,).
+        seed: Of the resamples.
+    """
+    if len(values) == 0:
+        return None
+    means = _resamples(len(values), seed) @ values / len(values)
     return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
 
 

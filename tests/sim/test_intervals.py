@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from sim.intervals import t_interval
+from sim.intervals import bootstrap_interval, paired_interval, t_interval
 
 
 def test_t_interval_by_hand():
@@ -26,3 +26,12 @@ def test_a_single_value_says_nothing_of_its_spread():
 def test_more_values_than_quantiles_are_refused():
     with pytest.raises(ValueError, match="a t interval is of at most 10 values, got 11"):
         t_interval(np.zeros(11))
+
+
+def test_the_interval_from_shared_resamples_is_the_bootstraps():
+    values = np.random.default_rng(1).random(80)
+    expected = bootstrap_interval(values, np.random.default_rng(3))
+    assert paired_interval(values, 3) == pytest.approx(expected, abs=1e-12)
+    assert paired_interval(values, 4) != pytest.approx(expected, abs=1e-6)
+    assert paired_interval(np.ones(7), 0) == [1.0, 1.0]
+    assert paired_interval(np.empty(0), 0) is None

@@ -48,7 +48,7 @@ def test_sizes_of_the_parts(robot, elites, train, test):
 def test_a_split_follows_from_the_elites_and_the_seed_alone():
     archive = make_archive(60)
     first = split_elites(archive, "anymal")
-    np.random.default_rng(3).random(7)  # nor from what was drawn before
+    make_sets(SETS, 3, 0, archive=archive, split=first)  # nor from what was drawn before
     again = split_elites(archive, "anymal")
     np.testing.assert_array_equal(first.test, again.test)
     np.testing.assert_array_equal(first.train, again.train)

@@ -1,0 +1,123 @@
+"""What a command line of the evaluation means."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from qd.workers import resolve_device
+from sim.robot import RobotCfg, get_robot
+from train.sets import paper_terrains
+
+FULL = (300, 20)
+"""Terrains a set and episodes a terrain of the published rates; tables take the paper's number of terrains."""
+SMALL = (24, 4)
+"""The same on a machine without a GPU."""
+SHIPPED = "shipped"
+"""Name of the controller that comes with the robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateCfg:
+    """Cross fresh terrains with one controller, or make the paper's tables of several.
+
+    The tables are made if --policies, --archive or --sets is given; killed, they go on by the same command.
+    """
+
+    robot: str = "anymal"
+    """Which robot."""
+    policy: str | None = None
+    """Without tables, the controller: an rsl_rl checkpoint, a TorchScript file or module:callable; the shipped one."""
+    policies: tuple[str, ...] = ()
+    """Controllers of the tables, each NAME=FILE, NAME=module:callable or NAME=shipped; the first is the one that the
+    others are held against; base=shipped."""
+    archive: Path | None = None
+    """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
+    split_seed: int = 0
+    """Which elites are held out: what the fine-tuning was told."""
+    sets: tuple[str, ...] = ()
+    """Sets of the tables: hand_crafted, hard_random and, of an archive, generated and generated_far; all there are."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    terrains: int | None = None
+    """Terrains a set; 300 on CUDA (tables of Cassie: 180), 24 on the CPU."""
+    episodes: int | None = None
+    """Episodes a terrain; 20 on CUDA, 4 on the CPU."""
+    seed: int = 0
+    """Draws other test sets."""
+    workers: int | Literal["auto"] | None = None
+    """Cross on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
+    out: Path | None = None
+    """Where to write the numbers: of the shipped controller and 300 x 20 results/<robot>/base.json, of others nowhere;
+    tables RUN_DIR/tables.json; their figure stands beside as .png."""
+    run_dir: Path | None = None
+    """Where tables keep what is crossed, so that they can go on; runs/<robot>-tables."""
+
+    @property
+    def makes_tables(self) -> bool:
+        """Whether the paper's tables are asked for."""
+        return bool(self.policies or self.sets or self.archive is not None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """How much is crossed, by what, where."""
+
+    robot: RobotCfg
+    device: str
+    """Warp device name."""
+    terrains: int
+    """Terrains a set."""
+    episodes: int
+    """Episodes a terrain."""
+
+
+def size_of(cfg: EvaluateCfg) -> Size:
+    """How much is crossed; says so where it is less than on a GPU.
+
+    Raises:
+        ValueError: If robot or device is unknown, or a number is out of range.
+    """
+    robot = get_robot(cfg.robot)
+    for name, least in (("terrains", 1), ("episodes", 1), ("seed", 0), ("split_seed", 0)):
+        value = getattr(cfg, name)
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}")
+    device = resolve_device(cfg.device, cfg.workers)
+    full = (paper_terrains(robot.name), FULL[1]) if cfg.makes_tables else FULL
+    terrains, episodes = full if device.startswith("cuda") else SMALL
+    if not device.startswith("cuda") and cfg.terrains is None and cfg.episodes is None:
+        print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {full[0]} x {full[1]}.")
+    return Size(robot=robot, device=device, terrains=cfg.terrains or terrains, episodes=cfg.episodes or episodes)
+
+
+def split_words(values: Sequence[str]) -> list[str]:
+    """Words of arguments of which make hands over several in one, apart by spaces or commas."""
+    return " ".join(values).replace(",", " ").split()
+
+
+def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
+    """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
+
+    Args:
+        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; several may stand in one, apart by
+            spaces, as make hands them over.
+        robot: The robot, whose controller is the shipped one.
+
+    Raises:
+        ValueError: If one has no name, or two have the same.
+    """
+    text = " ".join(policies).strip() or f"base={SHIPPED}"
+    found: dict[str, str] = {}
+    for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is
+        name, _, policy = item.partition("=")
+        if not re.fullmatch(r"[\w.+-]+", name) or not policy:
+            raise ValueError(
+                f"policies must be NAME=FILE each, the name of letters, digits and . _ + -, got '{item}': "
+                "write for example C-G=runs/tuned/policy.pt"
+            )
+        if name in found:
+            raise ValueError(f"policies must have different names, got '{name}' twice: rename one of them")
+        found[name] = str(robot.policy_file) if policy == SHIPPED else policy
+    return found
