@@ -25,6 +25,12 @@ FLAG_FINE := fine
 FLAG_METHOD := method
 FLAG_INTERVALS := intervals
 FLAG_WITHOUT := without
+FLAG_POLICIES := policies
+FLAG_ARCHIVE := archive
+FLAG_SPLIT_SEED := split-seed
+FLAG_SETS := sets
+FLAG_TERRAINS := terrains
+FLAG_EPISODES := episodes
 
 help: ## This list
 	@echo 'faultline: find the terrains that break a legged robot. Targets:'
@@ -47,6 +53,11 @@ help: ## This list
 	@echo '  INTERVALS=N      intervals of each ratio           archive'
 	@echo '  WITHOUT="A B"    penalties to leave out            archive'
 	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
+	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables, each NAME=SPEC          evaluate'
+	@echo '  ARCHIVE=DIR      run of a search whose held-out elites are the generated terrains  evaluate'
+	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
+	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
+	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate'
 	@echo '  OUT=FILE         where to write the numbers        compare calibrate evaluate crosscheck bench'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
@@ -84,8 +95,8 @@ calibrate: setup ## Measure the penalty scales of ROBOT
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
 	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
 
-evaluate: setup ## Success and goal rates of the controller of ROBOT
-	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT WORKERS)
+evaluate: setup ## Rates of the controller of ROBOT, or with POLICIES or ARCHIVE the tables of the paper
+	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS)
 
 crosscheck: setup ## Hold the crossings of ROBOT against the same in plain MuJoCo C
 	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES FINE OUT)
