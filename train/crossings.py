@@ -1,7 +1,7 @@
 """Every controller on every set: crosses what is not kept yet, and says how far it is."""
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 
@@ -46,35 +46,43 @@ def cross_all(
         EvaluatorError: If a worker is lost.
     """
     whole = {name: chosen for name, chosen in sets.items() if name != "generated_far" or "generated" not in sets}
-    found = {(who, name): kept.read(policy, whole[name]) for who, policy in controllers.items() for name in whole}
-    todo = [pair for pair, result in found.items() if result is None]
-    if len(todo) < len(found):
-        print(f"{len(found) - len(todo)} of {len(found)} crossings of a set are kept from before in {kept.folder}")
-    episodes = evaluator.num_replicas * sum(len(whole[name]) for _, name in todo)
+    found = {}
+    for who, policy in controllers.items():
+        for name in whole:
+            if (result := kept.read(policy, whole[name])) is not None:
+                found[who, name] = result
+    todo = {who: [name for name in whole if (who, name) not in found] for who in controllers}
+    if found:
+        count = len(controllers) * len(whole)
+        print(f"{len(found)} of {count} crossings of a set are kept from before in {kept.folder}", flush=True)
+    episodes = evaluator.num_replicas * sum(len(whole[name]) for names in todo.values() for name in names)
     with tqdm(total=episodes, file=sys.stderr, dynamic_ncols=True, bar_format=_FORMAT, disable=None) as bar:
-        for who, policy in controllers.items():
-            for size, names in _by_size([name for owner, name in todo if owner == who], whole).items():
-                at_once = min(size, max(1, _MOST_ENVS // evaluator.num_replicas))
-                with open_evaluator(replace(evaluator, policy=policy, num_terrains=at_once)) as evaluate:
-                    for name in names:
-                        bar.set_description_str(f"{who} on {name}")
-                        result = _cross(evaluate, whole[name], evaluator.num_replicas, bar)
-                        kept.write(policy, whole[name], result)
-                        found[who, name] = result
-                        bar.write(_line(who, whole[name], result))
-    results = {name: {who: result for who in controllers if (result := found[who, name]) is not None} for name in whole}
+        for who, names in todo.items():
+            own = replace(evaluator, policy=controllers[who])
+            for name, result in _cross_missing(who, own, {name: whole[name] for name in names}, bar, open_evaluator):
+                kept.write(controllers[who], whole[name], result)
+                found[who, name] = result
+    results = {name: {who: found[who, name] for who in controllers} for name in whole}
     if "generated_far" in sets and "generated_far" not in whole:
         far = np.flatnonzero(np.isin(whole["generated"].numbers, sets["generated_far"].numbers))
         results["generated_far"] = {who: take_terrains(one, far) for who, one in results["generated"].items()}
     return {name: results[name] for name in sets}
 
 
-def _by_size(names: list[str], sets: Mapping[str, TerrainSet]) -> dict[int, list[str]]:
-    """Sets of as many terrains share a simulation, which is built for a number of them."""
-    sizes: dict[int, list[str]] = {}
-    for name in names:
-        sizes.setdefault(len(sets[name]), []).append(name)
-    return sizes
+def _cross_missing(
+    who: str, evaluator: EvaluatorCfg, sets: Mapping[str, TerrainSet], bar: tqdm, open_evaluator: Open
+) -> Iterator[tuple[str, RolloutResult]]:
+    """Crossings of one controller by set, each as soon as it is done; sets of one size share a simulation."""
+    for size in sorted({len(chosen) for chosen in sets.values()}, reverse=True):
+        bar.set_description_str(f"{who}: building the simulation")
+        at_once = min(size, max(1, _MOST_ENVS // evaluator.num_replicas))
+        with open_evaluator(replace(evaluator, num_terrains=at_once)) as evaluate:
+            for name, chosen in sets.items():
+                if len(chosen) == size:
+                    bar.set_description_str(f"{who} on {name}")
+                    result = _cross(evaluate, chosen, evaluator.num_replicas, bar)
+                    bar.write(_line(who, chosen, result))
+                    yield name, result
 
 
 def _cross(evaluate: Evaluate, terrains: TerrainSet, num_replicas: int, bar: tqdm) -> RolloutResult:

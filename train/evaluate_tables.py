@@ -22,6 +22,8 @@ class _Plan:
     """An evaluation that can begin: everything a user may have got wrong has been looked at."""
 
     size: Size
+    evaluator: EvaluatorCfg
+    """Where to cross; controllers and sets are filled in."""
     scales: tuple[float, ...]
     controllers: dict[str, str]
     sets: dict[str, TerrainSet]
@@ -54,12 +56,25 @@ def _plan_of(cfg: EvaluateCfg) -> _Plan:
         check_policy(policy, robot.name, size.device)
     return _Plan(
         size=size,
+        evaluator=_evaluator_of(size, cfg),
         scales=scales,
         controllers=controllers,
         sets=make_sets(names, size.terrains, cfg.seed, archive=archive, split=split),
         archive=_about(cfg, archive, split),
         kept=kept,
         out=out,
+    )
+
+
+def _evaluator_of(size: Size, cfg: EvaluateCfg) -> EvaluatorCfg:
+    return EvaluatorCfg(
+        robot=size.robot.name,
+        policy="",
+        num_terrains=size.terrains,
+        num_replicas=size.episodes,
+        device=size.device,
+        workers=cfg.workers,
+        reward=True,
     )
 
 
@@ -90,16 +105,7 @@ def evaluate_tables(cfg: EvaluateCfg, *, open_evaluator: Open = open_evaluator) 
     plan = _plan_of(cfg)
     size, robot = plan.size, plan.size.robot
     kept = KeptCrossings(plan.kept, robot=robot.name, episodes=size.episodes, device=size.device)
-    evaluator = EvaluatorCfg(
-        robot=robot.name,
-        policy="",
-        num_terrains=size.terrains,
-        num_replicas=size.episodes,
-        device=size.device,
-        workers=cfg.workers,
-        reward=True,
-    )
-    results = cross_all(plan.controllers, plan.sets, evaluator, kept, open_evaluator=open_evaluator)
+    results = cross_all(plan.controllers, plan.sets, plan.evaluator, kept, open_evaluator=open_evaluator)
     crossed = {name: {who: measure(one, plan.scales) for who, one in row.items()} for name, row in results.items()}
     about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in plan.controllers.items()}
     report = {

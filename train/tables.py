@@ -4,7 +4,7 @@ All numbers are means over the terrains of a set, each the mean over its valid e
 over terrains, with the same resamples for every controller.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -38,19 +38,9 @@ def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCf
         (:mod:`train.differences`); ``traversable`` by generated set (:func:`split_by_goal`); ``terrains``: set ->
         number of terrains; ``paper``: the paper's numbers likewise, None of a robot it has none of; ``reward_weights``.
     """
-    means: dict[str, Any] = {
-        name: _by_controller(crossed, lambda one, name=name: _mean(one.values[name])) for name in MEASURES
-    }
-    intervals: dict[str, Any] = {
-        name: _by_controller(crossed, lambda one, name=name: _interval(one.values[name], seed)) for name in MEASURES
-    }
-    means["penalties"] = _by_controller(crossed, lambda one: {key: _mean(v) for key, v in one.penalties.items()})
-    intervals["penalties"] = _by_controller(
-        crossed, lambda one: {key: _interval(v, seed) for key, v in one.penalties.items()}
-    )
     return {
-        **means,
-        "intervals": intervals,
+        **_statistics(crossed, _mean),
+        "intervals": _statistics(crossed, lambda values: _interval(values, seed)),
         "terrains": {name: len(chosen) for name, chosen in sets.items()},
         "outcomes": _by_controller(crossed, lambda one: one.outcomes),
         "invalid_terrains": _by_controller(crossed, lambda one: int((~one.valid).sum())),
@@ -100,8 +90,19 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
     return found
 
 
-def _by_controller(crossed: Crossed, of: Any) -> dict[str, dict[str, Any]]:
-    """Set -> controller -> what ``of`` makes of a :class:`Measured`."""
+def _statistics(crossed: Crossed, of: Callable[[NDArray[np.float64]], Any]) -> dict[str, Any]:
+    """Each of the measures, and ``penalties``: set -> controller -> what ``of`` makes of the terrains' values."""
+    tables: dict[str, Any] = {
+        name: _by_controller(crossed, lambda one, name=name: of(one.values[name])) for name in MEASURES
+    }
+    tables["penalties"] = _by_controller(
+        crossed, lambda one: {name: of(values) for name, values in one.penalties.items()}
+    )
+    return tables
+
+
+def _by_controller(crossed: Crossed, of: Callable[[Measured], Any]) -> dict[str, dict[str, Any]]:
+    """Set -> controller -> what ``of`` makes of what it made of the set."""
     return {name: {who: of(one) for who, one in row.items()} for name, row in crossed.items()}
 
 
