@@ -38,7 +38,8 @@ LABELS = {
     "trio": ("CMA-MAE, iso+line, directions", "#d55e00", "--"),
 }
 """Name, colour and line of each method."""
-_OTHER_LOOKS = [(color, style) for style in ("-", "--", ":") for color in ("#0072b2", "#e69f00", "#cc79a7", "#009e73")]
+_OTHER_STYLES = ((0, (6, 2, 1, 2)), (0, (1, 3)))
+_OTHER_LOOKS = [(color, style) for style in _OTHER_STYLES for color in ("#009e73", "#0072b2", "#cc79a7")]
 
 
 def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[str, Any]:
@@ -91,10 +92,10 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     Args:
         report: As of :func:`report_of`, with ``robot`` and ``seeds``.
     """
-    figure = new_figure(12.0, 4.6)
+    figure, seeds = new_figure(12.0, 4.6), len(report["seeds"])
     figure.suptitle(
-        f"{report['robot']}: {len(report['seeds'])} seeds a method, mean and 95 % interval over them, "
-        f"{report['terrains_evaluated'][-1]:,} terrains a seed"
+        f"{report['robot']}: {report['terrains_evaluated'][-1]:,} terrains a run, "
+        + (f"{seeds} seeds a method, mean and 95 % interval over them" if seeds > 1 else "one seed")
     )
     panels = (
         ("qd_score", "QD score, as found", 1.0, "terrains_evaluated"),

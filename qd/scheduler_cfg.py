@@ -11,11 +11,13 @@ RESTART_RULES = ("basic", "no_improvement")
 class SchedulerCfg:
     """How terrains are asked for."""
 
-    method: str = "cma_mae"
+    method: str = "cma_mae+map_elites"
     """Where new terrains come from: `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
     `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `directions`, toward higher and lower ratios;
     or none is learned from: `hard_random` (the paper's: every height at its limit) and `uniform_random`. Several are
-    joined by a plus: emitters take them in turn."""
+    joined by a plus: emitters take them in turn, and where they are fewer, the first ones. After 75 iterations of the
+    paper preset the default's corrected QD score was 6,103, that of CMA-MAE alone 5,675 (one seed each;
+    `results/anymal/compare_long.json`)."""
     emitters: int = 10
     """Emitters, each with an evolution strategy or a stream of its own."""
     batch_size: int = 20
@@ -47,10 +49,9 @@ class SchedulerCfg:
         for name in ("iso_sigma", "line_sigma"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be a number of at least 0, got {getattr(self, name)}")
-        if self.emitters < len(self.methods) or self.batch_size < 2:
+        if self.emitters < 1 or self.batch_size < 2:
             raise ValueError(
-                f"emitters must be at least 1, one a method, and batch_size at least 2, got {self.emitters} and "
-                f"{self.batch_size}"
+                f"emitters must be at least 1 and batch_size at least 2, got {self.emitters} and {self.batch_size}"
             )
         if not 0.0 <= self.learning_rate <= 1.0:
             raise ValueError(f"learning_rate must lie in [0, 1], got {self.learning_rate}")

@@ -169,8 +169,6 @@ def test_joined_methods_take_turns_each_judged_by_its_own_archive():
     of_result = [emitter.archive is search.result for emitter in search.emitters]
     assert of_result == [True, False, True, True, False]
     assert search.archive is not search.result
-    with pytest.raises(ValueError, match="emitters must be at least 1, one a method"):
-        SchedulerCfg(emitters=2, method="cma_me+cma_mae+directions")
 
 
 @pytest.mark.parametrize("state", [{}, {"archive": 1, "result": 2, "emitters": []}])

@@ -13,7 +13,7 @@ from train import evaluate, speed
 
 @pytest.fixture
 def shipped_search() -> Path:
-    return Path(__file__).parents[2] / "results" / "anymal" / "cma_me_212"
+    return Path(__file__).parents[2] / "results" / "anymal" / "archive"
 
 
 def fail(error: BaseException) -> int:
