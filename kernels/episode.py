@@ -5,7 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_position, base_yaw, state_is_invalid, wrap_angle
+from kernels.base_state import base_position, base_yaw, state_is_invalid
+from kernels.goal import Task, goal_command, is_at_goal, is_out
 from kernels.heightfield import Terrain
 from kernels.penalties import max_base_force
 from kernels.start import StartRanges, place_robot
@@ -31,31 +32,6 @@ _INVALID = wp.constant(int(Outcome.INVALID))
 
 PARKING_HEIGHT = wp.constant(50.0)
 """Height at which robots whose episodes have ended are kept [m]."""
-
-
-@wp.struct
-class Task:
-    """Goal, speed and limits of a crossing."""
-
-    goal: wp.vec2
-    goal_radius: float
-    speed: float
-    """Commanded speed [m/s]."""
-    yaw_gain: float
-    max_yaw_rate: float
-    lower: wp.vec2
-    """World-local corner of the allowed area [m]; leaving it ends the episode as OUT."""
-    upper: wp.vec2
-    max_steps: int
-    """Physics steps of the longest episode."""
-    first_counted_step: int
-    """Penalties count from this physics step on."""
-    base_force: float
-    """Contact force on the base that counts as a collision [N]."""
-    max_speed: float
-    """Any velocity beyond is invalid [m/s or rad/s]."""
-    overflow_mask: int
-    """Solver overflow bits that make an episode invalid."""
 
 
 @wp.struct
@@ -127,18 +103,6 @@ def start_episodes(
     )
 
 
-@wp.func
-def goal_command(position: wp.vec2, yaw: float, task: Task) -> wp.vec3:
-    """Velocity toward the goal in the yaw frame [m/s] and the yaw rate that turns the robot to it [rad/s]."""
-    to_goal = task.goal - position
-    error = wrap_angle(wp.atan2(to_goal[1], to_goal[0]) - yaw)
-    return wp.vec3(
-        task.speed * wp.cos(error),
-        task.speed * wp.sin(error),
-        wp.clamp(task.yaw_gain * error, -task.max_yaw_rate, task.max_yaw_rate),
-    )
-
-
 @wp.kernel
 def _command_goal_kernel(
     joint_q: wp.array2d[float], outcome: wp.array[int], task: Task, command_out: wp.array2d[float]
@@ -174,11 +138,9 @@ def judge_step(
     if base_force > task.base_force:
         return _BASE_COLLISION
     position = base_position(joint_q, env)
-    if wp.length(task.goal - wp.vec2(position[0], position[1])) < task.goal_radius:
+    if is_at_goal(position, task):
         return _GOAL
-    if position[0] < task.lower[0] or position[0] > task.upper[0]:
-        return _OUT
-    if position[1] < task.lower[1] or position[1] > task.upper[1]:
+    if is_out(position, task):
         return _OUT
     if steps >= task.max_steps:
         return _TIME_OUT

@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from kernels.base_state import base_yaw, wrap_angle
+from kernels.goal import goal_command
 from kernels.heightfield import Terrain
 from kernels.rewards import Feet
 from kernels.start import StartRanges, place_robot
@@ -151,10 +152,15 @@ def _command_episodes_kernel(
     env = wp.tid()
     counter = episodes_out.counter[0]
     num_envs = joint_q.shape[0]
-    if episodes_out.steps[env] % rules.command_steps == 0:
-        _draw_command(_random_stream(counter, _STREAM_COMMAND, num_envs, env), rules, env, episodes_out)
-    error = wrap_angle(episodes_out.heading[env] - base_yaw(joint_q, env))
-    episodes_out.command[env, 2] = wp.clamp(rules.yaw_gain * error, -rules.max_yaw_rate, rules.max_yaw_rate)
+    if rules.crosses == 1:
+        command = goal_command(wp.vec2(joint_q[env, 0], joint_q[env, 1]), base_yaw(joint_q, env), rules.crossing)
+        for k in range(3):
+            episodes_out.command[env, k] = command[k]
+    else:
+        if episodes_out.steps[env] % rules.command_steps == 0:
+            _draw_command(_random_stream(counter, _STREAM_COMMAND, num_envs, env), rules, env, episodes_out)
+        error = wrap_angle(episodes_out.heading[env] - base_yaw(joint_q, env))
+        episodes_out.command[env, 2] = wp.clamp(rules.yaw_gain * error, -rules.max_yaw_rate, rules.max_yaw_rate)
     if rules.push_steps == 0:
         return
     if (counter + env * _PUSH_STAGGER) % rules.push_steps == 0:
@@ -164,7 +170,10 @@ def _command_episodes_kernel(
 
 
 def command_episodes(rules: Rules, joint_q: Any, joint_qd_out: Any, episodes_out: Episodes) -> None:
-    """Draw a new command where one is due (at the start too), turn headings into yaw rates, and push where one is due.
+    """Tell every robot what to do next, and push where that is due.
+
+    Where robots cross, the command is to go to the goal; else a new one is drawn where it is due (at the start too),
+    and headings become yaw rates.
 
     Args:
         rules: Ranges and intervals.

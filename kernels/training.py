@@ -8,7 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_ang_vel_b, base_lin_vel_b, projected_gravity, state_is_invalid
+from kernels.base_state import base_ang_vel_b, base_lin_vel_b, base_position, projected_gravity, state_is_invalid
+from kernels.goal import Task, is_at_goal, is_out
 from kernels.penalties import max_base_force
 from kernels.rewards import REWARDS
 
@@ -21,19 +22,23 @@ class End(IntEnum):
     BASE_COLLISION = 2
     TILT = 3
     INVALID = 4
+    GOAL = 5
+    OUT = 6
 
 
 STATISTICS = (
-    "steps", "episodes", "time_out", "base_collision", "tilt", "invalid", "overflow",
+    "steps", "episodes", "time_out", "base_collision", "tilt", "invalid", "goal", "out", "overflow",
     "episode_steps", "episode_reward", "lin_vel_error", "yaw_rate_error",
 )  # fmt: skip
-"""Columns of the sums that training progress is read from; the four ends count episodes."""
+"""Columns of the sums that training progress is read from; the six ends count episodes."""
 
 _RUNNING = wp.constant(int(End.RUNNING))
 _TIME_OUT = wp.constant(int(End.TIME_OUT))
 _BASE_COLLISION = wp.constant(int(End.BASE_COLLISION))
 _TILT = wp.constant(int(End.TILT))
 _INVALID = wp.constant(int(End.INVALID))
+_GOAL = wp.constant(int(End.GOAL))
+_OUT = wp.constant(int(End.OUT))
 # Columns of STATISTICS as a kernel needs them.
 _STEPS = wp.constant(STATISTICS.index("steps"))
 _EPISODES = wp.constant(STATISTICS.index("episodes"))
@@ -43,6 +48,7 @@ _EPISODE_STEPS = wp.constant(STATISTICS.index("episode_steps"))
 _EPISODE_REWARD = wp.constant(STATISTICS.index("episode_reward"))
 _LIN_VEL_ERROR = wp.constant(STATISTICS.index("lin_vel_error"))
 _YAW_RATE_ERROR = wp.constant(STATISTICS.index("yaw_rate_error"))
+
 
 @wp.struct
 class Rules:
@@ -78,6 +84,10 @@ class Rules:
     """A push every so often; 0 for none."""
     push_speed: float
     """A push sets vx and vy of the mass centre to +- this, world frame [m/s]."""
+    crosses: int
+    """1: robots are told to go to a goal, where their episode ends; 0: they are told random velocities and headings."""
+    crossing: Task
+    """The goal and what is told on the way to it; of its ends, the goal and the borders of the world count."""
 
 
 @wp.struct
@@ -162,6 +172,11 @@ def judge_state(
         return _BASE_COLLISION
     if projected_gravity(joint_q, env)[2] > rules.max_gravity_z:
         return _TILT
+    if rules.crosses == 1:
+        if is_at_goal(base_position(joint_q, env), rules.crossing):
+            return _GOAL
+        if is_out(base_position(joint_q, env), rules.crossing):
+            return _OUT
     if steps >= rules.max_steps:
         return _TIME_OUT
     return _RUNNING

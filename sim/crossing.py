@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from kernels.episode import EpisodeState, Task
+from kernels.episode import EpisodeState
+from kernels.goal import Task
 from kernels.start import StartRanges
 from sim.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels.episode import EpisodeState, Task, latch_outcomes
+from kernels.episode import EpisodeState, latch_outcomes
+from kernels.goal import Task
 from kernels.paid_steps import add_paid, make_paid_steps, mark_paid, start_paying
 from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
 from sim.crossing import make_episode_state

@@ -18,7 +18,7 @@ from sim.motion import make_motion
 from sim.policy import prepare_torch
 from sim.robot import RobotCfg
 from sim.simulation import Simulation
-from train.curriculum import first_levels, make_tiles
+from train.curriculum import Tiles, first_levels, make_tiles
 from train.task_cfg import TaskCfg, fill, make_rules, make_start_ranges
 
 
@@ -37,7 +37,9 @@ class CommandTask:
         max_episode_steps: Control steps of the longest episode.
     """
 
-    def __init__(self, robot: RobotCfg, cfg: TaskCfg, *, num_envs: int, device: str, seed: int) -> None:
+    def __init__(
+        self, robot: RobotCfg, cfg: TaskCfg, *, num_envs: int, device: str, seed: int, tiles: Tiles | None = None
+    ) -> None:
         """Build the terrain, the robots and the graph; every episode begins.
 
         Args:
@@ -46,6 +48,7 @@ class CommandTask:
             num_envs: Number of robots.
             device: Warp device name.
             seed: Of everything drawn.
+            tiles: The terrains; those of the curriculum if left out.
 
         Raises:
             ValueError: If a count or range is not usable.
@@ -56,11 +59,11 @@ class CommandTask:
         self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
         tile_seed, level_seed, model_seed, count_seed = np.random.SeedSequence(seed).generate_state(4)
         first_count = int(count_seed) % 2**30  # far from where a 32-bit counter wraps
-        self.tiles = make_tiles(cfg.curriculum, int(tile_seed))
+        self.tiles = tiles or make_tiles(cfg.curriculum, int(tile_seed))
         columns = self.tiles.columns_of(num_envs)
-        levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(level_seed))
+        levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(level_seed)) % self.tiles.num_levels
         self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
-        self._rules = make_rules(cfg, robot.control_dt, self.tiles.num_levels, self.tiles.num_columns)
+        self._rules = make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
         self.max_episode_steps: int = self._rules.max_steps
         self._episodes = make_episodes(
             columns,
@@ -116,6 +119,7 @@ class CommandTask:
         self._column = torch.from_dlpack(episodes.column)
         self._terrain_of_env = torch.from_dlpack(self.sim.terrain_of_env)
         self._statistics = torch.from_dlpack(episodes.statistics)
+        self._counted = torch.zeros_like(self._statistics)
         self._reward_terms = torch.from_dlpack(episodes.reward_terms)
 
     def step(self, action: torch.Tensor) -> None:
@@ -140,12 +144,31 @@ class CommandTask:
         self._begin_episodes()
         self.read_statistics()
 
+    def exchange(self, tiles: Tiles) -> None:
+        """Put other terrains, as many, in place of the present ones, and begin every episode anew on its first level.
+
+        Raises:
+            ValueError: If they are of another number, or a height is not finite.
+        """
+        self.sim.bank.set_heights(tiles.heights)
+        self.tiles = tiles
+        self.restart_all(torch.zeros_like(self.levels))
+        self._counted.zero_()
+
+    def counts(self) -> dict[str, np.ndarray]:
+        """Since the terrains were last exchanged, of each environment: :data:`STATISTICS`, shape (num_envs,) each.
+
+        Synchronises with the device.
+        """
+        return dict(zip(STATISTICS, (self._counted + self._statistics).T.cpu().numpy(), strict=True))
+
     def read_statistics(self) -> dict[str, float]:
         """Sums over all environments since the last call: :data:`STATISTICS`, then each weighted reward term.
 
         Synchronises with the device.
         """
         sums = torch.cat((self._statistics.sum(0), self._reward_terms.sum(0))).tolist()
+        self._counted += self._statistics
         self._statistics.zero_()
         self._reward_terms.zero_()
         return dict(zip((*STATISTICS, *REWARDS), sums, strict=True))

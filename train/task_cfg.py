@@ -7,6 +7,7 @@ import numpy as np
 
 from kernels.start import StartRanges
 from kernels.training import Rules
+from sim import crossing
 from sim.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS
 from sim.training import TrainingCfg
@@ -34,6 +35,9 @@ class TaskCfg(TrainingCfg):
 
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
+    crosses: bool = False
+    """Robots start at one side of a terrain and are told to go to the other, as in a search, instead of random
+    velocities and headings from its middle."""
     episode_s: float = 20.0
     command_interval_s: float = 10.0
     """A new command every so often."""
@@ -83,8 +87,9 @@ def fill(struct: Any, **values: Any) -> Any:
     return struct
 
 
-def make_rules(cfg: TaskCfg, control_dt: float, num_levels: int, num_columns: int) -> Any:
+def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
     """Limits, ranges and intervals of the task as a kernel argument."""
+    control_dt = robot.control_dt
     return fill(
         Rules(),
         max_steps=round(cfg.episode_s / control_dt),
@@ -104,11 +109,15 @@ def make_rules(cfg: TaskCfg, control_dt: float, num_levels: int, num_columns: in
         max_yaw_rate=cfg.max_yaw_rate,
         push_steps=round(cfg.push_interval_s / control_dt),
         push_speed=cfg.push_speed,
+        crosses=int(cfg.crosses),
+        crossing=crossing.make_task(crossing.CrossingCfg(), robot),
     )
 
 
 def make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
     """The randomised start of an episode as a kernel argument."""
+    if cfg.crosses:
+        return crossing.make_start_ranges(crossing.CrossingCfg(), robot)
     return fill(
         StartRanges(),
         position=_TILE_CENTRE,

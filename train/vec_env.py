@@ -45,8 +45,10 @@ class CommandVecEnv(VecEnv):
 
         Returns:
             Observations after it (of the new episode where one ended), rewards (num_envs,), dones (num_envs,) and
-            ``{"time_outs": (num_envs,)}``, the dones that only the clock caused. No host synchronisation.
+            ``{"time_outs": (num_envs,)}``, the dones that no failure caused. No host synchronisation.
         """
         self.task.step(actions)
         end = self.task.end
-        return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": end == int(End.TIME_OUT)}
+        # A robot at its goal or out of the world did not fail: as with the clock, its value goes on.
+        cut = (end == int(End.TIME_OUT)) | (end == int(End.GOAL)) | (end == int(End.OUT))
+        return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": cut}

@@ -9,6 +9,8 @@ from kernels.restart import command_episodes, promote_episodes, remember_steps, 
 from kernels.rewards import make_feet
 from kernels.start import StartRanges
 from kernels.training import End, Rules, make_episodes
+from sim.crossing import CrossingCfg, make_task
+from sim.robot import get_robot
 
 NUM_JOINTS = 2
 DEFAULT_POSE = (0.5, -1.0)
@@ -166,7 +168,7 @@ def test_random_numbers_depend_on_counter_and_environment_alone():
     assert len(np.unique(np.concatenate([once[:, 0], restart(4, End.TIME_OUT, count=8)[0][:, 0]]))) == 8
 
 
-def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, before=(0.0, 0.0, 0.0), count=0, **rules):
+def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, before=(0.0, 0.0, 0.0), count=0, place=(0.0, 0.0), **rules):
     """Commands, joint velocities and episodes after the launch."""
     episodes = make_batch(num_envs, end=End.RUNNING, count=count)
     episodes.steps.assign(np.broadcast_to(np.int32(steps), num_envs))
@@ -174,6 +176,7 @@ def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, before=(0.0, 0.0, 0.0
     if heading is not None:
         episodes.heading.fill_(heading)
     joint_q = np.zeros((num_envs, 7 + NUM_JOINTS), np.float32)
+    joint_q[:, :2] = place
     joint_q[:, 5], joint_q[:, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
     joint_qd = rows(num_envs, 6 + NUM_JOINTS, 9.0)
     command_episodes(make_rules(**rules), wp.array(joint_q, dtype=float), joint_qd, episodes)
@@ -203,6 +206,24 @@ def test_commands_are_drawn_when_due(steps, drawn):
 def test_heading_becomes_a_yaw_rate_the_short_way_round(heading, yaw, rate):
     commands, _, _ = command(steps=1, heading=heading, yaw=yaw)
     assert commands[0, 2] == pytest.approx(rate, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("place", "yaw", "expected"),
+    [
+        ((2.0, 4.0), 0.0, (0.75, 0.0, 0.0)),
+        # The goal lies to the left of a robot that looks along x: turn left, at most 1 rad/s.
+        ((14.0, 0.0), 0.0, (0.0, 0.75, 0.5 * np.pi / 2)),
+        ((14.0, 8.0), np.pi / 2, (-0.75, 0.0, -1.0)),
+    ],
+)
+def test_a_crossing_robot_is_told_to_go_to_its_goal(place, yaw, expected):
+    task = make_task(CrossingCfg(), get_robot("anymal"))
+    commands, _, episodes = command(steps=0, heading=0.3, yaw=yaw, place=place, crosses=1, crossing=task)
+    if abs(expected[2]) == 1.0:  # straight behind: either way round is the short one
+        commands[0, 2] = -abs(commands[0, 2])
+    np.testing.assert_allclose(commands[0], expected, atol=1e-6)
+    assert episodes.heading.numpy().tolist() == [np.float32(0.3)]  # nothing is drawn
 
 
 def test_each_environment_is_pushed_once_an_interval():

@@ -10,8 +10,13 @@ ROLES = [BASE, FOOT]
 UPRIGHT = (0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 1.0, 0.1)
 
 
-def make_rules():
+def make_rules(*, crosses=0):
     rules = Rules()
+    rules.crosses = crosses
+    rules.crossing.goal = (14.0, 4.0)
+    rules.crossing.goal_radius = 0.5
+    rules.crossing.lower = (-2.0, -2.0)
+    rules.crossing.upper = (18.0, 10.0)
     rules.max_steps = 1000
     rules.base_force = 1.0
     rules.max_gravity_z = -0.1
@@ -31,7 +36,7 @@ def tilted(angle):
     return (0.0, 0.0, 0.6, np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2), 0.1)
 
 
-def judge(rows, *, velocity=0.0, base_force=0.0, steps=0):
+def judge(rows, *, velocity=0.0, base_force=0.0, steps=0, crosses=0):
     """End of each environment; arguments are one for all or one for each."""
     num_envs = len(rows)
     episodes = episodes_of(num_envs)
@@ -43,7 +48,7 @@ def judge(rows, *, velocity=0.0, base_force=0.0, steps=0):
     force[:, 1, 2] = 500.0  # the foot's force ends nothing
     judge_steps(
         wp.array(np.float32(rows), dtype=float), wp.array(joint_qd, dtype=float), wp.array(force, dtype=wp.vec3),
-        wp.array(ROLES, dtype=int), make_rules(), episodes,
+        wp.array(ROLES, dtype=int), make_rules(crosses=crosses), episodes,
     )  # fmt: skip
     return episodes
 
@@ -64,6 +69,16 @@ def test_non_finite_states_are_invalid():
     broken = [(*UPRIGHT[:7], value) for value in (np.nan, np.inf, -np.inf)]
     assert ends(broken) == [End.INVALID] * 3
     assert ends([UPRIGHT], velocity=np.nan) == [End.INVALID]
+
+
+def test_a_crossing_ends_at_the_goal_and_beyond_the_borders():
+    places = [(13.4, 4.0), (13.6, 4.0), (14.0, 4.6), (-2.1, 4.0), (18.1, 4.0), (5.0, -2.1), (5.0, 10.1), (5.0, 9.9)]
+    rows = [(*place, *UPRIGHT[2:]) for place in places]
+    out = [End.OUT] * 4
+    assert ends(rows, crosses=1) == [End.RUNNING, End.GOAL, End.RUNNING, *out, End.RUNNING]
+    assert ends(rows) == [End.RUNNING] * 8
+    assert ends([rows[1]], crosses=1, steps=999) == [End.GOAL]
+    assert ends([rows[1]], crosses=1, base_force=5.0) == [End.BASE_COLLISION]
 
 
 def test_the_gravest_end_wins():
