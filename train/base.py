@@ -4,9 +4,7 @@ Ctrl-C or ``--max-seconds`` saves and stops; ``--resume RUN_DIR`` goes on where 
 """
 
 import argparse
-import io
 import os
-import signal
 import sys
 import tempfile
 import time
@@ -15,29 +13,38 @@ from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
 
 from sim.command import exit_code_of
-from sim.files import check_writable, read_json, to_json, write_atomically
+from sim.files import to_json, write_atomically
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
-from train.learner import Learner, check_entries, read_checkpoint
+from train.learner import Learner
 from train.ppo import PpoCfg
-from train.progress import STATE, Progress
+from train.progress import Progress
 from train.ranks import Ranks
+from train.run import (
+    CHECKPOINT,
+    CONFIG,
+    POLICY,
+    RESERVE_S,
+    StopRequest,
+    changes,
+    finish,
+    iterate,
+    plain,
+    prepare_run_dir,
+    read_saved,
+    resumable,
+)
 from train.task import CommandTask
 from train.task_cfg import TaskCfg
 from train.vec_env import CommandVecEnv
 
-CHECKPOINT = "checkpoint.pt"
-POLICY = "policy.pt"
-CONFIG = "config.json"
 _ROBOT = "anymal"
-_RESERVE_S = 10.0  # kept back of --max-seconds for the last save
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,26 +81,6 @@ class BaseCfg:
     ppo: PpoCfg = field(default_factory=PpoCfg)
 
 
-class StopRequest:
-    """Set by Ctrl-C or SIGTERM: the iteration at hand is finished, then everything is saved. A second one kills."""
-
-    def __init__(self) -> None:
-        """Not asked yet; listens inside a ``with`` block."""
-        self.requested = False
-
-    def __enter__(self) -> "StopRequest":
-        self._before = {kind: signal.signal(kind, self._handle) for kind in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for kind, handler in self._before.items():
-            signal.signal(kind, handler)
-
-    def _handle(self, kind: int, _frame: object) -> None:
-        self.requested = True
-        signal.signal(kind, signal.SIG_DFL)
-
-
 def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
     """Device, number of environments and iterations."""
     device = Ranks.of_environment().device(resolve_device(cfg.device))
@@ -113,60 +100,9 @@ def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
     return device, num_envs, iterations
 
 
-def _prepare_run_dir(cfg: BaseCfg) -> Path:
-    """The run directory, made and fit to be written to."""
+def _run_dir(cfg: BaseCfg) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    run_dir = cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-base-{stamp}"
-    if (run_dir / CHECKPOINT).exists() and (cfg.resume is None or run_dir.resolve() != cfg.resume.resolve()):
-        raise ValueError(
-            f"{run_dir} already holds a training run: go on with --resume {run_dir}, or name another --run-dir"
-        )
-    config = run_dir / CONFIG
-    if config.exists() and "settings" in read_json(config):
-        raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        if cfg.export is not None:
-            cfg.export.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"cannot write to {error.filename}: {error.strerror}; name another place") from error
-    for folder in {run_dir, cfg.export.parent if cfg.export else run_dir}:
-        check_writable(folder)
-    return run_dir
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return str(value) if isinstance(value, Path) else value
-
-
-def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
-    """What differs between two nested settings, one line each."""
-    found = []
-    for key in sorted(before.keys() | after.keys()):
-        old, new = before.get(key), after.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            found += changes(old, new, f"{prefix}{key}.")
-        elif old != new:
-            found.append(f"{prefix}{key} {old} -> {new}")
-    return found
-
-
-def _read_saved(path: Path, robot: str) -> dict[str, Any]:
-    """The checkpoint of a training run, with the progress it had made."""
-    saved = read_checkpoint(path, robot)
-    check_entries(saved["extra"], STATE, path)
-    check_entries(saved["extra"]["settings"], {"seed": (int,)}, path)
-    return saved
-
-
-def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
-    """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
-    buffer = io.BytesIO()
-    torch.save({"actor_state_dict": learner.actor_state(), "iter": learner.iteration}, buffer)
-    write_atomically(path, buffer.getvalue())
-    write_atomically(path.with_suffix(".train.json"), to_json(record))
+    return cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-base-{stamp}"
 
 
 def train(cfg: BaseCfg) -> int:
@@ -187,10 +123,10 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     began = time.monotonic()
     robot = get_robot(cfg.robot)
     device, num_envs, iterations = _resolve_size(cfg)
-    saved = _read_saved(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
+    saved = read_saved(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
-    run_dir = _prepare_run_dir(cfg)
+    run_dir = prepare_run_dir(_run_dir(cfg), resume=cfg.resume, export=cfg.export)
     settings = {
         "seed": seed,
         "num_envs": num_envs,
@@ -207,54 +143,22 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
         learner = Learner(env, cfg.ppo, seed=seed)
         if saved is not None:
             learner.resume(saved)
-        write_atomically(run_dir / CONFIG, to_json({"device": device, **_plain(asdict(cfg))}))
+        write_atomically(run_dir / CONFIG, to_json({"device": device, **plain(asdict(cfg))}))
         about = {**provenance(device, seed), "settings": settings}
         progress = Progress(run_dir, learner, iterations, rows=cfg.rows, about=about, saved=saved and saved["extra"])
-        deadline = began + cfg.max_seconds - _RESERVE_S if cfg.max_seconds else float("inf")
+        deadline = began + cfg.max_seconds - RESERVE_S if cfg.max_seconds else float("inf")
+
+        def save() -> None:
+            learner.save(run_dir / CHECKPOINT, progress.state())
+
         try:
-            _iterate(learner, progress, cfg, run_dir / CHECKPOINT, stop, deadline)
-            _finish(learner, progress, cfg, run_dir)
+            iterate(learner, progress, save=save, save_every_s=cfg.save_every_s, stop=stop, deadline=deadline)
+            finish(learner, progress, save=save, policies=[run_dir / POLICY, *([cfg.export] if cfg.export else [])])
         except OSError as error:
-            if not (run_dir / CHECKPOINT).exists():
-                raise
-            raise OSError(f"{error}. Go on with: --resume {run_dir}") from error
+            raise resumable(run_dir, error) from error
     if learner.iteration < iterations:
         print(f"Stopped after {learner.iteration} of {iterations} iterations. Go on with: --resume {run_dir}")
     return 130 if stop.requested else 0
-
-
-def _finish(learner: Learner, progress: Progress, cfg: BaseCfg, run_dir: Path) -> None:
-    """The last checkpoint, the controller and its record."""
-    learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
-    progress.close()
-    learner.save(run_dir / CHECKPOINT, progress.state())
-    record = progress.record()
-    for path in (run_dir / POLICY, cfg.export):
-        if path is not None:
-            export_policy(path, learner, record)
-            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
-
-
-def _iterate(
-    learner: Learner, progress: Progress, cfg: BaseCfg, checkpoint: Path, stop: StopRequest, deadline: float
-) -> None:
-    """Iterate until all is done, a stop is requested, or another iteration might end past the deadline."""
-    iterations = progress.iterations
-    slowest = 0.0
-    last_save = time.monotonic()
-    ranks, device = learner.ranks, learner.env.device
-
-    def wanted() -> bool:
-        return learner.iteration < iterations and not stop.requested and time.monotonic() + slowest < deadline
-
-    while ranks.all_want(wanted(), device):
-        step = learner.iterate()
-        if progress.warm:  # the first iteration compiles and is no measure
-            slowest = max(slowest, step.collection_s + step.learning_s)
-        progress.add(step)
-        if time.monotonic() - last_save > cfg.save_every_s:
-            learner.save(checkpoint, progress.state())
-            last_save = time.monotonic()
 
 
 def read_arguments(arguments: Sequence[str]) -> BaseCfg:

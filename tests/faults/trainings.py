@@ -12,6 +12,7 @@ from train import base
 from train.curriculum import CurriculumCfg
 from train.learner import read_checkpoint
 from train.ppo import PpoCfg
+from train.run import CHECKPOINT
 from train.task import CommandTask
 from train.task_cfg import TaskCfg
 
@@ -24,7 +25,7 @@ TASK = CommandTask(_ROBOT, _CFG, num_envs=6, device="cpu", seed=0)
 
 def config(run_dir: Path, iterations: int) -> base.BaseCfg:
     """Settings that begin a training, or go on with what is left of it; every iteration is saved."""
-    resume = run_dir if (run_dir / base.CHECKPOINT).exists() else None
+    resume = run_dir if (run_dir / CHECKPOINT).exists() else None
     sizes = {"num_envs": 6, "iterations": iterations, "rows": 100, "save_every_s": 0.0}
     return base.BaseCfg(run_dir=run_dir, resume=resume, device="cpu", task=_CFG, ppo=_PPO, **sizes)
 
@@ -43,7 +44,7 @@ def train_watched(run_dir: Path, *, iterations: int, **watched: Any) -> int:
 
 def saved(run_dir: Path) -> dict[str, Any]:
     """All of a checkpoint but what a clock says; empty without one."""
-    path = run_dir / base.CHECKPOINT
+    path = run_dir / CHECKPOINT
     if not path.exists():
         return {}
     content = read_checkpoint(path, "anymal")

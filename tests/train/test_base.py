@@ -11,8 +11,9 @@ import torch
 from sim.policy import load_policy
 from sim.robot import get_robot
 from tests.train.conftest import CURRICULUM
-from train.base import BaseCfg, StopRequest, main, train
+from train.base import BaseCfg, main, train
 from train.ppo import PpoCfg
+from train.run import StopRequest
 from train.task_cfg import TaskCfg
 
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)

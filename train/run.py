@@ -1,0 +1,161 @@
+"""What all trainings share: a run directory, iterating until told to stop, checkpoints, the controller at the end."""
+
+import io
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sim.files import check_writable, read_json, to_json, write_atomically
+from train.learner import Learner, check_entries, read_checkpoint
+from train.progress import STATE, Progress
+
+CHECKPOINT = "checkpoint.pt"
+POLICY = "policy.pt"
+CONFIG = "config.json"
+RESERVE_S = 10.0
+"""Kept back of a time limit for the last save [s]."""
+
+
+class StopRequest:
+    """Set by Ctrl-C or SIGTERM: the iteration at hand is finished, then everything is saved. A second one kills."""
+
+    def __init__(self) -> None:
+        """Not asked yet; listens inside a ``with`` block."""
+        self.requested = False
+
+    def __enter__(self) -> "StopRequest":
+        self._before = {kind: signal.signal(kind, self._handle) for kind in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for kind, handler in self._before.items():
+            signal.signal(kind, handler)
+
+    def _handle(self, kind: int, _frame: object) -> None:
+        self.requested = True
+        signal.signal(kind, signal.SIG_DFL)
+
+
+def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) -> Path:
+    """The run directory, made and fit to be written to.
+
+    Args:
+        run_dir: Where to write.
+        resume: Run to go on from; the only one that may be written over.
+        export: Where else the controller goes.
+
+    Raises:
+        ValueError: If it holds another run, or one of the places cannot be written to.
+    """
+    if (run_dir / CHECKPOINT).exists() and (resume is None or run_dir.resolve() != resume.resolve()):
+        raise ValueError(
+            f"{run_dir} already holds a training run: go on with --resume {run_dir}, or name another --run-dir"
+        )
+    config = run_dir / CONFIG
+    if config.exists() and "settings" in read_json(config):
+        raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        if export is not None:
+            export.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"cannot write to {error.filename}: {error.strerror}; name another place") from error
+    for folder in {run_dir, export.parent if export else run_dir}:
+        check_writable(folder)
+    return run_dir
+
+
+def plain(value: Any) -> Any:
+    """Settings as JSON values: paths as text."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    return str(value) if isinstance(value, Path) else value
+
+
+def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
+    """What differs between two nested settings, one line each."""
+    found = []
+    for key in sorted(before.keys() | after.keys()):
+        old, new = before.get(key), after.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += changes(old, new, f"{prefix}{key}.")
+        elif old != new:
+            found.append(f"{prefix}{key} {old} -> {new}")
+    return found
+
+
+def read_saved(path: Path, robot: str) -> dict[str, Any]:
+    """The checkpoint of a training run, with the progress it had made.
+
+    Raises:
+        ValueError: As :func:`train.learner.read_checkpoint`.
+    """
+    saved = read_checkpoint(path, robot)
+    check_entries(saved["extra"], STATE, path)
+    check_entries(saved["extra"]["settings"], {"seed": (int,)}, path)
+    return saved
+
+
+def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
+    """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
+    buffer = io.BytesIO()
+    torch.save({"actor_state_dict": learner.actor_state(), "iter": learner.iteration}, buffer)
+    write_atomically(path, buffer.getvalue())
+    write_atomically(path.with_suffix(".train.json"), to_json(record))
+
+
+def iterate(
+    learner: Learner,
+    progress: Progress,
+    *,
+    save: Callable[[], None],
+    save_every_s: float,
+    stop: StopRequest,
+    deadline: float,
+    before: Callable[[], None] = lambda: None,
+) -> None:
+    """Iterate until all is done, a stop is requested, or another iteration might end past the deadline.
+
+    Args:
+        learner: What learns.
+        progress: What is told of every iteration.
+        save: Saves everything.
+        save_every_s: How often [s].
+        stop: Whether to stop.
+        deadline: On the clock of :func:`time.monotonic` [s].
+        before: Called before each iteration.
+    """
+    slowest, last_save = 0.0, time.monotonic()
+
+    def wanted() -> bool:
+        return learner.iteration < progress.iterations and not stop.requested and time.monotonic() + slowest < deadline
+
+    while learner.ranks.all_want(wanted(), learner.env.device):
+        before()
+        step = learner.iterate()
+        if progress.warm:  # the first iteration compiles and is no measure
+            slowest = max(slowest, step.collection_s + step.learning_s)
+        progress.add(step)
+        if time.monotonic() - last_save > save_every_s:
+            save()
+            last_save = time.monotonic()
+
+
+def finish(learner: Learner, progress: Progress, *, save: Callable[[], None], policies: list[Path]) -> None:
+    """The last checkpoint, and the controller with its record at every place asked for."""
+    learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
+    progress.close()
+    save()
+    record = progress.record()
+    for path in policies:
+        export_policy(path, learner, record)
+        print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+
+
+def resumable(run_dir: Path, error: OSError) -> OSError:
+    """An error with how to go on, where that can be done."""
+    return OSError(f"{error}. Go on with: --resume {run_dir}") if (run_dir / CHECKPOINT).exists() else error
