@@ -12,11 +12,12 @@ import torch
 import warp as wp
 
 from sim.files import check_zip
+from sim.onnx_policy import load_onnx
 from sim.robot import RobotCfg
 
 _FORMATS = (
-    "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), or module:callable (a function on device tensors, "
-    "or a class or factory marked by `faultline_factory = True` that is called with (robot, device))"
+    "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), or module:callable (a function "
+    "on device tensors, or a class or factory marked by `faultline_factory = True` that is called with (robot, device))"
 )
 
 
@@ -96,11 +97,12 @@ def read_weights(path: Path) -> Any:
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Load a controller and try it on one batch of zeros.
 
-    Files are loaded as data only (``weights_only``; TorchScript holds no Python) after a look at their checksums; code
-    runs only from ``module:callable``. TorchScript is read by torch's C++, which a file made to harm can crash.
+    Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
+    checksums; code runs only from ``module:callable``. TorchScript and ONNX are read by C++, which a file made to harm
+    can crash.
 
     Args:
-        spec: An rsl_rl checkpoint, a TorchScript file, or ``module:callable``.
+        spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, or ``module:callable``.
         robot: The robot it is to walk: fixes observation and action size.
         device: Warp device name.
 
@@ -147,6 +149,8 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
         )
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
+    if path.suffix.lower() == ".onnx":
+        return load_onnx(path, (robot.observation_size, robot.num_joints), device)
     try:
         if zipfile.is_zipfile(path):
             check_zip(path)
