@@ -1,14 +1,14 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare train calibrate replay evaluate crosscheck bench test lint clean
+.PHONY: help setup archive compare train calibrate replay reevaluate evaluate crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
 BIN := .venv/bin
 STAMP := .venv/.setup-done
 
-# The flags of the variables that are set, of those named: $(call flags,DEVICE SEED) -> --device cpu
-flags = $(foreach name,$(1),$(if $($(name)),--$(FLAG_$(name)) $(call quoted,$($(name)))))
+# The flags of the variables that are set, of those named: $(call flags,DEVICE SEED) -> --device='cpu'
+flags = $(foreach name,$(1),$(if $($(name)),--$(FLAG_$(name))=$(call quoted,$($(name)))))
 quoted = '$(subst ','\'',$(1))'
 FLAG_PRESET := preset
 FLAG_DEVICE := device
@@ -21,6 +21,9 @@ FLAG_ELITE := elite
 FLAG_OUT := out
 FLAG_GENES := genes
 FLAG_WORKERS := workers
+FLAG_WORKER_LIMIT_S := worker-limit-s
+FLAG_PROCESSES := processes
+FLAG_REPRODUCE := reproduce
 FLAG_FINE := fine
 FLAG_METHOD := method
 FLAG_INTERVALS := intervals
@@ -38,21 +41,23 @@ help: ## This list
 	@echo
 	@echo 'Variables (left out: the default of the command):'
 	@echo '  ROBOT=anymal     which robot'
-	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare train calibrate replay evaluate'
-	@echo '                                                   crosscheck bench'
+	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare train calibrate replay reevaluate'
+	@echo '                                                   evaluate crosscheck bench'
 	@echo '  PRESET=small     size of the search: paper, small  archive compare'
 	@echo '  ITERATIONS=N     stop after N iterations           archive compare train'
 	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, or'
-	@echo '                   module:callable                   archive compare calibrate replay evaluate'
-	@echo '                                                   crosscheck'
-	@echo '  SEED=N           seed of everything drawn          archive compare train calibrate evaluate'
-	@echo '                                                   crosscheck bench'
+	@echo '                   module:callable                   archive compare calibrate replay reevaluate'
+	@echo '                                                   evaluate crosscheck'
+	@echo '  SEED=N           seed of everything drawn          archive compare train calibrate reevaluate'
+	@echo '                                                   evaluate crosscheck bench'
 	@echo '  RESUME=DIR       go on with this run               archive compare train'
 	@echo '  METHOD=NAME      where terrains come from: cma_mae, cma_me, map_elites, directions, hard_random,'
 	@echo '                   uniform_random, or several with +  archive'
 	@echo '  INTERVALS=N      intervals of each ratio           archive'
 	@echo '  WITHOUT="A B"    penalties to leave out            archive'
-	@echo '  RUN=DIR ELITE=N  which archive, which elite of it  replay'
+	@echo '  REPRODUCE=yes    evaluate elites again at the end: yes, no; auto: of preset paper  archive'
+	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay reevaluate'
+	@echo '  ELITE=N          which elite of it, 0 the worst    replay'
 	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables, each NAME=SPEC          evaluate'
 	@echo '  ARCHIVE=DIR      run of a search whose held-out elites are the generated terrains  evaluate'
 	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
@@ -62,7 +67,9 @@ help: ## This list
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
 	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
-	@echo '                   joined by RAY_ADDRESS             archive compare calibrate evaluate'
+	@echo '                   joined by RAY_ADDRESS             archive compare calibrate reevaluate evaluate'
+	@echo '  WORKER_LIMIT_S=S give a worker up that gets no further for so many seconds         archive compare reevaluate'
+	@echo '  PROCESSES=N      processes on the CPU without Ray  archive compare reevaluate'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
 	@echo '  TORCH=SPEC       torch other than the pinned one, e.g. a build for your GPU driver: a requirement or a wheel'
 	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.replay, train.base, ...)'
@@ -81,10 +88,10 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 archive: setup ## Search the terrains on which the controller of ROBOT fails; writes a run under runs/
-	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS METHOD INTERVALS WITHOUT)
+	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS PROCESSES WORKER_LIMIT_S METHOD INTERVALS WITHOUT REPRODUCE)
 
 compare: setup ## Let the search and its baselines loose on the same number of terrains
-	$(BIN)/python -m qd.compare --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS OUT)
+	$(BIN)/python -m qd.compare --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS PROCESSES WORKER_LIMIT_S OUT)
 
 train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)
@@ -94,6 +101,9 @@ calibrate: setup ## Measure the penalty scales of ROBOT
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
 	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
+
+reevaluate: setup ## Evaluate every elite of an archive again with 40 fresh episodes
+	$(BIN)/python -m qd.reevaluate --robot $(call quoted,$(ROBOT)) $(call flags,RUN DEVICE POLICY SEED WORKERS PROCESSES WORKER_LIMIT_S)
 
 evaluate: setup ## Rates of the controller of ROBOT, or with POLICIES or ARCHIVE the tables of the paper
 	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS)

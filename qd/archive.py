@@ -133,6 +133,13 @@ class Archive:
             rate = np.where(self.fresh.valid, self.fresh.collision_rate, rate)
         return rate > 0.0
 
+    def has_elites_of(self, other: "Archive") -> bool:
+        """Whether the elites and all that was found of them are another's too, in whatever order."""
+        if len(self) != len(other):
+            return False
+        own, others = np.argsort(self.cell), np.argsort(other.cell)
+        return all(np.array_equal(getattr(self, name)[own], getattr(other, name)[others]) for name in PER_ELITE)
+
     def rows(self, chosen: NDArray[np.int64]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
         fresh = None if self.fresh is None else self.fresh.rows(chosen)

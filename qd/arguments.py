@@ -1,11 +1,11 @@
 """What a command line of the search means: a new run, or an old one that goes on."""
 
 import itertools
-import shlex
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
+from qd.next_commands import Placed, next_command
 from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
 from qd.settings import (
     SearchCfg,
@@ -108,6 +108,8 @@ class Job:
     """Provenance of the run's beginning."""
     resume_command: str
     """How to go on with it."""
+    reevaluate_command: str
+    """How to evaluate its elites again once it has found them."""
 
     @property
     def device(self) -> str:
@@ -150,11 +152,17 @@ def job_of(args: Arguments) -> Job:
         evaluator=evaluator_of(cfg, policy, device, args),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
         origin=origin,
-        resume_command=resume_command("archive", cfg.robot, path, args, moved),
+        resume_command=_resume_command(cfg.robot, path, args, moved),
+        reevaluate_command=next_command("reevaluate", args, robot=cfg.robot, run=path, policy=moved),
     )
 
 
-def evaluator_of(cfg: SearchCfg, policy: str, device: str, args: "Placed", *, runs_on_gpu: int = 1) -> EvaluatorCfg:
+def _resume_command(robot: str, path: Path, args: Arguments, moved: str | None) -> str:
+    reproduce = None if args.reproduce == "auto" else args.reproduce
+    return next_command("archive", args, robot=robot, resume=path, policy=moved, reproduce=reproduce)
+
+
+def evaluator_of(cfg: SearchCfg, policy: str, device: str, args: Placed, *, runs_on_gpu: int = 1) -> EvaluatorCfg:
     """What evaluates an iteration's terrains all at once, with a controller that was tried.
 
     Args:
@@ -242,7 +250,7 @@ def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
         if different:
             found = f"{args.run_dir} holds a run of other settings"
             raise ValueError(f"{found}: {', '.join(different)}: give another --run-dir")
-        command = resume_command("archive", cfg.robot, args.run_dir, args, None)
+        command = _resume_command(cfg.robot, args.run_dir, args, None)
         raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
     if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
         raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
@@ -260,40 +268,4 @@ def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments) -> None:
         if done < config["iterations"] and not differences(config["settings"], as_settings(cfg)):
             state = f"stopped after {done} of {config['iterations']} iterations"
             print(f"{path} holds the same search, {state}. Go on with:")
-            print(f"  {resume_command('archive', cfg.robot, path, args, None)}")
-
-
-class Placed(Protocol):
-    """The arguments that say where a command works."""
-
-    @property
-    def device(self) -> str | None:
-        """Warp device name."""
-
-    @property
-    def workers(self) -> int | Literal["auto"] | None:
-        """Ray workers."""
-
-    @property
-    def processes(self) -> int | None:
-        """Processes without Ray."""
-
-    @property
-    def worker_limit_s(self) -> float:
-        """When a Ray worker is given up [s]."""
-        ...
-
-
-def resume_command(target: str, robot: str, path: Path, args: Placed, moved: str | None) -> str:
-    """How to go on, as one types it: ``make archive ROBOT=anymal RESUME=runs/x DEVICE=cpu``.
-
-    Args:
-        target: Of the Makefile.
-        robot: Name of the robot.
-        path: What to resume.
-        args: Where it worked.
-        moved: Where the controller is now, if elsewhere than the settings say.
-    """
-    workers = None if args.workers is None else str(args.workers)
-    flags = {"ROBOT": robot, "RESUME": str(path), "DEVICE": args.device, "WORKERS": workers, "POLICY": moved}
-    return " ".join([f"make {target}", *(f"{name}={shlex.quote(value)}" for name, value in flags.items() if value)])
+            print(f"  {_resume_command(cfg.robot, path, args, None)}")

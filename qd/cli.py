@@ -3,7 +3,8 @@
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn, TypeVar
 
@@ -18,6 +19,27 @@ Arguments = TypeVar("Arguments")
 
 class Interrupted(KeyboardInterrupt):
     """The program was asked to stop; what it says next, such as how to resume, is its text."""
+
+
+@contextmanager
+def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None]:
+    """Ends work that is stopped or fails half way with what there is and how to go on.
+
+    Args:
+        state: What is saved, after ``Stopped;``.
+        command: Says what to do next, once it is known.
+
+    Raises:
+        Interrupted: On Ctrl-C.
+        EvaluatorError: If a worker is lost.
+        OSError: If a file cannot be written.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(f"Stopped; {state}. {command()}") from None
+    except (EvaluatorError, OSError) as error:
+        raise type(error)(f"{error}. {command()}") from None
 
 
 def run_command(arguments: type[Arguments], main: Callable[[Arguments], object], argv: list[str] | None = None) -> None:
@@ -38,7 +60,7 @@ def run_command(arguments: type[Arguments], main: Callable[[Arguments], object],
     except (ValueError, OSError, EvaluatorError) as error:
         if os.environ.get(_DEBUG):
             raise
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error: {' '.join(filter(None, map(str.strip, str(error).splitlines())))}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)

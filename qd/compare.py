@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qd.archive import Archive
-from qd.cli import Interrupted, run_command
+from qd.cli import naming_what_is_next, run_command
 from qd.compare_arguments import Arguments, Comparison, comparison_of
 from qd.comparison import draw_comparison, report_of
 from qd.fitness import FITNESS_FLOOR
@@ -25,7 +25,7 @@ from qd.run_directory import Metrics, RunDirectory, archive_of, claimed
 from qd.search import begin, take_in
 from qd.settings import SearchCfg, as_settings
 from qd.shards import taken
-from qd.workers import Evaluate, EvaluatorError, crew_status, episode_seeds, open_evaluator
+from qd.workers import Evaluate, crew_status, episode_seeds, open_evaluator
 from sim.files import to_json, write_atomically
 
 if TYPE_CHECKING:
@@ -138,17 +138,13 @@ def compare(args: Arguments, *, open_evaluator: Open = open_evaluator) -> None:
             f"{cfg.preset}: {episodes:,} episodes, and those of the elites evaluated again; runs in {asked.path}",
             flush=True,
         )
-        try:
+        with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(asked)):
             with open_evaluator(asked.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
                 _write_configs(asked, entrants)
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:
                         lock_step(entrants, evaluate, cfg, bar)
             _finish(asked, entrants)
-        except KeyboardInterrupt:
-            raise Interrupted(f"Stopped; finished iterations are saved. {_how_to_go_on(asked)}") from None
-        except (EvaluatorError, OSError) as error:
-            raise type(error)(f"{error}. {_how_to_go_on(asked)}") from None
 
 
 def _how_to_go_on(asked: Comparison) -> str:
@@ -170,7 +166,7 @@ def _finish(asked: Comparison, entrants: Sequence[Entrant]) -> None:
     runs: dict[str, list[Metrics]] = {method: [] for method in asked.methods}
     for entrant in entrants:
         found = archive_of(as_settings(entrant.cfg), entrant.search, entrant.done)
-        entrant.run.write_derived(entrant.metrics, found)
+        entrant.run.write_derived(entrant.metrics, entrant.run.with_fresh_values(found))
         runs[entrant.method].append(entrant.metrics)
     cfg = asked.cfg
     settings = {name: as_settings(asked.cfg_of(name, cfg.seed))["scheduler"] for name in asked.methods}

@@ -5,7 +5,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from qd.arguments import evaluator_of, moved_policy, origin_in, refuse_changes, resume_command, resumed
+from qd.arguments import evaluator_of, moved_policy, origin_in, refuse_changes, resumed
+from qd.next_commands import next_command
 from qd.run_directory import numbered
 from qd.scheduler_cfg import SchedulerCfg
 from qd.settings import SearchCfg, Settings, as_settings, changed, from_settings, measured_now, policy_spec, preset
@@ -148,7 +149,7 @@ def comparison_of(args: Arguments) -> Comparison:
         evaluator=evaluator,
         out=args.out or path / "compare.json",
         origin=origin,
-        resume_command=resume_command("compare", cfg.robot, path, args, moved),
+        resume_command=next_command("compare", args, robot=cfg.robot, resume=path, policy=moved),
     )
 
 

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from qd.archive import Archive
 from qd.arguments import evaluator_of, origin_in
-from qd.cli import Interrupted, run_command
+from qd.cli import naming_what_is_next, run_command
 from qd.fresh import Open, corrected
-from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed
+from qd.next_commands import next_command
+from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed, newest_run
 from qd.search import write_results
 from qd.settings import SHIPPED, SearchCfg, as_settings, file_hash, policy_spec
 from qd.workers import open_evaluator, origin_of, resolve_device
@@ -25,8 +26,10 @@ class ReevaluateCfg:
     and figures are written again with them, elites by descending corrected fitness.
     """
 
-    run: Path
-    """Run directory."""
+    robot: str | None = None
+    """Which robot the run is of; left out, whatever --run is of."""
+    run: Path | None = None
+    """Run directory; the newest of the robot, or of anymal, under runs/."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     workers: int | Literal["auto"] | None = None
@@ -59,26 +62,29 @@ def reevaluate_run(args: ReevaluateCfg, *, open_evaluator: Open = open_evaluator
     """
     from sim.robot import get_robot
 
-    run = RunDirectory(args.run)
+    path = args.run or newest_run(args.robot or "anymal")
+    run = RunDirectory(path)
     config, cfg = run.read_config(), run.read_cfg()
+    if args.robot not in (None, cfg.robot):
+        raise ValueError(f"{path} is of {cfg.robot}, got --robot {args.robot}: give that robot or another --run")
     seed = cfg.seed if args.seed is None else args.seed
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
     device = resolve_device(args.device, args.workers)
-    policy = args.policy or _own_policy(args.run, cfg, get_robot(cfg.robot))
+    policy = args.policy or _own_policy(path, cfg, get_robot(cfg.robot))
     evaluator = evaluator_of(cfg, policy, device, args)
-    with claimed(args.run):
+    again = next_command("reevaluate", args, robot=cfg.robot, run=path, policy=args.policy, seed=args.seed)
+    with claimed(path):
         loaded = run.load(as_settings(cfg))
         if loaded is None:
-            raise ValueError(f"{args.run} has no finished iteration, expected at least one: go on with it (--resume)")
+            raise ValueError(f"{path} has no finished iteration, expected at least one: go on with it (--resume)")
         search, metrics = loaded
         found = archive_of(as_settings(cfg), search, len(metrics))
-        try:
+        with naming_what_is_next(f"{path} is as it was", lambda: f"Start again with:  {again}"):
             archive = corrected(found, cfg, evaluator, open_evaluator, seed)
-        except KeyboardInterrupt:
-            raise Interrupted(f"Stopped; {args.run} is as it was: start again") from None
-        again = origin_of(device, seed, args.workers) | _given_policy(args)
-        write_results(run, archive, metrics, {**origin_in(config), "reproduced_by": again})
+        by = origin_of(device, seed, args.workers) | _given_policy(args)
+        with naming_what_is_next("some files may not be written", lambda: f"Start again with:  {again}"):
+            write_results(run, archive, metrics, {**origin_in(config), "reproduced_by": by})
     return archive
 
 

@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import ARCHIVE_FILE, Archive, read_archive
+from qd.archive import Archive, read_archive
 from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.report import new_figure, save_figure
-from qd.run_directory import CONFIG_FILE, RunDirectory
+from qd.run_directory import CONFIG_FILE, RunDirectory, newest_run
 from qd.settings import SHIPPED
 from qd.workers import check_policy, episode_seeds, resolve_device
+from sim.intervals import wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sim.rollout import RolloutResult
 
-_RUNS = Path("runs")
 _REPLAY_STREAM = 2
 _UNITS = {"yaw_rate": "rad", "vel_x": "m", "vel_y": "m", "contact_force": "N s", "stumble": "s", "collision": "s"}
 _LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
@@ -62,21 +62,6 @@ class Replay:
     result: "RolloutResult"
     """One terrain, with paths."""
     fresh: Evaluation
-
-
-def newest_run(robot: str) -> Path:
-    """The run of a robot under runs/ whose archive changed last.
-
-    Raises:
-        FileNotFoundError: If there is none.
-    """
-    files = sorted(_RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
-    for file in files:
-        if read_archive(file).robot == robot:
-            return file.parent
-    raise FileNotFoundError(
-        f"no archive of {robot} under {_RUNS}/: make one with `make archive ROBOT={robot}`, or give --run"
-    )
 
 
 def replay(cfg: ReplayCfg) -> Replay:
@@ -152,16 +137,14 @@ def describe(replay: Replay) -> str:
             for _, values, k in columns
         ]
     for label, name in (("base collision", "collision_rate"), ("goal reached", "goal_rate"), ("fallen", "fallen_rate")):
-        rows[label] = [
-            _rate(getattr(values, name)[k], int(values.episodes[k] - values.invalid_episodes[k]))
-            for _, values, k in columns
-        ]
+        rows[label] = [_rate(getattr(values, name)[k], _counted(values, k)) for _, values, k in columns]
     table = [f"  {label:22}" + "".join(f"{cell:>34}" for cell in row) for label, row in rows.items()]
     return "\n".join(
         [
             f"Elite {n} of {len(archive):,} of {archive.robot}, found in iteration {archive.iteration[n]}, with ratios "
             f"in {cells.describe(int(archive.cell[n]))}",
             *table,
+            "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
             f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} "
             "again.",
         ]
@@ -172,8 +155,18 @@ def _penalty(mean: float, std: float, scale: float, ratio: float) -> str:
     return f"{mean * scale:.2f} +- {std * scale:.2f} ({ratio:.0%} of all)"
 
 
+def _counted(values: Archive | Evaluation, number: int) -> int:
+    """Episodes that a terrain's rates are of: none of a terrain that is invalid as a whole."""
+    valid = isinstance(values, Archive) or values.valid[number]  # what is found is valid, or it were no elite
+    return int(values.episodes[number] - values.invalid_episodes[number]) if valid else 0
+
+
 def _rate(rate: float, count: int) -> str:
-    return f"{round(rate * count)} of {count} ({rate:.0%})"
+    if not count:
+        return "no valid episode"
+    hits = round(rate * count)
+    low, high = wilson_interval(hits, count)
+    return f"{hits} of {count} ({rate:.0%}, {100 * low:.0f} to {high:.0%})"
 
 
 def draw(replay: Replay) -> "Figure":

@@ -10,10 +10,11 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qd.archive import ARCHIVE_FILE, Archive, write_archive
+from qd.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.settings import SearchCfg, Settings, from_settings
 from sim.files import check_writable, read_json, to_json, write_atomically
@@ -24,10 +25,29 @@ if TYPE_CHECKING:
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"
+SUMMARY_FILE = "archive.json"
 _REMEDY = "put a copy of it back, or start a new run"
 
 Metrics = list[dict[str, Any]]
 """One row an iteration."""
+
+
+_RUNS = Path("runs")
+
+
+def newest_run(robot: str) -> Path:
+    """The run of a robot under runs/ whose archive changed last.
+
+    Raises:
+        FileNotFoundError: If there is none.
+    """
+    files = sorted(_RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
+    for file in files:
+        if read_archive(file).robot == robot:
+            return file.parent
+    raise FileNotFoundError(
+        f"no archive of {robot} under {_RUNS}/: make one with `make archive ROBOT={robot}`, or give --run"
+    )
 
 
 def numbered(root: Path, name: str) -> Iterator[Path]:
@@ -152,6 +172,34 @@ class RunDirectory:
         rows = "".join(json.dumps(row, allow_nan=False) + "\n" for row in metrics)
         write_atomically(self.path / METRICS_FILE, rows.encode())
         write_archive(self.path / ARCHIVE_FILE, archive)
+
+    def has_fresh_values(self) -> bool:
+        """Whether the archive's file says what fresh episodes made of its elites."""
+        return self._fresh_archive() is not None
+
+    def with_fresh_values(self, found: Archive) -> Archive:
+        """An archive with the fresh values of its file, where those are of just these elites; else as it is.
+
+        Args:
+            found: What the search has found.
+        """
+        there = self._fresh_archive()
+        return replace(there, iterations=found.iterations) if there and there.has_elites_of(found) else found
+
+    def _fresh_archive(self) -> Archive | None:
+        """The archive of the file if it has fresh values; a damaged one, which is made again, has none."""
+        try:
+            archive = read_archive(self.path)
+        except (OSError, ValueError):
+            return None
+        return None if archive.fresh is None else archive
+
+    def read_summary(self) -> dict[str, Any]:
+        """The run in numbers; nothing where they were not written or are damaged, as they are made again."""
+        try:
+            return read_json(self.path / SUMMARY_FILE)
+        except (OSError, ValueError):
+            return {}
 
     def iterations_done(self) -> int:
         """Rows of the metrics file, without reading the checkpoint."""

@@ -17,7 +17,7 @@ from qd import space
 from qd.directions import DirectionEmitter
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.scheduler_cfg import SchedulerCfg
-from sim.terrain import hard_random_genes
+from sim.terrain import hard_random_genes, uniform_random_genes
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
 
@@ -38,7 +38,7 @@ class RandomEmitter:
 
     def ask(self) -> NDArray[np.float32]:
         """Genes, shape (batch_size, 64)."""
-        draw = space.random if self.method == "uniform_random" else hard_random_genes
+        draw = uniform_random_genes if self.method == "uniform_random" else hard_random_genes
         return draw(self.batch_size, self._rng)
 
     def tell(self, **told: Any) -> None:

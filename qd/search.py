@@ -1,27 +1,26 @@
 """Search the terrains that break a controller: ask for terrains, let robots cross them, tell what became of them."""
 
-import shlex
 import time
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import Archive
 from qd.arguments import Arguments, Job, job_of
-from qd.cli import Interrupted, run_command
+from qd.cli import naming_what_is_next, run_command
 from qd.fitness import Evaluation, evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
+from qd.next_commands import make_command
 from qd.progress import ProgressBar, clock, plan
 from qd.report import summary, write_figures
-from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed
-from qd.settings import SearchCfg, as_settings, policy_spec
-from qd.workers import Evaluate, EvaluatorError, crew_status, episode_seeds, open_evaluator, origin_of
+from qd.run_directory import CONFIG_FILE, SUMMARY_FILE, Metrics, RunDirectory, archive_of, claimed
+from qd.settings import SearchCfg, as_settings
+from qd.workers import Evaluate, crew_status, episode_seeds, open_evaluator, origin_of
 from sim.files import to_json, write_atomically
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
     from sim.rollout import RolloutResult
 
-SUMMARY_FILE = "archive.json"
 MOST_DRAWN = 200
 """Elites drawn for a look at them in the middle of a search (the paper's figure of mean STD)."""
 
@@ -136,20 +135,30 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                 f"iterations must be at least {done}, as many as {job.path} has done, got {cfg.iterations}"
             )
         print(plan(cfg, job.path, done, job.device, job.evaluator.processes), flush=True)
-        try:
+        _mention_fresh_values(job, run, done)
+        with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(job)):
             with open_evaluator(job.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
                 search, metrics = loaded or (begin(cfg), [])
                 run.write_config(as_settings(cfg), cfg.iterations, job.origin)
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:
                         search_terrains(cfg, run, search, metrics, evaluate, bar)
-            return _finish(job, run, search, metrics, open_evaluator)
-        except Interrupted:
-            raise
-        except KeyboardInterrupt:
-            raise Interrupted(f"Stopped; finished iterations are saved. {_how_to_go_on(job)}") from None
-        except (EvaluatorError, OSError) as error:
-            raise type(error)(f"{error}. {_how_to_go_on(job)}") from None
+            archive = _write_found(job, run, search, metrics)
+        if job.reproduce:
+            again = f"Go on with:  {job.reevaluate_command}"
+            with naming_what_is_next("the archive is saved as found", lambda: again):
+                archive = _write_corrected(job, run, archive, metrics, open_evaluator)
+    print(f"Next, see the worst terrain:  {make_command('replay', robot=cfg.robot, run=job.path, elite=0)}")
+    return archive
+
+
+def _mention_fresh_values(job: Job, run: RunDirectory, done: int) -> None:
+    """Says so before a run loses what fresh episodes said of its elites."""
+    if job.resumes and not job.reproduce and done < job.cfg.iterations and run.has_fresh_values():
+        print(
+            "Its elites were evaluated again with fresh episodes; the first new iteration drops those values. "
+            f"Afterwards:  {job.reevaluate_command}"
+        )
 
 
 def _how_to_go_on(job: Job) -> str:
@@ -166,35 +175,22 @@ def begin(cfg: SearchCfg) -> "Scheduler":
     return Scheduler(cfg.scheduler, num_cells=cfg.cells.num_cells, num_ratios=num_ratios, seed=cfg.seed)
 
 
-def _finish(job: Job, run: RunDirectory, search: "Scheduler", metrics: Metrics, open_evaluator: Open) -> Archive:
-    """Figures and numbers of a search that reached its iterations: as found, then as fresh episodes correct it."""
-    archive = archive_of(as_settings(job.cfg), search, len(metrics))
-    write_results(run, archive, metrics, {**job.origin, "reproduced_by": None})
-    if job.reproduce:
-        try:
-            archive = corrected(archive, job.cfg, job.evaluator, open_evaluator, job.cfg.seed)
-        except KeyboardInterrupt:
-            raise Interrupted(f"Stopped; the archive is saved as found. Go on with:  {_again_command(job)}") from None
-        # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
-        again = origin_of(job.device, job.cfg.seed, job.evaluator.workers)
-        write_results(run, archive, metrics, {**job.origin, "reproduced_by": again})
-    print(f"Next, see the worst terrain:  make replay ROBOT={job.cfg.robot} RUN={shlex.quote(str(job.path))} ELITE=0")
+def _write_found(job: Job, run: RunDirectory, search: "Scheduler", metrics: Metrics) -> Archive:
+    """Figures and numbers of a search that reached its iterations, with the fresh values that still hold."""
+    found = archive_of(as_settings(job.cfg), search, len(metrics))
+    archive = found if job.reproduce else run.with_fresh_values(found)
+    by = run.read_summary().get("reproduced_by") if archive.fresh is not None else None
+    write_results(run, archive, metrics, {**job.origin, "reproduced_by": by})
     return archive
 
 
-def _again_command(job: Job) -> str:
-    """How to evaluate the elites of a finished search again."""
-    from sim.robot import get_robot
-
-    moved = job.evaluator.policy != policy_spec(job.cfg, get_robot(job.cfg.robot))
-    flags = {
-        "run": job.path,
-        "device": job.device,
-        "workers": job.evaluator.workers,
-        "policy": job.evaluator.policy if moved else None,
-    }
-    given = [f"--{name} {shlex.quote(str(value))}" for name, value in flags.items() if value is not None]
-    return " ".join([".venv/bin/python -m qd.reevaluate", *given])
+def _write_corrected(job: Job, run: RunDirectory, archive: Archive, metrics: Metrics, open_evaluator: Open) -> Archive:
+    """The same as 40 fresh episodes of each elite correct it."""
+    archive = corrected(archive, job.cfg, job.evaluator, open_evaluator, job.cfg.seed)
+    # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
+    again = origin_of(job.device, job.cfg.seed, job.evaluator.workers)
+    write_results(run, archive, metrics, {**job.origin, "reproduced_by": again})
+    return archive
 
 
 def write_results(run: RunDirectory, archive: Archive, metrics: Metrics, origin: dict[str, Any]) -> None:

@@ -48,16 +48,3 @@ def clip(genes: ArrayLike) -> NDArray[np.float32]:
         ValueError: If the shape is another one, or a gene is not finite.
     """
     return np.clip(validate(genes), -1.0, 1.0)
-
-
-def random(count: int, seed: int | np.random.Generator) -> NDArray[np.float32]:
-    """Terrains drawn uniformly from the space, the baseline that a search has to beat.
-
-    Args:
-        count: Number of terrains.
-        seed: Seed, or a generator to draw from.
-
-    Returns:
-        Genes, float32, shape (count, 64).
-    """
-    return np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, NUM_GENES)).astype(np.float32)

@@ -26,7 +26,7 @@ class Arguments:
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     out: Path | None = None
-    """Where to write the numbers; results/bench/<device>.json by default."""
+    """Where to write the numbers; runs/bench/<device>.json by default."""
     num_envs: int | None = None
     """Robots: 4,096 on CUDA, 16 on the CPU."""
     num_terrains: int | None = None

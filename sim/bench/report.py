@@ -15,7 +15,7 @@ from sim.bench.timing import TimingCfg
 from sim.policy import prepare_torch
 from sim.robot import RobotCfg
 
-RESULTS = Path(__file__).resolve().parents[2] / "results" / "bench"
+_RUNS = Path("runs") / "bench"  # a measurement made in passing does not replace the published one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +42,9 @@ def preset(device: str, *, seed: int) -> BenchCfg:
 
 
 def file_of(device_name: str) -> Path:
-    """Where the results of a device go: ``nvidia-h200.json`` for an NVIDIA H200, ``cpu.json`` for any CPU."""
+    """Where numbers go by default: ``runs/bench/nvidia-h200.json`` for an NVIDIA H200, ``cpu.json`` for any CPU."""
     name = "cpu" if device_name.startswith("CPU") else re.sub(r"[^a-z0-9]+", "-", device_name.lower()).strip("-")
-    return RESULTS / f"{name}.json"
+    return _RUNS / f"{name}.json"
 
 
 def _measure_rows(cases: list[Case], cfg: BenchCfg, device: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:

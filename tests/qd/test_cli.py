@@ -190,6 +190,16 @@ def test_new_runs_get_directories_of_their_own_and_stopped_ones_are_mentioned(ca
     assert "make archive ROBOT=anymal RESUME=runs/anymal-small-0 DEVICE=cpu" in output
 
 
+def test_the_command_to_go_on_says_all_that_was_given_of_where_to_work(capsys):
+    run_main(*TINY, "--run-dir", "a  b$c")
+    given = ["--processes", "1", "--worker-limit-s", "20.5", "--reproduce", "yes"]
+    message = fails(capsys, *TINY, "--run-dir", "a  b$c", *given)
+    assert message.endswith(
+        "go on with `make archive ROBOT=anymal RESUME='a  b$$c' REPRODUCE=yes DEVICE=cpu PROCESSES=1 "
+        "WORKER_LIMIT_S=20.5`"
+    )
+
+
 def test_a_resumed_run_keeps_where_it_came_from():
     run_main(*TINY, "--run-dir", "a")
     first = json.loads(Path("a/config.json").read_text())

@@ -12,6 +12,7 @@ from qd.archive import read_archive
 from qd.arguments import job_of
 from qd.cli import Interrupted
 from qd.compare import Arguments
+from qd.reevaluate import ReevaluateCfg, reevaluate_run
 from qd.run_directory import RunDirectory
 from qd.search import run_search
 from sim.robot import RobotCfg
@@ -167,6 +168,16 @@ def test_resuming_a_finished_one_evaluates_nothing_and_writes_its_numbers_again(
     before = numbers_of(run("a"))
     Path("a/compare.json").unlink()
     assert numbers_of(go_on("a", open_evaluator=never)) == before
+
+
+def test_fresh_values_of_a_run_stay_while_it_does_not_grow():
+    path = run("a", iterations=1) / "cma_mae_narrow-5"
+    reevaluate_run(ReevaluateCfg(run=path, device="cpu"), open_evaluator=open_stand_in)
+    kept = (path / "archive.npz").read_bytes()
+    go_on("a", open_evaluator=never)
+    assert (path / "archive.npz").read_bytes() == kept
+    go_on("a", iterations=2)
+    assert read_archive(path).fresh is None
 
 
 def test_numbers_go_where_they_are_asked_for():

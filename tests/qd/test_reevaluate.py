@@ -1,8 +1,9 @@
 """A run's elites again: at the end of its search, and by the command, over the stand-in evaluator."""
 
 import json
-import re
+import os
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from qd.archive import read_archive
 from qd.cli import Interrupted
 from qd.reevaluate import ReevaluateCfg, reevaluate_run
 from qd.search import run_search
+from qd.workers import EvaluatorError
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 from tests.qd.test_search import make_job, rows_of, run
@@ -48,18 +50,26 @@ def watching(configs, seeds_seen):
     return opened
 
 
-def stopped_in_fresh_episodes(cfg):
+def ended_in_fresh_episodes(error):
+    """The stand-in, but for an error half way through the fresh episodes."""
+
     @contextmanager
     def opened(cfg):
         def evaluate(genes, seeds, progress=None):
             if cfg.num_replicas == 40:
                 progress(0.5)
-                raise KeyboardInterrupt
+                raise error
             return stand_in.evaluate(genes, seeds, cfg.num_replicas)
 
         yield evaluate
 
-    return opened(cfg)
+    return opened
+
+
+STOPS = [
+    (KeyboardInterrupt(), Interrupted, "Stopped; the archive is saved as found. "),
+    (EvaluatorError("a worker process died"), EvaluatorError, "a worker process died. "),
+]
 
 
 def test_a_search_ends_with_forty_fresh_episodes_of_each_elite(tmp_path, capsys):
@@ -84,10 +94,15 @@ def test_a_search_ends_with_forty_fresh_episodes_of_each_elite(tmp_path, capsys)
     assert "fresh episodes [" in output.err and "ETA" in output.err
 
 
-def test_stopped_in_the_fresh_episodes_a_search_leaves_what_it_found_and_the_command_goes_on(tmp_path):
+@pytest.mark.parametrize(("error", "kind", "message"), STOPS, ids=["Ctrl-C", "a lost worker"])
+def test_stopped_in_the_fresh_episodes_a_search_leaves_what_it_found_and_the_command_goes_on(
+    tmp_path, error, kind, message
+):
     path = tmp_path / "run"
-    with pytest.raises(Interrupted, match=re.escape(f"Go on with:  .venv/bin/python -m qd.reevaluate --run {path}")):
-        run_search(make_job(path, reproduce=True, policy=POLICY), open_evaluator=stopped_in_fresh_episodes)
+    with pytest.raises(kind) as raised:
+        job = make_job(path, reproduce=True, policy=POLICY)
+        run_search(job, open_evaluator=ended_in_fresh_episodes(error))
+    assert str(raised.value) == f"{message}Go on with:  make reevaluate RUN={path}"
     found = run(tmp_path / "found", policy=POLICY)
     assert (path / "archive.npz").read_bytes() == (tmp_path / "found/archive.npz").read_bytes()
     assert numbers_in(path)["elites_reproduced"] is None
@@ -114,13 +129,77 @@ def test_the_command_adds_fresh_values_to_a_run_and_another_seed_gives_others(tm
     assert rows_of(path, timed=True) == metrics
 
 
-def test_stopped_the_command_leaves_the_run_as_it_was(tmp_path):
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), EvaluatorError("no worker came")])
+def test_stopped_the_command_leaves_the_run_as_it_was_and_says_how_to_start_again(tmp_path, error):
     path = tmp_path / "run"
     run(path, policy=POLICY)
     before = {file.name: file.read_bytes() for file in path.iterdir()}
-    with pytest.raises(Interrupted, match="is as it was"):
-        reevaluate_run(ReevaluateCfg(run=path, device="cpu"), open_evaluator=stopped_in_fresh_episodes)
+    args = ReevaluateCfg(run=path, device="cpu", seed=7, processes=1, worker_limit_s=20.0)
+    with pytest.raises((Interrupted, EvaluatorError)) as raised:
+        reevaluate_run(args, open_evaluator=ended_in_fresh_episodes(error))
+    state = f"Stopped; {path} is as it was" if isinstance(error, KeyboardInterrupt) else "no worker came"
+    assert str(raised.value) == (
+        f"{state}. Start again with:  make reevaluate ROBOT=anymal RUN={path} SEED=7 DEVICE=cpu PROCESSES=1 "
+        "WORKER_LIMIT_S=20"
+    )
     assert {file.name: file.read_bytes() for file in path.iterdir()} == before
+
+
+def test_fresh_values_stay_while_the_elites_are_the_same(tmp_path, capsys):
+    path = tmp_path / "run"
+    run(path, policy=POLICY)
+    again(path, seed=7)
+    kept, numbers = (path / "archive.npz").read_bytes(), numbers_in(path)
+    run(path, policy=POLICY, resumes=True)  # nothing is left to do but to write its results again
+    assert (path / "archive.npz").read_bytes() == kept
+    assert numbers_in(path) == numbers
+    assert numbers["reproduced_by"]["seed"] == 7
+    assert "drops those values" not in capsys.readouterr().out
+    # Searched again at the end, they are those of the run's own seed.
+    run_search(make_job(path, policy=POLICY, resumes=True, reproduce=True), open_evaluator=open_stand_in)
+    assert numbers_in(path)["reproduced_by"]["seed"] == 3
+
+
+def test_a_run_that_grows_says_that_its_fresh_values_go(tmp_path, capsys):
+    path = tmp_path / "run"
+    run(path, policy=POLICY)
+    assert "drops those values" not in capsys.readouterr().out
+    again(path)
+    run(path, policy=POLICY, resumes=True, iterations=4)
+    output = capsys.readouterr().out
+    assert f"the first new iteration drops those values. Afterwards:  make reevaluate RUN={path}" in output
+    assert read_archive(path).fresh is None
+    assert numbers_in(path)["reproduced_by"] is None
+    run(tmp_path / "whole", policy=POLICY, iterations=4)
+    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
+
+
+def test_fresh_values_of_other_elites_or_of_a_damaged_file_are_not_taken(tmp_path):
+    path, other = tmp_path / "run", tmp_path / "other"
+    run(path, policy=POLICY)
+    run(other, policy=POLICY, seed=4)
+    found = (path / "archive.npz").read_bytes()
+    again(other)
+    for strayed in ((other / "archive.npz").read_bytes(), b"PK and no more"):
+        (path / "archive.npz").write_bytes(strayed)
+        (path / "archive.json").write_text("{")
+        run(path, policy=POLICY, resumes=True)
+        assert (path / "archive.npz").read_bytes() == found
+        assert numbers_in(path)["elites_reproduced"] is None
+
+
+def test_the_newest_run_of_the_robot_is_taken_and_another_robots_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(tmp_path / "runs/older", policy=POLICY)
+    run(tmp_path / "runs/newer", policy=POLICY)
+    os.utime(tmp_path / "runs/older/archive.npz", (0, 0))
+    reevaluate_run(ReevaluateCfg(device="cpu"), open_evaluator=open_stand_in)
+    assert read_archive("runs/older").fresh is None
+    assert read_archive("runs/newer").fresh is not None
+    with pytest.raises(ValueError, match=r"runs/newer is of anymal, got --robot cassie: give that robot or another"):
+        reevaluate_run(ReevaluateCfg(robot="cassie", run=Path("runs/newer"), device="cpu"))
+    with pytest.raises(FileNotFoundError, match="no archive of cassie under runs/"):
+        reevaluate_run(ReevaluateCfg(robot="cassie", device="cpu"))
 
 
 def test_a_controller_that_is_another_now_is_refused_unless_it_is_given(tmp_path):

@@ -7,7 +7,8 @@ import pytest
 from kernels.episode import Outcome
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.replay import Replay, ReplayCfg, describe, draw, newest_run
+from qd.replay import Replay, ReplayCfg, describe, draw
+from qd.run_directory import newest_run
 from tests.qd.stand_in import make_result
 from tests.qd.test_archive import fresh_values, small_archive
 
@@ -46,7 +47,10 @@ def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
     row = next(line for line in text.splitlines() if "vel_x [m]" in line)
     assert " ".join(row.split()) == "vel_x [m] 6.00 +- 1.00 (65% of all) 16.00 +- 0.00 (67% of all)"
     row = next(line for line in text.splitlines() if "base collision" in line)
-    assert " ".join(row.split()) == "base collision 1 of 4 (25%) 1 of 4 (25%)"
+    assert " ".join(row.split()) == "base collision 1 of 4 (25%, 5 to 70%) 1 of 4 (25%, 5 to 70%)"
+    # Wilson, z^2 = 3.8415, of 1 of 4: (.25 + .4802 +- 1.96 sqrt(.0469 + .0600)) / 1.9604 = .3725 +- .3269
+    row = next(line for line in text.splitlines() if "goal reached" in line)
+    assert " ".join(row.split()) == "goal reached 3 of 4 (75%, 30 to 95%) 3 of 4 (75%, 30 to 95%)"
     # fresh: 4 + 8 - 0 - 2 * 3/4
     assert next(line for line in text.splitlines() if "fitness" in line).split() == ["fitness", "3.25", "10.50"]
     assert "lands in its cell or a neighbour of it again" in text
@@ -58,9 +62,16 @@ def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
     lines = [" ".join(line.split()) for line in describe(corrected).splitlines()]
     assert lines[1:3] == ["found (4 episodes) corrected (40 episodes) now (4 episodes)", "fitness 3.25 1.62 10.50"]
     assert "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
-    assert "base collision 1 of 4 (25%) 8 of 32 (25%) 1 of 4 (25%)" in lines  # 8 of the 40 are invalid
+    # 8 of the 40 are invalid
+    assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) 1 of 4 (25%, 5 to 70%)" in lines
     title = draw(corrected).axes[0].get_title()
     assert title.endswith("fitness 3.25 as found, 1.62 corrected, 10.50 in 4 fresh episodes")
+
+
+def test_of_an_invalid_terrain_no_rate_is_known(done):
+    fresh = dataclasses.replace(done.fresh, invalid_episodes=np.array([3]), collision_rate=np.array([0.0]))
+    lines = [" ".join(line.split()) for line in describe(dataclasses.replace(done, fresh=fresh)).splitlines()]
+    assert "base collision 1 of 4 (25%, 5 to 70%) no valid episode" in lines
 
 
 def test_the_drawing_has_all_paths_and_how_they_ended(done):

@@ -56,6 +56,7 @@ def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **ch
         reproduce=reproduce,
         origin=provenance("cpu", cfg.seed),
         resume_command=f"make archive RESUME={path}",
+        reevaluate_command=f"make reevaluate RUN={path}",
     )
 
 
@@ -79,21 +80,29 @@ def plain_figures(monkeypatch):
     monkeypatch.setattr(search, "write_figures", write_figures)
 
 
-def test_golden_search(tmp_path, capsys):
-    archive = run(tmp_path / "run")
+@pytest.mark.parametrize("method", ["cma_mae", "cma_mae+map_elites"])
+def test_golden_search(tmp_path, capsys, method):
+    archive = run(tmp_path / "run", scheduler=dataclasses.replace(CFG.scheduler, method=method))
     assert sorted(os.listdir(tmp_path / "run")) == sorted(KEPT)
-    assert (len(archive), archive.iterations) == (GOLDEN["elites"], 2)
-    assert archive.cell[:5].tolist() == GOLDEN["cells"]
-    assert archive.fitness[:5] == pytest.approx(GOLDEN["fitness"], abs=1e-4)
+    assert (len(archive), archive.iterations) == (GOLDEN[method]["elites"], 2)
+    assert archive.cell[:5].tolist() == GOLDEN[method]["cells"]
+    assert archive.fitness[:5] == pytest.approx(GOLDEN[method]["fitness"], abs=1e-4)
     output = capsys.readouterr().out
     assert "2 iterations of 12 terrains x 4 episodes of up to 20 s" in output
     assert f"make replay ROBOT=anymal RUN={tmp_path / 'run'} ELITE=0" in output
 
 
 GOLDEN = {
-    "elites": 24,
-    "cells": [3904, 2497, 3149, 3449, 1009],
-    "fitness": [3.23625, 3.04963, 2.86269, 2.72434, 2.58613],
+    "cma_mae": {
+        "elites": 24,
+        "cells": [3904, 2497, 3149, 3449, 1009],
+        "fitness": [3.23625, 3.04963, 2.86269, 2.72434, 2.58613],
+    },
+    "cma_mae+map_elites": {
+        "elites": 19,
+        "cells": [2753, 1452, 933, 761, 1471],
+        "fitness": [5.15655, 4.97512, 4.70702, 4.56382, 3.88451],
+    },
 }
 
 

@@ -30,13 +30,3 @@ def test_genes_that_are_not_finite_are_refused_by_row(value):
     genes[1, 5] = value
     with pytest.raises(ValueError, match="row 1"):
         space.clip(genes)
-
-
-def test_random_fills_the_space_and_repeats_with_its_seed():
-    genes = space.random(500, 3)
-    assert genes.shape == (500, 64)
-    assert genes.min() >= -1.0
-    assert genes.max() <= 1.0
-    assert abs(genes.mean()) < 0.02  # 4 standard errors: .577 / sqrt(32000) = .0032
-    assert np.array_equal(genes, space.random(500, np.random.default_rng(3)))
-    assert not np.array_equal(genes, space.random(500, 4))

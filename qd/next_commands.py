@@ -1,0 +1,61 @@
+"""What to type next: commands that go on with a run or look at it again, as the Makefile takes them."""
+
+import shlex
+from pathlib import Path
+from typing import Literal, Protocol
+
+
+class Placed(Protocol):
+    """The arguments that say where a command works."""
+
+    @property
+    def device(self) -> str | None:
+        """Warp device name."""
+
+    @property
+    def workers(self) -> int | Literal["auto"] | None:
+        """Ray workers."""
+
+    @property
+    def processes(self) -> int | None:
+        """Processes without Ray."""
+
+    @property
+    def worker_limit_s(self) -> float:
+        """When a Ray worker is given up [s]."""
+        ...
+
+
+def make_command(target: str, **variables: str | int | Path | None) -> str:
+    """A command as one types it: ``make replay ROBOT=anymal RUN=runs/x ELITE=0``.
+
+    Args:
+        target: Of the Makefile.
+        variables: Its variables by their names in small letters; None is left out.
+    """
+    given = [(name.upper(), str(value)) for name, value in variables.items() if value is not None]
+    return " ".join([f"make {target}", *(f"{name}={_quoted(value)}" for name, value in given)])
+
+
+def next_command(target: str, args: Placed, **variables: str | int | Path | None) -> str:
+    """A command that works where another one worked: ``make archive RESUME=runs/x DEVICE=cpu``.
+
+    Args:
+        target: Of the Makefile.
+        args: Where the other one worked; what is not as by default is handed on.
+        variables: As of :func:`make_command`.
+    """
+    by_default = args.worker_limit_s == vars(type(args)).get("worker_limit_s")
+    return make_command(
+        target,
+        **variables,
+        device=args.device,
+        workers=args.workers,
+        processes=args.processes,
+        worker_limit_s=None if by_default else f"{args.worker_limit_s:g}",
+    )
+
+
+def _quoted(value: str) -> str:
+    """A value as make gets it through the shell; make takes a lone dollar for a variable of its own."""
+    return shlex.quote(value.replace("$", "$$"))

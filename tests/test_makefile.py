@@ -1,0 +1,86 @@
+"""The Makefile hands its variables on as they are, and only such flags as the command knows."""
+
+import dataclasses
+import importlib
+import os
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+import tyro
+
+from qd.arguments import Arguments
+from qd.compare_arguments import Arguments as CompareArguments
+from qd.next_commands import next_command
+from qd.reevaluate import ReevaluateCfg
+
+ROOT = Path(__file__).parents[1]
+ARGUMENTS = {
+    "archive": ("qd.arguments", "Arguments"),
+    "compare": ("qd.compare_arguments", "Arguments"),
+    "calibrate": ("qd.calibrate", "CalibrateCfg"),
+    "replay": ("qd.replay", "ReplayCfg"),
+    "reevaluate": ("qd.reevaluate", "ReevaluateCfg"),
+}
+"""Where the arguments of each target's command are."""
+VARIABLES = dict(re.findall(r"^FLAG_(\w+) := (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE))
+"""Variables of the Makefile and the flags they become."""
+
+
+def command_of(target: str, **variables: str) -> list[str]:
+    """What a target with some variables runs."""
+    given = [shlex.quote(f"{name}={value.replace('$', '$$')}") for name, value in variables.items()]
+    return run_by(" ".join(["make", target, *given]))
+
+
+def run_by(line: str) -> list[str]:
+    """What a line that is typed into a shell makes ``make`` run, word by word."""
+    done = subprocess.run(
+        ["sh", "-c", f"{line} --dry-run"],
+        env={"PATH": os.environ["PATH"]},  # without what a make that runs this test hands on
+        cwd=ROOT, capture_output=True, text=True, check=True, timeout=60,
+    )  # fmt: skip
+    return shlex.split(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("target", ARGUMENTS)
+def test_every_flag_of_a_target_is_one_of_its_command(target):
+    command = command_of(target, ROBOT="cassie", **dict.fromkeys(VARIABLES, "7"))
+    module, name = ARGUMENTS[target]
+    known = {field.name for field in dataclasses.fields(getattr(importlib.import_module(module), name))}
+    given = {word.split("=")[0].removeprefix("--").replace("-", "_") for word in command[3:] if word.startswith("--")}
+    assert given <= known
+    assert given >= {"robot", "device", "policy"}
+
+
+ODD = ("a b", "a  b", "it's", '"', "$HOME", "$x", "a#b", "-x", "a=b:c", "*", "ü\\", "`id`", "%", "~")
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_a_run_with_an_odd_name_gets_there(name):
+    command = command_of("reevaluate", ROBOT="cassie", RUN=name, WORKER_LIMIT_S="9", SEED="3", PROCESSES="1")
+    assert command[:3] == [".venv/bin/python", "-m", "qd.reevaluate"]
+    parsed = tyro.cli(ReevaluateCfg, args=command[3:])
+    assert parsed == ReevaluateCfg(robot="cassie", run=Path(name), worker_limit_s=9.0, seed=3, processes=1)
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_the_commands_a_search_names_arrive_as_they_were_meant(name):
+    placed = Arguments(device="cpu", workers="auto", worker_limit_s=900.0)
+    line = next_command("archive", placed, robot="cassie", resume=Path(name), policy=f"{name}.pt", reproduce="no")
+    parsed = tyro.cli(Arguments, args=run_by(line)[3:])
+    given = {"robot": "cassie", "resume": Path(name), "policy": f"{name}.pt", "reproduce": "no"}
+    assert parsed == dataclasses.replace(placed, **given)
+
+
+def test_a_command_names_only_what_is_not_as_by_default():
+    assert next_command("reevaluate", Arguments(), run=Path("runs/x"), seed=0) == "make reevaluate RUN=runs/x SEED=0"
+    assert next_command("compare", CompareArguments(processes=2)) == "make compare PROCESSES=2"  # 900 s is its default
+    assert next_command("archive", Arguments(worker_limit_s=0.5)) == "make archive WORKER_LIMIT_S=0.5"
+
+
+def test_several_words_in_one_variable_are_one_value():
+    parsed = tyro.cli(Arguments, args=command_of("archive", WITHOUT="stumble collision", REPRODUCE="yes")[3:])
+    assert (parsed.robot, parsed.without, parsed.reproduce) == ("anymal", ("stumble collision",), "yes")
