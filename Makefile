@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare train calibrate replay reevaluate evaluate crosscheck bench test lint clean
+.PHONY: help setup archive compare train finetune calibrate replay reevaluate evaluate crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -17,6 +17,10 @@ FLAG_POLICY := policy
 FLAG_SEED := seed
 FLAG_RESUME := resume
 FLAG_RUN := run
+FLAG_MIX := mix
+FLAG_DRAW := draw
+FLAG_TASK := task
+FLAG_EXPORT := export
 FLAG_ELITE := elite
 FLAG_OUT := out
 FLAG_GENES := genes
@@ -44,13 +48,17 @@ help: ## This list
 	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare train calibrate replay reevaluate'
 	@echo '                                                   evaluate crosscheck bench'
 	@echo '  PRESET=small     size of the search: paper, small  archive compare'
-	@echo '  ITERATIONS=N     stop after N iterations           archive compare train'
+	@echo '  ITERATIONS=N     stop after N iterations           archive compare train finetune'
 	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, or'
 	@echo '                   module:callable                   archive compare calibrate replay reevaluate'
 	@echo '                                                   evaluate crosscheck'
-	@echo '  SEED=N           seed of everything drawn          archive compare train calibrate reevaluate'
+	@echo '  SEED=N           seed of everything drawn          archive compare train finetune calibrate reevaluate'
 	@echo '                                                   evaluate crosscheck bench'
-	@echo '  RESUME=DIR       go on with this run               archive compare train'
+	@echo '  RESUME=DIR       go on with this run               archive compare train finetune'
+	@echo '  MIX=generated    terrains to train on beside hand-crafted ones: generated, hard-random, or hand-crafted'
+	@echo '                   (nothing else)                    finetune'
+	@echo '  DRAW=failing     draw the elites to train on by how often they were not crossed; uniform   finetune'
+	@echo '  EXPORT=FILE      also write the controller there   finetune'
 	@echo '  METHOD=NAME      where terrains come from: cma_mae, cma_me, map_elites, directions, hard_random,'
 	@echo '                   uniform_random, or several with +  archive'
 	@echo '  INTERVALS=N      intervals of each ratio           archive'
@@ -59,7 +67,7 @@ help: ## This list
 	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay reevaluate'
 	@echo '  ELITE=N          which elite of it, 0 the worst    replay'
 	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables, each NAME=SPEC          evaluate'
-	@echo '  ARCHIVE=DIR      run of a search whose held-out elites are the generated terrains  evaluate'
+	@echo '  ARCHIVE=DIR      run of a search: elites to train on, and those held out to evaluate on   finetune evaluate'
 	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
 	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
 	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate'
@@ -95,6 +103,9 @@ compare: setup ## Let the search and its baselines loose on the same number of t
 
 train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)
+
+finetune: setup ## Train the controller of ROBOT further, on the terrains of an archive that broke it
+	$(BIN)/python -m train.finetune --robot $(call quoted,$(ROBOT)) $(call flags,MIX ARCHIVE POLICY DRAW TASK DEVICE ITERATIONS SEED RESUME EXPORT)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
 	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT WORKERS)

@@ -130,6 +130,30 @@ class Learner:
         torch.save(content, buffer)
         write_atomically(path, buffer.getvalue())
 
+    def start_from(self, actor: dict[str, torch.Tensor], critic: dict[str, torch.Tensor] | None) -> None:
+        """Begin with a trained actor, and its critic where it is known.
+
+        Args:
+            actor: State under rsl_rl's keys; without a standard deviation of the actions, the configured one is kept.
+            critic: Likewise.
+
+        Raises:
+            ValueError: If one has other shapes than the networks.
+        """
+        own = self.alg.get_policy().state_dict()
+        known = {"distribution.std_param": own["distribution.std_param"], **actor}
+        for name, network, state in (("actor", self.alg.get_policy(), known), ("critic", self.alg.critic, critic)):
+            try:
+                if state is not None:
+                    network.load_state_dict(state)
+            except Exception as error:  # torch answers states that do not fit with many types
+                reason = " ".join(str(error).split())
+                raise ValueError(f"the controller's {name} does not fit the training's networks: {reason}") from error
+
+    def begin_again(self) -> None:
+        """Go on from the environment as it is now: to be called between iterations when its episodes began anew."""
+        self._observations = self.env.get_observations()
+
     def resume(self, content: dict[str, Any]) -> None:
         """Go on from a checkpoint: networks, optimiser, learning rate, terrain levels, random numbers.
 

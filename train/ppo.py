@@ -7,6 +7,7 @@ import torch
 from rsl_rl.algorithms import PPO
 from torch import nn
 
+_FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on
 _EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels
 
 
@@ -96,6 +97,7 @@ class CapturedPPO(PPO):
             )
         on_cuda = torch.device(self.device).type == "cuda"
         self._lr = torch.tensor(float(self.learning_rate), device=self.device)
+        self._actor_learns = torch.ones((), device=self.device)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=self._lr, fused=on_cuda or None, capturable=on_cuda)
         count = self.storage.num_envs * self.storage.num_transitions_per_env
@@ -105,6 +107,24 @@ class CapturedPPO(PPO):
         self._stream = torch.cuda.Stream(self.device) if on_cuda else None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._eager_steps = 0
+
+    def let_actor_learn(self, learns: bool) -> None:
+        """Whether updates change the actor; without, the critic alone learns, and the learning rate stays.
+
+        A critic that has seen nothing yet would lead a trained actor astray.
+        """
+        self._actor_learns.fill_(float(learns))
+
+    def begin_actor(self) -> None:
+        """Forget the optimiser's moments of the actor, and let it learn in small steps at first.
+
+        While the critic learned alone, the actor's gradients were zero: Adam would take its first steps three times too
+        large, for a moment of squares that has counted zeros.
+        """
+        for parameter in self.actor.parameters():
+            for value in self.optimizer.state.get(parameter, {}).values():
+                value.zero_()
+        self._lr.clamp_(max=_FIRST_ACTOR_RATE)
 
     def update(self) -> dict[str, float]:
         """Run all epochs over the stored rollout; returns the mean value, surrogate and entropy losses."""
@@ -179,7 +199,8 @@ class CapturedPPO(PPO):
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
         value_loss = self._value_loss(observations)
-        loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        actor_loss = surrogate_loss - self.entropy_coef * entropy
+        loss = self._actor_learns * actor_loss + self.value_loss_coef * value_loss
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         if self.is_multi_gpu:
@@ -204,4 +225,5 @@ class CapturedPPO(PPO):
             kl = kl / self.gpu_world_size
         lower = torch.where(kl > 2.0 * self.desired_kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
         higher = (self._lr * 1.5).clamp(max=1e-2)
-        self._lr.copy_(torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), higher, lower))
+        adapted = torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), higher, lower)
+        self._lr.copy_(torch.where(self._actor_learns > 0.0, adapted, self._lr))

@@ -8,12 +8,12 @@ from kernels.rewards import REWARDS
 from train.learner import Iteration, Learner
 from train.scalars import ScalarFile
 
-_ENDS = ("time_out", "base_collision", "tilt", "invalid")
+_ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out")
 STATE = {"settings": (dict,), "curve": (list,), "pieces": (list,), "env_steps": (int,), "wall_s": (float, int)}
 """Entries of :meth:`Progress.state` and their types."""
 _HEADER = (
     f"{'iteration':>12} {'env-steps':>10} {'steps/s':>9} {'collect':>8} {'learn':>8} {'reward':>7} {'length':>7} "
-    f"{'falls':>6} {'v err':>6} {'w err':>6} {'level':>6} {'std':>5} {'rate':>8} {'ETA':>7}"
+    f"{'falls':>6} {'goal':>6} {'v err':>6} {'w err':>6} {'level':>6} {'std':>5} {'rate':>8} {'ETA':>7}"
 )
 
 
@@ -126,6 +126,7 @@ class Progress:
             "reward": sums["episode_reward"] / episodes if episodes else None,
             "length_s": sums["episode_steps"] / episodes * dt if episodes else None,
             "fall_rate": (sums["base_collision"] + sums["tilt"]) / episodes if episodes else None,
+            "goal_rate": sums["goal"] / episodes if episodes and learner.env.task.cfg.crosses else None,
             "ends": {name: int(sums[name]) for name in _ENDS},
             "overflows": int(sums["overflow"]),
             "lin_vel_error": sums["lin_vel_error"] / steps,
@@ -148,8 +149,9 @@ class Progress:
             f"{row['iteration']:>6}/{self.iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
             f"{row['env_steps_per_s']:>9,.0f} "
             f"{row['collection_s'] * 1e3:>6.0f}ms {row['learning_s'] * 1e3:>6.0f}ms {_number(row['reward'], '.2f'):>7} "
-            f"{_number(row['length_s'], '.1f'):>6}s {_number(row['fall_rate'], '.3f'):>6} {row['lin_vel_error']:>6.3f} "
-            f"{row['yaw_rate_error']:>6.3f} {row['level']:>6.2f} {row['noise_std']:>5.2f} {row['learning_rate']:>8.1e} "
+            f"{_number(row['length_s'], '.1f'):>6}s {_number(row['fall_rate'], '.3f'):>6} "
+            f"{_number(row['goal_rate'], '.3f'):>6} {row['lin_vel_error']:>6.3f} {row['yaw_rate_error']:>6.3f} "
+            f"{row['level']:>6.2f} {row['noise_std']:>5.2f} {row['learning_rate']:>8.1e} "
             f"{_clock(left):>7}",
             flush=True,
         )

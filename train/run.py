@@ -70,9 +70,11 @@ def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) 
 
 
 def plain(value: Any) -> Any:
-    """Settings as JSON values: paths as text."""
+    """Settings as they come back from a file: paths as text, tuples as lists."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 

@@ -1,0 +1,198 @@
+"""The fine-tuning command: what it starts from, exchanges, resuming, what it leaves behind, and errors."""
+
+import itertools
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from qd.archive import write_archive
+from sim.policy import load_policy
+from sim.robot import get_robot
+from tests.train.archives import make_archive
+from train import finetune as command
+from train.finetune import finetune, main
+from train.finetune_job import FinetuneCfg, job_of
+from train.learner import read_checkpoint
+from train.ppo import PpoCfg
+
+PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
+ROBOT = get_robot("anymal")
+
+
+def write_actor(path, *, hidden=(16, 8), critic=False, **extra):
+    """A controller of random layers, as rsl_rl writes it."""
+    torch.manual_seed(0)
+    state = {"distribution.std_param": torch.full((12,), 0.3)}
+    sizes = (235, *hidden, 12)
+    for k, (width, out) in enumerate(itertools.pairwise(sizes)):
+        state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
+    content = {"actor_state_dict": {**state, **extra}}
+    if critic:
+        shapes = {f"mlp.{2 * k}": (out, width) for k, (width, out) in enumerate(itertools.pairwise((235, *hidden, 1)))}
+        content["critic_state_dict"] = {f"{key}.weight": torch.randn(shape) for key, shape in shapes.items()}
+        content["critic_state_dict"] |= {f"{key}.bias": torch.zeros(shape[0]) for key, shape in shapes.items()}
+    torch.save(content, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finetune")
+    (folder / "archive").mkdir()
+    write_archive(folder / "archive" / "archive.npz", make_archive(10))
+    write_actor(folder / "start.pt")
+    return folder
+
+
+def config(places, **changes):
+    values = {
+        "policy": places / "start.pt", "archive": places / "archive" / "archive.npz", "device": "cpu", "num_envs": 6,
+        "terrains": 4, "swap_every": 2, "iterations": 3, "critic_iterations": 1, "rows": 3, "ppo": PPO, **changes,
+    }  # fmt: skip
+    return FinetuneCfg(**values)
+
+
+@pytest.fixture(scope="module")
+def finished(places):
+    assert finetune(config(places, run_dir=places / "run", export=places / "out" / "tuned.pt")) == 0
+    return places / "run"
+
+
+def test_a_run_leaves_a_controller_and_its_record(places, finished):
+    policy = load_policy(places / "out" / "tuned.pt", ROBOT, "cpu")
+    start = load_policy(places / "start.pt", ROBOT, "cpu")
+    rows = torch.randn(5, 235)
+    assert 1e-6 < (policy(rows) - start(rows)).abs().max() < 0.1  # it learned, and is still what it came from
+    record = json.loads((places / "out" / "tuned.train.json").read_text())
+    for key in ("command", "commit", "device", "versions", "seed", "date", "wall_s", "settings", "pieces"):
+        assert key in record, key
+    settings = record["settings"]
+    assert settings["mix"] == {"mix": "generated", "terrains": 4, "swap_every": 2, "draw": "uniform"}
+    assert (settings["archive"]["elites"], settings["archive"]["trained_on"]) == (10, 8)
+    assert settings["ppo"]["hidden_dims"] == [16, 8] and settings["task"]["crosses"]
+    assert record["env_steps"] == 3 * 4 * 6
+    same = load_policy(finished / "policy.onnx", ROBOT, "cpu")
+    torch.testing.assert_close(same(rows), policy(rows), atol=1e-5, rtol=1e-5)
+
+
+def test_without_the_packages_for_onnx_it_says_how_to_make_the_file(places, finished, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "train.export", None)
+    run = places / "without"
+    assert finetune(config(places, run_dir=run, iterations=1)) == 0
+    assert f"python -m train.export --robot anymal --policy {run / 'policy.pt'}" in capsys.readouterr().out
+    assert not (run / "policy.onnx").exists()
+
+
+def test_the_critic_learns_alone_first(places):
+    states = []
+    for iterations in (1, 2):
+        run = places / f"alone{iterations}"
+        assert finetune(config(places, run_dir=run, iterations=iterations, critic_iterations=1)) == 0
+        states.append(torch.load(run / "policy.pt", weights_only=True)["actor_state_dict"])
+    start = torch.load(places / "start.pt", weights_only=True)["actor_state_dict"]
+    assert all(value.equal(start[key]) for key, value in states[0].items())
+    assert not any(value.equal(start[key]) for key, value in states[1].items())
+
+
+def test_a_critic_that_comes_along_is_taken(places):
+    path = write_actor(places / "with_critic.pt", critic=True)
+    job = job_of(config(places, policy=path, run_dir=places / "none"))
+    assert job.settings["critic_iterations"] == 0
+    tuning = command.Tuning(job)
+    expected = torch.load(path, weights_only=True)["critic_state_dict"]
+    assert all(value.equal(expected[key]) for key, value in tuning.learner.alg.critic.state_dict().items())
+
+
+def test_a_normaliser_becomes_part_of_the_first_layer(places):
+    normaliser = {"obs_normalizer._mean": torch.randn(1, 235), "obs_normalizer._std": torch.rand(1, 235) + 0.5}
+    path = write_actor(places / "normalised.pt", **normaliser)
+    actor = job_of(config(places, policy=path, run_dir=places / "none")).actor
+    torch.save({"actor_state_dict": actor}, places / "folded.pt")
+    rows = torch.randn(5, 235)
+    expected = load_policy(path, ROBOT, "cpu")(rows)
+    torch.testing.assert_close(load_policy(places / "folded.pt", ROBOT, "cpu")(rows), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_terrains_are_exchanged_when_due(places, monkeypatch):
+    seen = []
+    exchange = command.CommandTask.exchange
+
+    def watched(task, tiles):
+        seen.append(int(task.counter))
+        exchange(task, tiles)
+        np.testing.assert_array_equal(task.sim.bank.heights.numpy(), tiles.heights)
+        assert (task.episode_steps == 0).all()
+
+    monkeypatch.setattr(command.CommandTask, "exchange", watched)
+    finetune(config(places, run_dir=places / "swaps", iterations=5, swap_every=2))
+    assert len(seen) == 2  # before iterations 3 and 5
+    assert seen[1] - seen[0] == 2 * 4 + 1  # two iterations of 4 steps, and the restart's own
+
+
+def test_resume_needs_the_directory_alone_and_goes_on_with_the_same_terrains(finished, places):
+    state = read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["mix"]
+    assert finetune(FinetuneCfg(resume=finished, run_dir=places / "longer", device="cpu", iterations=4)) == 0
+    later = read_checkpoint(places / "longer" / "checkpoint.pt", "anymal")
+    assert later["iter"] == 4 and later["extra"]["mix"]["rows"] == state["rows"]
+    assert later["extra"]["settings"] == read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["settings"]
+
+
+def test_a_resume_of_other_settings_is_refused(finished, places):
+    before = (finished / "checkpoint.pt").read_bytes()
+    with pytest.raises(ValueError, match=r"was begun with other settings .*mix.swap_every 2 -> 3"):
+        finetune(FinetuneCfg(resume=finished, device="cpu", swap_every=3))
+    with pytest.raises(ValueError, match=r"was begun with other settings .*seed 0 -> 5"):
+        finetune(FinetuneCfg(resume=finished, device="cpu", seed=5))
+    assert (finished / "checkpoint.pt").read_bytes() == before
+
+
+def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places, finished, monkeypatch):
+    run = places / "nan"
+    finetune(config(places, run_dir=run, iterations=2))
+    kept = (run / "checkpoint.pt").read_bytes()
+    monkeypatch.setattr(command.CapturedPPO, "update", lambda alg: {"value": float("nan")})
+    with pytest.raises(FloatingPointError, match=r"losses are not finite.*the last checkpoint is kept in"):
+        finetune(FinetuneCfg(resume=run, device="cpu", iterations=3))
+    assert (run / "checkpoint.pt").read_bytes() == kept
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--robot", "spot"], "unknown robot 'spot'"),
+        (["--archive", "{dir}/nowhere"], "make one (make archive ROBOT=anymal) and name it with --archive"),
+        (["--archive", "{dir}/cassie.npz"], "the archive must be of robot 'anymal', got one of 'cassie'"),
+        (["--archive", "{dir}/empty.npz"], "needs at least 5 elites, got 0"),
+        (["--mix", "hand-crafted", "--archive", "{dir}/archive"], "takes no terrains from an archive"),
+        (["--mix", "hard-random", "--draw", "failing"], "draw failing chooses among elites"),
+        (["--policy", "{dir}/nowhere.pt"], "no such file"),
+        (["--policy", "{dir}/narrow.pt"], "maps 100 observations to 12 actions"),
+        (["--policy", "{dir}/script.pt"], "a fine-tuning starts from an rsl_rl checkpoint"),
+        (["--terrains", "1"], "terrains must be at least 2"),
+        (["--terrains", "30", "--num-envs", "6"], "num_envs must be at least as many as terrains, 30, got 6"),
+        (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
+        (["--iterations", "-1"], "iterations must be at least 1, got -1"),
+        (["--seed", "-1"], "seed must be at least 0, got -1"),
+        (["--resume", "{dir}/nowhere"], "no checkpoint at"),
+        (["--ppo.no-captured"], "leave --ppo.captured on"),
+    ],
+)
+def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeypatch, capsys):
+    write_archive(places / "cassie.npz", make_archive(10, robot="cassie"))
+    write_archive(places / "empty.npz", make_archive(0))
+    state = torch.load(places / "start.pt", weights_only=True)["actor_state_dict"]
+    state["mlp.0.weight"] = state["mlp.0.weight"][:, :100]
+    torch.save({"actor_state_dict": state}, places / "narrow.pt")
+    torch.jit.script(torch.nn.Linear(235, 12)).save(places / "script.pt")
+    monkeypatch.setattr("train.finetune.CommandTask", None)  # building anything would fail with another error
+    monkeypatch.chdir(places)
+    given = ["--device", "cpu", *(flag.format(dir=places) for flag in flags)]
+    if "--archive" not in flags and not {"hand-crafted", "hard-random"} & set(flags) and "--resume" not in flags:
+        given += ["--archive", str(places / "archive" / "archive.npz")]
+    monkeypatch.setattr(sys, "argv", ["train.finetune", *given])
+    assert main() == 2
+    error = capsys.readouterr().err
+    assert message in error and error.startswith("error: ") and error.count("\n") == 1

@@ -1,0 +1,259 @@
+"""What a command line of the fine-tuning means: controller, terrains and sizes, looked at before any long work."""
+
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from qd.archive import read_archive
+from sim.files import read_json
+from sim.policy import MlpPolicy, load_policy, read_weights
+from sim.robot import RobotCfg, get_robot
+from sim.simulation import resolve_device
+from train.learner import check_entries
+from train.mix import Mix, MixCfg
+from train.ppo import PpoCfg
+from train.run import CHECKPOINT, CONFIG, changes, plain, prepare_run_dir, read_saved
+from train.sets import split_elites
+from train.task_cfg import TaskCfg
+
+_PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
+_PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}
+_SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 4, "iterations": 10}
+_DEFAULTS = {
+    "mix": "generated", "split_seed": 0, "draw": "uniform", "task": "crossing", "critic_iterations": 50, "seed": 0,
+}  # fmt: skip
+_TASKS = ("crossing", "commands")
+_PPO = PpoCfg(steps_per_env=24)
+_STATE = {"mix": (dict,)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetuneCfg:
+    """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
+
+    Sizes are the paper's on a GPU, and small ones on the CPU, enough to see that it runs.
+    """
+
+    robot: str = "anymal"
+    """Which robot."""
+    policy: Path | None = None
+    """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one. A checkpoint.pt of
+    train.base brings its critic too."""
+    mix: Literal["generated", "hard-random", "hand-crafted"] | None = None
+    """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G, the default) or hard-random ones
+    (C-HR), or nothing else (C-HC)."""
+    archive: Path | None = None
+    """Run of a search, or its archive.npz, for mix generated; results/<robot>/archive."""
+    split_seed: int | None = None
+    """Which elites are held out for the evaluation; 0."""
+    draw: Literal["uniform", "failing"] | None = None
+    """How elites are drawn at each exchange: uniform; or failing, the likelier the less often they were crossed."""
+    task: Literal["crossing", "commands"] | None = None
+    """What robots are told: to cross, as in a search, the default; or random velocities, as in the base's training."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    num_envs: int | None = None
+    """Robots trained at once; on CUDA 1500 (Cassie: 600), on the CPU 24."""
+    terrains: int | None = None
+    """Terrains at a time; 500 (Cassie: 100), 12."""
+    swap_every: int | None = None
+    """Iterations after which they are exchanged; 400 (Cassie: 200), 4."""
+    iterations: int | None = None
+    """Iterations in all, those before a resume included; 1200 (Cassie: 3000), 10."""
+    critic_iterations: int | None = None
+    """Iterations at first in which the critic learns alone, where the controller comes without one; 50."""
+    max_seconds: float | None = None
+    """Save and stop in time to be done this many seconds after the start."""
+    run_dir: Path | None = None
+    """Where to write; runs/<robot>-<mix>-<date>, or the resumed run."""
+    resume: Path | None = None
+    """Run directory to go on from, as it was begun."""
+    export: Path | None = None
+    """Also write the controller to this file and its training record beside it."""
+    seed: int | None = None
+    """Seed of everything drawn; 0."""
+    save_every_s: float = 60.0
+    """A checkpoint every so often [s]."""
+    rows: int = 100
+    """Progress rows over the whole training."""
+    ppo: PpoCfg = field(default_factory=lambda: _PPO)
+    """The layers are those of the controller."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A fine-tuning that can begin: everything a user may have got wrong has been looked at."""
+
+    cfg: FinetuneCfg
+    """Sizes, layers and seed filled in."""
+    robot: RobotCfg
+    device: str
+    iterations: int
+    num_envs: int
+    seed: int
+    actor: dict[str, torch.Tensor]
+    """Where it starts, under rsl_rl's keys."""
+    critic: dict[str, torch.Tensor] | None
+    mix: Mix
+    task: TaskCfg
+    settings: dict[str, Any]
+    """What makes it what it is, as JSON values."""
+    saved: dict[str, Any] | None
+    """The checkpoint it goes on from."""
+    run_dir: Path
+
+
+def job_of(cfg: FinetuneCfg) -> Job:
+    """What a command line asks for.
+
+    Raises:
+        ValueError: If controller, archive, mix, a size or the directory is not as it must be.
+    """
+    robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
+    saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
+    cfg = _filled(cfg, device)
+    actor, critic = _start(cfg.policy or robot.policy_file, robot)
+    hidden = [len(actor[f"mlp.{k}.bias"]) for k in _layers(actor)[:-1]]
+    cfg = replace(cfg, ppo=replace(_ppo(cfg, saved), hidden_dims=tuple(hidden)))
+    values: Any = cfg  # whose numbers and names are all there now
+    mix_cfg = MixCfg(mix=values.mix, terrains=values.terrains, swap_every=values.swap_every, draw=values.draw)
+    if values.num_envs < mix_cfg.terrains:
+        raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {values.num_envs}")
+    if values.task not in _TASKS:
+        raise ValueError(f"task must be one of {', '.join(_TASKS)}, got '{values.task}'")
+    genes, about = _elites(cfg, robot)
+    mix = Mix(cfg=mix_cfg, genes=genes, crosses=values.task == "crossing", seed=values.seed, device=device)
+    task = TaskCfg.of(robot, crosses=mix.crosses)
+    settings = plain(
+        {
+            "seed": values.seed,
+            "num_envs": values.num_envs,
+            "policy": str(cfg.policy or "shipped"),
+            "mix": asdict(mix_cfg),
+            "archive": about,
+            "critic_iterations": 0 if critic else cfg.critic_iterations,
+            "task": asdict(task),
+            "ppo": asdict(cfg.ppo),
+        }
+    )
+    if saved is not None:
+        _check_resumed(cfg, saved, settings)
+    return Job(
+        cfg=cfg,
+        robot=robot,
+        device=device,
+        iterations=values.iterations,
+        num_envs=values.num_envs,
+        seed=values.seed,
+        actor=actor,
+        critic=critic,
+        mix=mix,
+        task=task,
+        settings=settings,
+        saved=saved,
+        run_dir=prepare_run_dir(_run_dir(cfg), resume=cfg.resume, export=cfg.export),
+    )
+
+
+def _filled(cfg: FinetuneCfg, device: str) -> FinetuneCfg:
+    """Settings with all that was left out: as the resumed run has it, else as the device can do.
+
+    Raises:
+        ValueError: If a number is out of range, or the resumed run's settings cannot be read.
+    """
+    on_gpu = device.startswith("cuda")
+    sizes = _PAPER.get(cfg.robot, _PAPER_OTHERS) if on_gpu else _SMALL
+    before = _settings_of(cfg.resume) if cfg.resume else {}
+    if not on_gpu and not before and cfg.num_envs is None and cfg.iterations is None:
+        print(
+            f"No GPU: a small fine-tuning of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough "
+            "to see that it runs. The paper's takes minutes on one GPU."
+        )
+    defaults = {**_DEFAULTS, **sizes, **before}
+    cfg = replace(cfg, **{name: value for name, value in defaults.items() if getattr(cfg, name) is None})
+    for name, least in (("num_envs", 1), ("iterations", 1), ("critic_iterations", 0), ("seed", 0)):
+        if getattr(cfg, name) < least:
+            raise ValueError(f"{name} must be at least {least}, got {getattr(cfg, name)}")
+    return cfg
+
+
+def _settings_of(run: Path) -> dict[str, Any]:
+    """What a run was begun with, as far as a command line may leave it out."""
+    config = read_json(run / CONFIG)
+    found = {name: config.get(name) for name in (*_DEFAULTS, *_PAPER_OTHERS)}
+    paths = {name: Path(config[name]) for name in ("policy", "archive") if isinstance(config.get(name), str)}
+    wrong = [name for name, value in found.items() if value is not None and type(value) not in (int, str)]
+    if wrong:
+        raise ValueError(f"{run / CONFIG} is damaged at {', '.join(wrong)}: put a copy of it back")
+    return {name: value for name, value in {**found, **paths}.items() if value is not None}
+
+
+def _elites(cfg: FinetuneCfg, robot: RobotCfg) -> tuple[np.ndarray, dict[str, Any] | None]:
+    """Genes of the elites to train on, shape (E, 64), and where they are from."""
+    if cfg.mix != "generated":
+        if cfg.archive is not None:
+            raise ValueError(f"mix {cfg.mix} takes no terrains from an archive: leave --archive out")
+        return np.zeros((0, 64), np.float32), None
+    path = cfg.archive or Path("results") / robot.name / "archive"
+    try:
+        archive = read_archive(path)
+    except FileNotFoundError as error:
+        raise ValueError(f"{error}; make one (make archive ROBOT={robot.name}) and name it with --archive") from error
+    split_seed = cfg.split_seed or 0
+    rows = split_elites(archive, robot.name, split_seed).train
+    about = {"archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows)}
+    return archive.genes[rows], {"path": str(path), **about, "split_seed": split_seed}
+
+
+def _layers(actor: dict[str, torch.Tensor]) -> list[int]:
+    """Numbers of an actor's linear layers in rsl_rl's keys, in order."""
+    return sorted(int(key.split(".")[1]) for key in actor if key.startswith("mlp.") and key.endswith(".weight"))
+
+
+def _start(path: Path, robot: RobotCfg) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor] | None]:
+    """Actor and, where the file has one, critic to begin with.
+
+    A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear.
+    """
+    policy = load_policy(path, robot, "cpu")
+    if not isinstance(policy, MlpPolicy):
+        raise ValueError(
+            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: {path}"
+        )
+    content = read_weights(path)
+    actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
+    if policy.normalised:
+        weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
+        actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
+    return actor, None if policy.normalised else content.get("critic_state_dict")
+
+
+def _ppo(cfg: FinetuneCfg, saved: dict[str, Any] | None) -> PpoCfg:
+    """Settings of the learner: the resumed run's, unless others are asked for."""
+    if not cfg.ppo.captured:
+        raise ValueError("rsl_rl's own PPO cannot let the critic learn alone at first: leave --ppo.captured on")
+    if saved is None or cfg.ppo != _PPO:
+        return cfg.ppo
+    try:
+        return PpoCfg(**saved["extra"]["settings"]["ppo"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{cfg.resume} is damaged: {error} in its settings of ppo; put a copy of it back") from error
+
+
+def _check_resumed(cfg: FinetuneCfg, saved: dict[str, Any], settings: dict[str, Any]) -> None:
+    assert cfg.resume is not None
+    check_entries(saved["extra"], _STATE, cfg.resume / CHECKPOINT)
+    different = changes(saved["extra"]["settings"], settings)
+    if different:
+        raise ValueError(
+            f"{cfg.resume} was begun with other settings ({'; '.join(different)}): leave them out, or begin a new run"
+        )
+
+
+def _run_dir(cfg: FinetuneCfg) -> Path:
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    return cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-{cfg.mix}-{stamp}"
