@@ -46,7 +46,7 @@ class CrosscheckCfg:
     robot: str = "anymal"
     """Which robot."""
     policy: str | None = None
-    """An rsl_rl checkpoint, a TorchScript file or module:callable; the shipped controller."""
+    """An rsl_rl checkpoint, a TorchScript or ONNX file, or module:callable; the shipped controller."""
     device: str | None = None
     """Of the parallel simulation: cpu, cuda or cuda:N; CUDA where there is one. Plain MuJoCo always runs on the CPU."""
     genes: Path | None = None

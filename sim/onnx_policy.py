@@ -86,7 +86,7 @@ def onnx_policy(data: bytes, name: str, sizes: tuple[int, int], device: str) -> 
     if where.type == "cuda" and session.get_providers()[0] != _CUDA:
         warnings.warn(
             f"policy '{name}' runs on the CPU, with copies to and from {device} every control step: this onnxruntime "
-            "is not built for CUDA, onnxruntime-gpu is",
+            "has no CUDA that works; install onnxruntime-gpu, or give the rsl_rl checkpoint",
             stacklevel=2,
         )
         where = torch.device("cpu")
@@ -172,8 +172,8 @@ def _open_session(data: bytes, name: str, device: torch.device) -> Any:
         # TF32 would round every product to 10 bits.
         providers = [(_CUDA, {"device_id": str(device.index or 0), "use_tf32": "0"}), _CPU]
     try:
-        return onnxruntime.InferenceSession(data, options, providers=providers)
-    except Exception as error:  # each of onnxruntime's errors is a class of its own, with no common base
+        return onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
+    except Exception as error:  # onnxruntime's errors have no base of their own; bytes that are no UTF-8 give another
         raise ValueError(
             f"policy '{name}' is refused by onnxruntime {onnxruntime.__version__}: {error}; {_EXPORT}"
         ) from None
@@ -204,7 +204,8 @@ def _check_ports(session: Any, name: str, sizes: tuple[int, int]) -> None:
             )
         widths.append(shape[1])
     if any(isinstance(got, int) and got != size for got, size in zip(widths, sizes, strict=True)):
+        found = [got if isinstance(got, int) else "any number of" for got in widths]
         raise ValueError(
-            f"policy '{name}' maps {widths[0]} observations to {widths[1]} actions, but this robot has {sizes[0]} "
+            f"policy '{name}' maps {found[0]} observations to {found[1]} actions, but this robot has {sizes[0]} "
             f"observations and {sizes[1]} joints: use a controller of this robot"
         )

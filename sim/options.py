@@ -28,7 +28,7 @@ class OptionsCfg:
     robot: str = "anymal"
     """Which robot."""
     policy: str | None = None
-    """An rsl_rl checkpoint, a TorchScript file or module:callable; the shipped controller."""
+    """An rsl_rl checkpoint, a TorchScript or ONNX file, or module:callable; the shipped controller."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     terrains: int = 200

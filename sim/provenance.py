@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 _ROOT = Path(__file__).resolve().parents[1]
-_PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "ribs", "rsl-rl-lib", "numpy")
+_PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:

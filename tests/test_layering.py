@@ -17,6 +17,8 @@ LIBRARY_DOORS = {
     "ribs": ("qd",),
     "rsl_rl": ("train",),
     "torch": ("sim", "train"),
+    "onnx": ("sim", "train"),
+    "onnxruntime": ("sim",),
 }
 MAX_LINES = 299
 FILES = [path.relative_to(ROOT) for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
@@ -81,6 +83,7 @@ def test_every_room_is_walked():
         ("train/a.py", "import warp as wp"),
         ("train/a.py", "from newton.solvers import SolverMuJoCo"),
         ("qd/a.py", "import mujoco"),
+        ("train/a.py", "import onnxruntime"),
         ("train/a.py", "from ribs.archives import GridArchive"),
         ("sim/a.py", "from rsl_rl.runners import OnPolicyRunner"),
         ("train/a.py", "from qd import archive, search"),

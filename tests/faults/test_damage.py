@@ -7,10 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from sim.policy import load_policy
 from sim.robot import get_robot
 from tests.faults import commands, searches, trainings
 from tests.faults.children import run_child
 from tests.faults.damage import copied, damages, snapshot
+from train.export import export_onnx
 
 SEED = 11
 
@@ -170,16 +172,17 @@ ON_A_PATH = ("_search", "_training", "_elite", "_with")
 
 @pytest.fixture(scope="module")
 def controllers(tmp_path_factory, training_run):
-    """A checkpoint and a TorchScript module."""
+    """A checkpoint, a TorchScript module and an ONNX file."""
     folder = tmp_path_factory.mktemp("controllers")
     script = torch.jit.script(torch.nn.Sequential(torch.nn.Linear(235, 4), torch.nn.ELU(), torch.nn.Linear(4, 12)))
     script.save(folder / "script.ts")
     (folder / "policy.pt").write_bytes((training_run[0] / "policy.pt").read_bytes())
+    export_onnx(load_policy(folder / "policy.pt", get_robot("anymal"), "cpu"), folder / "policy.onnx")
     return folder
 
 
 @pytest.mark.parametrize("command", [commands.calibrate_with, commands.evaluate_with])
-@pytest.mark.parametrize("name", ["policy.pt", "script.ts"])
+@pytest.mark.parametrize("name", ["policy.pt", "script.ts", "policy.onnx"])
 def test_damaged_controllers(folder, controllers, name, command):
     cases = list(damages(controllers / name, SEED).items())
     taken = []

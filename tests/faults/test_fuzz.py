@@ -20,12 +20,13 @@ from qd.archive import Archive, read_archive, write_archive
 from qd.checkpoint import load_checkpoint
 from qd.run_directory import RunDirectory
 from qd.speed import training_rates
-from sim.policy import load_policy
+from sim.policy import MlpPolicy, load_policy
 from sim.robot import RobotCfg, get_robot
 from tests.faults import searches, trainings
 from tests.faults.children import run_child
 from tests.faults.damage import flipped, npz, other_arrays, other_values
 from tests.qd.test_archive import small_archive
+from train.export import to_onnx
 from train.learner import read_checkpoint
 
 SEED = 5
@@ -81,13 +82,21 @@ def with_right_checksums(whole: bytes, rng: np.random.Generator) -> bytes:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """A search, a training and a controller in TorchScript."""
+    """A search, a training and controllers in TorchScript and ONNX."""
     folder = tmp_path_factory.mktemp("made")
     assert run_child(folder / "log", searches.search, folder / "search", iterations=2)[0] == 0
     assert run_child(folder / "log", trainings.train, folder / "training", iterations=1)[0] == 0
     script = torch.jit.script(torch.nn.Sequential(torch.nn.Linear(235, 4), torch.nn.ELU(), torch.nn.Linear(4, 12)))
     script.save(folder / "script.ts")
+    (folder / "policy.onnx").write_bytes(to_onnx(small_actor()))
     return folder
+
+
+def small_actor() -> MlpPolicy:
+    """An actor of four hidden units."""
+    first, second = torch.linspace(-1, 1, 4 * 235).reshape(4, 235), torch.linspace(-1, 1, 12 * 4).reshape(12, 4)
+    biases = {"mlp.0.bias": torch.zeros(4), "mlp.2.bias": torch.zeros(12)}
+    return MlpPolicy({"mlp.0.weight": first, "mlp.2.weight": second, **biases})
 
 
 def actions(file: Path) -> bytes:
@@ -113,6 +122,7 @@ def training_state(file: Path) -> bytes:
 LOADERS = {
     "a controller's checkpoint": ("training/policy.pt", actions),
     "a TorchScript controller": ("script.ts", actions),
+    "an ONNX controller": ("policy.onnx", actions),
     "the archive": ("search/archive.npz", elites),
     "the checkpoint of a search": ("search/checkpoint.bin", search_state),
     "the checkpoint of a training": ("training/checkpoint.pt", training_state),
