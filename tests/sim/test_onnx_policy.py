@@ -250,3 +250,14 @@ def test_a_sealed_file_that_was_changed_is_named(tmp_path, anymal, how):
     model.producer_name = "another tool"
     del model.metadata_props[:]
     assert isinstance(load_policy(save(tmp_path / "changed.onnx", model), anymal, "cpu"), OnnxPolicy)
+
+
+@pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="this one can use a GPU")
+def test_without_cuda_in_onnxruntime_it_computes_on_the_cpu_and_says_so(tmp_path):
+    path = save(tmp_path / "policy.onnx", linear())
+    with pytest.warns(
+        UserWarning, match=r"policy\.onnx' runs on the CPU, with copies to and from cuda:0.*onnxruntime-gpu"
+    ):
+        policy = load_onnx(path, (OBSERVATIONS, ACTIONS), "cuda:0")
+    assert policy.device == torch.device("cpu")
+    assert policy(torch.zeros(3, OBSERVATIONS)).shape == (3, ACTIONS)
