@@ -31,7 +31,7 @@ class EvaluateCfg:
     """Without tables, the controller: an rsl_rl checkpoint, a TorchScript file or module:callable; the shipped one."""
     policies: tuple[str, ...] = ()
     """Controllers of the tables, each NAME=FILE, NAME=module:callable or NAME=shipped; the first is the one that the
-    others are held against; base=shipped."""
+    others are held against; base=shipped. C-G, C-G@1, C-G@2 are one kind of several seeds, whose mean is shown too."""
     archive: Path | None = None
     """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
     split_seed: int = 0
@@ -112,9 +112,9 @@ def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
     found: dict[str, str] = {}
     for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is
         name, _, policy = item.partition("=")
-        if not re.fullmatch(r"[\w.+-]+", name) or not policy:
+        if not re.fullmatch(r"[\w.+@-]+", name) or not policy:
             raise ValueError(
-                f"policies must be NAME=FILE each, the name of letters, digits and . _ + -, got '{item}': "
+                f"policies must be NAME=FILE each, the name of letters, digits and . _ + @ -, got '{item}': "
                 "write for example C-G=runs/tuned/policy.pt"
             )
         if name in found:

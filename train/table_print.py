@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from typing import Any
 
+from train.seeds import print_over_seeds
+
 _DIGITS = {"success": 3, "goal": 3, "fallen": 3, "reward": 1}
 
 
@@ -22,6 +24,7 @@ def print_tables(report: dict[str, Any]) -> None:
         _print_set(report, name, wide)
     if report["paper"] is not None:
         print("paper: its success rate and reward, where it has a controller of that name")
+    print_over_seeds(report["over_seeds"])
     _print_penalties(report, wide)
     _print_differences(report)
     for name, groups in report["traversable"].items():

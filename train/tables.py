@@ -16,6 +16,7 @@ from sim.robot import RobotCfg
 from train.differences import differences
 from train.measures import MEASURES, Measured
 from train.paper import published
+from train.seeds import firsts, over_seeds
 from train.sets import FROM_ARCHIVE, TerrainSet
 
 Crossed = Mapping[str, Mapping[str, Measured]]
@@ -34,17 +35,23 @@ def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCf
     Returns:
         ``success``, ``goal``, ``fallen`` (fractions), ``reward`` (sum over 20 s): set -> controller -> mean;
         ``penalties``: set -> controller -> penalty -> mean, scaled; ``intervals``: the same five with [lower, upper];
-        ``outcomes`` and ``invalid_terrains``: counts; ``differences`` of every two controllers by set
+        ``outcomes`` and ``invalid_terrains``: counts; ``over_seeds``: mean over the controllers of a kind
+        (:func:`train.seeds.over_seeds`); ``differences`` of every two kinds' first controllers by set
         (:mod:`train.differences`); ``traversable`` by generated set (:func:`split_by_goal`); ``terrains``: set ->
         number of terrains; ``paper``: the paper's numbers likewise, None of a robot it has none of; ``reward_weights``.
     """
+    means = _statistics(crossed, _mean)
     return {
-        **_statistics(crossed, _mean),
+        **means,
+        "over_seeds": over_seeds(means, MEASURES),
         "intervals": _statistics(crossed, lambda values: _interval(values, seed)),
         "terrains": {name: len(chosen) for name, chosen in sets.items()},
         "outcomes": _by_controller(crossed, lambda one: one.outcomes),
         "invalid_terrains": _by_controller(crossed, lambda one: int((~one.valid).sum())),
-        "differences": {name: differences(dict(row), sets[name].numbers, seed) for name, row in crossed.items()},
+        "differences": {
+            name: differences({who: row[who] for who in firsts(row)}, sets[name].numbers, seed)
+            for name, row in crossed.items()
+        },
         "traversable": {
             name: split_by_goal(row, sets[name].numbers, seed) for name, row in crossed.items() if name in FROM_ARCHIVE
         },

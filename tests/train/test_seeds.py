@@ -1,0 +1,36 @@
+"""Controllers of one kind from several seeds."""
+
+import pytest
+
+from train.seeds import firsts, over_seeds, print_over_seeds
+
+TABLES = {
+    "success": {"near": {"base": 0.5, "C-G": 0.8, "C-G@1": 0.9, "C-G@2": 1.0, "C-HC@7": 0.4}},
+    "goal": {"near": {"base": 0.5, "C-G": 0.7, "C-G@1": None, "C-G@2": 0.9, "C-HC@7": 0.4}},
+}
+
+
+def test_the_first_of_each_kind():
+    assert firsts(TABLES["success"]["near"]) == ["base", "C-G", "C-HC@7"]
+
+
+def test_mean_and_interval_of_a_kind_with_several():
+    found = over_seeds(TABLES, ["success", "goal"])
+    assert found["success"]["near"].keys() == {"C-G"}
+    kind = found["success"]["near"]["C-G"]
+    assert kind["mean"] == pytest.approx(0.9) and kind["values"] == [0.8, 0.9, 1.0]
+    # Standard deviation .1, so .1 / sqrt(3) * 4.303 either way.
+    assert kind["interval"] == pytest.approx([0.9 - 0.2484, 0.9 + 0.2484], abs=1e-4)
+    assert found["goal"]["near"]["C-G"]["mean"] is None
+
+
+def test_more_than_an_interval_is_known_for():
+    row = {f"C-G@{k}": 0.5 for k in range(11)}
+    assert over_seeds({"goal": {"near": row}}, ["goal"])["goal"]["near"]["C-G"]["interval"] is None
+
+
+def test_it_is_printed_where_there_is_something(capsys):
+    print_over_seeds(over_seeds(TABLES, ["success", "goal"]))
+    assert "near, C-G: success 0.900 [0.652 1.148], goal -\n" in capsys.readouterr().out
+    print_over_seeds({})
+    assert capsys.readouterr().out == ""

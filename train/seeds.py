@@ -1,0 +1,72 @@
+"""Controllers of one kind that were trained from different seeds: what their kind is worth, whatever the seed."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from sim.intervals import MAX_T_VALUES, t_interval
+
+MARK = "@"
+"""Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""
+
+
+def kind_of(name: str) -> str:
+    """The kind of a controller by its name."""
+    return name.split(MARK)[0]
+
+
+def firsts(names: Iterable[str]) -> list[str]:
+    """The first controller of each kind, in order."""
+    found = {}
+    for name in names:
+        found.setdefault(kind_of(name), name)
+    return list(found.values())
+
+
+def over_seeds(tables: dict[str, Any], measures: Iterable[str]) -> dict[str, Any]:
+    """Mean over the controllers of each kind that has several.
+
+    Args:
+        tables: Measure -> set -> controller -> value.
+        measures: Which of them.
+
+    Returns:
+        Measure -> set -> kind -> ``mean``, 95 % t ``interval`` over controllers and their ``values``; empty where no
+        kind has several. A mean is None where one of the values is, an interval too where there are more than
+        :data:`sim.intervals.MAX_T_VALUES`.
+    """
+    found: dict[str, Any] = {}
+    for measure in measures:
+        for name, row in tables[measure].items():
+            for kind in dict.fromkeys(map(kind_of, row)):
+                values = [value for who, value in row.items() if kind_of(who) == kind]
+                if len(values) > 1:
+                    found.setdefault(measure, {}).setdefault(name, {})[kind] = _summary(values)
+    return found
+
+
+def _summary(values: list[float | None]) -> dict[str, Any]:
+    numbers = [value for value in values if value is not None]
+    if len(numbers) < len(values):
+        return {"mean": None, "interval": None, "values": values}
+    interval = t_interval(np.array(numbers)) if len(numbers) <= MAX_T_VALUES else None
+    return {"mean": sum(numbers) / len(numbers), "interval": interval, "values": values}
+
+
+def print_over_seeds(found: dict[str, Any]) -> None:
+    """Print what :func:`over_seeds` found; nothing where no kind has several controllers."""
+    if not found:
+        return
+    print("\nmean over the controllers of a kind, and its 95 % t interval over them")
+    for name in next(iter(found.values())):
+        for kind in found[next(iter(found))][name]:
+            cells = (f"{measure} {_shown(rows[name][kind])}" for measure, rows in found.items())
+            print(f"  {name}, {kind}: " + ", ".join(cells))
+
+
+def _shown(summary: dict[str, Any]) -> str:
+    if summary["mean"] is None:
+        return "-"
+    limits = summary["interval"]
+    return f"{summary['mean']:.3f}" + ("" if limits is None else f" [{limits[0]:.3f} {limits[1]:.3f}]")
