@@ -1,6 +1,7 @@
 """Where a result comes from: the keys that every results file carries."""
 
 import hashlib
+import importlib.util
 import os
 import platform
 import shlex
@@ -50,6 +51,21 @@ def code_fingerprint(rooms: Sequence[str]) -> str:
             if path.suffix in (".py", ".xml"):
                 digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
+
+
+def controller_hash(policy: str) -> str | None:
+    """SHA-256 of a controller's file, or of the module that a ``module:callable`` stands in; None where there is none.
+
+    What a callable reads beside its own module is not in it.
+    """
+    file: str | None = policy
+    if not os.path.isfile(policy):
+        try:
+            spec = importlib.util.find_spec(policy.partition(":")[0])
+        except (ImportError, ValueError):  # no package of that name, or no name of a module
+            spec = None
+        file = None if spec is None else spec.origin
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file and os.path.isfile(file) else None
 
 
 def _module() -> str:

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,48 +15,12 @@ from sim.crossing import CrossingCfg, make_episode_state, make_start_ranges, mak
 from sim.policy import PolicyRunner, PolicySpec, load_policy, prepare_torch
 from sim.reward import RewardSum
 from sim.robot import RobotCfg
+from sim.rollout_result import RolloutResult, RolloutState
 from sim.simulation import Simulation, SolverCfg
 
+__all__ = ["Rollout", "RolloutResult", "evaluate"]
+
 _FALLEN_TILT_DEG = 60.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class RolloutResult:
-    """What came of every episode; arrays lead with (num_terrains, num_replicas)."""
-
-    penalties: np.ndarray
-    """Raw penalty sums times the physics step, unscaled; (T, R, P) float64, NaN where invalid."""
-    penalty_names: tuple[str, ...]
-    outcome: np.ndarray
-    """:class:`kernels.episode.Outcome` of each episode, uint8."""
-    fallen: np.ndarray
-    """Tilt above 60 degrees at the end, bool."""
-    duration_s: np.ndarray
-    """Simulated time up to the end [s], float32."""
-    final_position: np.ndarray
-    """Base position at the end, world-local [m], (T, R, 3) float32."""
-    physics_steps: int
-    """Physics steps run until the last episode ended."""
-    wall_s: float
-    paths: np.ndarray | None = None
-    """Base position at every control step [m], NaN after the end; (T, R, steps, 3) float32, or None."""
-    reward: np.ndarray | None = None
-    """Training reward summed to the end of the time, (T, R) float64, NaN where invalid; None unless asked for."""
-
-    @property
-    def base_collision(self) -> np.ndarray:
-        """Ended by base collision, bool."""
-        return self.outcome == Outcome.BASE_COLLISION
-
-    @property
-    def reached_goal(self) -> np.ndarray:
-        """Ended at the goal, bool."""
-        return self.outcome == Outcome.GOAL
-
-    @property
-    def invalid(self) -> np.ndarray:
-        """Non-finite, too fast or overflowed, bool."""
-        return self.outcome == Outcome.INVALID
 
 
 class Rollout:
@@ -176,6 +139,7 @@ class Rollout:
         seeds: np.ndarray,
         *,
         record_paths: bool = False,
+        before_step: Callable[[], None] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> RolloutResult:
         """Run one crossing of every replica on every terrain.
@@ -186,6 +150,7 @@ class Rollout:
             terrains: Genes, shape (num_terrains, 64), or heights [m], shape (num_terrains, nrow, ncol).
             seeds: One seed a terrain, shape (num_terrains,), uint32.
             record_paths: Keep the base's position at every control step.
+            before_step: Called before every control step, to look at :attr:`state` (:mod:`sim.recording`).
             progress: Called with (control steps done, most control steps) at every poll.
 
         Raises:
@@ -194,8 +159,28 @@ class Rollout:
         began = time.perf_counter()
         self.begin(terrains, seeds)
         paths: list[np.ndarray] | None = [] if record_paths else None
-        control_steps = self._run(progress, paths)
+
+        def look() -> None:
+            if paths is not None:
+                running = self._episode.outcome.numpy() == Outcome.RUNNING
+                paths.append(np.where(running[:, None], self.sim.joint_q.numpy()[:, :3], np.nan))
+            if before_step is not None:
+                before_step()
+
+        control_steps = self._run(progress, look)
         return self._collect(control_steps, began, paths)
+
+    @property
+    def state(self) -> RolloutState:
+        """What the rollout stands at, on the device."""
+        return RolloutState(
+            joint_q=self.sim.joint_q,
+            geom_force=self.sim.geom_force,
+            penalty_sums=self._sums,
+            command=self._command,
+            outcome=self._episode.outcome,
+            steps=self._episode.steps,
+        )
 
     def begin(self, terrains: np.ndarray, seeds: np.ndarray) -> None:
         """Set the terrains and put every robot at its start; arguments and errors as of :meth:`evaluate`."""
@@ -213,13 +198,11 @@ class Rollout:
         self._policy()
         self.sim.launch(self._graph)
 
-    def _run(self, progress: Callable[[int, int], None] | None, paths: list[np.ndarray] | None) -> int:
+    def _run(self, progress: Callable[[int, int], None] | None, look: Callable[[], None]) -> int:
         most = round(self.cfg.max_duration_s / self.robot.control_dt)
         poll = max(1, round(self.cfg.poll_every_s / self.robot.control_dt))
         for step in range(1, most + 1):
-            if paths is not None:
-                running = self._episode.outcome.numpy() == Outcome.RUNNING
-                paths.append(np.where(running[:, None], self.sim.joint_q.numpy()[:, :3], np.nan))
+            look()
             self.control_step()
             if step % poll == 0 or step == most:
                 running_count = int(self._stepped.num_running.numpy()[0])

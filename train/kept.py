@@ -6,7 +6,6 @@ of device, code and packages. Nothing in it can be out of date, whichever comman
 
 import dataclasses
 import hashlib
-import importlib.util
 import io
 import json
 import os
@@ -17,7 +16,7 @@ import numpy as np
 
 from kernels.episode import Outcome
 from sim.files import check_zip, write_atomically
-from sim.provenance import code_fingerprint
+from sim.provenance import code_fingerprint, controller_hash
 from sim.rollout import RolloutResult
 from train.sets import TerrainSet
 
@@ -30,21 +29,6 @@ def take_terrains(result: RolloutResult, places: np.ndarray) -> RolloutResult:
     """Crossings of some of the terrains, shape (num_places,) of integers, in the order given."""
     arrays = {name: getattr(result, name) for name in _ARRAYS}
     return dataclasses.replace(result, **{name: array[places] for name, array in arrays.items() if array is not None})
-
-
-def controller_hash(policy: str) -> str | None:
-    """SHA-256 of a controller's file, or of the module that a ``module:callable`` stands in; None where there is none.
-
-    What a callable reads beside its own module is not in it.
-    """
-    file: str | None = policy
-    if not os.path.isfile(policy):
-        try:
-            spec = importlib.util.find_spec(policy.partition(":")[0])
-        except (ImportError, ValueError):  # no package of that name, or no name of a module
-            spec = None
-        file = None if spec is None else spec.origin
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file and os.path.isfile(file) else None
 
 
 class KeptCrossings:
