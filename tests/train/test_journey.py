@@ -1,0 +1,57 @@
+"""A user's controller of other layer sizes is fine-tuned, exported and evaluated by the documented commands alone."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+from tests.train.test_finetune import write_actor
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(*words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", *words, "--robot", "anymal"], cwd=ROOT, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_from_a_file_of_the_user_to_the_tables(tmp_path):
+    mine, tuned = write_actor(tmp_path / "mine.pt", hidden=(24, 20, 16)), tmp_path / "tuned"
+    sizes = ("--num-envs", "8", "--terrains", "4", "--swap-every", "1", "--iterations", "2", "--critic-iterations", "1")
+    said = run("train.finetune", "--policy", str(mine), "--device", "cpu", "--run-dir", str(tuned), *sizes)
+    assert "Fine-tuning 'anymal' on 4 terrains at a time (generated): 8 robots on cpu, 2 iterations" in said
+    state = torch.load(tuned / "policy.pt", weights_only=True)["actor_state_dict"]
+    assert [state[f"mlp.{k}.weight"].shape[0] for k in (0, 2, 4, 6)] == [24, 20, 16, 12]
+
+    run("train.export", "--policy", str(tuned / "policy.pt"), "--out", str(tmp_path / "again.onnx"))
+    assert (tmp_path / "again.onnx").read_bytes() == (tuned / "policy.onnx").read_bytes()
+
+    controllers = (f"mine={mine}", f"C-G={tuned / 'policy.pt'}", f"C-G@onnx={tuned / 'policy.onnx'}")
+    out = tmp_path / "tables.json"
+    where = ("--archive", "results/anymal/archive", "--out", str(out), "--run-dir", str(tmp_path / "kept"))
+    said = run(
+        "train.evaluate",
+        "--policies",
+        *controllers,
+        *where,
+        "--sets",
+        "generated",
+        "--terrains",
+        "2",
+        "--episodes",
+        "1",
+        "--device",
+        "cpu",
+    )
+    assert "generated: 2 terrains x 1 episodes" in said
+    tables = json.loads(out.read_text())
+    for measure in ("success", "goal"):
+        row = tables[measure]["generated"]
+        assert list(row) == ["mine", "C-G", "C-G@onnx"]
+        assert row["C-G"] == row["C-G@onnx"]
+    assert tables["goal"]["generated"]["mine"] == 0.0  # random layers do not cross
