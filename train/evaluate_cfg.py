@@ -28,7 +28,7 @@ class EvaluateCfg:
     robot: str = "anymal"
     """Which robot."""
     policy: str | None = None
-    """Without tables, the controller: an rsl_rl checkpoint, a TorchScript file or module:callable; the shipped one."""
+    """Without tables, the controller: a checkpoint, a TorchScript or ONNX file, or module:callable; the shipped one."""
     policies: tuple[str, ...] = ()
     """Controllers of the tables, each NAME=FILE, NAME=module:callable or NAME=shipped; the first is the one that the
     others are held against; base=shipped. C-G, C-G@1, C-G@2 are one kind of several seeds, whose mean is shown too."""
