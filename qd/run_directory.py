@@ -201,6 +201,22 @@ class RunDirectory:
         except (OSError, ValueError):
             return {}
 
+    def read_metrics(self) -> Metrics:
+        """Rows of the metrics file, without reading the checkpoint.
+
+        Raises:
+            FileNotFoundError: If there is none.
+            ValueError: If it is damaged.
+        """
+        file = self.path / METRICS_FILE
+        try:
+            rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        except ValueError as error:
+            raise ValueError(f"{file} is damaged: {error}; {_REMEDY}") from None
+        if not rows or not all(isinstance(row, dict) for row in rows):
+            raise ValueError(f"{file} must have a row an iteration, got {len(rows)}; {_REMEDY}")
+        return rows
+
     def iterations_done(self) -> int:
         """Rows of the metrics file, without reading the checkpoint."""
         file = self.path / METRICS_FILE
