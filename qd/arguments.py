@@ -246,7 +246,7 @@ def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
         _mention_unfinished(name, cfg, args)
         return path
     if (args.run_dir / CONFIG_FILE).exists():
-        different = differences(RunDirectory(args.run_dir).read_config()["settings"], as_settings(cfg))
+        different = differences(as_settings(RunDirectory(args.run_dir).read_cfg()), as_settings(cfg))
         if different:
             found = f"{args.run_dir} holds a run of other settings"
             raise ValueError(f"{found}: {', '.join(different)}: give another --run-dir")
@@ -262,10 +262,10 @@ def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments) -> None:
     for path in itertools.takewhile(Path.exists, numbered(_RUNS, name)):
         run = RunDirectory(path)
         try:
-            config, done = run.read_config(), run.iterations_done()
+            there, done = run.read_cfg(), run.iterations_done()
         except (OSError, ValueError):
             continue
-        if done < config["iterations"] and not differences(config["settings"], as_settings(cfg)):
-            state = f"stopped after {done} of {config['iterations']} iterations"
+        if done < there.iterations and as_settings(there) == as_settings(cfg):
+            state = f"stopped after {done} of {there.iterations} iterations"
             print(f"{path} holds the same search, {state}. Go on with:")
             print(f"  {_resume_command(cfg.robot, path, args, None)}")

@@ -7,7 +7,7 @@ in lock-step: each iteration's terrains of all runs are crossed together, so tha
 import itertools
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -97,15 +97,20 @@ def _shown(active: Sequence[Entrant], wall_s: float) -> dict[str, Any]:
     return {**best.metrics[-1], "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
 
 
-def entrants_of(asked: Comparison) -> Iterator[Entrant]:
+def entrants_of(asked: Comparison, claims: ExitStack) -> Iterator[Entrant]:
     """The runs of a comparison, new or as far as they are.
 
+    Args:
+        asked: The comparison.
+        claims: Keeps searches that extend one of the runs out of their directories until it ends.
+
     Raises:
-        ValueError: If a run that is there has other settings, is damaged, or has gone further than asked.
+        ValueError: If a run that is there has other settings, is damaged or at work, or has gone further than asked.
     """
     first, iterations = asked.cfg.seed, asked.cfg.iterations
     for method, seed in itertools.product(asked.methods, range(first, first + asked.seeds)):
         cfg, run = asked.cfg_of(method, seed), RunDirectory(asked.path / f"{method}-{seed}")
+        claims.enter_context(claimed(run.path))
         search, metrics = run.load(as_settings(cfg)) or (begin(cfg), [])
         if len(metrics) > iterations:
             raise ValueError(
@@ -129,8 +134,9 @@ def compare(args: Arguments, *, open_evaluator: Open = open_evaluator) -> None:
     """
     asked = comparison_of(args)
     cfg = asked.cfg
-    with claimed(asked.path):
-        entrants = list(entrants_of(asked))
+    with ExitStack() as claims:
+        claims.enter_context(claimed(asked.path))
+        entrants = list(entrants_of(asked, claims))
         done = min(entrant.done for entrant in entrants)
         episodes = sum(cfg.iterations - entrant.done for entrant in entrants) * cfg.episodes_per_iteration
         print(
@@ -156,7 +162,6 @@ def _how_to_go_on(asked: Comparison) -> str:
 def _write_configs(asked: Comparison, entrants: Sequence[Entrant]) -> None:
     asked.write_config()
     for entrant in entrants:
-        entrant.run.path.mkdir(exist_ok=True)
         origin = {**asked.origin, "seed": entrant.cfg.seed}
         entrant.run.write_config(as_settings(entrant.cfg), asked.cfg.iterations, origin)
 

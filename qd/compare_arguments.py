@@ -1,6 +1,7 @@
 """What a command line of a comparison means: a new one, or an old one that goes on."""
 
 import os
+import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -33,6 +34,7 @@ METHODS: dict[str, dict[str, Any]] = {
 
 COMPARE_CONFIG_FILE = "compare.config.json"
 _RUNS = Path("runs")
+_NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a directory can be called, with a seed behind it
 _DEFAULTS = {"robot": "anymal", "methods": tuple(METHODS), "seeds": 3, "iterations": 33, "reevaluate_every": 11}
 
 
@@ -176,8 +178,7 @@ def _checked(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> _Asked:
     unknown = [name for name in methods if name.split(":")[0] not in METHODS]
     if unknown or not methods or len(set(methods)) < len(methods):
         raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(methods)}")
-    for name in methods:
-        changed(cfg, _changes(name))
+    _check_settings(cfg, methods)
     if not 1 <= seeds <= MAX_T_VALUES:
         raise ValueError(f"seeds must be 1 to {MAX_T_VALUES}, got {seeds}")
     if cfg.reevaluate_every < 1:
@@ -185,16 +186,38 @@ def _checked(cfg: SearchCfg, methods: tuple[str, ...], seeds: int) -> _Asked:
     return cfg, methods, seeds
 
 
+def _check_settings(cfg: SearchCfg, methods: tuple[str, ...]) -> None:
+    """That methods are different searches on the same number of terrains, with names that a directory can have."""
+    names: dict[SearchCfg, str] = {}
+    for name in methods:
+        if not _NAME.fullmatch(name):
+            raise ValueError(
+                f"methods: a name must be up to 200 letters, digits and _+-.,:= without spaces, got {name!r}"
+            )
+        own = changed(cfg, _changes(name))
+        if own in names:
+            raise ValueError(f"methods: {names[own]} and {name} are the same search: leave one of them out")
+        names[own] = name
+        if own.scheduler.num_terrains != cfg.scheduler.num_terrains:
+            raise ValueError(
+                f"methods: emitters times batch_size must be {cfg.scheduler.num_terrains} as in all runs of the "
+                f"comparison, got {own.scheduler.num_terrains} in {name}"
+            )
+
+
 def _changes(method: str) -> dict[str, Any]:
     """Changes of the search's settings that a method is, those behind its colon included."""
-    name, *given = method.split(":")
-    found = dict(METHODS[name])
+    name, colon, given = method.partition(":")
+    found, seen = dict(METHODS[name]), set()
     kinds = {field.name: type(field.default) for field in fields(SchedulerCfg)}
-    for item in given[0].split(",") if given else ():
+    for item in given.split(",") if colon else ():
         key, _, value = item.partition("=")
         key = key.replace("-", "_")
         if key not in kinds:
             raise ValueError(f"methods: no setting named {key} in {method}: expected some of {', '.join(kinds)}")
+        if key in seen:
+            raise ValueError(f"methods: {key} is given twice in {method}")
+        seen.add(key)
         try:
             found[key] = kinds[key](value)
         except ValueError:
@@ -239,6 +262,11 @@ def _free_path(given: Path | None, robot: str) -> Path:
         return next(path for path in numbered(_RUNS, f"{robot}-compare") if not path.exists())
     if (given / COMPARE_CONFIG_FILE).exists():
         raise ValueError(f"{given} holds a comparison already: go on with --resume {given}, or give another --run-dir")
-    if given.is_dir() and not all(map(is_leftover, given.iterdir())):
+    if given.is_dir() and not all(is_leftover(path) or _is_empty(path) for path in given.iterdir()):
         raise ValueError(f"{given} is not empty and holds no comparison: give another --run-dir")
     return given
+
+
+def _is_empty(path: Path) -> bool:
+    """Whether it is a directory of a run that was killed before anything was written."""
+    return path.is_dir() and all(map(is_leftover, path.iterdir()))

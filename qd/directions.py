@@ -7,10 +7,13 @@ from numpy.typing import NDArray
 from ribs.archives import GridArchive
 from ribs.emitters.opt import CMAEvolutionStrategy, SeparableCMAEvolutionStrategy
 
+from qd.fitness import FITNESS_FLOOR
 from sim.terrain import hard_random_genes
 
 _STRATEGIES = {"cma_es": CMAEvolutionStrategy, "sep_cma_es": SeparableCMAEvolutionStrategy}
 _CONTENDERS = 8  # elites of which the one furthest along the direction is the start
+_LAST = -1.0  # below the projection of any ratios: those lie within sqrt(1 - 1 / P) of equal ones, whose is 0
+_NO_SPREAD = 1e-9  # ratios are means of numbers in [0, 1], off by about 1e-16
 
 
 class DirectionEmitter:
@@ -59,15 +62,16 @@ class DirectionEmitter:
         """Genes, unclipped, shape (batch_size, 64)."""
         return self._strategy.ask()
 
-    def tell(self, *, ratios: NDArray[np.float64], **told: Any) -> None:
+    def tell(self, *, ratios: NDArray[np.float64], objective: NDArray[np.float64], **told: Any) -> None:
         """What became of the terrains last asked for.
 
         Args:
             ratios: Shape (batch_size, P).
+            objective: Fitness, shape (batch_size,); what is no elite, as an invalid terrain, ranks last.
             told: Their other fields, which have no say here.
         """
         self.itrs += 1
-        along = ratios @ self.direction
+        along = np.where(objective > FITNESS_FLOOR, ratios @ self.direction, _LAST)
         order = np.argsort(-along, kind="stable")
         self._strategy.tell(order, along, self.batch_size // 2)
         if self.itrs % self.restart_every == 0 or self._strategy.check_stop(along[order]):
@@ -77,7 +81,7 @@ class DirectionEmitter:
         elites: Any = self.archive.data(["solution", "ratios"])
         spread = elites["ratios"].std(axis=0)
         # A ratio that all elites share has no scale to go by.
-        self.direction = _unit(self._rng.standard_normal(len(spread)) / np.where(spread > 0.0, spread, np.inf))
+        self.direction = _unit(self._rng.standard_normal(len(spread)) / np.where(spread > _NO_SPREAD, spread, np.inf))
         drawn = self._rng.integers(len(elites["ratios"]), size=_CONTENDERS)
         start = drawn[np.argmax(elites["ratios"][drawn] @ self.direction)]
         self._strategy.reset(elites["solution"][start])

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.settings import SearchCfg, Settings, from_settings
+from qd.settings import SearchCfg, Settings, as_settings, from_settings
 from sim.files import check_writable, read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
@@ -250,13 +250,21 @@ class RunDirectory:
         there, metrics = state.get("settings"), state.get("metrics")
         if not isinstance(there, dict) or not isinstance(metrics, list):
             raise ValueError(f"{file} is no checkpoint of a search: it lacks settings or metrics; {_REMEDY}")
-        different = differences(there, settings)
+        different = differences(_of_now(there), settings)
         if different:
             raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}; {_REMEDY}")
         try:
             return Scheduler.from_state(state), metrics
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{file} is no checkpoint of a search: {error}; {_REMEDY}") from None
+
+
+def _of_now(settings: Settings) -> Settings:
+    """Settings with those that later versions added, which stand for what was done before; damaged ones as they are."""
+    try:
+        return as_settings(from_settings(settings, iterations=1))
+    except ValueError:
+        return settings
 
 
 def archive_of(settings: Settings, search: "Scheduler", iterations: int) -> Archive:

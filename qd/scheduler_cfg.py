@@ -5,6 +5,8 @@ from dataclasses import dataclass
 METHODS = ("cma_mae", "cma_me", "map_elites", "directions", "hard_random", "uniform_random")
 ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
+STEPS = (1e-6, 1e3)
+"""Step sizes that evolution strategies and iso+line can reckon with; genes are float32 and live in [-1, 1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +49,8 @@ class SchedulerCfg:
                 f"method must be one of {', '.join(METHODS)}, or several joined by a plus, each once, got {self.method}"
             )
         for name in ("iso_sigma", "line_sigma"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} must be a number of at least 0, got {getattr(self, name)}")
+            if not 0.0 <= getattr(self, name) <= STEPS[1]:
+                raise ValueError(f"{name} must lie in [0, {STEPS[1]:g}], got {getattr(self, name)}")
         if self.emitters < 1 or self.batch_size < 2:
             raise ValueError(
                 f"emitters must be at least 1 and batch_size at least 2, got {self.emitters} and {self.batch_size}"
@@ -56,8 +58,8 @@ class SchedulerCfg:
         if not 0.0 <= self.learning_rate <= 1.0:
             raise ValueError(f"learning_rate must lie in [0, 1], got {self.learning_rate}")
         for name in ("sigma0", "direction_sigma"):
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} must be a positive number, got {getattr(self, name)}")
+            if not STEPS[0] <= getattr(self, name) <= STEPS[1]:
+                raise ValueError(f"{name} must lie in [{STEPS[0]:g}, {STEPS[1]:g}], got {getattr(self, name)}")
         if self.direction_restart < 1:
             raise ValueError(f"direction_restart must be at least 1, got {self.direction_restart}")
         if self.es not in ES_KINDS:

@@ -97,7 +97,7 @@ def test_controllers_that_cannot_be_used(capsys, policy, message):
 
 
 def test_a_setting_out_of_range(capsys):
-    assert fails(capsys, *TINY, "--sigma0", "0") == "sigma0 must be a positive number, got 0.0"
+    assert fails(capsys, *TINY, "--sigma0", "0") == "sigma0 must lie in [1e-06, 1000], got 0.0"
 
 
 def test_directories(capsys):

@@ -13,7 +13,7 @@ from qd.arguments import job_of
 from qd.cli import Interrupted
 from qd.compare import Arguments
 from qd.reevaluate import ReevaluateCfg, reevaluate_run
-from qd.run_directory import RunDirectory
+from qd.run_directory import RunDirectory, claimed
 from qd.search import run_search
 from sim.robot import RobotCfg
 from tests.qd import stand_in
@@ -170,6 +170,52 @@ def test_resuming_a_finished_one_evaluates_nothing_and_writes_its_numbers_again(
     assert numbers_of(go_on("a", open_evaluator=never)) == before
 
 
+def search_alone(path: Path, **given):
+    asked = arguments.Arguments(resume=path, device="cpu", reproduce="no", **given)
+    return run_search(job_of(asked), open_evaluator=open_stand_in)
+
+
+def test_a_run_is_extended_alone_and_the_others_follow():
+    path, whole, name = run("a"), run("whole", iterations=5), "cma_mae_narrow-6"
+    search_alone(path / name, iterations=5)
+    assert (path / name / "archive.npz").read_bytes() == (whole / name / "archive.npz").read_bytes()
+    with pytest.raises(ValueError, match=f"iterations must be at least 5, as many as a/{name} has done, got 3"):
+        go_on("a", open_evaluator=never)
+    go_on("a", iterations=5)
+    for name in runs_of(path):
+        assert (path / name / "archive.npz").read_bytes() == (whole / name / "archive.npz").read_bytes()
+    # Alone it had some of its elites looked at, not all: the common looks are those at iterations 2 and 3.
+    assert numbers_of(path)["corrected_at"] == [64, 96]
+
+
+def test_a_search_and_a_comparison_do_not_share_a_run():
+    path = run("a", iterations=1)
+
+    @contextmanager
+    def intruding(cfg):
+        with pytest.raises(ValueError, match="another search works in a/uniform_random-5"):
+            search_alone(path / "uniform_random-5", iterations=2)
+        yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds, cfg.num_replicas)
+
+    go_on("a", open_evaluator=intruding, iterations=2)
+    with (
+        claimed(path / "uniform_random-6"),
+        pytest.raises(ValueError, match="another search works in a/uniform_random-6"),
+    ):
+        go_on("a", open_evaluator=never, iterations=3)
+    go_on("a", iterations=3)
+
+
+def test_a_comparison_killed_before_it_wrote_anything_is_begun_again():
+    Path("a/uniform_random-5").mkdir(parents=True)
+    Path("a/uniform_random-5/.write-test").touch()
+    run("a", iterations=1)
+    Path("b/mine").mkdir(parents=True)
+    Path("b/mine/thesis.tex").touch()
+    with pytest.raises(ValueError, match="b is not empty and holds no comparison"):
+        run("b", iterations=1)
+
+
 def test_fresh_values_of_a_run_stay_while_it_does_not_grow():
     path = run("a", iterations=1) / "cma_mae_narrow-5"
     reevaluate_run(ReevaluateCfg(run=path, device="cpu"), open_evaluator=open_stand_in)
@@ -192,6 +238,17 @@ def test_numbers_go_where_they_are_asked_for():
         ({"methods": ("cma_mae:colour=3",)}, "no setting named colour in cma_mae:colour=3: expected some of method"),
         ({"methods": ("cma_mae:sigma0=wide",)}, "sigma0 must be float, got 'wide'"),
         ({"methods": ("cma_mae:learning-rate=7",)}, "learning_rate must lie in"),
+        ({"methods": ("cma_mae:sigma0=1:alpha=0",)}, "sigma0 must be float, got '1:alpha=0'"),
+        ({"methods": ("cma_mae:sigma0=1,sigma0=2",)}, "sigma0 is given twice in cma_mae:sigma0=1,sigma0=2"),
+        ({"methods": ("cma_mae:",)}, "no setting named  in cma_mae:"),
+        ({"methods": ("cma_mae:sigma0=1\n",)}, r"without spaces, got 'cma_mae:sigma0=1\\n'"),
+        ({"methods": (f"cma_mae:sigma0=1.{200 * '0'}",)}, "a name must be up to 200 letters"),
+        ({"methods": ("mixed:method=../../x",)}, "a name must be up to 200 letters"),
+        ({"methods": ("cma_mae", "cma_mae_sep:es=cma_es")}, "cma_mae and cma_mae_sep:es=cma_es are the same search"),
+        (
+            {"methods": ("cma_mae", "cma_mae:emitters=8")},
+            "emitters times batch_size must be 32 as in all runs of the comparison, got 64 in cma_mae:emitters=8",
+        ),
         ({"methods": ("mixed", "mixed")}, "each once, got mixed, mixed"),
         ({"methods": ()}, "methods must be some of"),
         ({"seeds": 0}, "seeds must be 1 to 10, got 0"),

@@ -16,8 +16,10 @@ import pytest
 from qd import search
 from qd.archive import read_archive
 from qd.arguments import Job
+from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.cli import Interrupted
 from qd.fitness import FitnessCfg
+from qd.run_directory import RunDirectory
 from qd.search import run_search
 from qd.settings import SchedulerCfg, SearchCfg
 from qd.workers import EvaluatorCfg, EvaluatorError
@@ -155,6 +157,26 @@ def test_resuming_a_finished_run_evaluates_nothing_and_writes_its_results_again(
     assert (path / "archive.npz").read_bytes() == before
     assert json.loads((path / "archive.json").read_text())["iterations"] == 2
     assert "All 2 iterations" in capsys.readouterr().out
+
+
+def test_a_run_from_before_a_setting_was_added_goes_on(tmp_path, plain_figures):
+    path, added = tmp_path / "run", ("direction_sigma", "direction_restart")
+    run(path)
+    state = load_checkpoint(path / "checkpoint.bin")
+    config = json.loads((path / "config.json").read_text())
+    for settings in (state["settings"], config["settings"]):
+        for name in added:
+            del settings["scheduler"][name]
+    save_checkpoint(path / "checkpoint.bin", state)
+    (path / "config.json").write_text(json.dumps(config))
+    assert RunDirectory(path).read_cfg() == CFG
+    run(path, iterations=4, resumes=True)
+    run(tmp_path / "whole", iterations=4)
+    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
+    assert set(added) < set(json.loads((path / "config.json").read_text())["settings"]["scheduler"])
+    # What is no default is a difference still.
+    with pytest.raises(ValueError, match=r"scheduler\.direction_restart \(20 there, 7 wanted\)"):
+        run(path, resumes=True, scheduler=dataclasses.replace(CFG.scheduler, direction_restart=7))
 
 
 def test_fewer_iterations_than_done_are_refused(tmp_path, plain_figures):

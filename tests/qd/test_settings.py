@@ -64,6 +64,12 @@ def test_changes_land_where_the_setting_stands():
         ("intervals", 100, "intervals must leave fewer than 500,000 cells for 6 penalties, got 100"),
         ("seed", -1, "seed must not be negative, got -1"),
         ("emitters", 0, "emitters must be at least 1"),
+        ("sigma0", 1e30, r"sigma0 must lie in \[1e-06, 1000\], got 1e\+30"),  # its square is no float32
+        ("direction_sigma", 1e-300, r"direction_sigma must lie in \[1e-06, 1000\]"),
+        ("sigma0", float("nan"), "sigma0 must lie in"),
+        ("line_sigma", float("inf"), r"line_sigma must lie in \[0, 1000\], got inf"),
+        ("method", "cma_mae+", "several joined by a plus, each once, got cma_mae\\+"),
+        ("method", "cma_mae+cma_mae", "each once, got cma_mae"),
     ],
 )
 def test_values_out_of_range(name, value, message):
