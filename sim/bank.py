@@ -75,3 +75,22 @@ class TerrainBank:
         on_device = wp.array(genes.astype(np.float32), dtype=float, device=self.device)
         rasterise(on_device, SPACING, self.terrain.heights)
         max_blocks(self.terrain.heights, self.terrain.ceilings)
+
+
+def heights_of(genes: np.ndarray, *, device: str = "cpu") -> np.ndarray:
+    """Height grids [m] of genes as a simulation has them, on the host.
+
+    Args:
+        genes: Shape (num_terrains, 8 * num_bumps), at least one terrain.
+        device: Warp device name.
+
+    Returns:
+        Float32, shape (num_terrains, NUM_ROWS, NUM_COLS).
+
+    Raises:
+        ValueError: If the shape is another one or a gene is not finite.
+    """
+    bank = TerrainBank(len(genes), device=device)
+    with wp.ScopedDevice(device):
+        bank.set_genes(genes)
+        return np.array(bank.heights.numpy())
