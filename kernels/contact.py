@@ -1,8 +1,8 @@
 """Terrain contact: strips of sphere probes against height grids, written as contact records for the physics solver.
 
-A strip is a straight row of equal spheres on one collision shape (:mod:`sim.probes` makes them). Of the probes of a
-strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its two ends and on the
-highest point between, and a robot on its back cannot flood the solver.
+A strip is a row of equal spheres on one collision shape (:mod:`sim.probes` makes them), straight but for meshes. Of the
+probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its two ends
+and on the highest point between, and a robot on its back cannot flood the solver.
 """
 
 from typing import Any
@@ -24,6 +24,8 @@ class Probes:
     """First probe of each strip, shape (num_strips + 1,)."""
     strip_radius: wp.array[float]
     """Probe radius of each strip [m], shape (num_strips,)."""
+    strip_spread: wp.array[float]
+    """Farthest that a strip's centres lie from the line between its ends [m], shape (num_strips,); 0 if straight."""
     strip_body: wp.array[int]
     """Body of each strip, counted within one robot, shape (num_strips,)."""
     strip_shape: wp.array[int]
@@ -96,9 +98,10 @@ def _collide_strips_kernel(
     end = probes.strip_start[strip + 1]
     a = wp.transform_point(pose, probes.position[begin])
     b = wp.transform_point(pose, probes.position[end - 1])
-    lowest = wp.min(a[2], b[2]) - radius
-    lower = wp.vec2(wp.min(a[0], b[0]) - radius, wp.min(a[1], b[1]) - radius)
-    upper = wp.vec2(wp.max(a[0], b[0]) + radius, wp.max(a[1], b[1]) + radius)
+    reach = radius + probes.strip_spread[strip]
+    lowest = wp.min(a[2], b[2]) - reach
+    lower = wp.vec2(wp.min(a[0], b[0]) - reach, wp.min(a[1], b[1]) - reach)
+    upper = wp.vec2(wp.max(a[0], b[0]) + reach, wp.max(a[1], b[1]) + reach)
     ceiling = ceiling_over(terrain, t, lower, upper)
     if not (lowest < ceiling):
         return  # also where the state is NaN

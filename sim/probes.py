@@ -1,24 +1,19 @@
 """Collision shapes to strips of sphere probes, close enough that no terrain edge slips between two of them."""
 
-from dataclasses import dataclass
+from typing import Any
 
 import newton
 import numpy as np
+import warp as wp
+
+from kernels.contact import Probes
+from sim.hull import hull_probes
+from sim.strip import Strip
 
 MAX_SAG = 0.005
 """Deepest that a sharp ridge may sink between two neighbouring probes [m]."""
 MAX_EDGE_RADIUS = 0.02
 """Largest probe radius on boxes and cylinders, whose edges the probes round off [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Strip:
-    """A straight row of equal spheres on one shape."""
-
-    centres: np.ndarray
-    """Centres in the shape's frame [m], shape (num_probes, 3), in order along the strip."""
-    radius: float
-    """Probe radius [m]."""
 
 
 def max_spacing(radius: float, sag: float = MAX_SAG) -> float:
@@ -79,15 +74,17 @@ def cylinder_strips(radius: float, half_height: float) -> list[Strip]:
     return strips
 
 
-def shape_strips(shape_type: newton.GeoType, scale: np.ndarray) -> list[Strip]:
+def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None) -> list[Strip]:
     """Strips of one collision shape, in the shape's frame.
 
     Args:
-        shape_type: Sphere, capsule, box or cylinder.
-        scale: Newton's shape scale [m]: (radius,), (radius, half height) or (half x, half y, half z).
+        shape_type: Sphere, capsule, box, cylinder or mesh.
+        scale: Newton's shape scale [m]: (radius,), (radius, half height) or (half x, half y, half z); of a mesh its
+            factors along x, y and z.
+        mesh: Newton's mesh, which collides as its convex hull.
 
     Raises:
-        ValueError: For any other shape.
+        ValueError: For any other shape, or a mesh without volume.
     """
     if shape_type == newton.GeoType.SPHERE:
         return [Strip(centres=np.zeros((1, 3)), radius=float(scale[0]))]
@@ -97,7 +94,47 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray) -> list[Strip]:
         return box_strips((float(scale[0]), float(scale[1]), float(scale[2])))
     if shape_type == newton.GeoType.CYLINDER:
         return cylinder_strips(float(scale[0]), float(scale[1]))
+    if shape_type in (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH):
+        return list(hull_probes(np.asarray(mesh.vertices, dtype=np.float64) * scale).strips)
     raise ValueError(
         f"no probes for a {newton.GeoType(shape_type).name} collision shape: "
-        "expected SPHERE, CAPSULE, BOX or CYLINDER; replace it in the robot's file"
+        "expected SPHERE, CAPSULE, BOX, CYLINDER or MESH; replace it in the robot's file"
     )
+
+
+def _place(pose: Any, point: np.ndarray) -> Any:
+    local: Any = wp.vec3(*point)
+    return wp.transform_point(pose, local)
+
+
+def make_probes(builder: newton.ModelBuilder) -> Probes:
+    """Sphere probes of all collision shapes of one robot, on the current device.
+
+    Raises:
+        ValueError: If a shape has no probes, by its name.
+    """
+    centres, radius, spread, body, shape = [], [], [], [], []
+    for k in range(builder.shape_count):
+        if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
+            continue
+        pose: Any = builder.shape_transform[k]
+        try:
+            strips = shape_strips(
+                newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k]), builder.shape_source[k]
+            )
+        except ValueError as error:
+            raise ValueError(f"geom {builder.shape_label[k]}: {error}") from error
+        for strip in strips:
+            centres.append([_place(pose, centre) for centre in strip.centres])
+            radius.append(strip.radius)
+            spread.append(strip.spread)
+            body.append(builder.shape_body[k])
+            shape.append(k)
+    probes = Probes()
+    probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
+    probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)
+    probes.strip_radius = wp.array(radius, dtype=float)
+    probes.strip_spread = wp.array(spread, dtype=float)
+    probes.strip_body = wp.array(body, dtype=int)
+    probes.strip_shape = wp.array(shape, dtype=int)
+    return probes

@@ -8,12 +8,12 @@ import newton
 import numpy as np
 import warp as wp
 
-from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
+from kernels.contact import ContactBuffer, Layout, collide_strips
 from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.reset import clear_rows
 from sim.bank import TerrainBank
-from sim.probes import shape_strips
+from sim.probes import make_probes
 from sim.robot import RobotCfg, build_robot, leaf_name
 
 GROUND_FRICTION = 0.3
@@ -258,32 +258,6 @@ class Simulation:
         """Run a captured graph once."""
         with wp.ScopedDevice(self.device):
             wp.capture_launch(graph)
-
-
-def _place(pose: Any, point: np.ndarray) -> Any:
-    local: Any = wp.vec3(*point)
-    return wp.transform_point(pose, local)
-
-
-def make_probes(builder: newton.ModelBuilder) -> Probes:
-    """Sphere probes of all collision shapes of one robot, on the current device."""
-    centres, radius, body, shape = [], [], [], []
-    for k in range(builder.shape_count):
-        if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
-            continue
-        pose: Any = builder.shape_transform[k]
-        for strip in shape_strips(newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k])):
-            centres.append([_place(pose, centre) for centre in strip.centres])
-            radius.append(strip.radius)
-            body.append(builder.shape_body[k])
-            shape.append(k)
-    probes = Probes()
-    probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
-    probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)
-    probes.strip_radius = wp.array(radius, dtype=float)
-    probes.strip_body = wp.array(body, dtype=int)
-    probes.strip_shape = wp.array(shape, dtype=int)
-    return probes
 
 
 def view_solver_contacts(data: Any) -> SolverContacts:

@@ -14,14 +14,15 @@ UNDECIDED = 1e-5  # a sphere this close to touching may go either way in float32
 FIRST_SHAPE, GROUND_SHAPE = 5, 2
 
 
-def make_probes(strips, device):
-    """Strips as (centres (n, 3), radius), each on a body and a shape of its own."""
+def make_probes(strips, device, spread=0.0):
+    """Strips as (centres (n, 3), radius), each on a body and a shape of its own; how far from straight they are [m]."""
     probes = Probes()
     centres = np.concatenate([np.reshape(centres, (-1, 3)) for centres, _ in strips])
     probes.position = wp.array(np.float32(centres), dtype=wp.vec3, device=device)
     starts = np.cumsum([0] + [len(np.reshape(centres, (-1, 3))) for centres, _ in strips])
     probes.strip_start = wp.array(starts, dtype=int, device=device)
     probes.strip_radius = wp.array([radius for _, radius in strips], dtype=float, device=device)
+    probes.strip_spread = wp.full(len(strips), spread, dtype=float, device=device)
     probes.strip_body = wp.array(np.arange(len(strips)), dtype=int, device=device)
     probes.strip_shape = wp.array(np.arange(len(strips)), dtype=int, device=device)
     return probes
@@ -39,13 +40,13 @@ def make_buffer(capacity, device):
     return buffer
 
 
-def collide(poses, terrain_of_env, grids, strips, device, capacity=None):
+def collide(poses, terrain_of_env, grids, strips, device, capacity=None, spread=0.0):
     """Contact records as a dict of arrays, plus ``env``, ``strip`` and the world ``centre`` and ``distance``."""
     num_envs = len(terrain_of_env)
     layout = Layout()
     layout.bodies_per_env = layout.shapes_per_env = len(strips)
     layout.first_shape, layout.ground_shape = FIRST_SHAPE, GROUND_SHAPE
-    probes = make_probes(strips, device)
+    probes = make_probes(strips, device, spread)
     buffer = make_buffer(capacity or 3 * num_envs * len(strips), device)
     poses = np.float32(poses).reshape(-1, 7)
     collide_strips(
@@ -119,6 +120,17 @@ def test_random_spheres_against_the_oracle(device, kind):
     assert (missed, invented) == ([], [])
     assert touching > 300
     assert sidelong > 10 or kind == "genes"  # the case that approximate nearest points get wrong
+
+
+def test_a_row_that_sags_is_looked_at_where_it_touches(device):
+    # The ends of the row stand 0.5 m over the ground, its middle in it: only the spread says so.
+    sagging = [[-0.3, 0, 0.5], [0, 0.2, 0.02], [0.3, 0, 0.5]]
+    poses = np.float32([[8, 4, 0, 0, 0, 0, 1]])
+    flat = np.zeros((1, 161, 321), np.float32)
+    found = collide(poses, [0], flat, [(np.array(sagging), 0.05)], device, spread=0.52)
+    assert found["count"] == 1
+    np.testing.assert_allclose(found["point1"][0], sagging[1], atol=1e-6)
+    assert collide(poses, [0], flat, [(np.array(sagging), 0.05)], device)["count"] == 0
 
 
 def test_strips_report_first_deepest_and_last(device):

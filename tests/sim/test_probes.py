@@ -4,9 +4,17 @@ import newton
 import numpy as np
 import pytest
 
-from sim.probes import MAX_EDGE_RADIUS, MAX_SAG, box_strips, capsule_strips, cylinder_strips, max_spacing, shape_strips
+from sim.probes import (
+    MAX_EDGE_RADIUS,
+    MAX_SAG,
+    box_strips,
+    capsule_strips,
+    cylinder_strips,
+    make_probes,
+    max_spacing,
+    shape_strips,
+)
 from sim.robot import build_robot
-from sim.simulation import make_probes
 
 CAPSULES = [(0.0175, 0.1), (0.06, 0.04), (0.1, 0.375), (0.003, 0.2), (0.05, 0.0)]
 BOXES = [(0.1, 0.1, 0.05), (0.3, 0.02, 0.15), (0.01, 0.01, 0.01)]
@@ -119,7 +127,7 @@ def test_shapes_by_their_newton_scale():
 
 
 def test_a_shape_without_probes_is_named():
-    with pytest.raises(ValueError, match=r"ELLIPSOID.*SPHERE, CAPSULE, BOX or CYLINDER"):
+    with pytest.raises(ValueError, match=r"ELLIPSOID.*SPHERE, CAPSULE, BOX, CYLINDER or MESH"):
         shape_strips(newton.GeoType.ELLIPSOID, np.ones(3))
 
 
