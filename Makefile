@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare train finetune calibrate replay reevaluate evaluate crosscheck bench test lint clean
+.PHONY: help setup archive compare ablation train finetune calibrate replay reevaluate evaluate crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -45,14 +45,14 @@ help: ## This list
 	@echo
 	@echo 'Variables (left out: the default of the command):'
 	@echo '  ROBOT=anymal     which robot'
-	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare train calibrate replay reevaluate'
+	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare ablation train finetune calibrate replay reevaluate'
 	@echo '                                                   evaluate crosscheck bench'
-	@echo '  PRESET=small     size of the search: paper, small  archive compare'
-	@echo '  ITERATIONS=N     stop after N iterations           archive compare train finetune'
+	@echo '  PRESET=small     size of the search: paper, small  archive compare ablation'
+	@echo '  ITERATIONS=N     stop after N iterations           archive compare ablation train finetune'
 	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, an'
-	@echo '                   ONNX file or module:callable      archive compare calibrate replay reevaluate'
+	@echo '                   ONNX file or module:callable      archive compare ablation finetune calibrate replay reevaluate'
 	@echo '                                                   evaluate crosscheck'
-	@echo '  SEED=N           seed of everything drawn          archive compare train finetune calibrate reevaluate'
+	@echo '  SEED=N           seed of everything drawn          archive compare ablation train finetune calibrate reevaluate'
 	@echo '                                                   evaluate crosscheck bench'
 	@echo '  RESUME=DIR       go on with this run               archive compare train finetune'
 	@echo '  MIX=generated    terrains to train on beside hand-crafted ones: generated, hard-random, or hand-crafted'
@@ -71,11 +71,11 @@ help: ## This list
 	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
 	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
 	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate'
-	@echo '  OUT=FILE         where to write the numbers        compare calibrate evaluate crosscheck bench'
+	@echo '  OUT=FILE         where to write the numbers        compare ablation calibrate evaluate crosscheck bench'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
 	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
-	@echo '                   joined by RAY_ADDRESS             archive compare calibrate reevaluate evaluate'
+	@echo '                   joined by RAY_ADDRESS             archive compare ablation calibrate reevaluate evaluate'
 	@echo '  WORKER_LIMIT_S=S give a worker up that gets no further for so many seconds         archive compare reevaluate'
 	@echo '  PROCESSES=N      processes on the CPU without Ray  archive compare reevaluate'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
@@ -100,6 +100,9 @@ archive: setup ## Search the terrains on which the controller of ROBOT fails; wr
 
 compare: setup ## Let the search and its baselines loose on the same number of terrains
 	$(BIN)/python -m qd.compare --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS PROCESSES WORKER_LIMIT_S OUT)
+
+ablation: setup ## Search with and without the standard deviations in the fitness
+	$(BIN)/python -m qd.ablation --robot $(call quoted,$(ROBOT)) $(call flags,RUN PRESET DEVICE ITERATIONS POLICY SEED WORKERS OUT)
 
 train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)
