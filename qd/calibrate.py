@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from qd.cli import run_command
 from qd.workers import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
+from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output, to_json, write_atomically
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def calibrate(cfg: CalibrateCfg) -> Path:
     report = {
         **origin_of(device, cfg.seed, cfg.workers),
         "robot": cfg.robot,
-        "policy": Path(policy).name,
+        "policy": ControllerSpec.parse(policy).label,
         **_measured(result),
     }
     write_atomically(out, to_json(report))

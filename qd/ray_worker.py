@@ -14,6 +14,7 @@ import ray
 from numpy.typing import NDArray
 
 from qd.worker_process import Crosser
+from sim.controller_spec import ControllerSpec
 from sim.provenance import code_fingerprint
 
 if TYPE_CHECKING:
@@ -27,24 +28,21 @@ _WATCH = "watch"
 class Controller:
     """A controller on its way to other machines, which need not have its file."""
 
-    name: str
-    """File name, or ``module:callable``."""
-    content: bytes | None
-    """Of the file; None for ``module:callable``."""
+    spec: ControllerSpec
+    files: tuple[tuple[str, bytes], ...]
+    """Name and content of each of its files; none of ``module:callable``."""
 
     @classmethod
     def of(cls, policy: str) -> "Controller":
         """What ``policy`` names."""
-        path = Path(policy)
-        return cls(name=path.name, content=path.read_bytes()) if path.is_file() else cls(name=policy, content=None)
+        spec = ControllerSpec.parse(policy)
+        return cls(spec=spec, files=tuple((file.name, file.read_bytes()) for file in spec.files if file.is_file()))
 
     def unpacked(self, folder: str) -> str:
-        """A policy as :func:`sim.policy.load_policy` takes it; the file is put into ``folder``."""
-        if self.content is None:
-            return self.name
-        path = Path(folder) / self.name
-        path.write_bytes(self.content)
-        return str(path)
+        """A policy as :func:`sim.policy.load_policy` takes it; its files are put into ``folder``."""
+        for name, content in self.files:
+            (Path(folder) / name).write_bytes(content)
+        return str(self.spec.in_folder(Path(folder)) if self.files else self.spec)
 
 
 def build_of_code() -> str:

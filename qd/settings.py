@@ -3,9 +3,7 @@
 Nothing here imports pyribs, which takes seconds: `--help` and the worker processes do without.
 """
 
-import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_h
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from qd.scheduler_cfg import SchedulerCfg
+from sim.controller_spec import ControllerSpec
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
@@ -36,9 +35,9 @@ class SearchCfg:
     robot: str
     preset: str
     policy: str
-    """Controller: ``shipped``, a file or ``module:callable``."""
+    """Controller: ``shipped``, or as :func:`sim.policy.load_policy` takes it."""
     policy_sha256: str | None
-    """Hash of the controller's file, None for code."""
+    """Hash of the controller's files, None for the code of a module."""
     seed: int
     iterations: int
     """Iterations to reach; may be raised later."""
@@ -183,9 +182,9 @@ def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
     return str(robot.policy_file) if cfg.policy == SHIPPED else cfg.policy
 
 
-def file_hash(file: Path) -> str | None:
-    """SHA-256 of a file; None where there is none."""
-    return hashlib.sha256(file.read_bytes()).hexdigest() if os.path.isfile(file) else None
+def file_hash(policy: str | Path) -> str | None:
+    """SHA-256 of a controller's file or files; None where there are none, as of ``module:callable``."""
+    return ControllerSpec.parse(policy).digest()
 
 
 def kept_penalties(robot: "RobotCfg", without: Sequence[str]) -> tuple[str, ...]:
@@ -221,7 +220,7 @@ def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
     Raises:
         ValueError: If the robot lacks one of the penalties, or their scales were never measured.
     """
-    digest = file_hash(Path(policy_spec(cfg, robot)))
+    digest = file_hash(policy_spec(cfg, robot))
     penalties = cfg.fitness.penalties
     _check_known(penalties, robot)
     scales = dict(zip(robot.penalties, robot.read_penalty_scales(), strict=True))

@@ -21,6 +21,7 @@ from kernels.penalties import PENALTIES
 from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
 from sim.command import exit_code_of, publish
+from sim.controller_spec import ControllerSpec
 from sim.plain_crossing import draw_starts
 from sim.plain_processes import run_plain
 from sim.provenance import provenance
@@ -218,7 +219,7 @@ class Crosscheck:
         return {
             **provenance(self.device, cfg.seed),
             "robot": self.robot.name,
-            "policy": Path(str(self.policy)).name,
+            "policy": ControllerSpec.parse(self.policy).label,
             "pool": "hard_random" if cfg.genes is None else str(cfg.genes),
             "looked_at": choice.looked_at,
             "ours": _settings(robot, time_constant_s),

@@ -55,7 +55,7 @@ class OnnxPolicy:
         return action.to(observation.device)
 
 
-def load_onnx(path: Path, sizes: tuple[int, int], device: str) -> OnnxPolicy:
+def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> OnnxPolicy:
     """Load a controller from an ONNX file.
 
     Nothing but that file is read and no code in it runs: weights beside it are refused, and onnxruntime knows only its
@@ -64,7 +64,7 @@ def load_onnx(path: Path, sizes: tuple[int, int], device: str) -> OnnxPolicy:
     Args:
         path: The file; its graph takes observations (batch, observation_size) and gives actions (batch, num_joints),
             both float32, for any batch.
-        sizes: Observation and action size of the robot.
+        sizes: Observation and action size of the robot; None takes whatever the file has.
         device: Torch device name; on CUDA the graph runs on the GPU if onnxruntime is built for it, else on the CPU.
 
     Raises:
@@ -77,12 +77,12 @@ def load_onnx(path: Path, sizes: tuple[int, int], device: str) -> OnnxPolicy:
     return onnx_policy(data, str(path), sizes, device)
 
 
-def onnx_policy(data: bytes, name: str, sizes: tuple[int, int], device: str) -> OnnxPolicy:
+def onnx_policy(data: bytes, name: str, sizes: tuple[int, int] | None, device: str) -> OnnxPolicy:
     """The controller in the bytes of an ONNX file, as :func:`load_onnx` reads them; ``name`` is what errors call it."""
     _check_file(data, name)
     where = torch.device(device)
     session = _open_session(data, name, where)
-    _check_ports(session, name, sizes)
+    sizes = _checked_sizes(session, name, sizes)
     if where.type == "cuda" and session.get_providers()[0] != _CUDA:
         warnings.warn(
             f"policy '{name}' runs on the CPU, with copies to and from {device} every control step: this onnxruntime "
@@ -179,8 +179,8 @@ def _open_session(data: bytes, name: str, device: torch.device) -> Any:
         ) from None
 
 
-def _check_ports(session: Any, name: str, sizes: tuple[int, int]) -> None:
-    """Refuses a graph that is not one batch of float32 rows to another."""
+def _checked_sizes(session: Any, name: str, sizes: tuple[int, int] | None) -> tuple[int, int]:
+    """Widths of input and output; refuses a graph that is not one batch of float32 rows of these sizes to another."""
     widths: list[Any] = []
     for kind, ports in (("input", session.get_inputs()), ("output", session.get_outputs())):
         if len(ports) != 1:
@@ -203,9 +203,14 @@ def _check_ports(session: Any, name: str, sizes: tuple[int, int]) -> None:
                 f"or {_EXPORT}"
             )
         widths.append(shape[1])
+    if sizes is None:
+        if not all(isinstance(got, int) for got in widths):
+            raise ValueError(f"policy '{name}' does not say how wide its rows are, got {widths}: save it with sizes")
+        return widths[0], widths[1]
     if any(isinstance(got, int) and got != size for got, size in zip(widths, sizes, strict=True)):
         found = [got if isinstance(got, int) else "any number of" for got in widths]
         raise ValueError(
             f"policy '{name}' maps {found[0]} observations to {found[1]} actions, but this robot has {sizes[0]} "
             f"observations and {sizes[1]} joints: use a controller of this robot"
         )
+    return sizes

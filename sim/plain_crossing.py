@@ -16,7 +16,7 @@ from kernels.penalties import BASE, PENALTIES
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
 from sim.mujoco_c import Array, crossing_model, goal_commands, observations, step_penalties
-from sim.policy import Policy
+from sim.policy import Policy, forget
 from sim.robot import RobotCfg, build_robot
 
 _mj: Any = mujoco  # its types are not written down
@@ -185,6 +185,8 @@ def cross(
     outcome = np.full(count, Outcome.RUNNING)
     steps, sums = np.zeros(count, int), np.zeros((count, len(PENALTIES)))
     last_action = np.zeros((count, robot.num_joints))
+    rows = np.zeros((count, robot.observation_size))
+    remembers = forget(policy)  # it must be asked for the same robots every time
     most = round(cfg.max_duration_s / robot.physics_dt)
     for step in range(most):
         running = np.flatnonzero(outcome == Outcome.RUNNING)
@@ -194,8 +196,10 @@ def cross(
             qpos, qvel = episodes.qpos[running], episodes.qvel[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, cfg)
-            rows = observations(robot, heights, qpos, qvel, command[running], last_action[running])
-            action = policy(torch.as_tensor(rows, dtype=torch.float32)).numpy().astype(np.float64)
+            rows[running] = observations(robot, heights, qpos, qvel, command[running], last_action[running])
+            asked = rows if remembers else rows[running]
+            action = policy(torch.as_tensor(asked, dtype=torch.float32)).numpy().astype(np.float64)
+            action = action[running] if remembers else action
             action = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
             last_action[running] = action
             episodes.hold(running, np.array(robot.default_joint_pos) + robot.action_scale * action)

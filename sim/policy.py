@@ -1,6 +1,5 @@
 """Controllers as black boxes: a batch of observation rows to a batch of actions."""
 
-import importlib
 import os
 import re
 import zipfile
@@ -11,18 +10,25 @@ from typing import Any, Protocol
 import torch
 import warp as wp
 
+from sim.controller_spec import ControllerSpec
 from sim.files import check_zip
+from sim.named_code import find_named
 from sim.onnx_policy import load_onnx
 from sim.robot import RobotCfg
 
 _FORMATS = (
-    "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), or module:callable (a function "
-    "on device tensors, or a class or factory marked by `faultline_factory = True` that is called with (robot, device))"
+    "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), module:callable or "
+    "file.py:callable (a function on device tensors, or a class or factory marked by `faultline_factory = True` that "
+    "is called with (robot, device)), or module:adapter@file (a function that is called with (controller, robot))"
 )
 
 
 class Policy(Protocol):
-    """Anything that maps observations to actions."""
+    """Anything that maps observations to actions.
+
+    One that remembers has a method ``reset()``, called before every evaluation: all robots begin anew, perhaps others
+    and another number of them.
+    """
 
     def __call__(self, observation: torch.Tensor, /) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size)."""
@@ -98,11 +104,13 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Load a controller and try it on one batch of zeros.
 
     Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
-    checksums; code runs only from ``module:callable``. TorchScript and ONNX are read by C++, which a file made to harm
-    can crash.
+    checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
+    file made to harm can crash.
 
     Args:
-        spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, or ``module:callable``.
+        spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or ``module:adapter@file``;
+            a Python file may stand for the module. An adapter is called with the file's controller, of whatever sizes,
+            and the robot, and returns a policy.
         robot: The robot it is to walk: fixes observation and action size.
         device: Warp device name.
 
@@ -115,33 +123,40 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
             f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build or "
             "use --device cpu"
         )
-    match = re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_][\w.]*)", str(spec))
-    if match and not Path(spec).exists():
-        policy = _import_callable(str(spec), *match.groups(), robot=robot, device=where)
-    else:
-        policy = _load_file(Path(spec), robot, where)
+    named = ControllerSpec.parse(spec)
+    policy = _load_file(Path(spec), robot, where) if named.place is None else _load_code(named, robot, where)
     _try_policy(policy, robot, where, str(spec))
     return policy
 
 
-def _import_callable(spec: str, module: str, name: str, *, robot: RobotCfg, device: str) -> Any:
+def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
+    assert spec.place is not None and spec.name is not None
     try:
-        target: Any = importlib.import_module(module)
-        for part in name.split("."):
-            target = getattr(target, part)
+        target: Any = find_named(spec.place, spec.name)
     except Exception as error:  # a module can fail with anything
         raise ValueError(f"policy '{spec}' cannot be imported: {reason_of(error)}; expected {_FORMATS}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
-    if getattr(target, "faultline_factory", False):
-        try:
-            target = target(robot, device)
-        except Exception as error:
-            raise ValueError(f"policy '{spec}' is a factory that failed: {reason_of(error)}; mend it first") from error
-    return target
+    kind, arguments = "factory", (robot, device)
+    if spec.file is not None:
+        kind, arguments = "adapter", (_load_file(Path(spec.file), robot, device, fits=False), robot)
+    elif not getattr(target, "faultline_factory", False):
+        return target
+    try:
+        policy = target(*arguments)
+    except Exception as error:
+        raise ValueError(f"policy '{spec}' is {_a(kind)} that failed: {reason_of(error)}; mend it first") from error
+    if not callable(policy):
+        raise ValueError(f"policy '{spec}' is {_a(kind)} that must return a callable, got {type(policy).__name__}")
+    return policy
 
 
-def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
+def _a(kind: str) -> str:
+    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
+
+
+def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -> Policy:
+    """The controller in a file; with ``fits`` it must have the robot's sizes."""
     if path == robot.policy_file and not path.exists():
         raise ValueError(
             f"robot '{robot.name}' has no shipped controller yet, expected at {path}: train one with "
@@ -149,8 +164,11 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
         )
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
+    if path.suffix == ".py":
+        raise ValueError(f"policy '{path}' is a Python file: name what to call in it, {path}:CALLABLE")
+    expected = (robot.observation_size, robot.num_joints)
     if path.suffix.lower() == ".onnx":
-        return load_onnx(path, (robot.observation_size, robot.num_joints), device)
+        return load_onnx(path, expected if fits else None, device)
     try:
         if zipfile.is_zipfile(path):
             check_zip(path)
@@ -170,11 +188,11 @@ def _load_file(path: Path, robot: RobotCfg, device: str) -> Policy:
         policy = MlpPolicy(state)
     except (KeyError, RuntimeError, AttributeError, TypeError, IndexError) as error:
         raise ValueError(f"policy '{path}' holds a damaged layer: {error}; save the checkpoint anew") from error
-    expected = (robot.observation_size, robot.num_joints)
-    if policy.sizes != expected:
+    if fits and policy.sizes != expected:
         raise ValueError(
             f"policy '{path}' maps {policy.sizes[0]} observations to {policy.sizes[1]} actions, but robot "
-            f"'{robot.name}' has {expected[0]} observations and {expected[1]} joints: use a controller of this robot"
+            f"'{robot.name}' has {expected[0]} observations and {expected[1]} joints: use a controller of this robot, "
+            "or an adapter"
         )
     return policy.to(device).eval()
 
@@ -210,8 +228,16 @@ def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
 
 
+def forget(policy: Any) -> bool:
+    """Let a policy that remembers forget; returns whether it is one."""
+    reset = getattr(policy, "reset", None)
+    if callable(reset):
+        reset()
+    return callable(reset)
+
+
 class PolicyRunner:
-    """Runs a policy between two Warp buffers: captured as a CUDA graph where it is a torch module, else called."""
+    """Runs a policy between two Warp buffers: captured as a CUDA graph where it is a torch module without memory."""
 
     def __init__(self, policy: Policy, observation: Any, action: Any) -> None:
         """Bind the buffers.
@@ -225,8 +251,13 @@ class PolicyRunner:
         self._observation = wp.to_torch(observation)
         self._action = wp.to_torch(action)
         self._graph: torch.cuda.CUDAGraph | None = None
-        if self._observation.is_cuda and isinstance(policy, torch.nn.Module):
+        # A graph would repeat its first memory for ever.
+        if self._observation.is_cuda and isinstance(policy, torch.nn.Module) and not forget(policy):
             self._graph = self._capture()
+
+    def reset(self) -> None:
+        """Let a policy that remembers forget."""
+        forget(self._policy)
 
     def _call(self) -> None:
         self._action.copy_(self._policy(self._observation))
@@ -251,4 +282,4 @@ class PolicyRunner:
 
 
 PolicySpec = str | Path | Callable[[torch.Tensor], torch.Tensor]
-"""A controller by file, by ``module:callable``, or as a callable."""
+"""A controller as :func:`load_policy` takes it, or as a callable."""

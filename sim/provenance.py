@@ -13,6 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from sim.controller_spec import ControllerSpec
+
 _ROOT = Path(__file__).resolve().parents[1]
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
 
@@ -54,18 +56,21 @@ def code_fingerprint(rooms: Sequence[str]) -> str:
 
 
 def controller_hash(policy: str) -> str | None:
-    """SHA-256 of a controller's file, or of the module that a ``module:callable`` stands in; None where there is none.
+    """SHA-256 of a controller's files, among them the module that a ``module:callable`` stands in; None without any.
 
-    What a callable reads beside its own module is not in it.
+    What code reads beside its own file is not in it.
     """
-    file: str | None = policy
-    if not os.path.isfile(policy):
-        try:
-            spec = importlib.util.find_spec(policy.partition(":")[0])
-        except (ImportError, ValueError):  # no package of that name, or no name of a module
-            spec = None
-        file = None if spec is None else spec.origin
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file and os.path.isfile(file) else None
+    spec = ControllerSpec.parse(policy)
+    if spec.place is None or spec.place.endswith(".py"):
+        return spec.digest()
+    try:
+        module = importlib.util.find_spec(spec.place)
+    except (ImportError, ValueError):  # no package of that name
+        module = None
+    if module is None or module.origin is None or not os.path.isfile(module.origin):
+        return None
+    digest = hashlib.sha256(Path(module.origin).read_bytes()).hexdigest()
+    return digest if spec.file is None else f"{digest} {spec.digest()}"
 
 
 def _module() -> str:

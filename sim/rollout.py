@@ -192,6 +192,7 @@ class Rollout:
             else:
                 self.sim.bank.set_genes(terrains)
             self._start(seeds.astype(np.uint32))
+        self._policy.reset()
 
     def control_step(self) -> None:
         """Let the policy act, then run the captured control step, without waiting for either."""

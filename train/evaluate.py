@@ -15,6 +15,7 @@ import tyro
 
 from qd.workers import EvaluatorCfg, EvaluatorError, check_policy, open_evaluator, origin_of
 from sim.command import exit_code_of
+from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output, to_json, write_atomically
 from train.base_rates import VELOCITY_FROM_S, evaluate_sets, print_rates
 from train.evaluate_cfg import FULL, EvaluateCfg, size_of
@@ -46,7 +47,8 @@ def evaluate_base(cfg: EvaluateCfg) -> dict[str, Any]:
     )
     with open_evaluator(evaluator) as crossings:
         sets = evaluate_sets(crossings, size.terrains, cfg.seed)
-    report = {**origin_of(size.device, cfg.seed, cfg.workers), "robot": robot.name, "policy": Path(policy).name, **sets}
+    about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
+    report = {**origin_of(size.device, cfg.seed, cfg.workers), **about, **sets}
     print_rates(report)
     if out is not None:
         write_atomically(out, to_json(report))

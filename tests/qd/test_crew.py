@@ -31,6 +31,23 @@ def expected(count):
     return stand_in.evaluate(GENES[:count], SEEDS[:count], 4)
 
 
+@pytest.mark.parametrize("name", ["{}/model.pt", "{}/mine.py:act", "{}/mine.py:adapt@{}/model.pt", "os.path:join"])
+def test_the_files_of_a_controller_travel(tmp_path, name):
+    from qd.ray_worker import Controller
+
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir(), there.mkdir()
+    (here / "model.pt").write_bytes(b"weights")
+    (here / "mine.py").write_bytes(b"x = 1")
+    controller = Controller.of(name.format(here, here))
+    unpacked = controller.unpacked(str(there))
+    assert unpacked == name.format(there, there)
+    content = {"model.pt": b"weights", "mine.py": b"x = 1"}
+    assert {file.name: file.read_bytes() for file in there.iterdir()} == {
+        file: text for file, text in content.items() if file in name
+    }
+
+
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_how_terrains_are_spread_changes_nothing(workers):
     with open_evaluator(dataclasses.replace(CFG, workers=workers), build=crossers.Crosser) as evaluate:

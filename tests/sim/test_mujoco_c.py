@@ -238,3 +238,29 @@ def test_episodes_shared_out_over_processes_come_back_in_order(anymal):
     for crossings in found:
         assert len(crossings.outcome) == 30
         assert np.flatnonzero(crossings.outcome == Outcome.GOAL).tolist() == [27]
+
+
+class Remembers:
+    """Stands; notes how many robots it is asked for."""
+
+    def __init__(self):
+        self.asked, self.resets = [], 0
+
+    def reset(self):
+        self.resets += 1
+
+    def __call__(self, row):
+        self.asked.append(len(row))
+        return stand(row)
+
+
+def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    starts = draw_starts(anymal, flat, 5, 3, "cpu")
+    starts.qpos[0, :2] = 13.7, 4.0  # at the goal: it ends at once
+    policy, cfg = Remembers(), CrossingCfg(max_duration_s=0.1)
+    found = cross(anymal, policy, flat, starts, cfg)
+    assert (policy.resets, policy.asked) == (1, [3] * 5)
+    expected = cross(anymal, stand, flat, starts, cfg)
+    np.testing.assert_array_equal(found.outcome, expected.outcome)
+    np.testing.assert_array_equal(found.penalties, expected.penalties)

@@ -70,6 +70,27 @@ def test_callables_are_told_apart_by_module_and_name():
     assert controller_hash("nosuchfile.pt") is None
 
 
+def test_an_adapter_and_what_it_adapts_are_both_in_the_hash(tmp_path):
+    code, file = tmp_path / "mine.py", tmp_path / "model.pt"
+    file.write_bytes(b"weights")
+    specs = [
+        "tests.sim.policies:stand",
+        f"tests.sim.policies:stand@{file}",
+        f"{code}:adapt@{file}",
+        f"{code}:other@{file}",
+    ]
+    code.write_text("x = 1")
+    before = [controller_hash(spec) for spec in specs]
+    assert None not in before and len(set(before)) == 4
+    file.write_bytes(b"other weights")
+    assert [old == controller_hash(spec) for old, spec in zip(before, specs, strict=True)] == [
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
 def test_callables_of_one_module_are_kept_apart(tmp_path):
     kept = keeper(tmp_path)
     files = {kept.file(f"tests.sim.policies:{name}", TERRAINS) for name in ("stand", "stretch")}
