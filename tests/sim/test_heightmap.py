@@ -139,7 +139,7 @@ PNG_MISTAKES = {
     "a scale that is true": (GRAY, {"size_m": [16, 8], "scale_m": True}, "got True"),
     "a scale beyond floats": (GRAY, {"size_m": [16, 8], "scale_m": 10**400}, "scale_m must be a finite number"),
     "millimetres for metres": (GRAY + 700, {"size_m": [16, 8], "scale_m": 1.0}, r"got 700 to 700 m: are they metres"),
-    "colours": (np.zeros((5, 9, 3), np.uint8), {"size_m": [16, 8], "scale_m": 0.1}, "must be a grayscale .* mode 'RGB'"),
+    "colours": (np.zeros((5, 9, 3), np.uint8), {"size_m": [16, 8], "scale_m": 0.1}, "grayscale .* mode 'RGB'"),
 }  # fmt: skip
 
 
