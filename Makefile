@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare ablation train finetune calibrate replay reevaluate evaluate crosscheck bench test lint clean
+.PHONY: help setup archive compare ablation train finetune calibrate replay reevaluate evaluate tables crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -121,6 +121,9 @@ reevaluate: setup ## Evaluate every elite of an archive again with 40 fresh epis
 
 evaluate: setup ## Rates of the controller of ROBOT, or with POLICIES or ARCHIVE the tables of the paper
 	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS)
+
+tables: setup ## Write the published numbers, with the paper's beside them, into the README
+	$(BIN)/python -m train.publish
 
 crosscheck: setup ## Hold the crossings of ROBOT against the same in plain MuJoCo C
 	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES FINE OUT)

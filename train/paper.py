@@ -18,6 +18,12 @@ _ROWS = {
     },
 }
 
+PAPER_ARCHIVES = {
+    "cassie": {"elites": 930, "with_collision": 598, "without_collision": 332, "fitness": 4.7},
+    "anymal": {"elites": 1129},
+}
+"""What the paper says of its archives after 1,000 iterations."""
+
 Published = dict[str, dict[str, dict[str, float]]]
 """Measure -> set -> controller -> value."""
 

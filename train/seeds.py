@@ -7,6 +7,8 @@ import numpy as np
 
 from sim.intervals import MAX_T_VALUES, t_interval
 
+RATES = ("success", "goal", "fallen")
+"""Measures that lie between 0 and 1, and so do their intervals."""
 MARK = "@"
 """Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""
 
@@ -42,15 +44,18 @@ def over_seeds(tables: dict[str, Any], measures: Iterable[str]) -> dict[str, Any
             for kind in dict.fromkeys(map(kind_of, row)):
                 values = [value for who, value in row.items() if kind_of(who) == kind]
                 if len(values) > 1:
-                    found.setdefault(measure, {}).setdefault(name, {})[kind] = _summary(values)
+                    summary = _summary(values, is_rate=measure in RATES)
+                    found.setdefault(measure, {}).setdefault(name, {})[kind] = summary
     return found
 
 
-def _summary(values: list[float | None]) -> dict[str, Any]:
+def _summary(values: list[float | None], *, is_rate: bool) -> dict[str, Any]:
     numbers = [value for value in values if value is not None]
     if len(numbers) < len(values):
         return {"mean": None, "interval": None, "values": values}
     interval = t_interval(np.array(numbers)) if len(numbers) <= MAX_T_VALUES else None
+    if interval is not None and is_rate:
+        interval = [max(interval[0], 0.0), min(interval[1], 1.0)]
     return {"mean": sum(numbers) / len(numbers), "interval": interval, "values": values}
 
 

@@ -19,8 +19,10 @@ def test_mean_and_interval_of_a_kind_with_several():
     assert found["success"]["near"].keys() == {"C-G"}
     kind = found["success"]["near"]["C-G"]
     assert kind["mean"] == pytest.approx(0.9) and kind["values"] == [0.8, 0.9, 1.0]
-    # Standard deviation .1, so .1 / sqrt(3) * 4.303 either way.
-    assert kind["interval"] == pytest.approx([0.9 - 0.2484, 0.9 + 0.2484], abs=1e-4)
+    # Standard deviation .1, so .1 / sqrt(3) * 4.303 either way; a rate is at most 1.
+    assert kind["interval"] == pytest.approx([0.9 - 0.2484, 1.0], abs=1e-4)
+    rewards = over_seeds({"reward": {"near": {"C-G": 8.0, "C-G@1": 9.0, "C-G@2": 10.0}}}, ["reward"])
+    assert rewards["reward"]["near"]["C-G"]["interval"] == pytest.approx([9.0 - 2.484, 9.0 + 2.484], abs=1e-3)
     assert found["goal"]["near"]["C-G"]["mean"] is None
 
 
@@ -31,6 +33,6 @@ def test_more_than_an_interval_is_known_for():
 
 def test_it_is_printed_where_there_is_something(capsys):
     print_over_seeds(over_seeds(TABLES, ["success", "goal"]))
-    assert "near, C-G: success 0.900 [0.652 1.148], goal -\n" in capsys.readouterr().out
+    assert "near, C-G: success 0.900 [0.652 1.000], goal -\n" in capsys.readouterr().out
     print_over_seeds({})
     assert capsys.readouterr().out == ""
