@@ -110,10 +110,12 @@ def _as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:
     folder = run if run.is_dir() else run.parent
     if (folder / CONFIG_FILE).exists():
         cfg = RunDirectory(folder).read_cfg()
-        if cfg.fitness.penalties != archive.penalties:
+        there = (cfg.fitness.penalties, cfg.fitness.scales)
+        if there != (archive.penalties, archive.scales):
             raise ValueError(
-                f"{folder / CONFIG_FILE} is of a search with penalties {', '.join(cfg.fitness.penalties)}, but its "
-                f"archive has {', '.join(archive.penalties)}: put back the one that is not this run's"
+                f"{folder / CONFIG_FILE} must have the penalties and scales of its archive, "
+                f"{', '.join(archive.penalties)}: {archive.scales}, got {', '.join(there[0])}: {there[1]}: put back "
+                "the one that is not this run's"
             )
         return cfg.policy, cfg.fitness
     return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)

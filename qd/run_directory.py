@@ -81,10 +81,13 @@ def claimed(path: Path) -> Iterator[None]:
         path: The directory; if it was made here and is still empty at the end, it is removed again.
 
     Raises:
-        ValueError: If it cannot be made or written to, or another search works in it.
+        ValueError: If it cannot be made or written to, its name cannot be typed into a command to go on, or another
+            search works in it.
     """
-    made = not path.exists()
+    if not str(path).isprintable():
+        raise ValueError(f"run directory {str(path)!a} must have a name of printable characters: rename it")
     try:
+        made = not path.exists()
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"run directory {path} cannot be made: {error.strerror}: give another --run-dir") from None
@@ -236,7 +239,7 @@ class RunDirectory:
         """
         file = self.path / CHECKPOINT_FILE
         derived = [self.path / name for name in (METRICS_FILE, ARCHIVE_FILE)]
-        for made in derived:
+        for made in (*derived, self.path / SUMMARY_FILE):
             if made.is_dir():
                 raise ValueError(f"{made} is a directory, expected a file or nothing: move it away")
         if not file.exists():

@@ -7,10 +7,13 @@ import pytest
 from kernels.episode import Outcome
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.replay import Replay, ReplayCfg, describe, draw
-from qd.run_directory import newest_run
+from qd.replay import Replay, ReplayCfg, describe, draw, replay
+from qd.run_directory import RunDirectory, newest_run
+from qd.settings import as_settings
+from tests.qd import stand_in
 from tests.qd.stand_in import make_result
 from tests.qd.test_archive import fresh_values, small_archive
+from tests.qd.test_search import CFG, run
 
 
 @pytest.fixture
@@ -89,6 +92,16 @@ def test_without_paths_the_ends_are_drawn(done):
     result = SimpleNamespace(**{**vars(done.result), "paths": None})
     axes = draw(dataclasses.replace(done, result=result)).axes[0]
     assert len(axes.collections) == 3
+
+
+@pytest.mark.parametrize("change", [{"scales": (9.0,) * 6}, {"penalties": stand_in.PENALTIES[::-1]}])
+def test_a_config_of_another_search_is_refused(tmp_path, change):
+    fitness = dataclasses.replace(CFG.fitness, **change)
+    run(tmp_path / "run")
+    settings = as_settings(dataclasses.replace(CFG, fitness=fitness))
+    RunDirectory(tmp_path / "run").write_config(settings, 2, {"device": "cpu"})
+    with pytest.raises(ValueError, match=r"config\.json must have the penalties and scales of its archive, yaw_rate"):
+        replay(ReplayCfg(run=tmp_path / "run", device="cpu"))
 
 
 def test_no_run_yet(tmp_path, monkeypatch):

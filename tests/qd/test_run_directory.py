@@ -1,4 +1,5 @@
 import itertools
+import os
 
 import pytest
 
@@ -39,6 +40,18 @@ def test_a_claim_ends_with_its_context(tmp_path):
     with claimed(tmp_path), pytest.raises(ValueError, match="another search works in"), claimed(tmp_path):
         pass
     with claimed(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\tb", os.fsdecode(b"\xff"), "\x1b[31m"])
+def test_a_name_that_no_command_can_take_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match="must have a name of printable characters"), claimed(tmp_path / name):
+        pass
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_name_that_is_too_long_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="cannot be made: File name too long"), claimed(tmp_path / ("a" * 300)):
         pass
 
 
