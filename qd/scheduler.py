@@ -68,9 +68,9 @@ class Scheduler:
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
         self.result = _make_archive(num_cells, num_ratios, streams[1], {})
-        learns = "cma_mae" in cfg.methods
+        in_turn = list(zip(cycle(cfg.methods), streams[2:], strict=False))
+        learns = any(name == "cma_mae" for name, _ in in_turn)
         self.archive = _make_archive(num_cells, num_ratios, streams[0], learning) if learns else self.result
-        in_turn = zip(cycle(cfg.methods), streams[2:], strict=False)
         self.emitters: list[Emitter] = [self._emitter(cfg, name, num_ratios, stream) for name, stream in in_turn]
         self._asked: NDArray[np.float32] | None = None
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from ribs.emitters import EvolutionStrategyEmitter
+from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.descriptors import Cells
@@ -169,6 +169,12 @@ def test_joined_methods_take_turns_each_judged_by_its_own_archive():
     of_result = [emitter.archive is search.result for emitter in search.emitters]
     assert of_result == [True, False, True, True, False]
     assert search.archive is not search.result
+
+
+def test_of_fewer_emitters_than_methods_the_first_ones_count():
+    search = make_search(SchedulerCfg(emitters=1, batch_size=2, method="map_elites+cma_mae"))
+    assert [type(emitter) for emitter in search.emitters] == [IsoLineEmitter]
+    assert search.archive is search.result  # nobody goes by CMA-MAE's
 
 
 @pytest.mark.parametrize("state", [{}, {"archive": 1, "result": 2, "emitters": []}])
