@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
     from sim.rollout import RolloutResult
 
-_REPLAY_STREAM = 2
+REPLAY_STREAM = 2
+"""Sets the episodes of replays apart from those of searches."""
+"""Of the seeds of a replay's episodes (:func:`qd.workers.episode_seeds`), which are those of a film too."""
 _UNITS = {"yaw_rate": "rad", "vel_x": "m", "vel_y": "m", "contact_force": "N s", "stumble": "s", "collision": "s"}
 _LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
 
@@ -78,11 +80,11 @@ def replay(cfg: ReplayCfg) -> Replay:
     run = cfg.run or newest_run(cfg.robot)
     archive = _archive_with(cfg, run)
     device = resolve_device(cfg.device)
-    policy, fitness = _as_searched(run, archive)
+    policy, fitness = as_searched(run, archive)
     policy = cfg.policy or (str(robot.policy_file) if policy == SHIPPED else policy)
     check_policy(policy, cfg.robot, device)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.replicas, device=device)
-    seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=_REPLAY_STREAM)
+    seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=REPLAY_STREAM)
     result = rollout.evaluate(archive.genes[cfg.elite : cfg.elite + 1], seeds, record_paths=True)
     return Replay(
         folder=run if run.is_dir() else run.parent,
@@ -105,8 +107,12 @@ def _archive_with(cfg: ReplayCfg, run: Path) -> Archive:
     return archive
 
 
-def _as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:
-    """Controller and fitness of the search that made an archive; defaults where it lies without its config."""
+def as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:
+    """Controller and fitness of the search that made an archive; defaults where it lies without its config.
+
+    Raises:
+        ValueError: If the config is not that of the archive, or damaged.
+    """
     folder = run if run.is_dir() else run.parent
     if (folder / CONFIG_FILE).exists():
         cfg = RunDirectory(folder).read_cfg()

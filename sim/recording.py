@@ -6,7 +6,7 @@ the state at ``k * dt``: frame 0 the start, the last one the end of the control 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,19 @@ class Recording:
     def times_s(self) -> NDArray[np.float64]:
         """Time of each frame since the start [s], shape (F,)."""
         return self.dt * np.arange(self.base_position.shape[2])
+
+    def of_terrain(self, terrain: int) -> "Recording":
+        """The recording of one of the terrains alone.
+
+        Args:
+            terrain: Its index.
+        """
+        num_frames = self.num_frames[terrain : terrain + 1]
+        cut = {name: getattr(self, name)[terrain : terrain + 1, :, : num_frames.max()] for name in FRAME_ARRAYS}
+        each = ("labels", "heights", "seeds", "outcome", "fallen", "duration_s")
+        cut |= {name: getattr(self, name)[terrain : terrain + 1] for name in each}
+        genes = None if self.genes is None else self.genes[terrain : terrain + 1]
+        return replace(self, num_frames=num_frames, genes=genes, **cut)
 
     def qpos(self, terrain: int, episode: int) -> NDArray[np.float64]:
         """MuJoCo's joint coordinates of an episode: position, quaternion w x y z, joints.
