@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
 REPLAY_STREAM = 2
-"""Sets the episodes of replays apart from those of searches."""
 """Of the seeds of a replay's episodes (:func:`qd.workers.episode_seeds`), which are those of a film too."""
 _UNITS = {"yaw_rate": "rad", "vel_x": "m", "vel_y": "m", "contact_force": "N s", "stumble": "s", "collision": "s"}
 _LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
