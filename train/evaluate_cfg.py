@@ -1,6 +1,5 @@
 """What a command line of the evaluation means."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,6 @@ FULL = (300, 20)
 """Terrains a set and episodes a terrain of the published rates; tables take the paper's number of terrains."""
 SMALL = (24, 4)
 """The same on a machine without a GPU."""
-SHIPPED = "shipped"
-"""Name of the controller that comes with the robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,29 +92,3 @@ def size_of(cfg: EvaluateCfg) -> Size:
 def split_words(values: Sequence[str]) -> list[str]:
     """Words of arguments of which make hands over several in one, apart by spaces or commas."""
     return " ".join(values).replace(",", " ").split()
-
-
-def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
-    """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
-
-    Args:
-        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; several may stand in one, apart by
-            spaces, as make hands them over.
-        robot: The robot, whose controller is the shipped one.
-
-    Raises:
-        ValueError: If one has no name, or two have the same.
-    """
-    text = " ".join(policies).strip() or f"base={SHIPPED}"
-    found: dict[str, str] = {}
-    for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is
-        name, _, policy = item.partition("=")
-        if not re.fullmatch(r"[\w.+@-]+", name) or not policy:
-            raise ValueError(
-                f"policies must be NAME=FILE each, the name of letters, digits and . _ + @ -, got '{item}': "
-                "write for example C-G=runs/tuned/policy.pt"
-            )
-        if name in found:
-            raise ValueError(f"policies must have different names, got '{name}' twice: rename one of them")
-        found[name] = str(robot.policy_file) if policy == SHIPPED else policy
-    return found

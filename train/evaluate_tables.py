@@ -7,8 +7,9 @@ from typing import Any
 from qd.archive import Archive, read_archive
 from qd.workers import EvaluatorCfg, check_policy, open_evaluator, origin_of
 from sim.files import prepare_output, to_json, write_atomically
+from sim.named_controllers import controllers_of
 from train.crossings import Open, cross_all
-from train.evaluate_cfg import EvaluateCfg, Size, controllers_of, size_of, split_words
+from train.evaluate_cfg import EvaluateCfg, Size, size_of, split_words
 from train.kept import KeptCrossings, controller_hash
 from train.measures import measure
 from train.sets import FROM_ARCHIVE, SETS, EliteSplit, TerrainSet, check_names, make_sets, split_elites

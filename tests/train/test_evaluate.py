@@ -12,13 +12,14 @@ import torch
 from qd.archive import write_archive
 from qd.workers import EvaluatorCfg
 from sim.crossing import CrossingCfg
+from sim.named_controllers import controllers_of
 from sim.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
 from train import evaluate_tables as tables
 from train.crossings import cross_all
 from train.evaluate import main
-from train.evaluate_cfg import EvaluateCfg, controllers_of, size_of, split_words
+from train.evaluate_cfg import EvaluateCfg, size_of, split_words
 from train.evaluate_tables import evaluate_tables
 from train.kept import KeptCrossings
 from train.sets import make_sets, split_elites
