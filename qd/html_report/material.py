@@ -1,0 +1,181 @@
+"""What a report is made from: the files of a run and of an evaluation, read and checked before any work."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qd.archive import ARCHIVE_FILE, Archive, read_archive
+from qd.fitness import FitnessCfg
+from qd.html_report.tables import read_tables
+from qd.report import summary
+from qd.run_directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory, newest_run
+from qd.settings import SHIPPED, SearchCfg
+from sim.files import prepare_output
+from sim.robot import get_robot
+
+RESULTS = Path("results")
+"""Where published archives and tables lie."""
+_ORIGIN = ("command", "commit", "device", "versions", "seed", "date")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HtmlReportCfg:
+    """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
+
+    Elites shown are crossed again for it, 20 times each; what was crossed is kept beside the page, so that the same
+    command, stopped or made again, goes on from there.
+    """
+
+    robot: str = "anymal"
+    """Which robot."""
+    run: Path | None = None
+    """Run directory; the newest of this robot under runs/, or without one results/<robot>/archive."""
+    tables: Path | None = None
+    """File of the evaluation tables; results/<robot>/tables.json if it is there."""
+    out: Path | None = None
+    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-report."""
+    policy: str | None = None
+    """Controller other than the one the archive was made with."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    elites: int = 5
+    """How many of the worst and of the most reproducible elites to show, beside one of each failure mode."""
+    episodes: int = 20
+    """Crossings of each elite shown."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.elites <= 10:
+            raise ValueError(f"elites must be 1 to 10 of each kind, got {self.elites}: each takes a figure and a table")
+        if not 1 <= self.episodes <= 100:
+            raise ValueError(f"episodes must be 1 to 100 of each elite, got {self.episodes}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """Everything read; None where there is no such file."""
+
+    cfg: HtmlReportCfg
+    run: Path
+    """Directory or archive file that was read."""
+    out: Path
+    archive: Archive
+    metrics: Metrics | None
+    """One row an iteration, up to those of the archive."""
+    search: SearchCfg | None
+    origin: dict[str, Any]
+    """Command, commit, device, versions, seed and date of the search, as far as they are known."""
+    gpus: int | None
+    tables: dict[str, Any] | None
+    tables_file: Path
+    """Where the tables are, or would be looked for."""
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """The run in numbers, as ``archive.json`` has them; None without metrics."""
+        return None if self.metrics is None else summary(self.archive, self.metrics, gpus=self.gpus or 0, origin={})
+
+    @property
+    def policy(self) -> str:
+        """Controller to cross with: what was asked for, or that of the search."""
+        searched = SHIPPED if self.search is None else self.search.policy
+        policy = self.cfg.policy or searched
+        return str(get_robot(self.cfg.robot).policy_file) if policy == SHIPPED else policy
+
+    @property
+    def fitness(self) -> FitnessCfg:
+        """Penalties, scales and weights of the search; the weights by default where it lies without its config."""
+        if self.search is not None:
+            return self.search.fitness
+        return FitnessCfg(penalties=self.archive.penalties, scales=self.archive.scales)
+
+
+def gather(cfg: HtmlReportCfg) -> Material:
+    """Reads what there is and makes sure that the page can be written.
+
+    Raises:
+        FileNotFoundError: If there is no run or no such tables.
+        ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
+    """
+    get_robot(cfg.robot)
+    run = cfg.run or _default_run(cfg.robot)
+    archive = _archive_of(run, cfg.robot)
+    folder = RunDirectory(run if run.is_dir() else run.parent)
+    search = folder.read_cfg() if (folder.path / CONFIG_FILE).exists() else None
+    if search is not None and search.fitness.penalties != archive.penalties:
+        raise ValueError(
+            f"{folder.path / CONFIG_FILE} is of a search with penalties {', '.join(search.fitness.penalties)}, but its "
+            f"archive has {', '.join(archive.penalties)}: put back the one that is not this run's"
+        )
+    numbers = folder.read_summary()
+    config = {} if search is None else folder.read_config()
+    tables_file = cfg.tables or RESULTS / cfg.robot / "tables.json"
+    has_tables = cfg.tables is not None or tables_file.exists()
+    material = Material(
+        cfg=cfg,
+        run=run,
+        out=cfg.out or _default_out(run, cfg.robot),
+        archive=archive,
+        metrics=_metrics_of(folder, archive),
+        search=search,
+        origin={key: config[key] for key in _ORIGIN if key in config},
+        gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
+        tables=read_tables(tables_file, cfg.robot) if has_tables else None,
+        tables_file=tables_file,
+    )
+    _check_out(material.out)
+    return material
+
+
+def _default_run(robot: str) -> Path:
+    """The newest run, or the published one."""
+    published = RESULTS / robot / "archive"
+    try:
+        return newest_run(robot)
+    except FileNotFoundError:
+        if (published / ARCHIVE_FILE).exists():
+            return published
+        raise
+
+
+def _archive_of(run: Path, robot: str) -> Archive:
+    if run.is_dir() and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
+        raise ValueError(
+            f"{run} must hold a search that has ended an iteration, got one without {ARCHIVE_FILE}: "
+            f"let it go on with `make archive RESUME={run}`"
+        )
+    archive = read_archive(run)
+    if archive.robot != robot:
+        raise ValueError(f"{run} is of robot {archive.robot}, got --robot {robot}: give that robot or another --run")
+    if not len(archive):
+        raise ValueError(
+            f"{run} must have elites to report on, got an archive of none after {archive.iterations} iterations: "
+            f"let it go on with `make archive RESUME={run} ITERATIONS=...`"
+        )
+    return archive
+
+
+def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
+    """The rows up to the archive's iteration; a run that goes on meanwhile may have some more."""
+    file = folder.path / METRICS_FILE
+    if not file.exists():
+        return None
+    rows = folder.read_metrics()
+    if len(rows) < archive.iterations:
+        raise ValueError(
+            f"{file} must have a row for each of the archive's {archive.iterations} iterations, got {len(rows)}: the "
+            f"run is half-written; `make archive RESUME={folder.path}` writes both again"
+        )
+    return rows[: archive.iterations]
+
+
+def _default_out(run: Path, robot: str) -> Path:
+    """In the run itself, unless it is published."""
+    folder = run if run.is_dir() else run.parent
+    published = RESULTS.resolve() in folder.resolve().parents
+    return (Path("runs") / f"{robot}-report" if published else folder) / "report.html"
+
+
+def _check_out(out: Path) -> None:
+    if out.suffix != ".html":
+        raise ValueError(f"out must be a file named *.html, got {out}: name for example {out / 'report.html'}")
+    prepare_output(out)

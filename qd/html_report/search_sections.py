@@ -1,0 +1,183 @@
+"""The page's chapters about the search: what was done, what came out, its curves and its archive."""
+
+import numpy as np
+
+from qd.html_report.elites import FAILING_BELOW, Elites
+from qd.html_report.figures import draw_pairs, label_of
+from qd.html_report.page import Absent, Block, Facts, Section, Table, Text
+from qd.html_report.shown import Shown, counted, percent, picture
+from qd.progress import clock
+from qd.report import draw_archive, draw_curves, draw_spread, spread
+from qd.settings import SHIPPED
+from sim.controller_spec import ControllerSpec
+from sim.intervals import bootstrap_interval
+
+
+def outcome_section(shown: Shown) -> Section:
+    """What was searched, at what cost, and in how many ways the controller breaks how often."""
+    elites, archive = shown.elites, shown.material.archive
+    failing = int(elites.failing.sum())
+    basis = (
+        f"by {int(elites.counted.max(initial=0))} fresh episodes each, free of the luck that made them elites"
+        if elites.fresh
+        else "by the episodes that found them, which flatter themselves"
+    )
+    facts = Facts(
+        [
+            ("different failures: cells of the archive whose terrain under half of the robots cross", f"{failing:,}"),
+            ("elites, the hardest terrain found of each kind", f"{len(archive):,}"),
+            ("groups that the elites fall into", f"{len(shown.modes.modes)}"),
+            ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
+            ("robots whose base collides, likewise", percent(float(elites.collision_rate.mean()))),
+        ]
+    )
+    text = (
+        f"The controller fails in {counted(failing, 'different way')}: of the {counted(len(elites), 'elite')} judged "
+        f"({basis}), under half of the robots reach the goal on {failing:,} ({percent(failing / len(elites))}), and "
+        f"none on {int((elites.goal_rate == 0.0).sum()):,}. Over all of them {_rate(elites.goal_rate)} of the robots "
+        f"reach the goal, the base of {_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
+    )
+    explained = (
+        "A cell is a combination of shares of the penalties, in tenths; terrains in different cells make the robot "
+        f"struggle differently. A terrain counts as failed if under {FAILING_BELOW:.0%} of the robots reach the goal; "
+        "the rates are means over terrains with 95 % intervals (bootstrap over terrains)."
+    )
+    return Section("What breaks the controller", "outcome", [_searched(shown), facts, Text(text), Text(explained)])
+
+
+def _rate(rates: np.ndarray) -> str:
+    """Mean over terrains with its interval."""
+    low, high = bootstrap_interval(rates, np.random.default_rng(0)) or (0.0, 1.0)
+    return f"{percent(float(rates.mean()))} ({percent(low)} to {percent(high)})"
+
+
+def _searched(shown: Shown) -> Block:
+    """Robot, controller, method and cost in a sentence."""
+    material, numbers = shown.material, shown.material.summary
+    archive, search = material.archive, material.search
+    policy = SHIPPED if search is None else search.policy
+    who = "its shipped controller" if policy == SHIPPED else f"controller {ControllerSpec.parse(policy).label}"
+    if search is None:
+        who = "a controller that is not on record (the archive lies without its config.json)"
+    text = f"{archive.robot} with {who}, after {counted(archive.iterations, 'iteration')}"
+    if search is not None:
+        text += f" of {search.scheduler.method.replace('+', ' and ')} (seed {search.seed})"
+    text += f": {counted(len(archive), 'elite')} in {percent(archive.reachable_coverage)} of the "
+    text += f"{archive.cells.num_cells:,} reachable cells"
+    if numbers is None or material.metrics is None:
+        return Text(f"{text}. What that cost is not on record: there is no metrics.jsonl beside the archive.")
+    text += f", from {counted(numbers['terrains_evaluated'], 'terrain')} and {numbers['episodes']:,} episodes"
+    walked = [row["episodes"] * row["mean_duration_s"] for row in material.metrics if "mean_duration_s" in row]
+    if len(walked) == len(material.metrics):
+        text += f" ({clock(sum(walked))} of walking, simulated)"
+    where = f" on {counted(material.gpus, 'GPU')}" if material.gpus else ""
+    invalid = counted(numbers["invalid_episodes"], "episode was", "episodes were")
+    return Text(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
+
+
+def curves_section(shown: Shown) -> Section:
+    """How the search went."""
+    section = Section("The search", "search")
+    rows, archive = shown.material.metrics, shown.material.archive
+    if not rows:
+        section.blocks.append(
+            Absent("The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:",
+                   f"make archive ROBOT={archive.robot}")
+        )  # fmt: skip
+        return section
+    first, last = rows[0], rows[-1]
+    half = next(row["iteration"] for row in rows if row["elites"] >= last["elites"] / 2)
+    text = (
+        f"From iteration {first['iteration']} to {last['iteration']} the archive grew from {first['elites']:,} to "
+        f"{counted(last['elites'], 'elite')}, half of them found by iteration {half}; the QD score, the sum of fitness "
+        f"above -20, rose from {first['qd_score']:,.0f} to {last['qd_score']:,.0f}, the mean fitness went from "
+        f"{first['mean_fitness']:.1f} to {last['mean_fitness']:.1f}."
+    )
+    if len(rows) > 1:
+        tail = rows[-max(1, len(rows) // 5) - 1 :]
+        gained = tail[-1]["elites"] - tail[0]["elites"]
+        text += f" The last {counted(len(tail) - 1, 'iteration')} added {counted(gained, 'elite')}."
+    shows = "QD score, number of elites with reachable coverage, and mean fitness over the iterations"
+    section.blocks += [Text(text), picture("curves", draw_curves(archive, rows), shows)]
+    return section
+
+
+def archive_section(shown: Shown) -> Section:
+    """The archive on parallel axes, and its spread over each share."""
+    elites, archive = shown.elites, shown.material.archive
+    largest = elites.ratios.max(axis=0)
+    ranges = ", ".join(
+        f"{label_of(name)} {percent(top)}" for name, top in zip(elites.penalties, largest.tolist(), strict=True)
+    )
+    lines = (
+        f"Each line is one of {counted(len(elites), 'elite')}; each axis a penalty, the height its share of all that "
+        f"went wrong. The largest shares reached are: {ranges}."
+    )
+    counts = spread(archive).sum(axis=2)
+    filled = (counts > 0).sum(axis=1).tolist()
+    widest = int(np.argmax(filled))
+    spread_text = (
+        f"Of the {archive.intervals} intervals of each share the search filled {min(filled)} to {max(filled)}, most of "
+        f"{label_of(archive.penalties[widest])}; in {int(archive.collided.sum()):,} of "
+        f"{counted(len(archive), 'elite')} the base collides in at least one episode."
+    )
+    return Section(
+        "The archive",
+        "archive",
+        [
+            Text(lines),
+            picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
+            Text(spread_text),
+            picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
+        ],
+    )
+
+
+def pairs_section(shown: Shown) -> Section:
+    """Every two shares against each other."""
+    elites, section = shown.elites, Section("Shares against each other", "pairs")
+    if len(elites) < 3 or len(elites.penalties) < 2:
+        section.blocks.append(
+            Absent(f"The projections are left out: they need 3 elites, and there are {len(elites)}. A longer search "
+                   "finds more:", f"make archive RESUME={shown.material.run} ITERATIONS=N")
+        )  # fmt: skip
+        return section
+    text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its group (next chapter)."
+    text += _related(elites)
+    shows = "Scatter plots of every two shares of the penalties, by failure mode"
+    section.blocks += [Text(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]
+    return section
+
+
+def _related(elites: Elites) -> str:
+    """Which shares go together, and in how few directions they vary; nothing of shares that do not."""
+    changing = np.flatnonzero(elites.ratios.std(axis=0) > 0.0)
+    if len(changing) < 3:  # of two shares, one is what the other leaves
+        return ""
+    related = np.corrcoef(elites.ratios[:, changing].T) - np.eye(len(changing))
+    names = [label_of(elites.penalties[column]) for column in changing]
+    low, high = (np.unravel_index(pick(related), related.shape) for pick in (np.argmin, np.argmax))
+    text = f" The shares of {names[low[0]]} and {names[low[1]]} are the most opposed (correlation {related[low]:.2f})"
+    if related[high] > 0.0:
+        text += f", those of {names[high[0]]} and {names[high[1]]} go together the most ({related[high]:.2f})"
+    variances = np.linalg.eigvalsh(np.cov(elites.ratios.T))[::-1]
+    share = float(variances[:2].sum() / variances.sum())
+    return f"{text}. Two principal directions hold {percent(share)} of their variance."
+
+
+def origin_section(shown: Shown) -> Section:
+    """Where the numbers come from."""
+    origin = shown.material.origin
+    section = Section("Where this comes from", "origin")
+    if not origin:
+        section.blocks.append(
+            Absent("The search is not on record: there is no config.json beside the archive. A search writes one:",
+                   f"make archive ROBOT={shown.material.cfg.robot}")
+        )  # fmt: skip
+        return section
+    rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]
+    versions = origin.get("versions")
+    if isinstance(versions, dict):
+        rows.append(["versions", ", ".join(f"{name} {version}" for name, version in versions.items())])
+    section.blocks += [Text(f"The archive read is {shown.material.run}; its search:"), Table(["", ""], rows)]
+    return section
