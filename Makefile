@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare ablation train finetune calibrate replay reevaluate evaluate tables crosscheck bench test lint clean
+.PHONY: help setup archive compare ablation train finetune calibrate replay reevaluate evaluate video export tables crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -37,6 +37,12 @@ FLAG_ARCHIVE := archive
 FLAG_SPLIT_SEED := split-seed
 FLAG_SETS := sets
 FLAG_TERRAINS := terrains
+FLAG_TERRAIN := terrain
+FLAG_SIZE := size
+FLAG_SCALE := scale
+FLAG_OFFSET := offset
+FLAG_RECORDING := recording
+FLAG_FORMATS := formats
 FLAG_EPISODES := episodes
 
 help: ## This list
@@ -46,14 +52,14 @@ help: ## This list
 	@echo 'Variables (left out: the default of the command):'
 	@echo '  ROBOT=anymal     which robot'
 	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare ablation train finetune calibrate replay reevaluate'
-	@echo '                                                   evaluate crosscheck bench'
+	@echo '                                                   evaluate video crosscheck bench'
 	@echo '  PRESET=small     size of the search: paper, small  archive compare ablation'
 	@echo '  ITERATIONS=N     stop after N iterations           archive compare ablation train finetune'
 	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, an'
 	@echo '                   ONNX file or module:callable      archive compare ablation finetune calibrate replay reevaluate'
-	@echo '                                                   evaluate crosscheck'
+	@echo '                                                   evaluate video crosscheck'
 	@echo '  SEED=N           seed of everything drawn          archive compare ablation train finetune calibrate reevaluate'
-	@echo '                                                   evaluate crosscheck bench'
+	@echo '                                                   evaluate video crosscheck bench'
 	@echo '  RESUME=DIR       go on with this run               archive compare train finetune'
 	@echo '  MIX=generated    terrains to train on beside hand-crafted ones: generated, hard-random, or hand-crafted'
 	@echo '                   (nothing else)                    finetune'
@@ -65,13 +71,22 @@ help: ## This list
 	@echo '  WITHOUT="A B"    penalties to leave out            archive'
 	@echo '  REPRODUCE=yes    evaluate elites again at the end: yes, no; auto: of preset paper  archive'
 	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay reevaluate'
-	@echo '  ELITE=N          which elite of it, 0 the worst    replay'
+	@echo '                                                   video export'
+	@echo '  ELITE=N          which elite of it, 0 the worst    replay video export'
+	@echo '                   (video, export: or several, ELITE="0 3", or ELITE=all)'
 	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables, each NAME=SPEC          evaluate'
 	@echo '  ARCHIVE=DIR      run of a search: elites to train on, and those held out to evaluate on   finetune evaluate'
 	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
 	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
 	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate'
+	@echo '  TERRAIN=FILE     cross a heightmap of your own: an .npz with heights (rows along y) [m], or a .png of'
+	@echo '                   8 or 16 bits seen from above      evaluate video'
+	@echo '  SIZE="X Y" SCALE=M OFFSET=M   of that map: metres along x and y; a gray level; gray level 0; those of'
+	@echo '                   its file, or of a .json beside it, if left out                     evaluate video'
+	@echo '  RECORDING=FILE   film this instead of crossing     video'
+	@echo '  FORMATS="A B"    of npz, png, xml, stl; all        export'
 	@echo '  OUT=FILE         where to write the numbers        compare ablation calibrate evaluate crosscheck bench'
+	@echo '                   or the film, or the folder        video export'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
 	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
@@ -119,8 +134,14 @@ replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the
 reevaluate: setup ## Evaluate every elite of an archive again with 40 fresh episodes
 	$(BIN)/python -m qd.reevaluate --robot $(call quoted,$(ROBOT)) $(call flags,RUN DEVICE POLICY SEED WORKERS PROCESSES WORKER_LIMIT_S)
 
-evaluate: setup ## Rates of the controller of ROBOT, or with POLICIES or ARCHIVE the tables of the paper
-	$(BIN)/python -m train.evaluate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS)
+evaluate: setup ## Rates of the controller of ROBOT; with TERRAIN on a map of yours, with POLICIES or ARCHIVE the paper's tables
+	$(BIN)/python -m $(if $(TERRAIN),qd.cross,train.evaluate) --robot $(call quoted,$(ROBOT)) $(call flags,$(if $(TERRAIN),TERRAIN SIZE SCALE OFFSET DEVICE POLICY EPISODES SEED OUT,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS))
+
+video: setup ## Film the robot on elite ELITE=N of an archive, or on TERRAIN=FILE
+	$(BIN)/python -m qd.video --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE TERRAIN SIZE SCALE OFFSET RECORDING DEVICE POLICY SEED OUT)
+
+export: setup ## Write elites as npz, 16-bit PNG, MJCF and STL: ELITE=N or ELITE=all
+	$(BIN)/python -m qd.export --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE OUT FORMATS)
 
 tables: setup ## Write the published numbers, with the paper's beside them, into the README
 	$(BIN)/python -m train.publish

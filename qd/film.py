@@ -76,7 +76,8 @@ def caption(shot: Shot) -> tuple[str, str]:
         "fallen": recording.fallen[t] & valid,
     }
     rates = [f"{name} {_rate(int(flags.sum()), count)}" for name, flags in hits.items()] if count else ["none valid"]
-    return first, f"{len(valid)} episode{'s' * (len(valid) != 1)}: {', '.join(rates)}"
+    of = f"{len(valid)} episode{'s' * (len(valid) != 1)}"
+    return first, f"{of}: {', '.join(rates)}; in brackets 95 % intervals"
 
 
 def _rate(hits: int, count: int) -> str:
@@ -146,6 +147,11 @@ def shown_frames(shot: Shot, fps: int) -> list[int]:
     last = shot.num_frames - 1
     times = np.arange(0.0, last * shot.recording.dt, 1.0 / fps)
     return [*np.rint(times / shot.recording.dt).astype(int).tolist(), last] if last else [0]
+
+
+def num_pictures(shot: Shot, fps: int) -> int:
+    """How many pictures :func:`frames_of` gives."""
+    return len(shown_frames(shot, fps)) + round(_HOLD_S * fps)
 
 
 def _lettered(view: Image, lines: tuple[str, str], clock: str) -> Image:

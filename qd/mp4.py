@@ -12,7 +12,7 @@ from sim.files import write_atomically
 
 
 def write_film(
-    path: Path, pictures: Iterator[NDArray[np.uint8]], fps: int, progress: Callable[[int], None] | None = None
+    path: Path, pictures: Iterator[NDArray[np.uint8]], fps: int, progress: Callable[[], object] | None = None
 ) -> int:
     """Encodes pictures as an MP4 (H.264) that plays everywhere, atomically.
 
@@ -20,7 +20,7 @@ def write_film(
         path: File to write.
         pictures: RGB, all of one shape, with even sides.
         fps: Pictures a second.
-        progress: Called with the number of pictures done.
+        progress: Called after every picture.
 
     Returns:
         How many pictures there were.
@@ -45,7 +45,7 @@ def write_film(
                 writer.send(np.ascontiguousarray(picture))
                 done += 1
                 if progress is not None:
-                    progress(done)
+                    progress()
         finally:
             if writer is not None:
                 writer.close()

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from qd.archive import Archive, read_archive
 from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
-from qd.report import new_figure, save_figure
+from qd.paths_figure import draw_paths
+from qd.report import save_figure
 from qd.run_directory import CONFIG_FILE, RunDirectory, newest_run
 from qd.settings import SHIPPED
 from qd.workers import check_policy, episode_seeds, resolve_device
@@ -23,8 +24,15 @@ if TYPE_CHECKING:
 
 REPLAY_STREAM = 2
 """Of the seeds of a replay's episodes (:func:`qd.workers.episode_seeds`), which are those of a film too."""
-_UNITS = {"yaw_rate": "rad", "vel_x": "m", "vel_y": "m", "contact_force": "N s", "stumble": "s", "collision": "s"}
-_LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
+PENALTY_UNITS = {
+    "yaw_rate": "rad",
+    "vel_x": "m",
+    "vel_y": "m",
+    "contact_force": "N s",
+    "stumble": "s",
+    "collision": "s",
+}
+"""Units of the raw penalties."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +147,7 @@ def describe(replay: Replay) -> str:
         "fitness": [f"{values.fitness[k]:.2f}" for _, values, k in columns],
     }
     for p, name in enumerate(archive.penalties):
-        rows[f"{name} [{_UNITS.get(name, '')}]"] = [
+        rows[f"{name} [{PENALTY_UNITS.get(name, '')}]"] = [
             _penalty(values.penalty_mean[k, p], values.penalty_std[k, p], archive.scales[p], values.ratios[k, p])
             for _, values, k in columns
         ]
@@ -178,48 +186,14 @@ def _rate(rate: float, count: int) -> str:
 
 def draw(replay: Replay) -> "Figure":
     """The height map of an elite with the robots' paths, and marks where they ended, by how."""
-    figure = new_figure(11.0, 6.2)
-    axes = figure.subplots()
-    image = axes.imshow(replay.heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap="gray", alpha=0.9)
-    figure.colorbar(image, ax=axes, label="height [m]", shrink=0.7)
-    paths = replay.result.paths
-    ends = _ends(replay.result)
-    for label, (color, marker, chosen) in ends.items():
-        for k in np.flatnonzero(chosen):
-            if paths is not None:
-                axes.plot(paths[0, k, :, 0], paths[0, k, :, 1], color=color, linewidth=0.9, alpha=0.8)
-        end = replay.result.final_position[0, chosen]
-        label = f"{label} ({len(end)})"
-        axes.scatter(end[:, 0], end[:, 1], color=color, marker=marker, s=55, edgecolors="white", label=label, zorder=3)
-    axes.plot(2.0, 4.0, marker=">", color="white", markeredgecolor="black", markersize=11, linestyle="", label="start")
-    axes.plot(14.0, 4.0, marker="*", color="white", markeredgecolor="black", markersize=16, linestyle="", label="goal")
     archive, n = replay.archive, replay.elite
     corrected = "" if archive.fresh is None else f"{archive.fresh.fitness[n]:.2f} corrected, "
-    axes.set_title(
+    title = (
         f"{archive.robot}, elite {n} of {len(archive):,} after {archive.iterations:,} iterations: fitness "
         f"{archive.fitness[n]:.2f} as found, {corrected}"
         f"{replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
     )
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.set_xlim(min(0.0, axes.get_xlim()[0]), max(_LENGTH, axes.get_xlim()[1]))
-    axes.set_aspect("equal")
-    figure.legend(loc="outside lower center", ncols=6, frameon=False)
-    return figure
-
-
-def _ends(result: "RolloutResult") -> dict[str, tuple[str, str, NDArray[np.bool_]]]:
-    """Label, colour, marker and episodes of each way to end that happened."""
-    from kernels.episode import Outcome
-
-    styles = {
-        Outcome.GOAL: ("reached the goal", "#009e73", "o"),
-        Outcome.BASE_COLLISION: ("base collision", "#d55e00", "X"),
-        Outcome.TIME_OUT: ("out of time", "#0072b2", "s"),
-        Outcome.OUT: ("left the terrain", "#cc79a7", "^"),
-    }
-    chosen = {outcome: result.outcome[0] == outcome for outcome in styles}
-    return {styles[o][0]: (*styles[o][1:], mask) for o, mask in chosen.items() if mask.any()}
+    return draw_paths(replay.heights, replay.result, title)
 
 
 def main(cfg: ReplayCfg) -> None:

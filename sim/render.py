@@ -18,10 +18,11 @@ from sim.scene import scene_model
 _mj: Any = mujoco  # its types are not written down
 
 _MAX_GEOMS = 4000
-_GHOST_OPACITY = 0.28
-_ARROW = 0.4  # length of the arrow of a force at the robot's limit [m]
+_GHOST_OPACITY, _GHOST_PALENESS = 0.25, 0.6
+_ARROW = 0.8  # length of the arrow of a force at the robot's limit [m]
 _ARROW_WIDTH = 0.012
 _LEAST_FORCE = 5.0  # shown [N]
+_SUN_AWAY = 8.0  # from what one looks at [m]
 _CALM, _ALARMED = np.array([0.95, 0.80, 0.20, 0.9], np.float32), np.array([0.85, 0.10, 0.10, 0.9], np.float32)
 
 
@@ -134,6 +135,8 @@ class Renderer:
         data = self._posed(0, qpos)
         self._camera.lookat[:] = camera.target
         self._camera.distance = camera.distance
+        # The sun goes with the camera, so that its shadows are sharp where one looks.
+        data.light_xpos[-1] = np.array(camera.target) - _SUN_AWAY * data.light_xdir[-1]
         self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
         everything = _mj.mjtCatBit.mjCAT_ALL.value
         _mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
@@ -166,6 +169,7 @@ class Renderer:
         moving = _mj.mjtCatBit.mjCAT_DYNAMIC.value
         _mj.mjv_addGeoms(self.model, data, self._options, self._nudge, moving, self._scene)
         for geom in self._scene.geoms[first : self._scene.ngeom]:
+            geom.rgba[:3] += _GHOST_PALENESS * (1.0 - geom.rgba[:3])
             geom.rgba[3] = _GHOST_OPACITY
             geom.transparent = 1
 

@@ -23,6 +23,7 @@ _PIXELS = 4  # of the paint a cell, along each side
 _LOW, _LEVEL, _HIGH = (np.array(color) for color in ((0.36, 0.50, 0.66), (0.80, 0.79, 0.74), (0.70, 0.44, 0.27)))
 _LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
 _COLORS = {"base": (0.20, 0.22, 0.25, 1.0), "limb": (0.42, 0.45, 0.50, 1.0), "foot": (0.90, 0.35, 0.13, 1.0)}
+_SHADOWED = 3.0  # half side of the square about the robot that shadows fall in [m]
 _HIDDEN_GROUP = 5  # MuJoCo shows groups 0 to 2
 _BONE, _LEAST_BONE = 0.35, 0.02  # radius of a bone in that of limbs and feet, and at least [m]
 
@@ -79,6 +80,7 @@ def scene_model(
     _add_light(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     model = spec.compile()
+    model.vis.map.shadowclip = _SHADOWED / model.stat.extent
     if model.nq != 7 + robot.num_joints:
         raise ValueError(
             f"robot '{robot.name}': {robot.model_file} has {model.nq} coordinates for MuJoCo, expected "

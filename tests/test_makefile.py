@@ -13,6 +13,7 @@ import tyro
 
 from qd.arguments import Arguments
 from qd.compare_arguments import Arguments as CompareArguments
+from qd.cross import CrossCfg
 from qd.next_commands import next_command
 from qd.reevaluate import ReevaluateCfg
 
@@ -23,6 +24,9 @@ ARGUMENTS = {
     "calibrate": ("qd.calibrate", "CalibrateCfg"),
     "replay": ("qd.replay", "ReplayCfg"),
     "reevaluate": ("qd.reevaluate", "ReevaluateCfg"),
+    "evaluate": ("qd.cross", "CrossCfg"),  # with TERRAIN
+    "video": ("qd.video", "VideoCfg"),
+    "export": ("qd.export", "ExportCfg"),
 }
 """Where the arguments of each target's command are."""
 VARIABLES = dict(re.findall(r"^FLAG_(\w+) := (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE))
@@ -52,7 +56,7 @@ def test_every_flag_of_a_target_is_one_of_its_command(target):
     known = {field.name for field in dataclasses.fields(getattr(importlib.import_module(module), name))}
     given = {word.split("=")[0].removeprefix("--").replace("-", "_") for word in command[3:] if word.startswith("--")}
     assert given <= known
-    assert given >= {"robot", "device", "policy"}
+    assert given >= {"robot", *(() if target == "export" else ("device", "policy"))}
 
 
 ODD = ("a b", "a  b", "it's", '"', "$HOME", "$x", "a#b", "-x", "a=b:c", "*", "ü\\", "`id`", "%", "~")
@@ -79,6 +83,15 @@ def test_a_command_names_only_what_is_not_as_by_default():
     assert next_command("reevaluate", Arguments(), run=Path("runs/x"), seed=0) == "make reevaluate RUN=runs/x SEED=0"
     assert next_command("compare", CompareArguments(processes=2)) == "make compare PROCESSES=2"  # 900 s is its default
     assert next_command("archive", Arguments(worker_limit_s=0.5)) == "make archive WORKER_LIMIT_S=0.5"
+
+
+def test_a_map_of_ones_own_is_handed_to_the_command_that_crosses_it():
+    assert command_of("evaluate", POLICY="a.pt", SIZE="16 8")[2] == "train.evaluate"
+    command = command_of("evaluate", TERRAIN="my hill.png", SIZE="16 8", SCALE="0.01", EPISODES="40", OUT="a.json")
+    assert command[:3] == [".venv/bin/python", "-m", "qd.cross"]
+    parsed = tyro.cli(CrossCfg, args=command[3:])
+    given = {"terrain": Path("my hill.png"), "size": ("16 8",), "scale": 0.01, "episodes": 40, "out": Path("a.json")}
+    assert parsed == CrossCfg(robot="anymal", **given)
 
 
 def test_several_words_in_one_variable_are_one_value():
