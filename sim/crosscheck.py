@@ -22,6 +22,7 @@ from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
 from sim.command import exit_code_of, publish
 from sim.controller_spec import ControllerSpec
+from sim.mujoco_c import crossing_model
 from sim.plain_crossing import draw_starts
 from sim.plain_processes import run_plain
 from sim.provenance import provenance
@@ -139,6 +140,7 @@ class Crosscheck:
             raise ValueError(f"processes must be at least 1 and seed at least 0, got {cfg.processes} and {cfg.seed}")
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)
+        crossing_model(self.robot, np.zeros((2, 2)))  # MuJoCo must read it too
         self.device = resolve_device(cfg.device)
         self.policy = cfg.policy or self.robot.policy_file
         self.rng = np.random.default_rng([_KEY, cfg.seed])

@@ -20,6 +20,7 @@ from sim.terrain import SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
 _MEMORY = "4M"
+_OF_THE_FILE = ("stiffness", "damping", "effort_limit", "armature", "friction", "contact_time_constant_s")
 _mj: Any = mujoco  # its types are not written down
 
 Array = NDArray[np.float64]
@@ -34,12 +35,15 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_const
         robot: Robot settings.
         heights: Height grid [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`.
         time_constant_s: Contact time constant of all geoms [s], critically damped; the file's if None.
+
+    Raises:
+        ValueError: If the robot is more than its MJCF says, or MuJoCo does not read it.
     """
+    root = _root_of(robot)
     grid = np.pad(np.asarray(heights, dtype=np.float64), _MARGIN_NODES, mode="edge")
     lowest, extent = float(grid.min()), max(float(np.ptp(grid)), 1e-3)
     half = [0.5 * SPACING * (count - 1) for count in (grid.shape[1], grid.shape[0])]
     centre = [0.5 * SPACING * (count - 1) for count in (heights.shape[1], heights.shape[0])]
-    root = ET.parse(robot.model_file).getroot()
     ET.SubElement(root, "size", memory=_MEMORY)
     option = root.find("option")
     option = ET.SubElement(root, "option") if option is None else option
@@ -63,9 +67,29 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_const
         ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")
     model = _mj.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
     model.hfield_data[:] = ((grid - lowest) / extent).ravel()
+    model.geom_conaffinity[:] = 0  # a robot does not touch itself
+    model.geom("ground").conaffinity[:] = 1
     if time_constant_s is not None:
         model.geom_solref[:] = time_constant_s, 1.0
     return model
+
+
+def _root_of(robot: RobotCfg) -> ET.Element:
+    """The XML of a robot's MJCF, its meshes found from anywhere."""
+    root = ET.parse(robot.model_file).getroot()
+    given = [name for name in _OF_THE_FILE if getattr(robot, name) is not None]
+    included = root.find(".//include")
+    if root.tag != "mujoco" or given or included is not None:
+        got = "a URDF" if root.tag != "mujoco" else "an include" if not given else f"{', '.join(given)} in the settings"
+        raise ValueError(
+            f"robot '{robot.name}': plain MuJoCo reads {robot.model_file} alone, expected an MJCF of one file with "
+            f"position actuators, got {got}: write such a file for it"
+        )
+    compiler = root.find("compiler")
+    compiler = ET.SubElement(root, "compiler") if compiler is None else compiler
+    folder = compiler.get("meshdir", compiler.get("assetdir", ""))
+    compiler.set("meshdir", str(robot.model_file.absolute().parent / folder))
+    return root
 
 
 def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:

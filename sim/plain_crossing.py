@@ -17,7 +17,8 @@ from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
 from sim.mujoco_c import Array, crossing_model, goal_commands, observations, step_penalties
 from sim.policy import Policy, forget
-from sim.robot import RobotCfg, build_robot
+from sim.robot import RobotCfg
+from sim.robot_model import build_robot
 
 _mj: Any = mujoco  # its types are not written down
 _WARNINGS = [

@@ -1,10 +1,10 @@
-"""Robots: their settings, and their MJCF file as a Newton model."""
+"""Robots: what the simulation and the search need to know of them; the shipped ones, and those of one's own."""
 
+import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import newton
 import numpy as np
 
 from kernels.observation import NUM_BASE_COLUMNS
@@ -17,17 +17,20 @@ _ROBOTS_DIR = Path(__file__).parent / "robots"
 
 @dataclass(frozen=True, kw_only=True)
 class RobotCfg:
-    """What the simulation and the search need to know of a robot beside its MJCF file.
+    """What the simulation and the search need to know of a robot beside its model file.
 
-    Gains, effort limits and armature stand in the MJCF (position actuators), so that any MuJoCo reads the same robot.
+    Base frame: x forward, y left, z up. Gains, effort limits and armature of the shipped robots stand in their MJCF
+    (position actuators), so that any MuJoCo reads the same robot.
     """
 
     name: str
+    """What files and folders are called after it."""
     model_file: Path
-    """MJCF file; the first body has the free joint."""
+    """MJCF, whose first body has the free joint, or URDF; relative to the settings' file."""
     base_geoms: tuple[str, ...]
     """Geoms whose touch ends an episode."""
     foot_geoms: tuple[str, ...]
+    """Geoms it walks on."""
     limb_geoms: tuple[str, ...]
     """Geoms whose touch is penalised, beside the base's."""
     joint_names: tuple[str, ...]
@@ -57,8 +60,27 @@ class RobotCfg:
     """Contacts an environment on average; the buffer is shared by all."""
     njmax: int = 100
     """Constraint rows an environment."""
+    stiffness: tuple[float, ...] | None = None
+    """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
+    damping: tuple[float, ...] | None = None
+    """Velocity gain of each joint [N m s/rad], together with ``stiffness``."""
+    effort_limit: tuple[float, ...] | None = None
+    """Largest torque of each joint [N m]; the file's if None, and never more than that of its actuators."""
+    armature: tuple[float, ...] | None = None
+    """Inertia of each joint's rotor, behind its gears [kg m^2]; the file's if None."""
+    friction: float | None = None
+    """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF."""
+    contact_time_constant_s: float | None = None
+    """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
     training: TrainingCfg = field(default_factory=TrainingCfg)
     """What the training of its controller takes of the robot."""
+    settings_file: Path | None = None
+    """The Python file of a robot of one's own, set by :func:`get_robot`; None of a shipped one."""
+
+    @property
+    def spec(self) -> str:
+        """What :func:`get_robot` knows it by: name or settings file."""
+        return self.name if self.settings_file is None else str(self.settings_file)
 
     @property
     def num_joints(self) -> int:
@@ -86,14 +108,19 @@ class RobotCfg:
         return (*self.base_geoms, *self.limb_geoms, *self.foot_geoms)
 
     @property
+    def home(self) -> Path:
+        """Folder of its controller, training record and penalty scales: beside the settings of a robot of one's own."""
+        return _ROBOTS_DIR if self.settings_file is None else self.settings_file.parent
+
+    @property
     def policy_file(self) -> Path:
-        """The shipped controller."""
-        return _ROBOTS_DIR / f"{self.name}.pt"
+        """The controller that comes with the robot."""
+        return self.home / f"{self.name}.pt"
 
     @property
     def scales_file(self) -> Path:
-        """The penalty scales measured with the shipped controller (``make calibrate``)."""
-        return _ROBOTS_DIR / f"{self.name}.scales.json"
+        """The penalty scales measured with that controller (``make calibrate``)."""
+        return self.home / f"{self.name}.scales.json"
 
     def role_of(self, geom: str) -> int:
         """Role bits of a geom (:mod:`kernels.penalties`)."""
@@ -110,7 +137,7 @@ class RobotCfg:
         Raises:
             ValueError: If they were never measured, or not for these penalties.
         """
-        remedy = f"run `make calibrate ROBOT={self.name}`"
+        remedy = f"run `make calibrate ROBOT={shlex.quote(self.spec)}`"
         if not self.scales_file.exists():
             raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
         scales = read_json(self.scales_file).get("scales")
@@ -191,52 +218,25 @@ ROBOTS = {
 }
 
 
-def get_robot(name: str) -> RobotCfg:
-    """Settings of a robot by name.
+def get_robot(spec: "str | RobotCfg") -> RobotCfg:
+    """Settings of a robot.
+
+    Args:
+        spec: Name of a shipped robot, or the Python file of another, which is run and must set ``ROBOT``; settings are
+            returned as they are.
 
     Raises:
-        ValueError: If there is no such robot.
+        ValueError: If there is no such robot, or something in its settings or model is wrong.
     """
-    if name not in ROBOTS:
-        raise ValueError(f"unknown robot '{name}': expected one of {', '.join(sorted(ROBOTS))}")
-    return ROBOTS[name]
+    if isinstance(spec, RobotCfg):
+        return spec
+    if spec in ROBOTS:
+        return ROBOTS[spec]
+    if spec.endswith(".py"):
+        from sim.own_robot import load_robot  # it needs this module's settings, and the model that is built of them
 
-
-def leaf_name(label: str) -> str:
-    """Name of a Newton label's last part: ``anymal/worldbody/base/LF_HIP`` -> ``LF_HIP``."""
-    return label.rsplit("/", 1)[-1]
-
-
-def _require(kind: str, wanted: tuple[str, ...], present: list[str], robot: RobotCfg) -> None:
-    missing = [name for name in wanted if name not in present]
-    if missing:
-        raise ValueError(
-            f"robot '{robot.name}': no {kind} named {', '.join(missing)} in {robot.model_file}: "
-            f"the file has {', '.join(present)}"
-        )
-
-
-def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
-    """One robot as a Newton builder, ready to be replicated into worlds.
-
-    Raises:
-        ValueError: If the file is missing or lacks a joint or geom that the settings name.
-    """
-    if not robot.model_file.exists():
-        raise ValueError(f"robot '{robot.name}': model file expected at {robot.model_file}, no such file")
-    builder = newton.ModelBuilder()
-    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-    builder.rigid_gap = 0.0  # the default of 0.1 m triples the contacts
-    builder.add_mjcf(str(robot.model_file), enable_self_collisions=False, parse_mujoco_options=False)
-    joints = [leaf_name(label) for label in builder.joint_label][1:]
-    _require("joint", robot.joint_names, joints, robot)
-    if tuple(joints) != robot.joint_names:
-        raise ValueError(
-            f"robot '{robot.name}': joint_names must follow the file's order {tuple(joints)}, got {robot.joint_names}"
-        )
-    if len(robot.default_joint_pos) != len(joints):
-        raise ValueError(
-            f"robot '{robot.name}': default_joint_pos needs {len(joints)} angles, got {len(robot.default_joint_pos)}"
-        )
-    _require("geom", robot.geom_names, [leaf_name(label) for label in builder.shape_label], robot)
-    return builder
+        return load_robot(Path(spec))
+    raise ValueError(
+        f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or a Python file that sets ROBOT "
+        "(README, Bring your own robot)"
+    )

@@ -14,7 +14,8 @@ from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.reset import clear_rows
 from sim.bank import TerrainBank
 from sim.probes import make_probes
-from sim.robot import RobotCfg, build_robot, leaf_name
+from sim.robot import RobotCfg
+from sim.robot_model import build_robot, geom_names
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
@@ -185,10 +186,10 @@ class Simulation:
         for field in ContactBuffer.vars:
             setattr(self.contact_records, field, getattr(self._contacts, f"rigid_contact_{field}"))
         geom_of_shape = self.solver.newton_shape_to_mjc_geom.numpy()
-        names = [leaf_name(label) for label in builder.shape_label]
         column_of_geom = np.full(self.solver.mjw_model.ngeom, -1)
-        for column, name in enumerate(self.robot.geom_names):
-            column_of_geom[geom_of_shape[first_shape + names.index(name)]] = column
+        for shape, name in enumerate(geom_names(builder)):
+            if name in self.robot.geom_names:  # a mesh of several parts is several shapes of one name
+                column_of_geom[geom_of_shape[first_shape + shape]] = self.robot.geom_names.index(name)
         self.column_of_geom = wp.array(column_of_geom, dtype=int)
         self.geom_role = wp.array([self.robot.role_of(name) for name in self.robot.geom_names], dtype=int)
 

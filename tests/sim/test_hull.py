@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from sim.hull import MAX_MESH_PROBES, MESH_TOLERANCE, SMALL_MESH_SHARE, hull_probes
 from sim.probes import shape_strips
-from sim.robot import build_robot
+from sim.robot_model import build_robot
 from sim.terrain import SPACING
 from tests.sim.scenes import Stepper, free_body, lying, positions, put, simulate, slope, velocities
 

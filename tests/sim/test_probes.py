@@ -14,7 +14,7 @@ from sim.probes import (
     max_spacing,
     shape_strips,
 )
-from sim.robot import build_robot
+from sim.robot_model import build_robot
 
 CAPSULES = [(0.0175, 0.1), (0.06, 0.04), (0.1, 0.375), (0.003, 0.2), (0.05, 0.0)]
 BOXES = [(0.1, 0.1, 0.05), (0.3, 0.02, 0.15), (0.01, 0.01, 0.01)]

@@ -9,7 +9,8 @@ import pytest
 
 from kernels import oracle
 from kernels.penalties import BASE, FOOT, LIMB
-from sim.robot import ROBOTS, build_robot, get_robot, leaf_name
+from sim.robot import ROBOTS, get_robot
+from sim.robot_model import build_robot, leaf_name
 from tests.sim import mujoco_c
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE, lying
 

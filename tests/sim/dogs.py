@@ -1,0 +1,213 @@
+"""A robot that the project does not ship: a dog of 13 kg with two joints a leg, as a user would bring it.
+
+:func:`write_dog` writes what README asks of a user: model, settings, and a scripted controller.
+"""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+LEGS = {"FL": (0.2, 0.12), "FR": (0.2, -0.12), "HL": (-0.2, 0.12), "HR": (-0.2, -0.12)}
+JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "knee"))
+TRUNK, THIGH, SHANK, FOOT = (0.25, 0.08, 0.05), (0.03, 0.15), (0.015, 0.15), 0.025
+"""Half sizes of the trunk's box; radius and length of thigh and shank; radius of a foot [m]."""
+STAND = 0.295
+"""Height of the trunk over its feet's soles in the default pose [m]."""
+MASS = 8.0 + 4 * (0.8 + 0.3 + 0.1)
+
+
+def mjcf(*, actuators: str = "position", trunk: str | None = None, asset: str = "", unnamed: bool = False) -> str:
+    """The dog's MJCF; hips turn forward, knees backward, about the axis to the left."""
+    trunk = trunk or f'type="box" size="{" ".join(map(str, TRUNK))}"'
+    thigh = [" " if unnamed else f'name="{leg}_thigh"' for leg in LEGS]
+    legs = "".join(
+        f"""
+      <body name="{leg}_thigh" pos="{x} {y} 0">
+        <inertial mass="0.8" pos="0 0 -0.07" diaginertia="0.002 0.002 0.0005"/>
+        <joint name="{leg}_hip" axis="0 1 0" range="-1.5 2.5"/>
+        <geom {thigh[k]} type="capsule" size="{THIGH[0]}" fromto="0 0 0 0 0 -{THIGH[1]}"/>
+        <body name="{leg}_shank" pos="0 0 -0.15">
+          <inertial mass="0.3" pos="0 0 -0.07" diaginertia="0.0006 0.0006 0.0001"/>
+          <joint name="{leg}_knee" axis="0 1 0" range="-2.6 -0.1"/>
+          <geom name="{leg}_shank" type="capsule" size="{SHANK[0]}" fromto="0 0 0 0 0 -{SHANK[1] - 0.02}"/>
+          <body name="{leg}_toe" pos="0 0 -0.15">
+            <inertial mass="0.1" pos="0 0 0" diaginertia="0.00005 0.00005 0.00005"/>
+            <geom name="{leg}_foot" type="sphere" size="{FOOT}"/>
+          </body>
+        </body>
+      </body>"""
+        for k, (leg, (x, y)) in enumerate(LEGS.items())
+    )
+    tags = {
+        "position": '<position name="{0}" joint="{0}" kp="60" kv="2" forcerange="-30 30"/>',
+        "motor": '<motor name="{0}" joint="{0}"/>',
+        "general": '<general name="{0}" joint="{0}" biastype="affine" gainprm="60" biasprm="0 -60 -2"/>',
+    }
+    drives = "".join(tags[actuators].format(joint) for joint in JOINTS) if actuators in tags else ""
+    return f"""<mujoco model="dog">
+  <compiler angle="radian" autolimits="true"/>
+  <default>
+    <joint type="hinge" armature="0.01"/>
+    <geom friction="0.8" solref="0.01 1" contype="1" conaffinity="0"/>
+  </default>
+  <asset>{asset}</asset>
+  <worldbody>
+    <body name="trunk" pos="0 0 {STAND}">
+      <freejoint name="root"/>
+      <inertial mass="8" pos="0 0 0" diaginertia="0.03 0.2 0.2"/>
+      <geom name="trunk" {trunk}/>{legs}
+    </body>
+  </worldbody>
+  <actuator>{drives}</actuator>
+</mujoco>
+"""
+
+
+def urdf(*, trunk: str | None = None) -> str:
+    """The same dog as a URDF, with a capsule tag, cylinders, visuals that are nowhere, and feet on fixed joints."""
+    trunk = trunk or f'<box size="{" ".join(str(2 * half) for half in TRUNK)}"/>'
+    missing = '<visual><geometry><mesh filename="package://nowhere/trunk.dae"/></geometry></visual>'
+
+    def link(name: str, mass: float, com: float, inertia: tuple[float, float, float], shape: str) -> str:
+        x, y, z = inertia
+        return f"""
+  <link name="{name}">
+    <inertial><origin xyz="0 0 {com}"/><mass value="{mass}"/>
+      <inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>
+    {shape}
+  </link>"""
+
+    def collision(shape: str, z: float = 0.0) -> str:
+        return f'<collision><origin xyz="0 0 {z}"/><geometry>{shape}</geometry></collision>'
+
+    def joint(name: str, kind: str, parent: str, child: str, xyz: str, limit: str) -> str:
+        return f"""
+  <joint name="{name}" type="{kind}">
+    <parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}"/><axis xyz="0 1 0"/>{limit}
+  </joint>"""
+
+    thigh = collision(f'<capsule radius="{THIGH[0]}" length="{THIGH[1]}"/>', -THIGH[1] / 2)
+    shank = collision(f'<cylinder radius="{SHANK[0]}" length="{SHANK[1] - 0.02}"/>', -(SHANK[1] - 0.02) / 2)
+    foot = collision(f'<sphere radius="{FOOT}"/>')
+    parts = [link("trunk", 8.0, 0.0, (0.03, 0.2, 0.2), missing + collision(trunk))]
+    for leg, (x, y) in LEGS.items():
+        parts += [
+            link(f"{leg}_thigh", 0.8, -0.07, (0.002, 0.002, 0.0005), thigh),
+            link(f"{leg}_shank", 0.3, -0.07, (0.0006, 0.0006, 0.0001), shank),
+            link(f"{leg}_foot", 0.1, 0.0, (0.00005, 0.00005, 0.00005), foot),
+            joint(
+                f"{leg}_hip", "revolute", "trunk", f"{leg}_thigh", f"{x} {y} 0",
+                '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>',
+            ),
+            joint(
+                f"{leg}_knee", "revolute", f"{leg}_thigh", f"{leg}_shank", "0 0 -0.15",
+                '<limit lower="-2.6" upper="-0.1" effort="30" velocity="30"/>',
+            ),
+            joint(f"{leg}_ankle", "fixed", f"{leg}_shank", f"{leg}_foot", "0 0 -0.15", ""),
+        ]  # fmt: skip
+    return f'<robot name="dog">{"".join(parts)}\n</robot>\n'
+
+
+SETTINGS = '''"""The dog's settings, as README describes them."""
+
+from sim.robot import RobotCfg
+
+LEGS = ("FL", "FR", "HL", "HR")
+
+ROBOT = RobotCfg(
+    name="dog",
+    model_file="{model}",
+    base_geoms=("trunk",),
+    foot_geoms=tuple(f"{{leg}}_foot" for leg in LEGS),
+    limb_geoms=tuple(f"{{leg}}_{{part}}" for leg in LEGS for part in ("thigh", "shank")),
+    joint_names=tuple(f"{{leg}}_{{joint}}" for leg in LEGS for joint in ("hip", "knee")),
+    default_joint_pos=(0.6, -1.2) * 4,
+    default_base_height=0.29,
+    footprint=(0.3, 0.2),
+    scan_x=(-0.4, -0.2, 0.0, 0.2, 0.4),
+    scan_y=(-0.2, 0.0, 0.2),
+    contact_force_limit=150.0,
+    penalties=("yaw_rate", "vel_x", "vel_y", "collision"),
+    collision_bit=False,{more}
+)
+'''
+GAINS = """
+    stiffness=(60.0,) * 8,
+    damping=(2.0,) * 8,
+    effort_limit=(30.0,) * 8,
+    armature=(0.01,) * 8,"""
+CONTROLLER = '''"""A trot by the clock: hips swing, and a leg that swings forward bends its knee."""
+
+import torch
+
+from sim.sensed import read_row
+
+
+class Trot:
+    """Diagonal legs in turn, three times a second; steers by shorter strides on the inner side."""
+
+    faultline_factory = True
+
+    def __init__(self, robot, device):
+        self.robot, self.step = robot, 0
+        self.phase = torch.tensor([0.0, 0.5, 0.5, 0.0], device=device)
+        self.left = torch.tensor([1.0, -1.0, 1.0, -1.0], device=device)
+
+    def reset(self):
+        self.step = 0
+
+    def __call__(self, row):
+        sensed = read_row(row, self.robot)
+        turn = 2.0 * torch.pi * (3.0 * self.step * self.robot.control_dt + self.phase)
+        self.step += 1
+        stride = 0.35 - 0.15 * self.left * sensed.command[:, 2:3]
+        hip = stride * torch.cos(turn)
+        knee = -0.5 * torch.clamp(torch.sin(turn), min=0.0).expand_as(hip)
+        legs = torch.stack([hip - 0.5 * knee, knee], dim=2)
+        return legs.flatten(1) / self.robot.action_scale
+'''
+
+
+def write_dog(folder: Path, *, model: str | None = None, suffix: str = "xml", more: str = "") -> Path:
+    """Writes dog.xml or dog.urdf, dog.py and dog_trot.py into a folder; returns the settings file.
+
+    Args:
+        folder: Where to write.
+        model: Text of the model; the MJCF with position actuators if left out.
+        suffix: Of the model's file.
+        more: Further lines of the settings, such as GAINS.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"dog.{suffix}").write_text(mjcf() if model is None else model)
+    (folder / "dog_trot.py").write_text(CONTROLLER)
+    file = folder / "dog.py"
+    file.write_text(SETTINGS.format(model=f"dog.{suffix}", more=more))
+    return file
+
+
+KINDS = {"mjcf": {}, "urdf": {"model": urdf(), "suffix": "urdf", "more": GAINS}}
+"""What :func:`write_dog` takes for each kind of model file."""
+
+
+def stl(half):
+    """A box as a binary STL file of twelve facets."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    facets = [corners[[a, *pair]] for a, b, c, d in quads for pair in ((b, c), (c, d))]
+    packed = [struct.pack("<12fH", 0, 0, 0, *np.ravel(facet), 0) for facet in facets]
+    return bytes(80) + struct.pack("<I", len(packed)) + b"".join(packed)
+
+
+def with_mesh(folder, kind):
+    """The dog with a trunk from an STL file, as a package: dog/meshes, dog/model."""
+    package = folder / "dog"
+    (package / "meshes").mkdir(parents=True)
+    (package / "meshes" / "trunk.stl").write_bytes(stl(TRUNK))
+    (package / "model").mkdir()
+    if kind == "mjcf":
+        text = mjcf(trunk='type="mesh" mesh="trunk"', asset='<mesh name="trunk" file="trunk.stl"/>')
+        text = text.replace("<compiler ", '<compiler meshdir="../meshes" ')
+        return write_dog(package / "model", model=text)
+    text = urdf(trunk='<mesh filename="package://dog/meshes/trunk.stl"/>')
+    return write_dog(package / "model", model=text, suffix="urdf", more=GAINS)
