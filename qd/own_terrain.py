@@ -1,5 +1,6 @@
 """A heightmap of a user's own, as the command line names it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -18,6 +19,7 @@ class Mapped(Protocol):
     @property
     def size(self) -> tuple[str, ...]:
         """Of the map along x and y [m], two words, or one that holds both as make hands them over; or none."""
+        ...
 
     @property
     def scale(self) -> float | None:
@@ -53,7 +55,7 @@ def read_own_terrain(path: Path, args: Mapped) -> OwnTerrain:
     return OwnTerrain(heights=as_terrain(heightmap), label=path.name, fitted=fitted(heightmap))
 
 
-def _size_of(words: tuple[str, ...]) -> tuple[float, ...] | None:
+def _size_of(words: Sequence[str]) -> tuple[float, ...] | None:
     sides = " ".join(words).replace(",", " ").split()
     try:
         return tuple(float(side) for side in sides) or None

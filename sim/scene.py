@@ -155,7 +155,7 @@ def _dress(spec: Any, robot: RobotCfg) -> None:
             geom = spec.geom(name)
             geom.rgba = list(_COLORS[role])
             sizes += [float(geom.size[0])] if role != "base" else []
-    radius = max(_LEAST_BONE, _BONE * float(np.median(sizes)))
+    radius = max(_LEAST_BONE, _BONE * float(np.median(sizes))) if sizes else _LEAST_BONE
     for body in spec.bodies:
         if body.parent is None or body.parent.name == "world":
             continue

@@ -16,10 +16,12 @@ from sim.recording import FRAME_ARRAYS, Recording, record
 from sim.recording_file import read_recording, write_recording
 from sim.rollout import Rollout
 from sim.terrain import uniform_random_genes
+from tests.sim.scenes import slope
 from tests.sim.test_rollout import FLAT, spike
 
 SHORT = CrossingCfg(max_duration_s=1.0, poll_every_s=0.5)
 SEEDS = np.array([5, 6], np.uint32)
+SLOPE = slope(np.deg2rad(4), np.deg2rad(-3))  # other along x than along y, and no mirror image of itself
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +32,7 @@ def rollout(anymal, device):
 @pytest.fixture(scope="module")
 def recorded(rollout, anymal):
     """Episodes that end in the middle of a control step, on a spike, beside some that last."""
-    return record(rollout, np.stack([spike(), FLAT]), SEEDS, policy=anymal.policy_file, labels=["spike", "flat"])
+    return record(rollout, np.stack([spike(), SLOPE]), SEEDS, policy=anymal.policy_file, labels=["spike", "slope"])
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,7 @@ def recording(recorded) -> Recording:
 
 def test_recorded_episodes_are_those_of_an_evaluation(rollout, recorded):
     result, recording = recorded
-    evaluated = rollout.evaluate(np.stack([spike(), FLAT]), SEEDS)
+    evaluated = rollout.evaluate(np.stack([spike(), SLOPE]), SEEDS)
     names = ("outcome", "penalties", "duration_s", "fallen", "final_position")
     for name in names if rollout.sim.device == "cpu" else ("outcome",):
         np.testing.assert_array_equal(getattr(result, name), getattr(evaluated, name))
@@ -57,7 +59,7 @@ def test_recorded_episodes_are_those_of_an_evaluation(rollout, recorded):
 
 
 def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anymal):
-    rollout.begin(np.stack([spike(), FLAT]), SEEDS)
+    rollout.begin(np.stack([spike(), SLOPE]), SEEDS)
     start = np.array(rollout.sim.joint_q.numpy()).reshape(2, 4, -1)
     np.testing.assert_array_equal(recording.base_position[:, :, 0], start[..., :3])
     np.testing.assert_array_equal(recording.base_quaternion[:, :, 0], start[..., [6, 3, 4, 5]])
@@ -73,7 +75,7 @@ def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anym
         array = getattr(recording, name)
         assert np.isnan(array[0, 0, recording.num_frames[0, 0] :]).all()
         assert np.isfinite(array[0, 0, : recording.num_frames[0, 0]]).all()
-    # A robot that walks on flat ground is carried by its feet: 50.6 kg, give or take its bouncing.
+    # A robot that walks is carried by its feet: 50.6 kg, give or take its bouncing.
     upward = recording.foot_force[1, :, 25:, :, 2].sum(axis=2).mean()
     mass = mujoco.MjModel.from_xml_path(str(anymal.model_file)).body_mass.sum()
     assert upward == pytest.approx(9.81 * mass, rel=0.1)
@@ -88,7 +90,7 @@ def test_feet_that_push_are_on_the_ground(recording, anymal):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         feet = np.array([data.geom(name).xpos for name in recording.foot_names])
-        gaps.append(feet[:, 2] - 0.03 - surface_heights(FLAT, feet[:, 0], feet[:, 1]))
+        gaps.append(feet[:, 2] - 0.03 - surface_heights(SLOPE, feet[:, 0], feet[:, 1]))
         forces.append(np.linalg.norm(recording.foot_force[1, 2, frame], axis=1))
     gaps, forces = np.array(gaps), np.array(forces)
     assert (forces > 50).sum() > 40
@@ -97,7 +99,7 @@ def test_feet_that_push_are_on_the_ground(recording, anymal):
 
 
 def test_of_all_episodes_some_may_be_recorded(rollout, recording, anymal):
-    terrains = np.stack([spike(), FLAT])
+    terrains = np.stack([spike(), SLOPE])
     result, some = record(rollout, terrains, SEEDS, policy=anymal.policy_file, replicas=[3, 1])
     assert result.outcome.shape == (2, 4) and some.outcome.shape == (2, 2)
     assert some.replicas.tolist() == [3, 1] and some.labels == ("terrain 0", "terrain 1")
@@ -134,9 +136,11 @@ def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
         assert type(value) is type(expected) and getattr(value, "dtype", 0) == getattr(expected, "dtype", 0)
     assert back.origin["policy_sha256"] == hashlib.sha256(anymal.policy_file.read_bytes()).hexdigest()
     assert {"policy", "command", "commit", "device", "versions", "seed", "date"} <= back.origin.keys()
-    assert back.labels == ("spike", "flat") and back.robot == "anymal" and back.genes is None
-    # 8 episodes of up to 51 frames of 44 numbers, and two height grids: half of it would be 4 bytes a number.
-    assert (tmp_path / "a.npz").stat().st_size < 100_000
+    assert back.labels == ("spike", "slope") and back.robot == "anymal" and back.genes is None
+    with np.load(tmp_path / "a.npz") as content:
+        assert {name: content[name].dtype for name in FRAME_ARRAYS} == FRAME_ARRAYS
+    # A frame is 3 + 4 + 6 floats of 4 bytes and 12 + 12 + 3 of 2; with two height grids no more than that.
+    assert (tmp_path / "a.npz").stat().st_size < 8 * 51 * 106 + 2 * 161 * 321 * 4
 
 
 def test_terrains_given_by_genes_are_kept_as_genes(rollout, anymal, tmp_path):
