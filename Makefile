@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare ablation train finetune calibrate replay reevaluate evaluate video export tables crosscheck bench test lint clean
+.PHONY: help setup archive compare ablation train finetune calibrate replay view reevaluate evaluate video export tables crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -44,6 +44,8 @@ FLAG_OFFSET := offset
 FLAG_RECORDING := recording
 FLAG_FORMATS := formats
 FLAG_EPISODES := episodes
+FLAG_PORT := port
+FLAG_HOST := host
 
 help: ## This list
 	@echo 'faultline: find the terrains that break a legged robot. Targets:'
@@ -70,11 +72,11 @@ help: ## This list
 	@echo '  INTERVALS=N      intervals of each ratio           archive'
 	@echo '  WITHOUT="A B"    penalties to leave out            archive'
 	@echo '  REPRODUCE=yes    evaluate elites again at the end: yes, no; auto: of preset paper  archive'
-	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay reevaluate'
+	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay view reevaluate'
 	@echo '                                                   video export'
-	@echo '  ELITE=N          which elite of it, 0 the worst    replay video export'
+	@echo '  ELITE=N          which elite of it, 0 the worst    replay view video export'
 	@echo '                   (video, export: or several, ELITE="0 3", or ELITE=all)'
-	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables, each NAME=SPEC          evaluate'
+	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables or the page, each NAME=SPEC   evaluate view'
 	@echo '  ARCHIVE=DIR      run of a search: elites to train on, and those held out to evaluate on   finetune evaluate'
 	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
 	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
@@ -85,6 +87,7 @@ help: ## This list
 	@echo '                   its file, or of a .json beside it, if left out                     evaluate video'
 	@echo '  RECORDING=FILE   film this instead of crossing     video'
 	@echo '  FORMATS="A B"    of npz, png, xml, stl; all        export'
+	@echo '  PORT=N HOST=ADDRESS   where the page is served: port 8080 for this machine alone      view'
 	@echo '  OUT=FILE         where to write the numbers        compare ablation calibrate evaluate crosscheck bench'
 	@echo '                   or the film, or the folder        video export'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
@@ -130,6 +133,9 @@ calibrate: setup ## Measure the penalty scales of ROBOT
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
 	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
+
+view: setup ## Show an archive in the browser: its elites, their terrains, and the robot that crosses them
+	$(BIN)/python -m qd.view --robot $(call quoted,$(ROBOT)) $(call flags,RUN POLICIES ELITE PORT HOST)
 
 reevaluate: setup ## Evaluate every elite of an archive again with 40 fresh episodes
 	$(BIN)/python -m qd.reevaluate --robot $(call quoted,$(ROBOT)) $(call flags,RUN DEVICE POLICY SEED WORKERS PROCESSES WORKER_LIMIT_S)
