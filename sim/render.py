@@ -93,6 +93,8 @@ class Renderer:
         self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg)
         self._context = open_context(width, height)
         self._robot = robot
+        geom = _mj.mjtObj.mjOBJ_GEOM.value
+        self._feet = [_mj.mj_name2id(self.model, geom, name) for name in robot.foot_geoms]
         self._data = [_mj.MjData(self.model)]
         self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
@@ -143,16 +145,17 @@ class Renderer:
         for number, pose in enumerate(ghosts, 1):
             self._add_ghost(self._posed(number, pose))
         if foot_force is not None:
-            for name, force in zip(self._robot.foot_geoms, foot_force, strict=True):
-                self._add_arrow(data.geom(name).xpos, np.asarray(force, dtype=np.float64))
+            for index, force in zip(self._feet, foot_force, strict=True):
+                if index >= 0:
+                    self._add_arrow(data.geom_xpos[index], np.asarray(force, dtype=np.float64))
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         return self._image[::-1].copy()  # OpenGL's lowest row is first
 
     def foot_positions(self, qpos: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Centres of the foot geoms in a pose, world-local [m], shape (num_feet, 3)."""
-        data = self._posed(0, qpos)
-        return np.array([data.geom(name).xpos for name in self._robot.foot_geoms])
+        """Centres of the foot geoms in a pose, world-local [m], shape (num_feet, 3); NaN of what no file names."""
+        centres = self._posed(0, qpos).geom_xpos
+        return np.array([centres[index] if index >= 0 else np.full(3, np.nan) for index in self._feet])
 
     def _posed(self, number: int, qpos: NDArray[np.floating]) -> Any:
         while len(self._data) <= number:

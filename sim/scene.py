@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sim.crossing import CrossingCfg
 from sim.hfield import as_hfield
 from sim.robot import RobotCfg
+from sim.robot_spec import robot_spec
 from sim.terrain import SPACING
 
 _mj: Any = mujoco  # its types are not written down
@@ -64,12 +65,9 @@ def scene_model(
         cfg: The crossing, for its goal.
 
     Raises:
-        ValueError: If MuJoCo cannot read the robot's file.
+        ValueError: If MuJoCo cannot read the robot's file, or finds other joints in it.
     """
-    try:
-        spec = _mj.MjSpec.from_file(str(robot.model_file))
-    except Exception as error:  # MuJoCo's own type has no name
-        raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {error}") from None
+    spec = robot_spec(robot)
     for geom in spec.worldbody.geoms:
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
     if not len(spec.meshes):
@@ -79,13 +77,11 @@ def scene_model(
     _add_goal(spec, heights, cfg or CrossingCfg())
     _add_light(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    model = spec.compile()
+    try:
+        model = spec.compile()
+    except Exception as error:  # MuJoCo's own type has no name
+        raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {error}") from None
     model.vis.map.shadowclip = _SHADOWED / model.stat.extent
-    if model.nq != 7 + robot.num_joints:
-        raise ValueError(
-            f"robot '{robot.name}': {robot.model_file} has {model.nq} coordinates for MuJoCo, expected "
-            f"{7 + robot.num_joints}: a free base and {robot.num_joints} joints"
-        )
     texture = model.texture(_GROUND)
     first = int(texture.adr[0])
     # The asset lies on its side (sim.hfield): the rows of its texture run along x, its columns along y.
@@ -152,7 +148,8 @@ def _dress(spec: Any, robot: RobotCfg) -> None:
     sizes = []
     for role, names in roles.items():
         for name in names:
-            geom = spec.geom(name)
+            if (geom := spec.geom(name)) is None:
+                continue  # a shape that its file does not name
             geom.rgba = list(_COLORS[role])
             sizes += [float(geom.size[0])] if role != "base" else []
     radius = max(_LEAST_BONE, _BONE * float(np.median(sizes))) if sizes else _LEAST_BONE

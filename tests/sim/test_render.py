@@ -6,10 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
+from sim.crossing import CrossingCfg
 from sim.mujoco_c import surface_heights
+from sim.recording import record
 from sim.render import Camera, Renderer, open_context
+from sim.robot import get_robot
+from sim.rollout import Rollout
 from sim.scene import MARGIN_NODES, ground_paint, scene_model
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from tests.sim.dogs import KINDS, write_dog
 
 SIZE = (640, 320)
 
@@ -128,6 +133,23 @@ def test_bones_join_a_robot_of_bare_shapes(opengl, robot):
     np.testing.assert_allclose(feet, [data.geom(name).xpos for name in robot.foot_geoms], atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_robot_of_ones_own_is_shown_as_the_simulation_has_it(opengl, tmp_path, device, kind):
+    dog = get_robot(str(write_dog(tmp_path, **KINDS[kind])))
+    rollout = Rollout(dog, str(tmp_path / "dog_trot.py") + ":Trot", num_terrains=1, num_replicas=4, device=device,
+                      cfg=CrossingCfg(max_duration_s=0.4))  # fmt: skip
+    _, recording = record(rollout, np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([1]), policy="trot")
+    with Renderer(dog, recording.heights[0], width=64, height=64) as renderer:
+        feet = np.array([renderer.foot_positions(pose) for pose in recording.qpos(0, 0)])
+        renderer.render(
+            recording.qpos(0, 0)[0], Camera(target=(2, 4, 0), distance=2), foot_force=recording.foot_force[0, 0, 9]
+        )
+    assert feet.shape == (21, 4, 3)
+    pushing = np.linalg.norm(recording.foot_force[0, 0], axis=2) > 15
+    assert pushing.sum() > 10
+    assert np.abs(feet[pushing][:, 2] - 0.025).max() < 0.01  # spheres of 25 mm on level ground
+
+
 def test_a_margin_is_shown_beyond_the_terrain(anymal, ground):
     model = scene_model(anymal, ground, width=64, height=64)
     assert model.hfield_nrow[0] == NUM_COLS + 2 * MARGIN_NODES and MARGIN_NODES * SPACING == 2.0
@@ -142,7 +164,7 @@ def test_what_cannot_be_shown_is_named(anymal, tmp_path, monkeypatch):
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
     )
     bare = dataclasses.replace(anymal, model_file=tmp_path / "body.xml", base_geoms=(), limb_geoms=(), foot_geoms=())
-    with pytest.raises(ValueError, match="has 7 coordinates for MuJoCo, expected 19"):
+    with pytest.raises(ValueError, match=r"has joints  for MuJoCo, expected a free base and LF_HAA, "):
         scene_model(bare, np.zeros((NUM_ROWS, NUM_COLS)), width=8, height=8)
     monkeypatch.setenv("MUJOCO_GL", "no_such_way")
     with pytest.raises(ValueError, match=r"'no_such_way' cannot be had here: ModuleNotFoundError.*libegl1"):

@@ -1,0 +1,49 @@
+"""A robot's file as a MuJoCo specification, to be shown: its own file, MJCF or URDF, with a free base."""
+
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import mujoco
+
+from sim.model_files import read_model_files
+from sim.robot import RobotCfg
+
+_mj: Any = mujoco  # its types are not written down
+
+
+def robot_spec(robot: RobotCfg) -> Any:
+    """An ``MjSpec`` with the robot's joints in the robot's order behind that of its base.
+
+    Shapes of a URDF are named as :func:`sim.robot_model.build_robot` names them, by their link.
+
+    Args:
+        robot: Robot settings.
+
+    Raises:
+        ValueError: If MuJoCo cannot read the file, or finds other joints.
+    """
+    try:
+        files = read_model_files(robot.model_file)
+        spec = _urdf_spec(files.root) if files.is_urdf else _mj.MjSpec.from_file(str(robot.model_file))
+    except Exception as error:  # MuJoCo's own type has no name
+        reason = " ".join(str(error).split())
+        raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {reason}") from None
+    found = tuple(joint.name for joint in spec.joints if joint.type != _mj.mjtJoint.mjJNT_FREE)
+    if found != robot.joint_names or len(spec.joints) != len(found) + 1:
+        raise ValueError(
+            f"robot '{robot.name}': {robot.model_file} has joints {', '.join(found)} for MuJoCo, expected a free base "
+            f"and {', '.join(robot.joint_names)}"
+        )
+    return spec
+
+
+def _urdf_spec(root: ET.Element) -> Any:
+    extension = ET.SubElement(root, "mujoco")
+    ET.SubElement(extension, "compiler", strippath="false", fusestatic="false", discardvisual="false")
+    spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    spec.worldbody.first_body().add_freejoint()
+    for body in spec.bodies:
+        geoms = list(body.geoms)
+        for number, geom in enumerate(geoms):
+            geom.name = body.name if len(geoms) == 1 else f"{body.name}_{number}"
+    return spec
