@@ -76,12 +76,16 @@ class Skeleton:
         """What is to be seen of it, in the file's order."""
 
     def geom(self, name: str) -> Geom:
-        """A shape by its name, to be seen or not.
+        """A shape by its name, to be seen or not; one without a name goes by that of its body.
 
         Raises:
-            KeyError: If there is none of that name.
+            ValueError: If there is none of that name.
         """
-        return self._geom(self._model.geom(name).id)
+        model = self._model
+        names = [model.geom(k).name or model.body(model.geom_bodyid[k]).name for k in range(model.ngeom)]
+        if name not in names:
+            raise ValueError(f"no geom named {name}: the robot's file has {', '.join(filter(None, names))}")
+        return self._geom(names.index(name))
 
     def _shown(self) -> list[int]:
         """Geoms on a body, without those of the groups that MuJoCo hides, unless there are no others."""

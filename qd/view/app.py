@@ -61,13 +61,14 @@ class App:
         self._curves: Curves | None = None
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self.page = Page(host=show.cfg.host, port=show.cfg.port, label="faultline", verbose=False)
-        self._recorder = Recorder(show.cfg.robot, lambda report: self.emit("report", report))
+        self._recorder = Recorder(show.robot, lambda report: self.emit("report", report))
         self._open()
 
     def _open(self) -> None:
         gui, show = self.page.gui, self._show
         gui.configure_theme(show_logo=False, show_share_button=False)
-        self._scene = Scene(self.page, body_meshes(self._skeleton, show.robot), CrossingCfg())
+        bodies, num_feet = body_meshes(self._skeleton, show.robot), len(show.robot.foot_geoms)
+        self._scene = Scene(self.page, bodies, num_feet, CrossingCfg())
         title = f"**{show.robot.name}** · `{show.found.folder}` · {len(self._elites):,} elites"
         self._list = ArchivePanel(self.page, self._elites, title, self.emit)
         self._panel = CrossingPanel(self.page, list(show.controllers), show.cfg.replicas, self.emit)

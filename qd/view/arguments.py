@@ -34,7 +34,7 @@ class ViewCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the Python file of your own."""
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, or if there is none the published one under results/."""
     policies: tuple[str, ...] = ()
@@ -78,8 +78,8 @@ def show_of(cfg: ViewCfg) -> Show:
     from sim.named_controllers import controllers_of
     from sim.robot import get_robot
 
-    robot = get_robot(cfg.robot)
-    found = archive_of_robot(robot.name, cfg.run or _newest_or_published(robot.name))
+    found = archive_of_robot(cfg.robot, cfg.run or _newest_or_published(get_robot(cfg.robot)))
+    robot = found.robot
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: let its search go on, or give another --run")
     if not 0 <= cfg.elite < len(found.archive):
@@ -90,23 +90,23 @@ def show_of(cfg: ViewCfg) -> Show:
     if any(map(str.strip, cfg.policies)):
         controllers = controllers_of(cfg.policies, robot)
         for policy in controllers.values():
-            check_policy(policy, cfg.robot, "cpu")
+            check_policy(policy, robot, "cpu")
     else:
         controllers = {"searched": policy_of(found, robot, None)}
         try:
-            check_policy(controllers["searched"], cfg.robot, "cpu")
+            check_policy(controllers["searched"], robot, "cpu")
         except ValueError as error:  # the terrains can be looked at all the same
             controllers, note = {}, f"{error}; name a controller with POLICIES to see crossings"
     published = _ROOT / "results" / robot.name / "view"
     return Show(cfg=cfg, found=found, robot=robot, controllers=controllers, note=note, published=published)
 
 
-def _newest_or_published(robot: str) -> Path:
+def _newest_or_published(robot: "RobotCfg") -> Path:
     """The newest run of a robot, else its published one."""
     try:
         return newest_run(robot)
     except FileNotFoundError:
-        published = _ROOT / "results" / robot / "archive"
+        published = _ROOT / "results" / robot.name / "archive"
         if not published.is_dir():
             raise
         return published

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from qd.replay import REPLAY_STREAM
 from qd.workers import episode_seeds
 from sim.files import prepare_output
+from sim.own_robot import robot_digest
 from sim.provenance import code_fingerprint, controller_hash
 from sim.recording import Recording
 from sim.recording_file import read_recording, write_recording
@@ -58,7 +59,7 @@ class Crossings:
             ValueError: If nothing can be written to ``cache``.
         """
         self._robot = robot
-        self._code = code_fingerprint(_ROOMS)
+        self._code = f"{code_fingerprint(_ROOMS)} {robot_digest(robot)}"
         self._cache, self._published = cache, published
         self._last: tuple[Wanted, Recording] | None = None
         prepare_output(cache / "recording.npz")

@@ -72,10 +72,10 @@ class Elites:
         return f"{hits / count:.0%} ({100 * low:.0f}-{100 * high:.0f})".replace("%", " %")
 
     def line(self, number: int) -> str:
-        """An elite on one line of the list."""
+        """An elite on one line of the list: number, fitness, rates."""
         fitness = self.axis("fitness").values[number]
         collided, goal = (self.rate_text(name, number) for name in ("collision_rate", "goal_rate"))
-        return f"{number}:  fitness {fitness:.1f} · collision {collided} · goal {goal}"
+        return f"{number}: {fitness:.1f} · collision {collided} · goal {goal}"
 
     def details(self, number: int) -> str:
         """All that the archive says of an elite, as Markdown."""

@@ -16,7 +16,7 @@ _LOW, _LEVEL, _HIGH = (np.array(color) for color in ((40, 84, 138), (214, 210, 1
 _LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
 _LINE_EVERY = 1.0  # [m]
 _LINE_DARKNESS = 0.84
-_BASE, _LIMB, _FOOT, _BONE = (88, 98, 116), (140, 150, 166), (230, 92, 34), (182, 188, 198)
+_BASE, _LIMB, _FOOT, _BONE = (112, 124, 146), (150, 160, 176), (230, 92, 34), (182, 188, 198)
 _BONE_RADIUS = 0.35  # in that of the robot's thinnest limb or foot
 _SEGMENTS = 20  # round a capsule
 

@@ -47,6 +47,7 @@ class ArchivePanel:
                 self._on_click("Free all axes", "clear", None)
 
     def _add_list(self) -> None:
+        self._gui.add_markdown("Elite: fitness · base collision · goal reached, with 95 % intervals")
         self._lines = [self._on_click("", "line", k) for k in range(PAGE)]
         pages = self._gui.add_button_group("Page", ("first", "previous", "next", "last"))
         turns = {"first": -len(self._elites), "previous": -1, "next": 1, "last": len(self._elites)}
@@ -78,7 +79,7 @@ class ArchivePanel:
         kept, listed = selection.kept, selection.listed
         self._plot.content = axes_svg(self._elites, kept, selection.ranges, selection.picked)
         pages = f" · page {selection.page + 1} of {selection.num_pages}" if len(kept) else ""
-        self._count.content = f"**{len(kept):,}** of {len(self._elites):,} elites in the ranges, worst first{pages}"
+        self._count.content = f"**{len(kept):,}** of {len(self._elites):,} elites in the ranges{pages}"
         for k, button in enumerate(self._lines):
             there = k < len(listed)
             button.visible = there
@@ -151,7 +152,7 @@ class CrossingPanel:
         self._replica.value = replica + 1
         for handle in (self._play, self._time):
             handle.disabled = not enabled
-        self._time.max = max(clock.duration_s, _CONTROL_DT)
+        self._time.max = max(round(clock.duration_s, 2), _CONTROL_DT)
         self.show_time(clock)
 
     def show_time(self, clock: Clock) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from qd.view.crossings import Wanted
 from qd.worker_process import EvaluatorError, WorkerProcess
 from sim.recording import Recording
+from sim.robot import RobotCfg
 
 MAX_PROCESSES = 3
 """Controllers whose simulation is kept ready, one process each."""
@@ -35,8 +36,8 @@ class Report:
 class RecorderCfg:
     """What a recording process builds."""
 
-    robot: str
-    """As :func:`sim.robot.get_robot` takes it."""
+    robot: RobotCfg
+    """Robot settings."""
     policy: str
     """The controller."""
     replicas: int
@@ -47,12 +48,10 @@ class _Recording:
     """A simulation of one terrain that records all its episodes."""
 
     def __init__(self, cfg: RecorderCfg) -> None:
-        from sim.robot import get_robot
         from sim.rollout import Rollout
 
         self._policy = cfg.policy
-        robot = get_robot(cfg.robot)
-        self._rollout = Rollout(robot, cfg.policy, num_terrains=1, num_replicas=cfg.replicas, device="cpu")
+        self._rollout = Rollout(cfg.robot, cfg.policy, num_terrains=1, num_replicas=cfg.replicas, device="cpu")
 
     def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[int, int], None] | None = None) -> Any:
         """The recording of the crossings of one terrain."""
@@ -72,11 +71,11 @@ Build = Callable[[RecorderCfg, int], Any]
 class Recorder:
     """Records the crossings asked for last; what was asked for before and is not begun is dropped."""
 
-    def __init__(self, robot: str, report: Callable[[Report], None], *, build: Build = build_recording) -> None:
+    def __init__(self, robot: RobotCfg, report: Callable[[Report], None], *, build: Build = build_recording) -> None:
         """Start to wait for work.
 
         Args:
-            robot: As :func:`sim.robot.get_robot` takes it.
+            robot: Robot settings.
             report: Called in another thread, with every step forward.
             build: Makes the simulation; a module-level function, since processes import it by name.
         """

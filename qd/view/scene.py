@@ -27,12 +27,15 @@ Points = NDArray[np.floating]
 class Scene:
     """What stands in the 3-D view."""
 
-    def __init__(self, server: viser.ViserServer, bodies: Sequence[Mesh | None], cfg: CrossingCfg) -> None:
+    def __init__(
+        self, server: viser.ViserServer, bodies: Sequence[Mesh | None], num_feet: int, cfg: CrossingCfg
+    ) -> None:
         """Put the robot there, unseen.
 
         Args:
             server: The page.
             bodies: Shape of each body in its own frame, None of one without.
+            num_feet: Arrows of forces there are at most.
             cfg: The crossing, for start and goal.
         """
         self._server, self._cfg = server, cfg
@@ -45,8 +48,9 @@ class Scene:
             None if mesh is None else scene.add_mesh_trimesh(f"/robot/{k}", mesh.as_trimesh(), receive_shadow=False)
             for k, mesh in enumerate(bodies)
         ]
-        self._forces: Any = None
-        self._command: Any = None
+        # A node an arrow: the browser does not bear that their number in one changes.
+        self._forces = [self._add_arrow(f"/forces/{k}", _FORCE_COLOR) for k in range(num_feet)]
+        self._command = self._add_arrow("/command", _COMMAND_COLOR)
         self._paths: Any = None
         self._followed: Points | None = None
         self._follow = False
@@ -96,11 +100,9 @@ class Scene:
         """Show the terrain alone."""
         self._robot.visible = False
         self._followed = None
-        for name in ("_forces", "_command", "_paths"):
-            handle = getattr(self, name)
+        for handle in (*self._forces, self._command, self._paths):
             if handle is not None:
-                handle.remove()
-                setattr(self, name, None)
+                handle.visible = False
 
     def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], tuple[int, int, int]]]) -> None:
         """Show the way of the base in every episode.
@@ -108,9 +110,6 @@ class Scene:
         Args:
             paths: Points [m], shape (num_points, 3), and colour of each.
         """
-        if self._paths is not None:
-            self._paths.remove()
-            self._paths = None
         segments = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
         colors = [
             np.tile(np.array(color, np.uint8), (len(part), 2, 1))
@@ -132,10 +131,7 @@ class Scene:
         """Go near the robot and along with it from now on, or stay."""
         self._follow = follow
         if follow and self._followed is not None:
-            for client in self._server.get_clients().values():
-                with client.atomic():
-                    client.camera.position = self._followed + _BEHIND
-                    client.camera.look_at = self._followed
+            self._go_near(self._followed)
 
     def show_frame(self, crossing: Crossing, frame: int) -> None:
         """Put the robot where it is at a frame of a crossing, with its forces and command."""
@@ -145,34 +141,41 @@ class Scene:
                 if handle is not None:
                     handle.position = tuple(crossing.positions[frame, k])
                     handle.wxyz = tuple(crossing.quaternions[frame, k])
-            arrows = crossing.forces[frame]
-            seen = np.any(arrows[:, 0] != arrows[:, 1], axis=1) & self.show_forces
-            self._forces = self._arrows("/forces", self._forces, arrows[seen], _FORCE_COLOR)
-            command = crossing.command[frame][None]
-            moving = np.any(command[:, 0] != command[:, 1], axis=1)
-            self._command = self._arrows("/command", self._command, command[moving], _COMMAND_COLOR)
+            for handle, arrow in zip(self._forces, crossing.forces[frame], strict=True):
+                _set_arrow(handle, arrow, shown=self.show_forces)
+            _set_arrow(self._command, crossing.command[frame], shown=True)
         self._go_along(crossing.positions[frame, 0])
 
-    def _arrows(self, name: str, handle: Any, points: Points, color: tuple[int, int, int]) -> Any:
-        """Arrows in the place of those that were there, if any."""
-        if not len(points):
-            if handle is not None:
-                handle.visible = False
-            return handle
-        if handle is None:
-            add = self._server.scene.add_arrows
-            return add(name, points, color, shaft_radius=0.02, head_radius=0.05, head_length=0.1)
-        handle.points = points.astype(np.float32)
-        handle.visible = True
-        return handle
+    def _add_arrow(self, name: str, color: tuple[int, int, int]) -> Any:
+        """An arrow that is not to be seen yet."""
+        nowhere = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+        add = self._server.scene.add_arrows
+        return add(name, nowhere, color, shaft_radius=0.02, head_radius=0.05, head_length=0.1, visible=False)
 
     def _go_along(self, base: Points) -> None:
         """Move every visitor's camera as the base has moved, if asked to follow."""
-        if self._follow and self._followed is not None:
-            moved = base - self._followed
+        before, self._followed = self._followed, base.copy()
+        if not self._follow:
+            return
+        if before is None:
+            self._go_near(base)
+        else:
             for client in self._server.get_clients().values():
-                client.camera.position = client.camera.position + moved  # what it looks at goes with it
-        self._followed = base.copy()
+                client.camera.position = client.camera.position + (base - before)  # what it looks at goes with it
+
+    def _go_near(self, base: Points) -> None:
+        for client in self._server.get_clients().values():
+            with client.atomic():
+                client.camera.position = base + _BEHIND
+                client.camera.look_at = base
+
+
+def _set_arrow(handle: Any, arrow: Points, *, shown: bool) -> None:
+    """Put an arrow from one point to another, shape (2, 3); one without length is not shown."""
+    shown = shown and bool(np.any(arrow[0] != arrow[1]))
+    if shown:
+        handle.points = arrow[None].astype(np.float32)
+    handle.visible = shown
 
 
 def _heights_at(heights: Points, places: NDArray[np.floating]) -> Points:
