@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare ablation train finetune calibrate replay view reevaluate evaluate video export tables crosscheck bench test lint clean
+.PHONY: help setup archive compare ablation train finetune calibrate replay report view reevaluate evaluate video export tables crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -44,6 +44,7 @@ FLAG_OFFSET := offset
 FLAG_RECORDING := recording
 FLAG_FORMATS := formats
 FLAG_EPISODES := episodes
+FLAG_TABLES := tables
 FLAG_PORT := port
 FLAG_HOST := host
 
@@ -53,12 +54,12 @@ help: ## This list
 	@echo
 	@echo 'Variables (left out: the default of the command):'
 	@echo '  ROBOT=anymal     which robot'
-	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare ablation train finetune calibrate replay reevaluate'
+	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare ablation train finetune calibrate replay report reevaluate'
 	@echo '                                                   evaluate video crosscheck bench'
 	@echo '  PRESET=small     size of the search: paper, small  archive compare ablation'
 	@echo '  ITERATIONS=N     stop after N iterations           archive compare ablation train finetune'
 	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, an'
-	@echo '                   ONNX file or module:callable      archive compare ablation finetune calibrate replay reevaluate'
+	@echo '                   ONNX file or module:callable      archive compare ablation finetune calibrate replay report reevaluate'
 	@echo '                                                   evaluate video crosscheck'
 	@echo '  SEED=N           seed of everything drawn          archive compare ablation train finetune calibrate reevaluate'
 	@echo '                                                   evaluate video crosscheck bench'
@@ -72,7 +73,7 @@ help: ## This list
 	@echo '  INTERVALS=N      intervals of each ratio           archive'
 	@echo '  WITHOUT="A B"    penalties to leave out            archive'
 	@echo '  REPRODUCE=yes    evaluate elites again at the end: yes, no; auto: of preset paper  archive'
-	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay view reevaluate'
+	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay report view reevaluate'
 	@echo '                                                   video export'
 	@echo '  ELITE=N          which elite of it, 0 the worst    replay view video export'
 	@echo '                   (video, export: or several, ELITE="0 3", or ELITE=all)'
@@ -80,15 +81,16 @@ help: ## This list
 	@echo '  ARCHIVE=DIR      run of a search: elites to train on, and those held out to evaluate on   finetune evaluate'
 	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
 	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
-	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate'
+	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate report'
 	@echo '  TERRAIN=FILE     cross a heightmap of your own: an .npz with heights (rows along y) [m], or a .png of'
 	@echo '                   8 or 16 bits seen from above      evaluate video'
 	@echo '  SIZE="X Y" SCALE=M OFFSET=M   of that map: metres along x and y; a gray level; gray level 0; those of'
 	@echo '                   its file, or of a .json beside it, if left out                     evaluate video'
 	@echo '  RECORDING=FILE   film this instead of crossing     video'
 	@echo '  FORMATS="A B"    of npz, png, xml, stl; all        export'
+	@echo '  TABLES=FILE      tables of make evaluate to show; results/ROBOT/tables.json         report'
 	@echo '  PORT=N HOST=ADDRESS   where the page is served: port 8080 for this machine alone      view'
-	@echo '  OUT=FILE         where to write the numbers        compare ablation calibrate evaluate crosscheck bench'
+	@echo '  OUT=FILE         where to write the numbers        compare ablation calibrate report evaluate crosscheck bench'
 	@echo '                   or the film, or the folder        video export'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
@@ -133,6 +135,9 @@ calibrate: setup ## Measure the penalty scales of ROBOT
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
 	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
+
+report: setup ## Write one HTML page about an archive: how the controller breaks, on which terrains, in figures
+	$(BIN)/python -m qd.html_report --robot $(call quoted,$(ROBOT)) $(call flags,RUN TABLES OUT DEVICE POLICY EPISODES)
 
 view: setup ## Show an archive in the browser: its elites, their terrains, and the robot that crosses them
 	$(BIN)/python -m qd.view --robot $(call quoted,$(ROBOT)) $(call flags,RUN POLICIES ELITE PORT HOST)

@@ -23,6 +23,7 @@ ARGUMENTS = {
     "compare": ("qd.compare_arguments", "Arguments"),
     "calibrate": ("qd.calibrate", "CalibrateCfg"),
     "replay": ("qd.replay", "ReplayCfg"),
+    "report": ("qd.html_report.material", "HtmlReportCfg"),
     "reevaluate": ("qd.reevaluate", "ReevaluateCfg"),
     "evaluate": ("qd.cross", "CrossCfg"),  # with TERRAIN
     "video": ("qd.video", "VideoCfg"),

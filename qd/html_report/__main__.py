@@ -65,16 +65,11 @@ def _with_crossings(shown: Shown, make_recorder: Callable[[Place], Record]) -> S
     """Crosses the elites to be shown, and the terrains to be shown before and after."""
     material = shown.material
     device = resolve_device(material.cfg.device)
-    try:
-        check_policy(material.policy, material.cfg.robot, device)
-    except ValueError as error:
-        if material.cfg.policy is not None:
-            raise
+    if reason := _uncrossable(material, device):
         changes = None if material.tables is None else Changes(reason="The controller of the search cannot be loaded.")
-        reason = f"Left out: the controller of the search cannot be loaded: {error}. Name one with POLICY="
         return replace(shown, changes=changes, not_crossed=reason)
     place = Place(
-        robot=material.cfg.robot,
+        robot=material.robot,
         device=device,
         episodes=material.cfg.episodes,
         folder=material.out.with_name(f"{material.out.stem}-recordings"),
@@ -87,6 +82,22 @@ def _with_crossings(shown: Shown, make_recorder: Callable[[Place], Record]) -> S
         return replace(shown, crossed=crossed)
     changes = changes_of(material.tables)
     return replace(shown, crossed=crossed, changes=changes, pairs=_pairs(material, changes, place, cross))
+
+
+def _uncrossable(material: Material, device: str) -> str:
+    """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
+    if material.is_unnamed_code:
+        return (
+            f"Left out: the run was searched with the controller {material.searched}, which is code, and no code runs "
+            f"that the command line does not name: name it with POLICY={material.searched}"
+        )
+    try:
+        check_policy(material.policy, material.robot, device)
+    except ValueError as error:
+        if material.cfg.policy is not None:
+            raise
+        return f"Left out: the controller of the search cannot be loaded: {error}. Name one with POLICY="
+    return ""
 
 
 def _elite_wanted(material: Material, number: int) -> Wanted:

@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.progress import share_bar
+from qd.replay import REPLAY_STREAM
 from qd.workers import episode_seeds
+from sim.own_robot import robot_digest
 from sim.provenance import code_fingerprint, controller_hash
 from sim.recording import Recording, record
 from sim.recording_file import read_recording, write_recording
+from sim.robot import RobotCfg
 
-_REPLAY_STREAM = 2  # the episodes of `make replay ELITE=N`, so that the page and the replay show the same
 _SEED = 0
 _ROOMS = ("kernels", "sim")
 
@@ -38,8 +40,8 @@ class Wanted:
 
     @property
     def seeds(self) -> NDArray[np.uint32]:
-        """Seed of its episodes, shape (1,); the same whoever crosses it."""
-        return episode_seeds(_SEED, self.number, 1, stream=_REPLAY_STREAM)
+        """Seed of its episodes, shape (1,): those of `make replay ELITE=N`, whoever crosses it."""
+        return episode_seeds(_SEED, self.number, 1, stream=REPLAY_STREAM)
 
 
 Record = Callable[[Wanted, Callable[[float], None]], Recording]
@@ -50,7 +52,7 @@ Record = Callable[[Wanted, Callable[[float], None]], Recording]
 class Place:
     """Where and how often terrains are crossed."""
 
-    robot: str
+    robot: RobotCfg
     device: str
     """Warp device name."""
     episodes: int
@@ -65,7 +67,6 @@ def recorder(place: Place) -> Record:
     Args:
         place: Where and how often.
     """
-    from sim.robot import get_robot
     from sim.rollout import Rollout
 
     rollouts: dict[str, Rollout] = {}
@@ -73,7 +74,7 @@ def recorder(place: Place) -> Record:
     def cross(wanted: Wanted, progress: Callable[[float], None]) -> Recording:
         if wanted.policy not in rollouts:
             rollouts[wanted.policy] = Rollout(
-                get_robot(place.robot), wanted.policy, num_terrains=1, num_replicas=place.episodes, device=place.device
+                place.robot, wanted.policy, num_terrains=1, num_replicas=place.episodes, device=place.device
             )
         _, recording = record(
             rollouts[wanted.policy], wanted.genes[None], wanted.seeds, policy=wanted.policy, labels=[wanted.label],
@@ -112,7 +113,8 @@ def cross_all(wanted: Sequence[Wanted], place: Place, cross: Record) -> list[Rec
 
 def _files_of(wanted: Sequence[Wanted], place: Place) -> list[Path]:
     kind = "cuda" if place.device.startswith("cuda") else "cpu"  # which differ in their last bits
-    common = [place.robot, place.episodes, kind, code_fingerprint(_ROOMS)]
+    own = None if place.robot.settings_file is None else robot_digest(place.robot)
+    common = [place.robot.name, own, place.episodes, kind, code_fingerprint(_ROOMS)]
     files = []
     for one in wanted:
         genes = hashlib.sha256(one.genes.astype(np.float32).tobytes()).hexdigest()

@@ -6,8 +6,9 @@ from qd.html_report.outcomes import ENDS, Crossed, Rate
 from qd.html_report.page import Absent, Block, Heading, Section, Table, Text
 from qd.html_report.shown import Shown, counted, percent, picture
 from qd.html_report.terrain_figures import draw_crossing, draw_maps
+from qd.next_commands import make_command
+from qd.replay import PENALTY_UNITS
 
-_UNITS = {"yaw_rate": "rad", "vel_x": "m", "vel_y": "m", "contact_force": "N s", "stumble": "s", "collision": "s"}
 _ARRIVED = next(iter(ENDS.values()))
 
 
@@ -21,8 +22,8 @@ def modes_section(shown: Shown) -> Section:
     modes, elites = shown.modes, shown.elites
     largest = max(modes.modes, key=lambda mode: len(mode.members))
     text = (
-        f"The {counted(len(elites), 'elite')} fall into {counted(len(modes.modes), 'group')} by how the robot "
-        f"struggles and how its crossings end. The largest, group {largest.number}, has {len(largest.members):,} "
+        f"The {counted(len(elites), 'elite')} fall into {counted(len(modes.modes), 'mode')} by how the robot "
+        f"struggles and how its crossings end. The largest, mode {largest.number}, has {len(largest.members):,} "
         f"({percent(len(largest.members) / len(elites))}): {_described(largest)}."
     )
     section = Section("Failure modes", "modes", [Text(text), Text(_how(shown))])
@@ -38,7 +39,7 @@ def modes_section(shown: Shown) -> Section:
     arrived = [shown.crossed[mode.typical].rates[_ARRIVED] for mode in modes.modes]
     reached = "; ".join(f"mode {mode.number}: {rate}" for mode, rate in zip(modes.modes, arrived, strict=True))
     section.blocks += [
-        Text(f"A typical terrain of each, the elite nearest to all others of its group, crossed again. Robots that "
+        Text(f"A typical terrain of each, the elite nearest to all others of its mode, crossed again. Robots that "
              f"reached the goal, with 95 % intervals: {reached}."),
         picture("modes-terrains", draw_maps(typical, f"{shown.material.archive.robot}: a typical terrain of each mode"),
                 "Height map of a typical terrain of each mode with the robots' paths"),
@@ -48,14 +49,14 @@ def modes_section(shown: Shown) -> Section:
 
 def _described(mode: Mode) -> str:
     return (
-        f"most often the robot {_verb(mode.ending)} (goal {percent(mode.goal_rate)}, base collision "
+        f"the robot {_ending(mode)} (goal {percent(mode.goal_rate)}, base collision "
         f"{percent(mode.collision_rate)}, neither {percent(mode.other_rate)}), and the share that stands out is that "
         f"of {label_of(mode.marked_by)}"
     )
 
 
-def _verb(ending: str) -> str:
-    return "strikes the terrain with its base" if ending.startswith("base") else ending
+def _ending(mode: Mode) -> str:
+    return mode.ending.replace("strikes the terrain", "strikes the terrain with its base")
 
 
 def _how(shown: Shown) -> str:
@@ -71,12 +72,12 @@ def _how(shown: Shown) -> str:
     taken = len(shown.modes.modes)
     return (
         f"{how}: {taken} have {found[taken]:.2f}, the best, {best}, {found[best]:.2f} (1: apart, 0: touching; under "
-        "one half the borders between groups are soft)."
+        "one half the borders between them are soft)."
     )
 
 
 def _modes_table(shown: Shown) -> Table:
-    head = ["mode", "elites", "of all", "reach the goal", "base collision", "neither", "fallen", "mean fitness",
+    head = ["mode", "elites", "of all", "goal", "base collision", "neither", "fallen", "fitness",
             "share that stands out", "typical elite"]  # fmt: skip
     rows = [
         [
@@ -161,7 +162,7 @@ def _penalty_table(shown: Shown, crossed: Crossed) -> Table:
     total = max(float(scaled.mean(axis=0).sum()), 1e-12)
     rows = [
         [
-            label_of(name) + (f" [{_UNITS[name]}]" if name in _UNITS else ""),
+            label_of(name) + (f" [{PENALTY_UNITS[name]}]" if name in PENALTY_UNITS else ""),
             f"{raw.mean():.2f}",
             f"{raw.std():.2f}",
             f"{own.mean():.2f}",
@@ -178,8 +179,8 @@ def _rate_table(crossed: Crossed) -> Table:
         [
             label,
             f"{rate.hits} of {rate.count}",
-            f"{rate.hits / rate.count:.0%}",
-            "{:.0%} to {:.0%}".format(*rate.interval),
+            f"{100 * rate.hits / rate.count:.0f} %",
+            rate.limits,
         ]
         for label, rate in crossed.rates.items()
     ]
@@ -189,7 +190,7 @@ def _rate_table(crossed: Crossed) -> Table:
 def all_section(shown: Shown) -> Section:
     """Every elite in a table that can be sorted."""
     elites, archive = shown.elites, shown.material.archive
-    head = ["elite", "fitness", "mode", "reach the goal", "95 % interval", "base collision", "fallen", "std / mean",
+    head = ["elite", "fitness", "mode", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]", "std / mean",
             "iteration", *(f"{label_of(name)} [%]" for name in elites.penalties)]  # fmt: skip
     rows, keys = [], []
     for k, number in enumerate(elites.numbers.tolist()):
@@ -209,14 +210,15 @@ def all_section(shown: Shown) -> Section:
             *shares,
         ]
         rows.append(
-            [f"{number}", f"{values[1]:.2f}", f"{mode}", f"{rates[0]:.0%}", "{:.0%} to {:.0%}".format(*low_high),
-             f"{rates[1]:.0%}", f"{rates[2]:.0%}", f"{values[7]:.2f}", f"{found}", *(f"{100 * s:.0f}" for s in shares)]
+            [f"{number}", f"{values[1]:.2f}", f"{mode}", f"{100 * rates[0]:.0f}", rate.limits,
+             f"{100 * rates[1]:.0f}", f"{100 * rates[2]:.0f}", f"{values[7]:.2f}", f"{found}",
+             *(f"{100 * share:.0f}" for share in shares)]
         )  # fmt: skip
         keys.append([f"{value:.5g}" for value in values])
     links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers.tolist()]
+    again = make_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
     table = Table(head, rows, sortable=True, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
     text = (
-        f"All {counted(len(rows), 'elite')}, the worst first; a click on a heading sorts. "
-        f"`make replay ROBOT={archive.robot} RUN={shown.material.run} ELITE=N` crosses one again."
+        f"All {counted(len(rows), 'elite')}, the worst first; a click on a heading sorts. `{again}` crosses one again."
     )
     return Section("All elites", "all", [Text(text), table])

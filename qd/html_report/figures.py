@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MODE_LOOKS = (
-    ("#d55e00", "X"), ("#0072b2", "s"), ("#009e73", "o"), ("#cc79a7", "^"), ("#e69f00", "D"), ("#56b4e9", "v"),
-    ("#000000", "P"),
-)  # fmt: skip
-"""Colour and marker of each failure mode."""
+_MODE_LOOKS = {
+    "collision_rate": (("#d55e00", "X"), ("#e69f00", "D"), ("#cc79a7", "^")),
+    "other_rate": (("#0072b2", "s"), ("#56b4e9", "v")),
+    "goal_rate": (("#009e73", "o"), ("#000000", "P")),
+}
+"""Colours and markers of failure modes by how most of their crossings end, as of the ends themselves."""
 PENALTY_LOOKS = {
     "yaw_rate": ("#cc79a7", "//"),
     "vel_x": ("#0072b2", ""),
@@ -32,6 +33,16 @@ PENALTY_LOOKS = {
 _PLAIN = ("#999999", "")  # of a penalty that this page does not know
 _ENDS = (("goal_rate", "goal", "#009e73", "o"), ("collision_rate", "base collision", "#d55e00", "X"),
          ("other_rate", "stuck, late or off", "#0072b2", "s"))  # fmt: skip
+
+
+def mode_looks(modes: Modes) -> list[tuple[str, str]]:
+    """Colour and marker of each mode, no two alike."""
+    free = {end: list(looks) for end, looks in _MODE_LOOKS.items()}
+    chosen = []
+    for mode in modes.modes:
+        own = max(free, key=lambda end: getattr(mode, end))
+        chosen.append((free[own] or max(free.values(), key=len)).pop(0))
+    return chosen
 
 
 def label_of(penalty: str) -> str:
@@ -55,6 +66,7 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
     figure = new_figure(1.75 * (count - 1) + 1.2, 1.7 * (count - 1) + 0.9)
     grid: Any = figure.subplots(count - 1, count - 1, sharex="col", sharey="row", squeeze=False)
     top = min(1.0, 0.1 * np.ceil(10.0 * float(elites.ratios.max()) + 0.2))
+    ticks = np.arange(0.0, top + 1e-9, 0.2 if top > 0.3 else 0.1)
     for row, column in np.ndindex(count - 1, count - 1):
         axes = grid[row, column]
         if column > row:
@@ -62,6 +74,7 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
             continue
         _scatter(axes, elites, modes, column, row + 1)
         axes.set(xlim=(-0.02, top), ylim=(-0.02, top))
+        axes.set(xticks=ticks, yticks=ticks)
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
         if row == count - 2:
@@ -77,8 +90,7 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
 
 
 def _scatter(axes: "Axes", elites: Elites, modes: Modes, x: int, y: int) -> None:
-    for mode in modes.modes:
-        colour, marker = MODE_LOOKS[mode.number - 1]
+    for mode, (colour, marker) in zip(modes.modes, mode_looks(modes), strict=True):
         style = {"s": 12, "color": colour, "marker": marker, "alpha": 0.65, "linewidths": 0}
         label = f"{mode.number}: {mode.ending} ({len(mode.members)})"
         axes.scatter(elites.ratios[mode.members, x], elites.ratios[mode.members, y], label=label, **style)
@@ -101,9 +113,11 @@ def draw_modes(elites: Elites, modes: Modes) -> "Figure":
         style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5, "label": label_of(penalty)}
         left.barh(places, shares, left=start, **style)
         start += shares
-    for name, label, colour, marker in _ENDS:
+    for shift, (name, label, colour, marker) in zip((-0.22, 0.0, 0.22), _ENDS, strict=True):
         rates = [100.0 * getattr(mode, name) for mode in modes.modes]
-        middle.plot(rates, places, linestyle="", marker=marker, markersize=8, color=colour, label=label, alpha=0.9)
+        middle.plot(
+            rates, places + shift, linestyle="", marker=marker, markersize=8, color=colour, label=label, alpha=0.9
+        )
     names = [f"mode {mode.number}: {mode.ending}\n{len(mode.members):,} elites" for mode in modes.modes]
     left.set_yticks(places, names)
     middle.set_yticks(places, [])
@@ -112,7 +126,9 @@ def draw_modes(elites: Elites, modes: Modes) -> "Figure":
         axes.set_xlabel(label)
         axes.grid(axis="x", alpha=0.3)
         axes.set_axisbelow(True)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3 if axes is left else 1, frameon=False,
+        for place in places[1:]:
+            axes.axhline(place - 0.5, color="0.85", linewidth=0.8, zorder=0)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2 if axes is left else 1, frameon=False,
                     fontsize=9)  # fmt: skip
     left.set_xlim(0, 100)
     middle.set_xlim(-3, 103)
@@ -121,7 +137,7 @@ def draw_modes(elites: Elites, modes: Modes) -> "Figure":
 
 
 def _draw_silhouettes(axes: "Axes", modes: Modes) -> None:
-    axes.set_xlabel("number of groups")
+    axes.set_xlabel("number of modes")
     axes.set_ylabel("mean silhouette")
     if not modes.silhouettes:
         axes.text(

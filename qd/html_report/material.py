@@ -5,13 +5,15 @@ from pathlib import Path
 from typing import Any
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
-from qd.fitness import FitnessCfg
 from qd.html_report.tables import read_tables
+from qd.next_commands import make_command
+from qd.replay import as_searched
 from qd.report import summary
 from qd.run_directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory, newest_run
 from qd.settings import SHIPPED, SearchCfg
+from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output
-from sim.robot import get_robot
+from sim.robot import RobotCfg, get_robot
 
 RESULTS = Path("results")
 """Where published archives and tables lie."""
@@ -27,7 +29,7 @@ class HtmlReportCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, or without one results/<robot>/archive."""
     tables: Path | None = None
@@ -35,7 +37,7 @@ class HtmlReportCfg:
     out: Path | None = None
     """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-report."""
     policy: str | None = None
-    """Controller other than the one the archive was made with."""
+    """Controller other than the one the archive was made with; that one too, if it is code."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     elites: int = 5
@@ -55,12 +57,15 @@ class Material:
     """Everything read; None where there is no such file."""
 
     cfg: HtmlReportCfg
+    robot: RobotCfg
     run: Path
     """Directory or archive file that was read."""
     out: Path
     archive: Archive
     metrics: Metrics | None
     """One row an iteration, up to those of the archive."""
+    searched: str
+    """Controller of the search, :data:`qd.settings.SHIPPED` where it lies without its config."""
     search: SearchCfg | None
     origin: dict[str, Any]
     """Command, commit, device, versions, seed and date of the search, as far as they are known."""
@@ -77,16 +82,14 @@ class Material:
     @property
     def policy(self) -> str:
         """Controller to cross with: what was asked for, or that of the search."""
-        searched = SHIPPED if self.search is None else self.search.policy
-        policy = self.cfg.policy or searched
-        return str(get_robot(self.cfg.robot).policy_file) if policy == SHIPPED else policy
+        policy = self.cfg.policy or self.searched
+        return str(self.robot.policy_file) if policy == SHIPPED else policy
 
     @property
-    def fitness(self) -> FitnessCfg:
-        """Penalties, scales and weights of the search; the weights by default where it lies without its config."""
-        if self.search is not None:
-            return self.search.fitness
-        return FitnessCfg(penalties=self.archive.penalties, scales=self.archive.scales)
+    def is_unnamed_code(self) -> bool:
+        """Whether that is code which only the run names: what a file names is never run."""
+        code = self.searched != SHIPPED and ControllerSpec.parse(self.searched).runs_code
+        return self.cfg.policy is None and code
 
 
 def gather(cfg: HtmlReportCfg) -> Material:
@@ -96,30 +99,28 @@ def gather(cfg: HtmlReportCfg) -> Material:
         FileNotFoundError: If there is no run or no such tables.
         ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
     """
-    get_robot(cfg.robot)
-    run = cfg.run or _default_run(cfg.robot)
-    archive = _archive_of(run, cfg.robot)
+    robot = get_robot(cfg.robot)
+    run = cfg.run or _default_run(robot.name)
+    archive = _archive_of(run, robot)
+    searched, _ = as_searched(run, archive)
     folder = RunDirectory(run if run.is_dir() else run.parent)
     search = folder.read_cfg() if (folder.path / CONFIG_FILE).exists() else None
-    if search is not None and search.fitness.penalties != archive.penalties:
-        raise ValueError(
-            f"{folder.path / CONFIG_FILE} is of a search with penalties {', '.join(search.fitness.penalties)}, but its "
-            f"archive has {', '.join(archive.penalties)}: put back the one that is not this run's"
-        )
     numbers = folder.read_summary()
     config = {} if search is None else folder.read_config()
-    tables_file = cfg.tables or RESULTS / cfg.robot / "tables.json"
+    tables_file = cfg.tables or RESULTS / robot.name / "tables.json"
     has_tables = cfg.tables is not None or tables_file.exists()
     material = Material(
         cfg=cfg,
+        robot=robot,
         run=run,
-        out=cfg.out or _default_out(run, cfg.robot),
+        out=cfg.out or _default_out(run, robot.name),
         archive=archive,
         metrics=_metrics_of(folder, archive),
+        searched=searched,
         search=search,
         origin={key: config[key] for key in _ORIGIN if key in config},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
-        tables=read_tables(tables_file, cfg.robot) if has_tables else None,
+        tables=read_tables(tables_file, robot.name) if has_tables else None,
         tables_file=tables_file,
     )
     _check_out(material.out)
@@ -137,19 +138,21 @@ def _default_run(robot: str) -> Path:
         raise
 
 
-def _archive_of(run: Path, robot: str) -> Archive:
+def _archive_of(run: Path, robot: RobotCfg) -> Archive:
     if run.is_dir() and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
         raise ValueError(
             f"{run} must hold a search that has ended an iteration, got one without {ARCHIVE_FILE}: "
-            f"let it go on with `make archive RESUME={run}`"
+            f"let it go on with `{make_command('archive', robot=robot.spec, resume=run)}`"
         )
     archive = read_archive(run)
-    if archive.robot != robot:
-        raise ValueError(f"{run} is of robot {archive.robot}, got --robot {robot}: give that robot or another --run")
+    if archive.robot != robot.name:
+        raise ValueError(
+            f"{run} is of robot {archive.robot}, got --robot {robot.spec}: give that robot or another --run"
+        )
     if not len(archive):
         raise ValueError(
             f"{run} must have elites to report on, got an archive of none after {archive.iterations} iterations: "
-            f"let it go on with `make archive RESUME={run} ITERATIONS=...`"
+            f"let it go on with `{make_command('archive', robot=robot.spec, resume=run)} ITERATIONS=N`"
         )
     return archive
 
@@ -161,9 +164,10 @@ def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
         return None
     rows = folder.read_metrics()
     if len(rows) < archive.iterations:
+        again = make_command("archive", robot=archive.robot, resume=folder.path)
         raise ValueError(
             f"{file} must have a row for each of the archive's {archive.iterations} iterations, got {len(rows)}: the "
-            f"run is half-written; `make archive RESUME={folder.path}` writes both again"
+            f"run is half-written; `{again}` writes both again"
         )
     return rows[: archive.iterations]
 

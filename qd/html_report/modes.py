@@ -17,6 +17,7 @@ MAX_MODES = 7
 """Most groups that are tried: as many as colours and markers stay apart."""
 TOLERANCE = 0.05
 """How far below the best silhouette that of a finer division may lie."""
+_COMMON = 0.25  # share of the crossings from which on an end is named
 _MIN_ELITES = 10  # of fewer a silhouette says nothing
 
 
@@ -44,13 +45,14 @@ class Mode:
 
     @property
     def ending(self) -> str:
-        """How most of its crossings end, in words."""
+        """How most of its crossings end, in words; both ways of two that are common."""
         ends = {
             "reaches the goal": self.goal_rate,
-            "topples" if self.fallen_rate >= 0.5 else "base strikes the terrain": self.collision_rate,
+            "topples" if self.fallen_rate >= 0.5 else "strikes the terrain": self.collision_rate,
             "gets stuck": self.other_rate,
         }
-        return max(ends, key=lambda end: ends[end])
+        first, second, _ = sorted(ends, key=lambda end: -ends[end])
+        return first if ends[second] < _COMMON else f"{first} or {second}"
 
 
 @dataclass(frozen=True, kw_only=True)

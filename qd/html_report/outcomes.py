@@ -33,8 +33,12 @@ class Rate:
     def __str__(self) -> str:
         if not self.count:
             return "no valid episode"
-        low, high = self.interval
-        return f"{self.hits} of {self.count} ({self.hits / self.count:.0%}; {100 * low:.0f} to {high:.0%})"
+        return f"{self.hits} of {self.count} ({100 * self.hits / self.count:.0f} %; {self.limits})"
+
+    @property
+    def limits(self) -> str:
+        """The interval in words: ``0 to 16 %``."""
+        return "{:.0f} to {:.0f} %".format(*(100.0 * limit for limit in self.interval))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """A page of HTML from plain parts: everything that is put in is escaped, everything that is shown is in the file."""
 
 import base64
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -112,7 +113,7 @@ def pictures_of(sections: Sequence[Section]) -> list[Picture]:
 def _block(block: Block) -> str:
     match block:
         case Text(text):
-            return f"<p>{escape(text)}</p>"
+            return f"<p>{_with_commands(text)}</p>"
         case Heading(text, anchor):
             return f'<h3 id="{escape(anchor)}">{escape(text)}</h3>' if anchor else f"<h3>{escape(text)}</h3>"
         case Absent(text, command):
@@ -125,6 +126,11 @@ def _block(block: Block) -> str:
             return f'<figure><img alt="{escape(shows)}" src="data:image/png;base64,{data}"></figure>'
         case Table():
             return _table(block)
+
+
+def _with_commands(text: str) -> str:
+    """Escaped text; what stands between backticks is a command."""
+    return re.sub(r"`([^`]*)`", r"<code>\1</code>", escape(text))
 
 
 def _table(table: Table) -> str:

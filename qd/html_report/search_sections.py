@@ -5,7 +5,8 @@ import numpy as np
 from qd.html_report.elites import FAILING_BELOW, Elites
 from qd.html_report.figures import draw_pairs, label_of
 from qd.html_report.page import Absent, Block, Facts, Section, Table, Text
-from qd.html_report.shown import Shown, counted, percent, picture
+from qd.html_report.shown import Shown, counted, hours, percent, picture
+from qd.next_commands import make_command
 from qd.progress import clock
 from qd.report import draw_archive, draw_curves, draw_spread, spread
 from qd.settings import SHIPPED
@@ -24,11 +25,11 @@ def outcome_section(shown: Shown) -> Section:
     )
     facts = Facts(
         [
-            ("different failures: cells of the archive whose terrain under half of the robots cross", f"{failing:,}"),
-            ("elites, the hardest terrain found of each kind", f"{len(archive):,}"),
-            ("groups that the elites fall into", f"{len(shown.modes.modes)}"),
+            ("cells whose terrain under half of the robots cross", f"{failing:,}"),
+            ("elites: filled cells, each with the hardest terrain found", f"{len(archive):,}"),
+            ("failure modes: groups that the elites fall into", f"{len(shown.modes.modes)}"),
             ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
-            ("robots whose base collides, likewise", percent(float(elites.collision_rate.mean()))),
+            ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
         ]
     )
     text = (
@@ -38,9 +39,10 @@ def outcome_section(shown: Shown) -> Section:
         f"reach the goal, the base of {_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
     )
     explained = (
-        "A cell is a combination of shares of the penalties, in tenths; terrains in different cells make the robot "
-        f"struggle differently. A terrain counts as failed if under {FAILING_BELOW:.0%} of the robots reach the goal; "
-        "the rates are means over terrains with 95 % intervals (bootstrap over terrains)."
+        f"A cell is a combination of shares of the penalties, each in {archive.intervals} intervals; terrains in "
+        "different cells make the robot struggle differently. A terrain counts as failed if under "
+        f"{percent(FAILING_BELOW)} of the robots reach the goal; the rates "
+        "are means over terrains with 95 % intervals (bootstrap over terrains)."
     )
     return Section("What breaks the controller", "outcome", [_searched(shown), facts, Text(text), Text(explained)])
 
@@ -69,7 +71,7 @@ def _searched(shown: Shown) -> Block:
     text += f", from {counted(numbers['terrains_evaluated'], 'terrain')} and {numbers['episodes']:,} episodes"
     walked = [row["episodes"] * row["mean_duration_s"] for row in material.metrics if "mean_duration_s" in row]
     if len(walked) == len(material.metrics):
-        text += f" ({clock(sum(walked))} of walking, simulated)"
+        text += f" ({hours(sum(walked))} of walking, simulated)"
     where = f" on {counted(material.gpus, 'GPU')}" if material.gpus else ""
     invalid = counted(numbers["invalid_episodes"], "episode was", "episodes were")
     return Text(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
@@ -82,7 +84,7 @@ def curves_section(shown: Shown) -> Section:
     if not rows:
         section.blocks.append(
             Absent("The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:",
-                   f"make archive ROBOT={archive.robot}")
+                   make_command("archive", robot=shown.material.robot.spec))
         )  # fmt: skip
         return section
     first, last = rows[0], rows[-1]
@@ -139,10 +141,10 @@ def pairs_section(shown: Shown) -> Section:
     if len(elites) < 3 or len(elites.penalties) < 2:
         section.blocks.append(
             Absent(f"The projections are left out: they need 3 elites, and there are {len(elites)}. A longer search "
-                   "finds more:", f"make archive RESUME={shown.material.run} ITERATIONS=N")
+                   "finds more:", make_command("archive", resume=shown.material.run, iterations="N"))
         )  # fmt: skip
         return section
-    text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its group (next chapter)."
+    text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode (next chapter)."
     text += _related(elites)
     shows = "Scatter plots of every two shares of the penalties, by failure mode"
     section.blocks += [Text(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]
@@ -172,7 +174,7 @@ def origin_section(shown: Shown) -> Section:
     if not origin:
         section.blocks.append(
             Absent("The search is not on record: there is no config.json beside the archive. A search writes one:",
-                   f"make archive ROBOT={shown.material.cfg.robot}")
+                   make_command("archive", robot=shown.material.robot.spec))
         )  # fmt: skip
         return section
     rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]

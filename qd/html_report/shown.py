@@ -11,11 +11,12 @@ from qd.html_report.modes import Modes
 from qd.html_report.outcomes import Crossed
 from qd.html_report.page import Picture
 from qd.html_report.tables import Change, Changes
+from qd.progress import clock
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_DPI = 110  # sharp at the width of the page, half again as fine in print, and small
+_DPI = 150  # as fine as print needs at the width of the page, and small
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +65,11 @@ def percent(share: float) -> str:
     if (text == "0.0" and share > 0.0) or (text == "100.0" and share < 1.0):
         text = "less than 0.1" if share < 0.5 else "over 99.9"
     return f"{text} %"
+
+
+def hours(seconds: float) -> str:
+    """A long duration."""
+    return f"{seconds / 3600:,.0f} hours" if seconds > 36_000 else clock(seconds)
 
 
 def counted(number: int, one: str, many: str = "") -> str:

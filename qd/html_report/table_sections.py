@@ -6,21 +6,19 @@ from qd.html_report.outcomes import ENDS
 from qd.html_report.page import Absent, Block, Section, Table, Text
 from qd.html_report.shown import Shown, counted, percent, picture
 from qd.html_report.table_figures import draw_tables
-from qd.html_report.tables import MEASURES
+from qd.html_report.tables import CHANGES, MEASURES
 from qd.html_report.terrain_figures import draw_maps
+from qd.next_commands import make_command
 
 _ARRIVED = next(iter(ENDS.values()))
 
 
 def tables_section(shown: Shown) -> Section:
     """Controllers on the evaluation's sets."""
-    section, tables, robot = Section("Controllers compared", "tables"), shown.material.tables, shown.material.cfg.robot
+    section, tables = Section("Controllers compared", "tables"), shown.material.tables
     if tables is None:
-        section.blocks.append(
-            Absent(f"Left out: there are no evaluation tables at {shown.material.tables_file}. They are made by",
-                   f'make evaluate ROBOT={robot} POLICIES="base=shipped C-G=FILE" ARCHIVE={shown.material.run} '
-                   f"OUT={shown.material.tables_file}")
-        )  # fmt: skip
+        about = f"Left out: there are no evaluation tables at {shown.material.tables_file}. They are made by"
+        section.blocks.append(Absent(about, _command(shown)))
         return section
     section.blocks += [
         Text(_told(tables)),
@@ -31,6 +29,18 @@ def tables_section(shown: Shown) -> Section:
     if changes is not None:
         section.blocks += changes
     return section
+
+
+def _command(shown: Shown) -> str:
+    """What makes the tables."""
+    material = shown.material
+    return make_command(
+        "evaluate",
+        robot=material.robot.spec,
+        policies="base=shipped C-G=FILE",
+        archive=material.run,
+        out=material.tables_file,
+    )
 
 
 def _told(tables: dict[str, Any]) -> str:
@@ -72,11 +82,11 @@ def _changes_table(tables: dict[str, Any]) -> list[Block] | None:
     rows = []
     for name, pairs in tables["differences"].items():
         for pair, found in pairs.items():
-            counts = [f"{found[kind]['count']}" for kind in ("mended", "still_failing", "newly_broken", "fine")]
+            counts = [f"{found[kind]['count']}" for kind in CHANGES]
             rows.append([f"{name}: {pair}", *counts, f"{found['compared']}"])
     if not rows:
         return None
-    head = ["terrains", "mended", "still failing", "newly broken", "fine", "compared"]
+    head = ["terrains", *(kind.replace("_", " ") for kind in CHANGES), "compared"]
     return [Text("Terrains that a controller fails, under half of its episodes reaching the goal, from the first "
                  "controller to the second:"), Table(head, rows)]  # fmt: skip
 
@@ -87,11 +97,8 @@ def before_after_section(shown: Shown) -> Section | None:
         return None
     section = Section("The same terrain before and after", "before-after")
     if not shown.pairs:
-        command = (
-            f'make evaluate ROBOT={shown.material.cfg.robot} POLICIES="base=shipped C-G=FILE" ARCHIVE=RUN OUT=FILE'
-        )
         reason = shown.changes.reason or shown.not_crossed
-        section.blocks.append(Absent(f"Left out. {reason} New tables are made by", command))
+        section.blocks.append(Absent(f"Left out. {reason} New tables are made by", _command(shown)))
         return section
     for change, (before, after) in shown.pairs.items():
         rates = {change.before: before.rates[_ARRIVED], change.after: after.rates[_ARRIVED]}

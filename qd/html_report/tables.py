@@ -5,11 +5,14 @@ from pathlib import Path
 from typing import Any
 
 from qd.archive import Archive, read_archive
+from sim.controller_spec import ControllerSpec
 from sim.files import read_json
 from sim.provenance import controller_hash
 
 MEASURES = {"success": "success (no base collision)", "goal": "goal reached", "reward": "training reward"}
 """Measures shown, in words; the first two are fractions."""
+CHANGES = ("mended", "still_failing", "newly_broken", "fine")
+"""What may have become of a terrain between two controllers."""
 _KEYS = ("robot", "episodes", "controllers", "terrains", "intervals", "differences", *MEASURES)
 _MENDED, _BROKEN = 2, 1  # terrains shown of each kind
 _GENERATED = "generated"
@@ -73,6 +76,12 @@ def _problem_of(tables: dict[str, Any]) -> str:
     dicts = [tables[key] for key in ("controllers", "terrains", "intervals", "differences", *MEASURES)]
     if not all(isinstance(part, dict) and part for part in dicts) or not isinstance(tables["episodes"], int):
         return "its parts are not such as that writes"
+    if not all(_is_controller(about) for about in tables["controllers"].values()):
+        return "its controllers are not such as that writes"
+    if not all(
+        isinstance(pairs, dict) and all(map(_is_pair, pairs.values())) for pairs in tables["differences"].values()
+    ):
+        return "its differences are not such as that writes"
     for measure in MEASURES:
         for name, row in tables[measure].items():
             limits = (tables["intervals"].get(measure) or {}).get(name)
@@ -83,6 +92,24 @@ def _problem_of(tables: dict[str, Any]) -> str:
             if not all(_is_measured(row[who], limits[who]) for who in row):
                 return f"its {measure} of {name} holds something else than numbers"
     return ""
+
+
+def _is_controller(about: Any) -> bool:
+    return isinstance(about, dict) and isinstance(about.get("policy"), str) and "sha256" in about
+
+
+def _is_pair(pair: Any) -> bool:
+    """Whether this says what became of terrains between two controllers."""
+    if not isinstance(pair, dict) or type(pair.get("compared")) is not int:
+        return False
+    kinds = [pair.get(kind) for kind in CHANGES]
+    return all(
+        isinstance(kind, dict)
+        and type(kind.get("count")) is int
+        and isinstance(kind.get("terrains"), list)
+        and all(type(number) is int for number in kind["terrains"])
+        for kind in kinds
+    )
 
 
 def _is_measured(value: Any, limits: Any) -> bool:
@@ -115,6 +142,8 @@ def changes_of(tables: dict[str, Any]) -> Changes:
     ]
     policies = {who: tables["controllers"][who] for who in (first, best)}
     for who, about in policies.items():
+        if ControllerSpec.parse(about["policy"]).runs_code:  # what a file names is never run
+            return Changes(reason=f"Controller {who} of the tables is code, {about['policy']}, and is not run.")
         if controller_hash(about["policy"]) != about["sha256"]:
             return Changes(reason=f"Controller {who} of the tables is not at {about['policy']} as it was then.")
     archive, reason = _archive_of(tables, chosen)

@@ -46,7 +46,7 @@ def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> "
     _draw_penalties(figure.add_subplot(grid[1:, 1]), crossed, penalties)
     legend = figure.add_subplot(grid[0, 1])
     legend.set_axis_off()
-    legend.legend(*_legend(top), loc="center left", frameon=False, title="crossings", alignment="left")
+    legend.legend(*_legend(top), loc="center left", frameon=False, title="crossings", alignment="left", handlelength=3)
     for axes in (top, profile):
         axes.tick_params(labelbottom=False)
     top.set_xlim(*_x_limits([crossed]))
@@ -65,14 +65,14 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
 
     heights = crossed.recording.heights[0]
     low, high = limits or (float(heights.min()), float(heights.max()))
-    greys = LinearSegmentedColormap.from_list("greys", ["0.35", "1.0"])  # light enough for every colour of a path
+    greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
     image = axes.imshow(
         heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
     )
     for end, (colour, marker, line) in END_LOOKS.items():
         chosen = np.flatnonzero(crossed.outcome == end)
         for k in chosen:
-            axes.plot(*crossed.path(int(k))[:, :2].T, color=colour, linestyle=line, linewidth=1.0, alpha=0.85)
+            axes.plot(*crossed.path(int(k))[:, :2].T, color=colour, linestyle=line, linewidth=0.9, alpha=0.7)
         if len(chosen):
             places = crossed.ends[chosen]
             label = f"{ENDS[end]} ({len(chosen)})"
@@ -157,7 +157,7 @@ def draw_maps(crossings: Mapping[str, Crossed], title: str) -> "Figure":
     """
     columns = 2
     rows = -(-len(crossings) // columns)
-    figure = new_figure(12.0, 3.5 * rows + 0.8)
+    figure = new_figure(12.0, 3.0 * rows + 0.9)
     figure.suptitle(title)
     panels = [*np.ravel(figure.subplots(rows, columns, squeeze=False))]
     heights = np.concatenate([crossed.recording.heights.ravel() for crossed in crossings.values()])
@@ -170,7 +170,9 @@ def draw_maps(crossings: Mapping[str, Crossed], title: str) -> "Figure":
     for axes in panels[len(crossings) :]:
         axes.set_axis_off()
     figure.colorbar(panels[0].images[0], ax=list(panels), label="height [m]", shrink=0.6)
-    figure.legend(*_common_legend(panels[: len(crossings)]), loc="outside lower center", ncols=6, frameon=False)
+    figure.legend(
+        *_common_legend(panels[: len(crossings)]), loc="outside lower center", ncols=6, frameon=False, handlelength=3
+    )
     return figure
 
 
@@ -180,4 +182,5 @@ def _common_legend(panels: Sequence["Axes"]) -> tuple[list[Any], list[str]]:
     for axes in panels:
         for handle, label in zip(*_legend(axes), strict=True):
             entries.setdefault(label.rpartition(" (")[0] or label, handle)
-    return list(entries.values()), list(entries)
+    order = [label for label in (*ENDS.values(), "start", "goal") if label in entries]
+    return [entries[label] for label in order], order

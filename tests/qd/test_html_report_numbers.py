@@ -28,6 +28,7 @@ def grouped_archive(sizes=(6, 9, 5)):
         collision_rate=values[:, 3],
         fallen_rate=np.zeros(len(kinds)),
         fitness=np.linspace(9.0, 1.0, len(kinds)),
+        cell=np.arange(len(kinds)) % archive.cells.num_cells,
     )
     return archive, kinds
 
@@ -82,7 +83,7 @@ def test_modes_are_the_kinds_that_were_made():
     by_kind = {int(kinds[mode.members[0]]): mode for mode in found.modes}
     assert all(set(kinds[mode.members]) == {kind} for kind, mode in by_kind.items())
     assert {kind: len(mode.members) for kind, mode in by_kind.items()} == {0: 6, 1: 9, 2: 5}
-    assert [by_kind[kind].ending for kind in range(3)] == ["gets stuck", "base strikes the terrain", "reaches the goal"]
+    assert [by_kind[kind].ending for kind in range(3)] == ["gets stuck", "strikes the terrain", "reaches the goal"]
     assert [by_kind[kind].marked_by for kind in range(2)] == ["yaw_rate", "vel_x"]
     assert found.modes[-1] is by_kind[2]
     assert all(mode.typical in mode.members for mode in found.modes)
@@ -125,7 +126,7 @@ def test_crossings_in_numbers_by_hand():
     crossed = crossed_of(recording, ("vel_x", "stumble"), (2.0, 4.0))
     assert crossed.chosen.tolist() == [0, 1, 2]
     assert crossed.scaled.tolist() == [[0.5, 1.0], [3.5, 2.5], [6.5, 4.0]]
-    assert str(crossed.rates["reached the goal"]) == "1 of 3 (33%; 6 to 79%)"
+    assert str(crossed.rates["reached the goal"]) == "1 of 3 (33 %; 6 to 79 %)"
     hits = {label: rate.hits for label, rate in crossed.rates.items()}
     assert hits == {"reached the goal": 1, "base collision": 2, "out of time": 0, "left the terrain": 0, "fallen": 1}
     np.testing.assert_allclose(crossed.ends[:, 0], [14.0, 5.0, 7.0])
@@ -143,8 +144,8 @@ def test_penalties_by_place_add_up():
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(0.0, "0 %"), (1.0, "100 %"), (0.5, "50 %"), (0.051, "5.1 %"), (0.9996, "over 99.9 %"), (0.0002, "less than 0.1 %"),
-     (0.998, "99.8 %")],
+    [(0.0, "0 %"), (1.0, "100 %"), (0.5, "50 %"), (0.051, "5.1 %"), (0.9996, "over 99.9 %"),
+     (0.0002, "less than 0.1 %"), (0.998, "99.8 %")],
 )  # fmt: skip
 def test_a_share_is_none_or_all_only_if_it_is(share, text):
     assert percent(share) == text
