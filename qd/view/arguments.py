@@ -13,7 +13,8 @@ from qd.workers import check_policy
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
 
-_ROOT = Path(__file__).resolve().parents[2]
+PUBLISHED = Path(__file__).resolve().parents[2] / "results"
+"""What came with the project, a folder a robot."""
 _CACHE = Path("runs") / "view-cache"
 _LOOK_AHEAD = 50
 """Ports looked at for a free one."""
@@ -97,7 +98,7 @@ def show_of(cfg: ViewCfg) -> Show:
             check_policy(controllers["searched"], robot, "cpu")
         except ValueError as error:  # the terrains can be looked at all the same
             controllers, note = {}, f"{error}; name a controller with POLICIES to see crossings"
-    published = _ROOT / "results" / robot.name / "view"
+    published = PUBLISHED / robot.name / "view"
     return Show(cfg=cfg, found=found, robot=robot, controllers=controllers, note=note, published=published)
 
 
@@ -106,7 +107,7 @@ def _newest_or_published(robot: "RobotCfg") -> Path:
     try:
         return newest_run(robot)
     except FileNotFoundError:
-        published = _ROOT / "results" / robot.name / "archive"
+        published = PUBLISHED / robot.name / "archive"
         if not published.is_dir():
             raise
         return published

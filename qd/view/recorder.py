@@ -3,14 +3,16 @@
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from qd.view.crossings import Wanted
 from qd.worker_process import EvaluatorError, WorkerProcess
-from sim.recording import Recording
-from sim.robot import RobotCfg
+
+if TYPE_CHECKING:  # they import torch, which a process takes with its simulation
+    from qd.view.crossings import Wanted
+    from sim.recording import Recording
+    from sim.robot import RobotCfg
 
 MAX_PROCESSES = 3
 """Controllers whose simulation is kept ready, one process each."""
@@ -21,12 +23,12 @@ _PREPARING = "building the simulation (the very first one compiles its kernels: 
 class Report:
     """How the recording of some crossings goes on."""
 
-    wanted: Wanted
+    wanted: "Wanted"
     text: str
     """In words, without who and what."""
     share: float = 0.0
     """Done so far."""
-    recording: Recording | None = None
+    recording: "Recording | None" = None
     """The result, once there is one."""
     failed: bool = False
     """Whether there will be none."""
@@ -36,7 +38,7 @@ class Report:
 class RecorderCfg:
     """What a recording process builds."""
 
-    robot: RobotCfg
+    robot: "RobotCfg"
     """Robot settings."""
     policy: str
     """The controller."""
@@ -71,7 +73,7 @@ Build = Callable[[RecorderCfg, int], Any]
 class Recorder:
     """Records the crossings asked for last; what was asked for before and is not begun is dropped."""
 
-    def __init__(self, robot: RobotCfg, report: Callable[[Report], None], *, build: Build = build_recording) -> None:
+    def __init__(self, robot: "RobotCfg", report: Callable[[Report], None], *, build: Build = build_recording) -> None:
         """Start to wait for work.
 
         Args:
@@ -87,7 +89,7 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, wanted: Wanted | None) -> None:
+    def record(self, wanted: "Wanted | None") -> None:
         """Record these crossings next; with None, nothing more after those at hand."""
         with self._changed:
             self._wish = wanted
@@ -118,7 +120,7 @@ class Recorder:
                 self._dismiss(cfg)
                 self._report(Report(wanted=wanted, text=str(error), failed=True))
 
-    def _recorded(self, wanted: Wanted, cfg: RecorderCfg) -> Report:
+    def _recorded(self, wanted: "Wanted", cfg: RecorderCfg) -> Report:
         worker = self._worker(wanted, cfg)
         worker.send(wanted.genes, wanted.seeds)
         while True:
@@ -127,7 +129,7 @@ class Recorder:
                 return Report(wanted=wanted, text="recorded", share=1.0, recording=value)
             self._report(Report(wanted=wanted, text="crossing", share=float(value)))
 
-    def _worker(self, wanted: Wanted, cfg: RecorderCfg) -> WorkerProcess:
+    def _worker(self, wanted: "Wanted", cfg: RecorderCfg) -> WorkerProcess:
         """The process of a controller, built if there is none; the one longest unused makes room."""
         worker = self._workers.pop(cfg, None)
         if worker is None:

@@ -1,0 +1,24 @@
+"""A simulation that takes no time, in a module that a process imports at once."""
+
+import time
+
+
+class Instant:
+    """A simulation that names what it would cross; elite 13 breaks it, and policy `slow` takes its time."""
+
+    def __init__(self, cfg):
+        if cfg.policy == "refused":
+            raise ValueError("no such controller")
+        self.policy = cfg.policy
+
+    def evaluate(self, terrains, seeds, progress=None):
+        if terrains[0, 0] == 13.0:
+            raise RuntimeError("broken")
+        progress(1, 2)
+        if self.policy == "slow":
+            time.sleep(1.0)
+        return f"{self.policy} on {terrains[0, 0]:.0f}"
+
+
+def build(cfg, num_terrains):
+    return Instant(cfg)
