@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
+from sim.hfield import as_hfield
 from sim.robot import RobotCfg
 from sim.simulation import GROUND_FRICTION
 from sim.terrain import SPACING
@@ -40,10 +41,7 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_const
         ValueError: If the robot is more than its MJCF says, or MuJoCo does not read it.
     """
     root = _root_of(robot)
-    grid = np.pad(np.asarray(heights, dtype=np.float64), _MARGIN_NODES, mode="edge")
-    lowest, extent = float(grid.min()), max(float(np.ptp(grid)), 1e-3)
-    half = [0.5 * SPACING * (count - 1) for count in (grid.shape[1], grid.shape[0])]
-    centre = [0.5 * SPACING * (count - 1) for count in (heights.shape[1], heights.shape[0])]
+    field = as_hfield(heights, margin=_MARGIN_NODES)
     ET.SubElement(root, "size", memory=_MEMORY)
     option = root.find("option")
     option = ET.SubElement(root, "option") if option is None else option
@@ -51,22 +49,22 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_const
     option.set("iterations", "100")
     option.set("ls_iterations", "50")
     ET.SubElement(option, "flag", autoreset="disable")  # or a state that blows up would begin anew unseen
-    rows, cols = map(str, grid.shape)
-    size = f"{half[0]} {half[1]} {extent} 1"  # half x, half y, height of data 1, thickness below data 0
-    ET.SubElement(ET.SubElement(root, "asset"), "hfield", name="grid", nrow=rows, ncol=cols, size=size)
+    rows, columns = map(str, field.data.shape)
+    size = " ".join(map(repr, field.size))
+    ET.SubElement(ET.SubElement(root, "asset"), "hfield", name="grid", nrow=rows, ncol=columns, size=size)
     world = root.find("worldbody")
     if world is None:
         raise ValueError(f"robot '{robot.name}': {robot.model_file} has no <worldbody>")
-    position = f"{centre[0]} {centre[1]} {lowest}"
     # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
     # solmix 0: the stiffness of a contact is the robot's.
-    ground = {"name": "ground", "type": "hfield", "hfield": "grid", "pos": position, "friction": str(GROUND_FRICTION)}
+    ground = {"name": "ground", "type": "hfield", "hfield": "grid", "friction": str(GROUND_FRICTION)}
+    ground |= {"pos": " ".join(map(repr, field.position)), "quat": " ".join(map(repr, field.quaternion))}
     ET.SubElement(world, "geom", ground | {"conaffinity": "1", "solmix": "0"})
     sensors = ET.SubElement(root, "sensor")
     for name in robot.geom_names:
         ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")
     model = _mj.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-    model.hfield_data[:] = ((grid - lowest) / extent).ravel()
+    model.hfield_data[:] = field.data.ravel()
     model.geom_conaffinity[:] = 0  # a robot does not touch itself
     model.geom("ground").conaffinity[:] = 1
     if time_constant_s is not None:

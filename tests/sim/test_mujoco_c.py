@@ -94,11 +94,13 @@ def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_c
     assert model.opt.timestep == robot.physics_dt
     fine = crossing_model(robot, heights, time_constant_s=0.003)
     assert (fine.geom_solref == [0.003, 1.0]).all() and (model.geom_solref[:, 0] > 0.003).all()
-    # The surface, edge heights continued beyond it: what a ray from above meets.
+    # The surface, between the nodes too, edge heights continued beyond it: what a ray from above meets.
+    heights = heights + np.random.default_rng(6).uniform(-0.1, 0.1, heights.shape).astype(np.float32)
+    model = crossing_model(robot, heights)
     data = mujoco.MjData(model)
     data.qpos[2] = 50.0
     mujoco.mj_forward(model, data)
-    for x, y in [(3.03, 2.2), (8.0, 4.0), (12.31, 7.9), (17.5, 9.5), (-1.5, -1.5)]:
+    for x, y in [(3.03, 2.2), (8.0, 4.0), (12.31, 7.9), (17.5, 9.5), (-1.5, -1.5), (5.025, 3.025), (6.01, 4.04)]:
         down, geom = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
         distance = mujoco.mj_ray(model, data, np.array([x, y, 5.0]), down, None, 1, -1, geom)
         assert geom[0] == ground
