@@ -11,6 +11,7 @@ from qd.beside import LOOKS
 from qd.cli import naming_what_is_next, run_command
 from qd.fresh import FRESH_EPISODES, Open
 from qd.report import new_figure, save_figure
+from qd.resuming import refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, differences
 from qd.search import run_search
 from qd.settings import SearchCfg, as_settings
@@ -67,7 +68,10 @@ def ablation(args: AblationCfg, *, open_evaluator: Open = open_evaluator) -> dic
         Interrupted: On Ctrl-C; all iterations that ended are saved.
         EvaluatorError: If a worker is lost; likewise.
     """
-    folder = args.run_dir or Path("runs") / f"{args.robot}-ablation"
+    from sim.robot import get_robot
+
+    name = get_robot(args.robot).name
+    folder = args.run_dir or Path("runs") / f"{name}-ablation"
     out = args.out or folder / "ablation.json"
     device = resolve_device(args.device, args.workers)
     asked = _asked(args, "paper" if device.startswith("cuda") else "small")
@@ -78,14 +82,14 @@ def ablation(args: AblationCfg, *, open_evaluator: Open = open_evaluator) -> dic
             cfg = _search(asked, 1.0, folder, open_evaluator)
         else:
             cfg = _checked(RunDirectory(args.run).read_cfg(), args)
-            asked = _of_run(cfg, asked)
+            asked = _of_run(cfg, asked, args)
         other = _search(asked, 0.0, folder, open_evaluator)
     _check_alike(cfg, other)
     metrics = {
         "alpha_1": RunDirectory(args.run or folder / "alpha_1").read_metrics(),
         "alpha_0": RunDirectory(folder / "alpha_0").read_metrics(),
     }
-    report = {**origin_of(device, other.seed, args.workers), "robot": args.robot, "preset": other.preset}
+    report = {**origin_of(device, other.seed, args.workers), "robot": name, "preset": other.preset}
     report |= numbers_of(metrics, asked["iterations"])
     _print(report)
     write_atomically(out, to_json(report))
@@ -104,10 +108,12 @@ def _asked(args: AblationCfg, preset: str) -> dict[str, Any]:
 
 def _checked(cfg: SearchCfg, args: AblationCfg) -> SearchCfg:
     """The settings of the run with alpha 1."""
+    from sim.robot import get_robot
+
     wrong = [
         f"{name} {there}, got {wanted}"
         for name, there, wanted in (
-            ("robot", cfg.robot, args.robot),
+            ("robot", cfg.robot, get_robot(args.robot).name),
             ("preset", cfg.preset, args.preset or cfg.preset),
             ("seed", cfg.seed, cfg.seed if args.seed is None else args.seed),
             ("policy", cfg.policy, args.policy or cfg.policy),
@@ -122,9 +128,13 @@ def _checked(cfg: SearchCfg, args: AblationCfg) -> SearchCfg:
     return cfg
 
 
-def _of_run(cfg: SearchCfg, asked: dict[str, Any]) -> dict[str, Any]:
+def _of_run(cfg: SearchCfg, asked: dict[str, Any], args: AblationCfg) -> dict[str, Any]:
     """What to ask of a search for it to have a run's settings."""
-    from sim.robot import get_robot
+    from sim.robot import robot_of
+
+    assert args.run is not None
+    robot = robot_of(cfg.robot, args.robot, args.run)
+    refuse_unnamed_code(cfg.policy, args.policy, args.run)
 
     parts = (cfg, cfg.scheduler, cfg.fitness)
     own = {
@@ -132,8 +142,8 @@ def _of_run(cfg: SearchCfg, asked: dict[str, Any]) -> dict[str, Any]:
         for field in fields(Arguments)
         if any(hasattr(part, field.name) for part in parts)
     }
-    left_out = tuple(name for name in get_robot(cfg.robot).penalties if name not in cfg.fitness.penalties)
-    own |= {"without": left_out or None, "policy": None if cfg.policy == "shipped" else cfg.policy}
+    left_out = tuple(name for name in robot.penalties if name not in cfg.fitness.penalties)
+    own |= {"robot": robot.spec, "without": left_out or None, "policy": None if cfg.policy == "shipped" else cfg.policy}
     iterations = asked["iterations"] if asked["preset"] == cfg.preset else _DEFAULTS[cfg.preset][0]
     return {**asked, **own, "iterations": iterations}
 

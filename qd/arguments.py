@@ -1,23 +1,14 @@
 """What a command line of the search means: a new run, or an old one that goes on."""
 
 import itertools
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qd.next_commands import Placed, next_command
+from qd.resuming import code_of, moved_policy, origin_in, own_file, refuse_changes, refuse_unnamed_code, resumed
 from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
-from qd.settings import (
-    SearchCfg,
-    Settings,
-    as_settings,
-    changed,
-    file_hash,
-    kept_penalties,
-    measured_now,
-    policy_spec,
-    preset,
-)
+from qd.settings import SearchCfg, as_settings, changed, kept_penalties, measured_now, policy_spec, preset
 from qd.workers import EvaluatorCfg, check_policy, origin_of, resolve_device
 from sim.files import is_leftover
 
@@ -36,7 +27,7 @@ class Arguments:
     """
 
     robot: str | None = None
-    """Which robot: anymal, unless resuming."""
+    """Which robot: anymal, unless resuming; anymal, cassie, or the settings file of another (my_robot.py)."""
     preset: str | None = None
     """Size of the search: paper (a GPU's work) or small (minutes on a CPU); by default what the device can do."""
     device: str | None = None
@@ -89,7 +80,8 @@ class Arguments:
     """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
 
 
-_NOT_SETTINGS = ("device", "resume", "run_dir", "without", "processes", "workers", "worker_limit_s", "reproduce")
+_PLACED = ("device", "processes", "workers", "worker_limit_s")
+_NOT_SETTINGS = (*_PLACED, "robot", "resume", "run_dir", "without", "reproduce")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +108,12 @@ class Job:
         """Warp device name."""
         return self.evaluator.device
 
+    @property
+    def robot(self) -> str:
+        """What the command line calls the robot."""
+        robot = self.evaluator.robot
+        return robot if isinstance(robot, str) else robot.spec
+
 
 def job_of(args: Arguments) -> Job:
     """The job that a command line asks for.
@@ -124,18 +122,21 @@ def job_of(args: Arguments) -> Job:
         FileNotFoundError: If there is no run to resume.
         ValueError: If robot, preset, device, controller, a setting or the run directory is not as it must be.
     """
-    from sim.robot import get_robot
+    from sim.robot import get_robot, robot_of
 
     if args.resume and args.run_dir:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
     there = RunDirectory(args.resume).read_cfg() if args.resume else None
-    robot = get_robot(args.robot or (there.robot if there else "anymal"))
+    robot = (
+        robot_of(there.robot, args.robot, args.resume) if args.resume and there else get_robot(args.robot or "anymal")
+    )
     device = resolve_device(args.device, args.workers)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
     if args.without is not None:
         changes["penalties"] = kept_penalties(robot, args.without)
     moved = None
     if args.resume and there:
+        refuse_unnamed_code(there.policy, args.policy, args.resume)
         moved = moved_policy(there, args.policy)
         path, cfg = args.resume, resumed(args.resume, there, robot, changes, moved)
         refuse_changes(path, "run", as_settings(there), as_settings(cfg))
@@ -143,30 +144,34 @@ def job_of(args: Arguments) -> Job:
     else:
         name = args.preset or ("paper" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
-        path, origin = _free_path(args, cfg), origin_of(device, cfg.seed, args.workers)
+        path, origin = _free_path(args, cfg, robot), origin_of(device, cfg.seed, args.workers) | own_file(robot)
     policy = moved or policy_spec(cfg, robot)
+    named = moved or code_of(cfg)
     return Job(
         cfg=cfg,
         path=path,
         resumes=there is not None,
-        evaluator=evaluator_of(cfg, policy, device, args),
+        evaluator=evaluator_of(cfg, robot, policy, device, args),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
         origin=origin,
-        resume_command=_resume_command(cfg.robot, path, args, moved),
-        reevaluate_command=next_command("reevaluate", args, robot=cfg.robot, run=path, policy=moved),
+        resume_command=_resume_command(robot.spec, path, args, named),
+        reevaluate_command=next_command("reevaluate", args, robot=robot.spec, run=path, policy=named),
     )
 
 
-def _resume_command(robot: str, path: Path, args: Arguments, moved: str | None) -> str:
+def _resume_command(robot: str, path: Path, args: Arguments, policy: str | None) -> str:
     reproduce = None if args.reproduce == "auto" else args.reproduce
-    return next_command("archive", args, robot=robot, resume=path, policy=moved, reproduce=reproduce)
+    return next_command("archive", args, robot=robot, resume=path, policy=policy, reproduce=reproduce)
 
 
-def evaluator_of(cfg: SearchCfg, policy: str, device: str, args: Placed, *, runs_on_gpu: int = 1) -> EvaluatorCfg:
+def evaluator_of(
+    cfg: SearchCfg, robot: "RobotCfg", policy: str, device: str, args: Placed, *, runs_on_gpu: int = 1
+) -> EvaluatorCfg:
     """What evaluates an iteration's terrains all at once, with a controller that was tried.
 
     Args:
         cfg: The search.
+        robot: Its robot.
         policy: Controller.
         device: Warp device name.
         args: Where to work.
@@ -175,9 +180,9 @@ def evaluator_of(cfg: SearchCfg, policy: str, device: str, args: Placed, *, runs
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot.
     """
-    check_policy(policy, cfg.robot, device)
+    check_policy(policy, robot, device)
     return EvaluatorCfg(
-        robot=cfg.robot,
+        robot=robot,
         policy=policy,
         num_terrains=cfg.scheduler.num_terrains * (runs_on_gpu if device.startswith("cuda") else 1),
         num_replicas=cfg.replicas,
@@ -188,76 +193,26 @@ def evaluator_of(cfg: SearchCfg, policy: str, device: str, args: Placed, *, runs
     )
 
 
-def origin_in(config: dict[str, Any]) -> dict[str, Any]:
-    """Where a run comes from, as its config has it."""
-    return {name: value for name, value in config.items() if name not in ("settings", "iterations")}
-
-
-def moved_policy(there: SearchCfg, given: str | None) -> str | None:
-    """The file given for a run's controller, if it is the run's own in another place."""
-    same = given is not None and there.policy_sha256 is not None and file_hash(Path(given)) == there.policy_sha256
-    return given if same else None
-
-
-def resumed(path: Path, there: SearchCfg, robot: "RobotCfg", changes: Settings, moved: str | None) -> SearchCfg:
-    """The settings that a run would go on with.
-
-    Args:
-        path: Its directory.
-        there: Its settings.
-        robot: Its robot as it is now.
-        changes: What the command line gives, as :func:`qd.settings.changed` takes it.
-        moved: Where the run's controller is now, if elsewhere.
-
-    Raises:
-        ValueError: If its controller is lost, or a setting is out of range.
-    """
-    if moved is not None:
-        changes = {**changes, "policy": None}
-    wanted = measured_now(changed(there, changes), robot)
-    if moved is not None:
-        return replace(wanted, policy_sha256=there.policy_sha256)
-    if wanted.policy == there.policy and there.policy_sha256 is not None and wanted.policy_sha256 is None:
-        raise ValueError(
-            f"{path} was searched with the controller in {policy_spec(there, robot)}, got no such file now: put it "
-            "back, or say where it is now with --policy"
-        )
-    return wanted
-
-
-def refuse_changes(path: Path, what: str, there: Settings, wanted: Settings) -> None:
-    """Nothing but its number of iterations may change where something goes on.
-
-    Raises:
-        ValueError: If a setting differs.
-    """
-    different = differences(there, wanted)
-    if different:
-        raise ValueError(
-            f"{path} holds a {what} of other settings: {', '.join(different)}: start a new {what} for those"
-        )
-
-
-def _free_path(args: Arguments, cfg: SearchCfg) -> Path:
+def _free_path(args: Arguments, cfg: SearchCfg, robot: "RobotCfg") -> Path:
     """Directory of a new run; never one that holds something."""
     if args.run_dir is None:
         name = f"{cfg.robot}-{cfg.preset}-{cfg.seed}"
         path = next(path for path in numbered(_RUNS, name) if not path.exists())
-        _mention_unfinished(name, cfg, args)
+        _mention_unfinished(name, cfg, args, robot)
         return path
     if (args.run_dir / CONFIG_FILE).exists():
         different = differences(as_settings(RunDirectory(args.run_dir).read_cfg()), as_settings(cfg))
         if different:
             found = f"{args.run_dir} holds a run of other settings"
             raise ValueError(f"{found}: {', '.join(different)}: give another --run-dir")
-        command = _resume_command(cfg.robot, args.run_dir, args, None)
+        command = _resume_command(robot.spec, args.run_dir, args, code_of(cfg))
         raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
     if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
         raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
     return args.run_dir
 
 
-def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments) -> None:
+def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments, robot: "RobotCfg") -> None:
     """Says so where the new run repeats one that was stopped; starting over is still the user's to choose."""
     for path in itertools.takewhile(Path.exists, numbered(_RUNS, name)):
         run = RunDirectory(path)
@@ -268,4 +223,4 @@ def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments) -> None:
         if done < there.iterations and as_settings(there) == as_settings(cfg):
             state = f"stopped after {done} of {there.iterations} iterations"
             print(f"{path} holds the same search, {state}. Go on with:")
-            print(f"  {_resume_command(cfg.robot, path, args, None)}")
+            print(f"  {_resume_command(robot.spec, path, args, code_of(cfg))}")

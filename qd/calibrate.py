@@ -27,13 +27,14 @@ _CPU_TERRAINS = 16  # at once: enough to keep some cores busy, little enough mem
 class CalibrateCfg:
     """Measure the penalty scales of a robot with a controller, on hard-random terrains.
 
-    Writes them beside the shipped controller, where every search reads them.
+    Writes them beside the robot's own controller, or the settings file of a robot that is not shipped, where every
+    search reads them.
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     policy: str | None = None
-    """Controller: a file or module:callable; the shipped one."""
+    """Controller: a file, file.py:callable or module:callable; the one that comes with the robot."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     terrains: int = 300
@@ -45,7 +46,7 @@ class CalibrateCfg:
     workers: int | Literal["auto"] | None = None
     """Cross on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
     out: Path | None = None
-    """Where to write; sim/robots/<robot>.scales.json."""
+    """Where to write; sim/robots/<robot>.scales.json, or <name>.scales.json beside a settings file."""
 
 
 def penalty_scales(result: "RolloutResult") -> dict[str, float]:
@@ -80,20 +81,20 @@ def calibrate(cfg: CalibrateCfg) -> Path:
 
     if cfg.terrains < 1 or cfg.replicas < 1:
         raise ValueError(f"terrains and replicas must be at least 1, got {cfg.terrains} and {cfg.replicas}")
-    if cfg.policy is not None and cfg.out is None:
+    robot = get_robot(cfg.robot)
+    if cfg.policy is not None and cfg.out is None and robot.settings_file is None:
         raise ValueError(
             "the scales kept with a robot are those of its shipped controller, got another one (--policy): "
             "name a file for its scales with --out"
         )
-    robot = get_robot(cfg.robot)
     device = resolve_device(cfg.device, cfg.workers)
     policy = cfg.policy or str(robot.policy_file)
-    check_policy(policy, cfg.robot, device)
+    check_policy(policy, robot, device)
     out = cfg.out or robot.scales_file
     prepare_output(out)
     print(f"Crossing {cfg.terrains} hard-random terrains {cfg.replicas} times on {device}.", flush=True)
     evaluator = EvaluatorCfg(
-        robot=cfg.robot,
+        robot=robot,
         policy=policy,
         num_terrains=cfg.terrains if device.startswith("cuda") else min(cfg.terrains, _CPU_TERRAINS),
         num_replicas=cfg.replicas,
@@ -106,7 +107,7 @@ def calibrate(cfg: CalibrateCfg) -> Path:
         result = evaluate(genes, seeds, lambda share: _move(bar, share))
     report = {
         **origin_of(device, cfg.seed, cfg.workers),
-        "robot": cfg.robot,
+        "robot": robot.name,
         "policy": ControllerSpec.parse(policy).label,
         **_measured(result),
     }

@@ -6,8 +6,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from qd.arguments import evaluator_of, moved_policy, origin_in, refuse_changes, resumed
+from qd.arguments import evaluator_of
 from qd.next_commands import next_command
+from qd.resuming import code_of, moved_policy, origin_in, own_file, refuse_changes, refuse_unnamed_code, resumed
 from qd.run_directory import numbered
 from qd.scheduler_cfg import SchedulerCfg
 from qd.settings import SearchCfg, Settings, as_settings, changed, from_settings, measured_now, policy_spec, preset
@@ -35,7 +36,7 @@ METHODS: dict[str, dict[str, Any]] = {
 COMPARE_CONFIG_FILE = "compare.config.json"
 _RUNS = Path("runs")
 _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a directory can be called, with a seed behind it
-_DEFAULTS = {"robot": "anymal", "methods": tuple(METHODS), "seeds": 3, "iterations": 33, "reevaluate_every": 11}
+_DEFAULTS = {"methods": tuple(METHODS), "seeds": 3, "iterations": 33, "reevaluate_every": 11}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,7 @@ class Arguments:
     """Where to write the numbers, with a figure beside them; compare.json in the comparison's directory."""
 
 
-_OF_RUNS = ("robot", "preset", "seed", "iterations", "reevaluate_every", "policy")
+_OF_RUNS = ("preset", "seed", "iterations", "reevaluate_every", "policy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,23 +125,25 @@ def comparison_of(args: Arguments) -> Comparison:
         FileNotFoundError: If there is none to resume.
         ValueError: If robot, methods, device, controller, another argument or the directory is not as it must be.
     """
-    from sim.robot import get_robot
+    from sim.robot import get_robot, robot_of
 
     if args.resume and args.run_dir:
         raise ValueError("give --resume for a comparison that is there or --run-dir for a new one, not both")
     device = resolve_device(args.device, args.workers)
     config = _read_config(args.resume) if args.resume else None
     there = _asked_in(args.resume, config) if args.resume and config else None
-    robot = get_robot(args.robot or (there[0].robot if there else "anymal"))
+    named = robot_of(there[0].robot, args.robot, args.resume) if args.resume and there else args.robot
+    robot = get_robot(named or "anymal")
     if args.resume and config and there:
+        refuse_unnamed_code(there[0].policy, args.policy, args.resume)
         path, origin, moved = args.resume, origin_in(config), moved_policy(there[0], args.policy)
         cfg, methods, seeds = _resumed(path, there, robot, args, moved)
     else:
         path, moved = _free_path(args.run_dir, robot.name), None
         cfg, methods, seeds = _begun(robot, device, args)
-        origin = origin_of(device, cfg.seed, args.workers)
+        origin = origin_of(device, cfg.seed, args.workers) | own_file(robot)
     policy = moved or policy_spec(cfg, robot)
-    evaluator = evaluator_of(cfg, policy, device, args, runs_on_gpu=len(methods) * seeds)
+    evaluator = evaluator_of(cfg, robot, policy, device, args, runs_on_gpu=len(methods) * seeds)
     if args.out is not None:
         prepare_output(args.out)
     return Comparison(
@@ -151,7 +154,7 @@ def comparison_of(args: Arguments) -> Comparison:
         evaluator=evaluator,
         out=args.out or path / "compare.json",
         origin=origin,
-        resume_command=next_command("compare", args, robot=cfg.robot, resume=path, policy=moved),
+        resume_command=next_command("compare", args, robot=robot.spec, resume=path, policy=moved or code_of(cfg)),
     )
 
 

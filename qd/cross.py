@@ -74,17 +74,17 @@ def cross(cfg: CrossCfg) -> dict[str, Any]:
     terrain = read_own_terrain(cfg.terrain, cfg)
     if cfg.episodes < 1 or cfg.seed < 0:
         raise ValueError(f"episodes must be at least 1 and seed at least 0, got {cfg.episodes} and {cfg.seed}")
-    out, figure = _outputs(cfg)
+    out, figure = _outputs(cfg, robot.name)
     prepare_output(out)
     device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
-    check_policy(policy, cfg.robot, device)
+    check_policy(policy, robot, device)
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.episodes, device=device)
     with share_bar("crossing") as progress:
         result = rollout.evaluate(
             terrain.heights[None], own_seeds(cfg.seed), record_paths=True, progress=lambda done, of: progress(done / of)
         )
-    report = {**origin_of(device, cfg.seed, None), **_about(cfg, terrain, policy), **numbers_of(result)}
+    report = {**origin_of(device, cfg.seed, None), **_about(cfg, robot.name, terrain, policy), **numbers_of(result)}
     print(describe(report))
     write_atomically(out, to_json(report))
     save_figure(figure, draw_paths(terrain.heights, result, f"{robot.name} on {terrain.label}: {_headline(report)}"))
@@ -92,9 +92,9 @@ def cross(cfg: CrossCfg) -> dict[str, Any]:
     return report
 
 
-def _outputs(cfg: CrossCfg) -> tuple[Path, Path]:
+def _outputs(cfg: CrossCfg, robot: str) -> tuple[Path, Path]:
     """Files of the numbers and of the figure, neither of which may be the map or what says its scale."""
-    out = cfg.out or OWN_FOLDER / f"{cfg.terrain.stem}-{cfg.robot}.json"
+    out = cfg.out or OWN_FOLDER / f"{cfg.terrain.stem}-{robot}.json"
     figure = out.with_name(f"{out.stem}-paths.png")
     given = {cfg.terrain.resolve(), cfg.terrain.with_suffix(".json").resolve()}
     if given & {out.resolve(), figure.resolve()}:
@@ -104,11 +104,11 @@ def _outputs(cfg: CrossCfg) -> tuple[Path, Path]:
     return out, figure
 
 
-def _about(cfg: CrossCfg, terrain: OwnTerrain, policy: str) -> dict[str, Any]:
+def _about(cfg: CrossCfg, robot: str, terrain: OwnTerrain, policy: str) -> dict[str, Any]:
     from sim.provenance import controller_hash
 
     return {
-        "robot": cfg.robot,
+        "robot": robot,
         "policy": policy,
         "policy_sha256": controller_hash(policy),
         "terrain": str(cfg.terrain),

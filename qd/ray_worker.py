@@ -45,6 +45,35 @@ class Controller:
         return str(self.spec.in_folder(Path(folder)) if self.files else self.spec)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Luggage:
+    """What a worker is sent beside its settings: controller and robot, with their files."""
+
+    controller: Controller
+    robot: Any
+    """As :func:`sim.own_robot.pack_robot` packs it."""
+
+    @classmethod
+    def of(cls, cfg: Any) -> "Luggage":
+        """That of an evaluator's settings."""
+        return cls(controller=Controller.of(cfg.policy), robot=_packed(cfg.robot))
+
+    def unpacked(self, cfg: Any, folder: str) -> Any:
+        """The settings with controller and robot from files in ``folder``."""
+        robot = self.robot
+        if not isinstance(robot, str):
+            robot = robot.unpacked(Path(folder) / "robot")
+        return replace(cfg, policy=self.controller.unpacked(folder), robot=robot)
+
+
+def _packed(robot: Any) -> Any:
+    if isinstance(robot, str):
+        return robot
+    from sim.own_robot import pack_robot  # with the physics, which only workers need otherwise
+
+    return pack_robot(robot)
+
+
 def build_of_code() -> str:
     """A fingerprint of what a worker runs."""
     return code_fingerprint(_ROOMS)
@@ -59,12 +88,12 @@ class RayWorker:
 
     Args:
         cfg: An evaluator's settings; its device is the one Ray gave to this process.
-        controller: The policy.
+        luggage: Its controller and robot.
         build: Makes the simulation of ``cfg`` for a number of terrains.
     """
 
-    def __init__(self, cfg: Any, controller: Controller, build: Callable[[Any, int], Crosser]) -> None:
-        self._cfg, self._controller, self._build = cfg, controller, build
+    def __init__(self, cfg: Any, luggage: Luggage, build: Callable[[Any, int], Crosser]) -> None:
+        self._cfg, self._luggage, self._build = cfg, luggage, build
         self._crosser: Crosser | None = None
         self._num_terrains = 0
         self._share = 0.0
@@ -86,8 +115,7 @@ class RayWorker:
         self._building_since = time.monotonic()
         # A worker is killed when it is no longer wanted: a folder that lived as long would be left behind.
         with tempfile.TemporaryDirectory(prefix="faultline-") as folder:
-            policy = self._controller.unpacked(folder)
-            self._crosser = self._build(replace(self._cfg, policy=policy), num_terrains)
+            self._crosser = self._build(self._luggage.unpacked(self._cfg, folder), num_terrains)
         self._building_since, self._num_terrains = None, num_terrains
 
     def cross(self, terrains: NDArray, seeds: NDArray, num_terrains: int) -> tuple["RolloutResult", float]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from qd.archive import Archive, read_archive
 from qd.own_terrain import own_seeds
 from qd.replay import REPLAY_STREAM, as_searched
+from qd.resuming import refuse_unnamed_code
 from qd.run_directory import newest_run
 from qd.settings import SHIPPED
-from qd.workers import check_policy, episode_seeds
+from qd.workers import episode_seeds
 
 if TYPE_CHECKING:
     from sim.recording import Recording
@@ -31,6 +32,8 @@ class Found:
     run: Path
     """What was given: a run directory or an archive file."""
     archive: Archive
+    robot: "RobotCfg"
+    """Whose archive it is."""
 
     @property
     def folder(self) -> Path:
@@ -38,18 +41,22 @@ class Found:
         return self.run if self.run.is_dir() else self.run.parent
 
 
-def archive_of_robot(robot: str, run: Path | None) -> Found:
+def archive_of_robot(named: "RobotCfg | str", run: Path | None) -> Found:
     """The archive of a run, the robot's newest one if none is given.
+
+    Args:
+        named: The robot, as the command line names it or as settings.
+        run: Run directory or archive file.
 
     Raises:
         FileNotFoundError: If there is none.
         ValueError: If it is damaged or of another robot.
     """
-    run = run or newest_run(robot)
+    from sim.robot import get_robot, robot_of
+
+    run = run or newest_run(get_robot(named))
     archive = read_archive(run)
-    if archive.robot != robot:
-        raise ValueError(f"{run} is of {archive.robot}, got --robot {robot}: give that robot or another --run")
-    return Found(run=run, archive=archive)
+    return Found(run=run, archive=archive, robot=robot_of(archive.robot, named, run))
 
 
 def chosen_elites(text: str, found: Found) -> list[int]:
@@ -69,7 +76,7 @@ def chosen_elites(text: str, found: Found) -> list[int]:
     unknown = [word for word in words if not (word.isascii() and word.isdigit() and int(word) < count)]
     if unknown or not words:
         valid = f"expected {ALL}, or numbers of 0 to {count - 1}" if count else "the archive is empty"
-        raise ValueError(f"{found.run} has no elite {', '.join(unknown) or text!r}: {valid}")
+        raise ValueError(f"{found.run} has no elite {', '.join(unknown) or repr(text)}: {valid}")
     return [int(word) for word in dict.fromkeys(words)]
 
 
@@ -80,6 +87,7 @@ def policy_of(found: Found, robot: "RobotCfg", given: str | None) -> str:
         ValueError: If the config of the run is not that of its archive.
     """
     searched, _ = as_searched(found.run, found.archive)
+    refuse_unnamed_code(searched, given, found.run)
     return given or (str(robot.policy_file) if searched == SHIPPED else searched)
 
 
@@ -112,9 +120,7 @@ def record_elites(
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot, or a number is out of range.
     """
-    from sim.robot import get_robot
-
-    robot = get_robot(found.archive.robot)
+    robot = found.robot
     return _record(
         robot,
         found.archive.genes[list(elites)],
@@ -178,7 +184,6 @@ def _record(
 
     if episodes < 1 or seed < 0:
         raise ValueError(f"episodes must be at least 1 and seed at least 0, got {episodes} and {seed}")
-    check_policy(policy, robot.name, device)
     rollout = Rollout(robot, policy, num_terrains=len(terrains), num_replicas=episodes, device=device)
     told = None if progress is None else lambda done, most: progress(done / most)
     return record(

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qd.archive import Archive
-from qd.arguments import evaluator_of, origin_in
+from qd.arguments import evaluator_of
 from qd.cli import naming_what_is_next, run_command
 from qd.fresh import Open, corrected
 from qd.next_commands import next_command
+from qd.resuming import origin_in, refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed, newest_run
 from qd.search import write_results
 from qd.settings import SHIPPED, SearchCfg, as_settings, file_hash, policy_spec
@@ -60,20 +61,19 @@ def reevaluate_run(args: ReevaluateCfg, *, open_evaluator: Open = open_evaluator
         Interrupted: On Ctrl-C; the run is as it was.
         EvaluatorError: If a worker is lost; likewise.
     """
-    from sim.robot import get_robot
+    from sim.robot import get_robot, robot_of
 
-    path = args.run or newest_run(args.robot or "anymal")
+    path = args.run or newest_run(get_robot(args.robot or "anymal"))
     run = RunDirectory(path)
     config, cfg = run.read_config(), run.read_cfg()
-    if args.robot not in (None, cfg.robot):
-        raise ValueError(f"{path} is of {cfg.robot}, got --robot {args.robot}: give that robot or another --run")
+    robot = robot_of(cfg.robot, args.robot, path)
     seed = cfg.seed if args.seed is None else args.seed
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
     device = resolve_device(args.device, args.workers)
-    policy = args.policy or _own_policy(path, cfg, get_robot(cfg.robot))
-    evaluator = evaluator_of(cfg, policy, device, args)
-    again = next_command("reevaluate", args, robot=cfg.robot, run=path, policy=args.policy, seed=args.seed)
+    policy = args.policy or _own_policy(path, cfg, robot)
+    evaluator = evaluator_of(cfg, robot, policy, device, args)
+    again = next_command("reevaluate", args, robot=robot.spec, run=path, policy=args.policy, seed=args.seed)
     with claimed(path):
         loaded = run.load(as_settings(cfg))
         if loaded is None:
@@ -90,8 +90,9 @@ def reevaluate_run(args: ReevaluateCfg, *, open_evaluator: Open = open_evaluator
 
 def _own_policy(path: Path, cfg: SearchCfg, robot: "RobotCfg") -> str:
     """The run's own controller, which must be what it was."""
+    refuse_unnamed_code(cfg.policy, None, path)
     policy = policy_spec(cfg, robot)
-    digest = file_hash(Path(policy))
+    digest = file_hash(policy)
     if digest != cfg.policy_sha256:
         what = "the shipped controller" if cfg.policy == SHIPPED else f"the controller in {policy}"
         state = "lost" if digest is None else "another one now"
@@ -106,7 +107,7 @@ def _given_policy(args: ReevaluateCfg) -> dict[str, Any]:
     """For the results: the controller, where it was given."""
     if args.policy is None:
         return {}
-    return {"policy": args.policy, "policy_sha256": file_hash(Path(args.policy))}
+    return {"policy": args.policy, "policy_sha256": file_hash(args.policy)}
 
 
 def main(args: ReevaluateCfg) -> None:

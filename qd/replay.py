@@ -12,6 +12,7 @@ from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.paths_figure import draw_paths
 from qd.report import save_figure
+from qd.resuming import refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, RunDirectory, newest_run
 from qd.settings import SHIPPED
 from qd.workers import check_policy, episode_seeds, resolve_device
@@ -20,6 +21,7 @@ from sim.intervals import wilson_interval
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from sim.robot import RobotCfg
     from sim.rollout import RolloutResult
 
 REPLAY_STREAM = 2
@@ -43,13 +45,13 @@ class ReplayCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
     """Run directory; the newest of this robot under runs/."""
     elite: int = 0
     """Number of the elite."""
     policy: str | None = None
-    """Controller other than the one the archive was made with."""
+    """Controller other than the one the archive was made with; that one too, if it is code."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     replicas: int = 20
@@ -84,12 +86,13 @@ def replay(cfg: ReplayCfg) -> Replay:
     from sim.rollout import Rollout
 
     robot = get_robot(cfg.robot)
-    run = cfg.run or newest_run(cfg.robot)
-    archive = _archive_with(cfg, run)
+    run = cfg.run or newest_run(robot)
+    archive = _archive_with(cfg, robot, run)
     device = resolve_device(cfg.device)
     policy, fitness = as_searched(run, archive)
+    refuse_unnamed_code(policy, cfg.policy, run)
     policy = cfg.policy or (str(robot.policy_file) if policy == SHIPPED else policy)
-    check_policy(policy, cfg.robot, device)
+    check_policy(policy, robot, device)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.replicas, device=device)
     seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=REPLAY_STREAM)
     result = rollout.evaluate(archive.genes[cfg.elite : cfg.elite + 1], seeds, record_paths=True)
@@ -103,10 +106,10 @@ def replay(cfg: ReplayCfg) -> Replay:
     )
 
 
-def _archive_with(cfg: ReplayCfg, run: Path) -> Archive:
+def _archive_with(cfg: ReplayCfg, robot: "RobotCfg", run: Path) -> Archive:
     """The archive of a run, which must be of the robot and have the elite."""
     archive = read_archive(run)
-    if archive.robot != cfg.robot:
+    if archive.robot != robot.name:
         raise ValueError(f"{run} is of {archive.robot}, got --robot {cfg.robot}: give that robot or another --run")
     if not 0 <= cfg.elite < len(archive):
         valid = f"expected 0 to {len(archive) - 1}" if len(archive) else "the archive is empty"

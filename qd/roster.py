@@ -13,7 +13,7 @@ from ray.exceptions import RayError, RayTaskError
 from tqdm import tqdm
 
 from qd.cluster import num_devices, resources
-from qd.ray_worker import Controller, RayWorker, build_of_code
+from qd.ray_worker import Luggage, RayWorker, build_of_code
 from qd.worker_process import Crosser, EvaluatorError
 
 if TYPE_CHECKING:
@@ -69,8 +69,10 @@ class Roster:
         self.members: list[Member] = []
         self._cfg, self._code = cfg, build_of_code()
         self._options = {"num_gpus": gpus, "num_cpus": 1 - gpus}
-        # The controller travels once a machine, however many workers there are.
-        self._work = replace(cfg, device="cuda:0" if gpus else "cpu"), ray.put(Controller.of(cfg.policy)), build
+        # Controller and robot travel once a machine, however many workers there are.
+        luggage = Luggage.of(cfg)
+        cfg = replace(cfg, device="cuda:0" if gpus else "cpu", robot="")  # the robot is in the luggage
+        self._work = cfg, ray.put(luggage), build
         self._number = self._refusals = 0
         self._recruited_at = -np.inf
 

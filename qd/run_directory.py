@@ -21,6 +21,7 @@ from sim.files import check_writable, read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
+    from sim.robot import RobotCfg
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
@@ -35,18 +36,19 @@ Metrics = list[dict[str, Any]]
 _RUNS = Path("runs")
 
 
-def newest_run(robot: str) -> Path:
+def newest_run(robot: "RobotCfg | str") -> Path:
     """The run of a robot under runs/ whose archive changed last.
 
     Raises:
         FileNotFoundError: If there is none.
     """
+    name, spec = (robot, robot) if isinstance(robot, str) else (robot.name, robot.spec)
     files = sorted(_RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in files:
-        if read_archive(file).robot == robot:
+        if read_archive(file).robot == name:
             return file.parent
     raise FileNotFoundError(
-        f"no archive of {robot} under {_RUNS}/: make one with `make archive ROBOT={robot}`, or give --run"
+        f"no archive of {name} under {_RUNS}/: make one with `make archive ROBOT={spec}`, or give --run"
     )
 
 

@@ -81,7 +81,7 @@ def measure(args: Arguments) -> dict[str, Any]:
     policy = str(robot.policy_file)
     terrains, replicas = args.terrains or (256 if on_gpu else 4), args.replicas or (16 if on_gpu else 4)
     alone = EvaluatorCfg(
-        robot=robot.name,
+        robot=robot,
         policy=policy,
         num_terrains=terrains,
         num_replicas=replicas,

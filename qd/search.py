@@ -12,6 +12,7 @@ from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
 from qd.next_commands import make_command
 from qd.progress import ProgressBar, clock, plan
 from qd.report import summary, write_figures
+from qd.resuming import code_of
 from qd.run_directory import CONFIG_FILE, SUMMARY_FILE, Metrics, RunDirectory, archive_of, claimed
 from qd.settings import SearchCfg, as_settings
 from qd.workers import Evaluate, crew_status, episode_seeds, open_evaluator, origin_of
@@ -148,7 +149,8 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
             again = f"Go on with:  {job.reevaluate_command}"
             with naming_what_is_next("the archive is saved as found", lambda: again):
                 archive = _write_corrected(job, run, archive, metrics, open_evaluator)
-    print(f"Next, see the worst terrain:  {make_command('replay', robot=cfg.robot, run=job.path, elite=0)}")
+    worst = make_command("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
+    print(f"Next, see the worst terrain:  {worst}")
     return archive
 
 

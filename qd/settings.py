@@ -33,6 +33,7 @@ class SearchCfg:
     """What is searched, with what, and how; runs that agree in all but ``iterations`` are the same run."""
 
     robot: str
+    """Name of the robot."""
     preset: str
     policy: str
     """Controller: ``shipped``, or as :func:`sim.policy.load_policy` takes it."""
@@ -49,6 +50,8 @@ class SearchCfg:
     """Whether base collision is a descriptor of its own."""
     fitness: FitnessCfg
     scheduler: SchedulerCfg
+    robot_sha256: str | None = None
+    """Hash of the settings, model and meshes of a robot that is not shipped."""
     reevaluate_every: int = 50
     """Every so many iterations, up to 200 elites are looked at again in 40 fresh episodes each; 0: never."""
 
@@ -178,7 +181,7 @@ def _brief(value: Any) -> str:
 
 
 def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
-    """What to load the controller from: a file or ``module:callable``."""
+    """What to load the controller from, as :func:`sim.policy.load_policy` takes it."""
     return str(robot.policy_file) if cfg.policy == SHIPPED else cfg.policy
 
 
@@ -215,7 +218,7 @@ def _check_known(names: Sequence[str], robot: "RobotCfg") -> None:
 
 
 def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
-    """Settings with the present scales of their penalties and the present hash of the controller's file.
+    """Settings with the present scales of their penalties and the present hashes of controller and robot.
 
     Raises:
         ValueError: If the robot lacks one of the penalties, or their scales were never measured.
@@ -225,4 +228,19 @@ def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
     _check_known(penalties, robot)
     scales = dict(zip(robot.penalties, robot.read_penalty_scales(), strict=True))
     fitness = replace(cfg.fitness, scales=tuple(scales[name] for name in penalties))
-    return replace(cfg, policy_sha256=digest, fitness=fitness, collision_bit=robot.collision_bit)
+    return replace(
+        cfg,
+        robot=robot.name,
+        robot_sha256=_robot_hash(robot),
+        policy_sha256=digest,
+        fitness=fitness,
+        collision_bit=robot.collision_bit,
+    )
+
+
+def _robot_hash(robot: "RobotCfg") -> str | None:
+    if robot.settings_file is None:
+        return None
+    from sim.own_robot import robot_digest
+
+    return robot_digest(robot)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from qd.cli import run_command
 from qd.progress import ProgressBar
+from qd.resuming import refuse_unnamed_code
 from qd.run_directory import Metrics, RunDirectory
 from qd.scheduler import Scheduler
 from qd.search import search_terrains
@@ -141,7 +142,7 @@ def measure(args: Arguments) -> dict[str, Any]:
         ValueError: If something asked for cannot be had.
     """
     from sim.bare import measure_bare_physics
-    from sim.robot import get_robot
+    from sim.robot import get_robot, robot_of
 
     if min(args.iterations, args.steps) < 1 or any(count < 1 or count % _CURVE_REPLICAS for count in args.curve):
         raise ValueError(
@@ -154,12 +155,13 @@ def measure(args: Arguments) -> dict[str, Any]:
         if not device.startswith("cuda"):
             raise ValueError(f"--run needs a CUDA device, got {device}: a run on the CPU has several workers")
         cfg, metrics, terrains = read_iterations(args.run, args.iterations, provenance(device, 0)["device"])
-        robot = get_robot(cfg.robot)
+        robot = robot_of(cfg.robot, args.robot if args.robot.endswith(".py") else None, args.run)
+        refuse_unnamed_code(cfg.policy, None, args.run)
     else:
         cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
         metrics, terrains = [], None
     evaluator = EvaluatorCfg(
-        robot=robot.name,
+        robot=robot,
         policy=policy_spec(cfg, robot),
         num_terrains=cfg.scheduler.num_terrains,
         num_replicas=cfg.replicas,

@@ -21,6 +21,7 @@ from sim.provenance import provenance
 
 if TYPE_CHECKING:
     from qd.crew import CrewStatus
+    from sim.robot import RobotCfg
     from sim.rollout import RolloutResult
 
 __all__ = [
@@ -42,10 +43,10 @@ __all__ = [
 class EvaluatorCfg:
     """What an evaluator crosses, with what, and where."""
 
-    robot: str
-    """Name of the robot."""
+    robot: "RobotCfg | str"
+    """The robot, or the name of a shipped one."""
     policy: str
-    """Controller: a file or ``module:callable``."""
+    """Controller, as :func:`sim.policy.load_policy` takes it."""
     num_terrains: int
     """Terrains at once; more are taken in turns."""
     num_replicas: int
@@ -153,8 +154,8 @@ def origin_of(device: str, seed: int, workers: int | Literal["auto"] | None) -> 
     return origin if workers is None else {**origin, "device": _cluster("cluster").name_of_device(device)}
 
 
-def check_policy(policy: str, robot: str, device: str) -> None:
-    """Loads a controller and tries it, so that a bad one is found before any long work.
+def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
+    """Loads a controller and tries it on the robot that is named, so that a bad one is found before any long work.
 
     Raises:
         ValueError: If it cannot be loaded or does not fit the robot.

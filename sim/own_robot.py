@@ -136,6 +136,12 @@ def robot_digest(robot: RobotCfg) -> str | None:
     return digest.hexdigest()
 
 
+def own_hash(robot: RobotCfg) -> dict[str, str]:
+    """For the settings that a training remembers: the hash of a robot of one's own, nothing of a shipped one."""
+    digest = robot_digest(robot)
+    return {} if digest is None else {"robot_sha256": digest}
+
+
 @dataclass(frozen=True, kw_only=True)
 class PackedRobot:
     """A robot of one's own on its way to a machine that need not have its files."""
@@ -154,10 +160,8 @@ class PackedRobot:
         return replace(self.robot, model_file=folder / self.model)
 
 
-def pack_robot(robot: "RobotCfg | str") -> "PackedRobot | str":
+def pack_robot(robot: RobotCfg) -> PackedRobot | str:
     """What to send of a robot: the name alone of a shipped one, which every machine has."""
-    if isinstance(robot, str):
-        return robot
     if robot.settings_file is None and ROBOTS.get(robot.name) == robot:
         return robot.name
     files = read_model_files(robot.model_file).files
@@ -165,8 +169,3 @@ def pack_robot(robot: "RobotCfg | str") -> "PackedRobot | str":
     root = Path(os.path.commonpath([file.parent for file in files])).parent
     packed = tuple((str(file.relative_to(root)), file.read_bytes()) for file in files)
     return PackedRobot(robot=robot, model=packed[0][0], files=packed)
-
-
-def unpack_robot(packed: "PackedRobot | str", folder: Path) -> "RobotCfg | str":
-    """The robot that was packed, its files in ``folder``."""
-    return packed.unpacked(folder) if isinstance(packed, PackedRobot) else packed

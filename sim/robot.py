@@ -219,7 +219,7 @@ ROBOTS = {
 
 
 def get_robot(spec: "str | RobotCfg") -> RobotCfg:
-    """Settings of a robot.
+    """Settings of a robot that the command line names; :func:`robot_of` is for what a file names.
 
     Args:
         spec: Name of a shipped robot, or the Python file of another, which is run and must set ``ROBOT``; settings are
@@ -240,3 +240,28 @@ def get_robot(spec: "str | RobotCfg") -> RobotCfg:
         f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or a Python file that sets ROBOT "
         "(README, Bring your own robot)"
     )
+
+
+def robot_of(name: str, given: "str | RobotCfg | None", file: Path) -> RobotCfg:
+    """The robot that a file says it is of, such as a run.
+
+    A shipped one is known by that name. Another one only if the command line names it too: what a file names is never
+    run.
+
+    Args:
+        name: What the file says.
+        given: What the command line names, if anything.
+        file: The file, for errors.
+
+    Raises:
+        ValueError: If the two are not the same, or the command line must name it.
+    """
+    robot = None if given is None else get_robot(given)
+    if robot is not None and robot.name != name:
+        raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --run")
+    if robot is None and name not in ROBOTS:
+        raise ValueError(
+            f"{file} is of robot '{name}', which is not shipped: name its settings file too (--robot .../{name}.py), "
+            "since no code runs that the command line does not name"
+        )
+    return robot or ROBOTS[name]

@@ -19,6 +19,7 @@ import tyro
 
 from sim.command import exit_code_of
 from sim.files import to_json, write_atomically
+from sim.own_robot import own_hash
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
@@ -55,7 +56,8 @@ class BaseCfg:
     """
 
     robot: str = _ROBOT
-    """Which robot; its own settings are the defaults of task."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults of
+    task."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
@@ -69,7 +71,8 @@ class BaseCfg:
     resume: Path | None = None
     """Run directory to go on from."""
     export: Path | None = None
-    """Also write the controller to this file and its training record beside it (sim/robots/<robot>.pt ships it)."""
+    """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
+    <name>.pt beside the settings file of another robot makes it that robot's own."""
     seed: int | None = None
     """Seed of everything drawn; 0, or that of the resumed run."""
     save_every_s: float = 60.0
@@ -100,9 +103,9 @@ def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
     return device, num_envs, iterations
 
 
-def _run_dir(cfg: BaseCfg) -> Path:
+def _run_dir(cfg: BaseCfg, robot: str) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    return cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-base-{stamp}"
+    return cfg.run_dir or cfg.resume or Path("runs") / f"{robot}-base-{stamp}"
 
 
 def train(cfg: BaseCfg) -> int:
@@ -123,16 +126,17 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     began = time.monotonic()
     robot = get_robot(cfg.robot)
     device, num_envs, iterations = _resolve_size(cfg)
-    saved = read_saved(cfg.resume / CHECKPOINT, cfg.robot) if cfg.resume else None
+    saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
-    run_dir = prepare_run_dir(_run_dir(cfg), resume=cfg.resume, export=cfg.export)
+    run_dir = prepare_run_dir(_run_dir(cfg, robot.name), resume=cfg.resume, export=cfg.export)
     settings = {
         "seed": seed,
         "num_envs": num_envs,
         "processes": ranks.size,
         "task": asdict(cfg.task),
         "ppo": asdict(cfg.ppo),
+        **own_hash(robot),
     }
     for change in changes(saved["extra"]["settings"], settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")

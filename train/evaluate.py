@@ -35,9 +35,9 @@ def evaluate_base(cfg: EvaluateCfg) -> dict[str, Any]:
     out = cfg.out or (Path("results") / robot.name / "base.json" if published else None)
     if out is not None:
         prepare_output(out)
-    check_policy(policy, robot.name, size.device)
+    check_policy(policy, robot, size.device)
     evaluator = EvaluatorCfg(
-        robot=robot.name,
+        robot=robot,
         policy=policy,
         num_terrains=size.terrains,
         num_replicas=size.episodes,

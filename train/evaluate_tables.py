@@ -8,6 +8,7 @@ from qd.archive import Archive, read_archive
 from qd.workers import EvaluatorCfg, check_policy, open_evaluator, origin_of
 from sim.files import prepare_output, to_json, write_atomically
 from sim.named_controllers import controllers_of
+from sim.own_robot import robot_digest
 from train.crossings import Open, cross_all
 from train.evaluate_cfg import EvaluateCfg, Size, size_of, split_words
 from train.kept import KeptCrossings, controller_hash
@@ -54,7 +55,7 @@ def _plan_of(cfg: EvaluateCfg) -> _Plan:
         prepare_output(file)
     scales = robot.read_penalty_scales()
     for policy in controllers.values():
-        check_policy(policy, robot.name, size.device)
+        check_policy(policy, robot, size.device)
     return _Plan(
         size=size,
         evaluator=_evaluator_of(size, cfg),
@@ -69,7 +70,7 @@ def _plan_of(cfg: EvaluateCfg) -> _Plan:
 
 def _evaluator_of(size: Size, cfg: EvaluateCfg) -> EvaluatorCfg:
     return EvaluatorCfg(
-        robot=size.robot.name,
+        robot=size.robot,
         policy="",
         num_terrains=size.terrains,
         num_replicas=size.episodes,
@@ -105,7 +106,13 @@ def evaluate_tables(cfg: EvaluateCfg, *, open_evaluator: Open = open_evaluator) 
     """
     plan = _plan_of(cfg)
     size, robot = plan.size, plan.size.robot
-    kept = KeptCrossings(plan.kept, robot=robot.name, episodes=size.episodes, device=size.device)
+    kept = KeptCrossings(
+        plan.kept,
+        robot=robot.name,
+        robot_sha256=robot_digest(robot),
+        episodes=size.episodes,
+        device=size.device,
+    )
     results = cross_all(plan.controllers, plan.sets, plan.evaluator, kept, open_evaluator=open_evaluator)
     crossed = {name: {who: measure(one, plan.scales) for who, one in row.items()} for name, row in results.items()}
     about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in plan.controllers.items()}

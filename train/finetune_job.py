@@ -10,6 +10,7 @@ import torch
 
 from qd.archive import read_archive
 from sim.files import read_json
+from sim.own_robot import own_hash
 from sim.policy import MlpPolicy, load_policy, read_weights
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
@@ -115,7 +116,7 @@ def job_of(cfg: FinetuneCfg) -> Job:
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
-    cfg = _filled(cfg, device)
+    cfg = _filled(cfg, robot.name, device)
     actor, critic = _start(cfg.policy or robot.policy_file, robot)
     hidden = [len(actor[f"mlp.{k}.bias"]) for k in _layers(actor)[:-1]]
     cfg = replace(cfg, ppo=replace(_ppo(cfg, saved), hidden_dims=tuple(hidden)))
@@ -138,6 +139,7 @@ def job_of(cfg: FinetuneCfg) -> Job:
             "critic_iterations": 0 if critic else cfg.critic_iterations,
             "task": asdict(task),
             "ppo": asdict(cfg.ppo),
+            **own_hash(robot),
         }
     )
     if saved is not None:
@@ -155,18 +157,18 @@ def job_of(cfg: FinetuneCfg) -> Job:
         task=task,
         settings=settings,
         saved=saved,
-        run_dir=prepare_run_dir(_run_dir(cfg), resume=cfg.resume, export=cfg.export),
+        run_dir=prepare_run_dir(_run_dir(cfg, robot.name), resume=cfg.resume, export=cfg.export),
     )
 
 
-def _filled(cfg: FinetuneCfg, device: str) -> FinetuneCfg:
+def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
     """Settings with all that was left out: as the resumed run has it, else as the device can do.
 
     Raises:
         ValueError: If a number is out of range, or the resumed run's settings cannot be read.
     """
     on_gpu = device.startswith("cuda")
-    sizes = _PAPER.get(cfg.robot, _PAPER_OTHERS) if on_gpu else _SMALL
+    sizes = _PAPER.get(robot, _PAPER_OTHERS) if on_gpu else _SMALL
     before = _settings_of(cfg.resume) if cfg.resume else {}
     if not on_gpu and not before and cfg.num_envs is None and cfg.iterations is None:
         print(
@@ -254,6 +256,6 @@ def _check_resumed(cfg: FinetuneCfg, saved: dict[str, Any], settings: dict[str, 
         )
 
 
-def _run_dir(cfg: FinetuneCfg) -> Path:
+def _run_dir(cfg: FinetuneCfg, robot: str) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    return cfg.run_dir or cfg.resume or Path("runs") / f"{cfg.robot}-{cfg.mix}-{stamp}"
+    return cfg.run_dir or cfg.resume or Path("runs") / f"{robot}-{cfg.mix}-{stamp}"

@@ -37,14 +37,17 @@ class KeptCrossings:
     Args:
         folder: Where they are kept; made when the first is written.
         robot: Name of the robot.
+        robot_sha256: Hash of a robot that is not shipped (:func:`sim.own_robot.robot_digest`).
         episodes: Episodes a terrain.
         device: Warp device name; crossings of a CPU and of a GPU differ in their last bits.
     """
 
-    def __init__(self, folder: Path, *, robot: str, episodes: int, device: str) -> None:
+    def __init__(
+        self, folder: Path, *, robot: str, robot_sha256: str | None = None, episodes: int, device: str
+    ) -> None:
         self.folder, self._episodes = folder, episodes
         kind = "cuda" if device.startswith("cuda") else "cpu"
-        self._common = [robot, episodes, kind, code_fingerprint(_ROOMS)]
+        self._common = [robot if robot_sha256 is None else robot_sha256, episodes, kind, code_fingerprint(_ROOMS)]
 
     def file(self, policy: str, terrains: TerrainSet) -> Path:
         """Where the crossings of one controller on one set are kept."""

@@ -45,15 +45,12 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
 
 
 def run_main(*argv: str) -> None:
-    """The search's command on the stand-in evaluator, with a controller that is there."""
+    """The search's command on the stand-in evaluator."""
 
     def main(args: Arguments) -> None:
         search.run_search(arguments.job_of(args), open_evaluator=stand_in.open_stand_in)
 
-    given = list(argv)
-    if "--policy" not in given and "--resume" not in given:
-        given += ["--policy", f"{__name__}:fine_policy"]
-    run_command(Arguments, main, given)
+    run_command(Arguments, main, list(argv))
 
 
 def fails(capsys, *argv: str, run=run_main) -> str:
@@ -69,7 +66,11 @@ def fails(capsys, *argv: str, run=run_main) -> str:
 
 
 def test_unknown_robot_and_preset(capsys):
-    assert fails(capsys, "--robot", "dog") == "unknown robot 'dog': expected one of anymal, cassie"
+    assert fails(capsys, "--robot", "dog") == (
+        "unknown robot 'dog': expected one of anymal, cassie, or a Python file that sets ROBOT (README, Bring your own "
+        "robot)"
+    )
+    assert fails(capsys, "--robot", "dog.py") == "dog.py: no such file"
     assert fails(capsys, "--preset", "huge", *TINY) == "unknown preset 'huge': expected one of paper, small"
     assert not Path("runs").exists()
 
@@ -159,6 +160,32 @@ def test_a_controller_that_moved_is_asked_for_and_taken_where_it_is_now(capsys):
     assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
     Path("moved.pt").rename("mine.pt")
     run_main("--resume", "a", "--iterations", "3")
+
+
+def test_code_runs_only_if_it_is_named_again(capsys):
+    fine = f"{__name__}:fine_policy"
+    run_main(*TINY, "--policy", fine, "--run-dir", "a")
+    told = capsys.readouterr().out
+    assert f"make replay ROBOT=anymal RUN=a ELITE=0 POLICY={fine}" in told
+    before = everything_in("a")
+    refused = f"a was searched with the controller {fine}, which is code: name it again (--policy)"
+    assert refused in fails(capsys, "--resume", "a", "--iterations", "2")
+    assert f"make archive ROBOT=anymal RESUME=a POLICY={fine} DEVICE=cpu" in fails(
+        capsys, *TINY, "--policy", fine, "--run-dir", "a"
+    )
+    config = json.loads(Path("a/config.json").read_text())
+    Path("evil.py").write_text("open('it_ran', 'w').close()\ndef act(row): pass\n")
+    for policy in ("evil:act", f"{Path.cwd()}/evil.py:act", f"{Path.cwd()}/evil.py:act@a/checkpoint.bin"):
+        settings = {**config["settings"], "policy": policy}
+        Path("a/config.json").write_text(json.dumps({**config, "settings": settings}))
+        assert "which is code" in fails(capsys, "--resume", "a", "--iterations", "2")
+    settings = {**config["settings"], "robot": f"{Path.cwd()}/evil.py"}
+    Path("a/config.json").write_text(json.dumps({**config, "settings": settings}))
+    assert "which is not shipped: name its settings file too" in fails(capsys, "--resume", "a", "--policy", fine)
+    assert not Path("it_ran").exists()
+    Path("a/config.json").write_bytes(before["config.json"])
+    run_main("--resume", "a", "--iterations", "2", "--policy", fine)
+    assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
 
 
 def test_what_a_killed_beginning_leaves_is_begun_in_again():

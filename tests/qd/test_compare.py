@@ -20,7 +20,7 @@ from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 from tests.qd.test_cli import fine_policy
 
-POLICY = f"{fine_policy.__module__}:{fine_policy.__name__}"
+POLICY = "shipped"
 METHODS = ("uniform_random", "cma_mae_narrow")
 ASKED = {"methods": METHODS, "seeds": 2, "seed": 5, "iterations": 3, "reevaluate_every": 2, "device": "cpu"}
 
@@ -290,7 +290,7 @@ def test_directories_that_hold_no_comparison_or_one_already():
         ({"seed": 0}, r"seed \(5 there, 0 wanted\)"),
         ({"reevaluate_every": 3}, r"reevaluate_every \(2 there, 3 wanted\)"),
         ({"preset": "paper"}, r'preset \("small" there, "paper" wanted\)'),
-        ({"policy": f"{__name__}:fine_policy"}, r"policy \(.* there, .* wanted\)"),
+        ({"policy": f"{fine_policy.__module__}:{fine_policy.__name__}"}, r"policy \(.* there, .* wanted\)"),
         ({"iterations": 1}, "iterations must be at least 2, as many as a/uniform_random-5 has done, got 1"),
     ],
 )

@@ -13,12 +13,15 @@ from qd.archive import read_archive
 from qd.cli import Interrupted
 from qd.reevaluate import ReevaluateCfg, reevaluate_run
 from qd.search import run_search
+from qd.settings import file_hash
 from qd.workers import EvaluatorError
+from sim.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 from tests.qd.test_search import make_job, rows_of, run
 
 POLICY = "tests.sim.policies:stand"
+SHIPPED = {"policy": "shipped", "policy_sha256": file_hash(get_robot("anymal").policy_file)}
 
 
 @pytest.fixture(autouse=True)
@@ -100,21 +103,21 @@ def test_stopped_in_the_fresh_episodes_a_search_leaves_what_it_found_and_the_com
 ):
     path = tmp_path / "run"
     with pytest.raises(kind) as raised:
-        job = make_job(path, reproduce=True, policy=POLICY)
+        job = make_job(path, reproduce=True, **SHIPPED)
         run_search(job, open_evaluator=ended_in_fresh_episodes(error))
     assert str(raised.value) == f"{message}Go on with:  make reevaluate RUN={path}"
-    found = run(tmp_path / "found", policy=POLICY)
+    found = run(tmp_path / "found", **SHIPPED)
     assert (path / "archive.npz").read_bytes() == (tmp_path / "found/archive.npz").read_bytes()
     assert numbers_in(path)["elites_reproduced"] is None
     again(path)
-    run_search(make_job(tmp_path / "whole", reproduce=True, policy=POLICY), open_evaluator=open_stand_in)
+    run_search(make_job(tmp_path / "whole", reproduce=True, **SHIPPED), open_evaluator=open_stand_in)
     assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
     assert numbers_in(path)["elites_reproduced"] == len(found)
 
 
 def test_the_command_adds_fresh_values_to_a_run_and_another_seed_gives_others(tmp_path):
     path = tmp_path / "run"
-    found = run(path, policy=POLICY)
+    found = run(path, **SHIPPED)
     metrics = rows_of(path, timed=True)
     first = again(path)
     assert first.fresh.fitness.tolist() != found.fitness.tolist()
@@ -132,7 +135,7 @@ def test_the_command_adds_fresh_values_to_a_run_and_another_seed_gives_others(tm
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), EvaluatorError("no worker came")])
 def test_stopped_the_command_leaves_the_run_as_it_was_and_says_how_to_start_again(tmp_path, error):
     path = tmp_path / "run"
-    run(path, policy=POLICY)
+    run(path, **SHIPPED)
     before = {file.name: file.read_bytes() for file in path.iterdir()}
     args = ReevaluateCfg(run=path, device="cpu", seed=7, processes=1, worker_limit_s=20.0)
     with pytest.raises((Interrupted, EvaluatorError)) as raised:
@@ -147,51 +150,51 @@ def test_stopped_the_command_leaves_the_run_as_it_was_and_says_how_to_start_agai
 
 def test_fresh_values_stay_while_the_elites_are_the_same(tmp_path, capsys):
     path = tmp_path / "run"
-    run(path, policy=POLICY)
+    run(path, **SHIPPED)
     again(path, seed=7)
     kept, numbers = (path / "archive.npz").read_bytes(), numbers_in(path)
-    run(path, policy=POLICY, resumes=True)  # nothing is left to do but to write its results again
+    run(path, **SHIPPED, resumes=True)  # nothing is left to do but to write its results again
     assert (path / "archive.npz").read_bytes() == kept
-    assert numbers_in(path) == numbers
+    assert {**numbers_in(path), "date": 0} == {**numbers, "date": 0}
     assert numbers["reproduced_by"]["seed"] == 7
     assert "drops those values" not in capsys.readouterr().out
     # Searched again at the end, they are those of the run's own seed.
-    run_search(make_job(path, policy=POLICY, resumes=True, reproduce=True), open_evaluator=open_stand_in)
+    run_search(make_job(path, **SHIPPED, resumes=True, reproduce=True), open_evaluator=open_stand_in)
     assert numbers_in(path)["reproduced_by"]["seed"] == 3
 
 
 def test_a_run_that_grows_says_that_its_fresh_values_go(tmp_path, capsys):
     path = tmp_path / "run"
-    run(path, policy=POLICY)
+    run(path, **SHIPPED)
     assert "drops those values" not in capsys.readouterr().out
     again(path)
-    run(path, policy=POLICY, resumes=True, iterations=4)
+    run(path, **SHIPPED, resumes=True, iterations=4)
     output = capsys.readouterr().out
     assert f"the first new iteration drops those values. Afterwards:  make reevaluate RUN={path}" in output
     assert read_archive(path).fresh is None
     assert numbers_in(path)["reproduced_by"] is None
-    run(tmp_path / "whole", policy=POLICY, iterations=4)
+    run(tmp_path / "whole", **SHIPPED, iterations=4)
     assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
 
 
 def test_fresh_values_of_other_elites_or_of_a_damaged_file_are_not_taken(tmp_path):
     path, other = tmp_path / "run", tmp_path / "other"
-    run(path, policy=POLICY)
-    run(other, policy=POLICY, seed=4)
+    run(path, **SHIPPED)
+    run(other, **SHIPPED, seed=4)
     found = (path / "archive.npz").read_bytes()
     again(other)
     for strayed in ((other / "archive.npz").read_bytes(), b"PK and no more"):
         (path / "archive.npz").write_bytes(strayed)
         (path / "archive.json").write_text("{")
-        run(path, policy=POLICY, resumes=True)
+        run(path, **SHIPPED, resumes=True)
         assert (path / "archive.npz").read_bytes() == found
         assert numbers_in(path)["elites_reproduced"] is None
 
 
 def test_the_newest_run_of_the_robot_is_taken_and_another_robots_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run(tmp_path / "runs/older", policy=POLICY)
-    run(tmp_path / "runs/newer", policy=POLICY)
+    run(tmp_path / "runs/older", **SHIPPED)
+    run(tmp_path / "runs/newer", **SHIPPED)
     os.utime(tmp_path / "runs/older/archive.npz", (0, 0))
     reevaluate_run(ReevaluateCfg(device="cpu"), open_evaluator=open_stand_in)
     assert read_archive("runs/older").fresh is None
@@ -219,10 +222,19 @@ def test_a_controller_that_is_another_now_is_refused_unless_it_is_given(tmp_path
 def test_what_is_no_run_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no run at .*: it has no config\.json"):
         again(tmp_path)
-    run(tmp_path / "run", policy=POLICY)
+    run(tmp_path / "run", **SHIPPED)
     with pytest.raises(ValueError, match="seed must not be negative, got -1"):
         again(tmp_path / "run", seed=-1)
     for name in ("checkpoint.bin", "metrics.jsonl", "archive.npz"):
         (tmp_path / "run" / name).unlink()
     with pytest.raises(ValueError, match="has no finished iteration"):
         again(tmp_path / "run")
+
+
+def test_a_run_of_code_is_asked_for_it_again(tmp_path):
+    path = tmp_path / "run"
+    run(path, policy=POLICY)
+    with pytest.raises(ValueError, match=r"searched with the controller tests\.sim\.policies:stand, which is code"):
+        again(path)
+    again(path, policy=POLICY)
+    assert numbers_in(path)["reproduced_by"]["policy"] == POLICY

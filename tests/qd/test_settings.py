@@ -24,6 +24,7 @@ def robot(policy_file: Path = Path("missing.pt"), scales=stand_in.SCALES):
     """What settings read of a robot."""
     return SimpleNamespace(
         name="anymal",
+        settings_file=None,
         policy_file=policy_file,
         collision_bit=False,
         penalties=stand_in.PENALTIES,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim.model_files import read_model_files
-from sim.own_robot import PackedRobot, pack_robot, robot_digest, unpack_robot
+from sim.own_robot import PackedRobot, pack_robot, robot_digest
 from sim.robot import get_robot
 from sim.robot_model import build_robot
 from tests.sim.dogs import GAINS, KINDS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
@@ -185,7 +185,7 @@ def test_a_robot_travels_with_its_files(tmp_path, kind):
     packed = pickle.loads(pickle.dumps(pack_robot(robot)))
     assert isinstance(packed, PackedRobot) and len(packed.files) == 2
     shutil.rmtree(tmp_path / "here")
-    there = unpack_robot(packed, tmp_path / "there")
+    there = packed.unpacked(tmp_path / "there")
     assert there == dataclasses.replace(robot, model_file=there.model_file)
     assert tmp_path / "there" in there.model_file.parents
     assert sum(build_robot(there).body_mass) == pytest.approx(MASS)
@@ -211,4 +211,4 @@ def test_what_an_mjcf_includes_belongs_to_it(tmp_path):
 
 
 def test_a_shipped_robot_travels_by_name(anymal):
-    assert pack_robot(anymal) == pack_robot("anymal") == unpack_robot("anymal", None) == "anymal"
+    assert pack_robot(anymal) == "anymal"
