@@ -11,8 +11,8 @@ from tqdm import tqdm
 from qd.cli import run_command
 from qd.own_terrain import read_own_terrain
 from qd.progress import share_bar
-from qd.recordings import archive_of_robot, chosen_elites, record_elites, record_heights
-from qd.workers import resolve_device
+from qd.recordings import archive_of_robot, chosen_elites, policy_of, record_elites, record_heights
+from qd.workers import check_policy, resolve_device
 from sim.files import prepare_output
 
 if TYPE_CHECKING:
@@ -118,10 +118,10 @@ def _orders(cfg: VideoCfg, robot: "RobotCfg") -> Iterator[Order]:
     elif cfg.terrain is not None:
         yield _own_order(cfg, cfg.terrain, robot)
     else:
-        yield from _elite_orders(cfg)
+        yield from _elite_orders(cfg, robot)
 
 
-def _elite_orders(cfg: VideoCfg) -> Iterator[Order]:
+def _elite_orders(cfg: VideoCfg, robot: "RobotCfg") -> Iterator[Order]:
     """Films of elites, whose recordings are written before the first is made."""
     found = archive_of_robot(cfg.robot, cfg.run)
     elites = chosen_elites(cfg.elite, found)
@@ -129,10 +129,11 @@ def _elite_orders(cfg: VideoCfg) -> Iterator[Order]:
     folder = cfg.out or found.folder
     outs = [cfg.out] if single and cfg.out else [folder / f"elite-{elite}.mp4" for elite in elites]
     prepare_output(outs[0])
-    device = resolve_device(cfg.device)
+    device, policy = resolve_device(cfg.device), policy_of(found, robot, cfg.policy)
+    check_policy(policy, robot, device)
     with share_bar("crossing") as progress:
         _, recording = record_elites(
-            found, elites, device=device, policy=cfg.policy, episodes=cfg.replicas, seed=cfg.seed, progress=progress
+            found, elites, device=device, policy=policy, episodes=cfg.replicas, seed=cfg.seed, progress=progress
         )
     scales = dict(zip(found.archive.penalties, found.archive.scales, strict=True))
     parts = [recording.of_terrain(k) for k in range(len(outs))]
@@ -147,10 +148,11 @@ def _own_order(cfg: VideoCfg, path: Path, robot: "RobotCfg") -> Order:
     print(f"{path}: {terrain.fitted}", flush=True)
     out = cfg.out or OWN_FOLDER / f"{path.stem}-{robot.name}.mp4"
     prepare_output(out)
-    policy = cfg.policy or str(robot.policy_file)
+    device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
+    check_policy(policy, robot, device)
     with share_bar("crossing") as progress:
         _, recording = record_heights(
-            robot, terrain.heights, label=terrain.label, policy=policy, device=resolve_device(cfg.device),
+            robot, terrain.heights, label=terrain.label, policy=policy, device=device,
             episodes=cfg.replicas, seed=cfg.seed, progress=progress,
         )  # fmt: skip
     _keep(recording, out)
