@@ -8,6 +8,7 @@ import time
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from qd.view.app import App
@@ -93,8 +94,11 @@ def test_playing_and_dragging_move_the_robot(app):
     done(app, ("play", None), ("speed", 0.25), ("follow", True), ("forces", False), ("paths", False))
     assert not app._clock.playing and app._clock.speed == 0.25
     assert not any(arrow.visible for arrow in app._scene._forces) and not app._scene._paths.visible
-    done(app, ("forces", True))
-    assert any(arrow.visible for arrow in app._scene._forces)
+    pushing = app._crossing.force_newtons >= 100.0
+    frame = int(np.flatnonzero(pushing.any(axis=1))[0])
+    done(app, ("forces", True), ("seek", 0.02 * frame))
+    seen = np.array([arrow.visible for arrow in app._scene._forces])
+    assert seen.any() and seen[pushing[frame]].all()
 
 
 def test_episodes_are_stepped_through(app):
