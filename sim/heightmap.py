@@ -12,7 +12,6 @@ that has the terrain's own nodes is taken as it is.
 
 import os
 import sys
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files import read_json
+from sim.npz import array_names, read_arrays
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 MIN_SIDE_M = 1.0
@@ -94,13 +94,8 @@ def read_heightmap(
 
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
     try:
-        with zipfile.ZipFile(path) as members:
-            damaged = members.testzip()
-        if damaged is not None:
-            raise ValueError(f"its part '{damaged}' does not have its checksum")
-        with np.load(path, allow_pickle=False) as content:
-            found = sorted(content.files)
-            arrays = {name: content[name] for name in ("heights", "size_m") if name in found}
+        found = sorted(array_names(path))
+        arrays = read_arrays(path, [name for name in ("heights", "size_m") if name in found])
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
         raise ValueError(f"{path} must be an .npz file of arrays, but it is damaged or another file: {error}") from None
     if "heights" not in arrays:
@@ -111,7 +106,8 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
             f"{path}: heights must be floats [m] of shape (nrow, ncol), got {heights.dtype} of shape {heights.shape}"
         )
     inside = {"size_m": arrays["size_m"].ravel().tolist()} if "size_m" in arrays else {}
-    return heights.astype(np.float64), inside
+    with np.errstate(invalid="ignore"):  # what is not finite is named later
+        return heights.astype(np.float64), inside
 
 
 def _read_png(path: Path) -> NDArray[np.float64]:

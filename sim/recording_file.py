@@ -7,7 +7,6 @@ as its name and version, and of terrains that were given by genes no heights: th
 import io
 import json
 import os
-import zipfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from kernels.episode import Outcome
 from sim.bank import heights_of
 from sim.files import write_atomically
+from sim.npz import array_names, read_arrays
 from sim.recording import FRAME_ARRAYS, Recording
 
 FORMAT = "faultline recording 1"
@@ -68,7 +68,7 @@ def read_recording(path: str | Path) -> Recording:
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no recording at {path}: `make video` writes one beside its film")
     try:
-        content = _read_arrays(path)
+        content = _read(path)
         _check_kinds(content)
         _check_shapes(content)
         recording = _built(content)
@@ -80,18 +80,13 @@ def read_recording(path: str | Path) -> Recording:
     return recording
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of the file, each compared with its checksum."""
-    with zipfile.ZipFile(path) as members:
-        found = [name.removesuffix(".npy") for name in members.namelist()]
-        if "format" not in found or (version := str(_array_in(members, "format"))) != FORMAT:
-            raise ValueError(f"its format must be '{FORMAT}', got {version if 'format' in found else 'none'}")
-        absent = "heights" if "genes" in found else "genes"
-        return {name: _array_in(members, name) for name in _NAMES if name != absent}
-
-
-def _array_in(members: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    return np.lib.format.read_array(io.BytesIO(members.read(f"{name}.npy")), allow_pickle=False)
+def _read(path: Path) -> dict[str, NDArray[Any]]:
+    found = array_names(path)
+    version = str(read_arrays(path, ["format"])["format"]) if "format" in found else "none"
+    if version != FORMAT:
+        raise ValueError(f"its format must be '{FORMAT}', got {version}")
+    absent = "heights" if "genes" in found else "genes"
+    return read_arrays(path, [name for name in _NAMES if name != absent])
 
 
 def _check_kinds(content: dict[str, NDArray[Any]]) -> None:

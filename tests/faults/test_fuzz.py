@@ -20,11 +20,16 @@ from qd.archive import Archive, read_archive, write_archive
 from qd.checkpoint import load_checkpoint
 from qd.run_directory import RunDirectory
 from qd.speed import training_rates
+from sim.heightmap import as_terrain, read_heightmap
 from sim.policy import MlpPolicy, load_policy
+from sim.recording import Recording
+from sim.recording_file import read_recording, write_recording
 from sim.robot import RobotCfg, get_robot
+from sim.terrain_files import write_terrain
 from tests.faults import searches, trainings
 from tests.faults.children import run_child
 from tests.faults.damage import flipped, npz, other_arrays, other_values
+from tests.qd.recordings import recording_of
 from tests.qd.test_archive import small_archive
 from train.export import to_onnx
 from train.learner import read_checkpoint
@@ -89,6 +94,9 @@ def made(tmp_path_factory) -> Path:
     script = torch.jit.script(torch.nn.Sequential(torch.nn.Linear(235, 4), torch.nn.ELU(), torch.nn.Linear(4, 12)))
     script.save(folder / "script.ts")
     (folder / "policy.onnx").write_bytes(to_onnx(small_actor()))
+    write_recording(folder / "elite-0.recording.npz", recording_of([1, 2, 3, 4], [14.0, 6.0, 8.0, 9.0]))
+    hill = np.random.default_rng(0).uniform(-0.3, 0.3, (161, 321)).astype(np.float32)
+    write_terrain(folder / "hill", hill, formats=["npz", "png"], about={})
     return folder
 
 
@@ -119,7 +127,22 @@ def training_state(file: Path) -> bytes:
     return pickle.dumps([sorted(content), content["levels"].tolist(), content["iter"], content["extra"]["env_steps"]])
 
 
+def recorded(file: Path) -> bytes:
+    """All of a recording, bit for bit."""
+    recording = read_recording(file)
+    values = [getattr(recording, field.name) for field in fields(Recording)]
+    return b"".join(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode() for value in values)
+
+
+def terrain(file: Path) -> bytes:
+    """The ground that a heightmap becomes, bit for bit."""
+    return as_terrain(read_heightmap(file, size_m=(16, 8), scale_m=1e-5, offset_m=0)).tobytes()
+
+
 LOADERS = {
+    "a recording": ("elite-0.recording.npz", recorded),
+    "a heightmap": ("hill.npz", terrain),
+    "an image of heights": ("hill.png", terrain),
     "a controller's checkpoint": ("training/policy.pt", actions),
     "a TorchScript controller": ("script.ts", actions),
     "an ONNX controller": ("policy.onnx", actions),
@@ -143,7 +166,10 @@ def test_mutated_files(made, tmp_path, what):
     assert refused > 200
 
 
-@pytest.mark.parametrize("what", ["a controller's checkpoint", "the archive", "the checkpoint of a training"])
+@pytest.mark.parametrize(
+    "what",
+    ["a controller's checkpoint", "the archive", "the checkpoint of a training", "a recording", "a heightmap"],
+)
 def test_mutated_parts_behind_right_checksums(made, tmp_path, what):
     name, read = LOADERS[what]
     whole = (made / name).read_bytes()
