@@ -102,6 +102,23 @@ def _painted(shape: trimesh.Trimesh, transform: NDArray[np.float64], color: Colo
     return Mesh(vertices=vertices, faces=np.asarray(shape.faces, dtype=np.uint32), colors=colors)
 
 
+def arrow_mesh(color: Color) -> Mesh:
+    """An arrow along z, 1 m long when it is not scaled."""
+    shaft = trimesh.creation.cylinder(radius=0.02, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=_SEGMENTS)
+    head = trimesh.creation.cone(radius=0.05, height=0.25, sections=_SEGMENTS)
+    head.apply_translation([0.0, 0.0, 0.75])
+    return _joined([_painted(part, np.eye(4), color) for part in (shaft, head)])
+
+
+def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
+    """Quaternion w x y z that turns z into the way from one point to another, and the length of that [m], not 0."""
+    length = float(np.linalg.norm(end - begin))
+    x, y, z = (end - begin) / length
+    half = np.array([1.0 + z, -y, x, 0.0])  # the half turn between z and it
+    size = float(np.linalg.norm(half))
+    return (half / size if size > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])), length
+
+
 def body_meshes(skeleton: Skeleton, robot: RobotCfg) -> list[Mesh | None]:
     """Each body's shapes in its own frame, coloured by role; None of a body with nothing to see.
 

@@ -7,7 +7,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from qd.view.meshes import Mesh, terrain_mesh
+from qd.view.meshes import Color, Mesh, arrow_mesh, arrow_pose, terrain_mesh
 from qd.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.terrain import SPACING
@@ -48,7 +48,7 @@ class Scene:
             None if mesh is None else scene.add_mesh_trimesh(f"/robot/{k}", mesh.as_trimesh(), receive_shadow=False)
             for k, mesh in enumerate(bodies)
         ]
-        # A node an arrow: the browser does not bear that their number in one changes.
+        # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
         self._forces = [self._add_arrow(f"/forces/{k}", _FORCE_COLOR) for k in range(num_feet)]
         self._command = self._add_arrow("/command", _COMMAND_COLOR)
         self._paths: Any = None
@@ -146,11 +146,10 @@ class Scene:
             _set_arrow(self._command, crossing.command[frame], shown=True)
         self._go_along(crossing.positions[frame, 0])
 
-    def _add_arrow(self, name: str, color: tuple[int, int, int]) -> Any:
+    def _add_arrow(self, name: str, color: Color) -> Any:
         """An arrow that is not to be seen yet."""
-        nowhere = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
-        add = self._server.scene.add_arrows
-        return add(name, nowhere, color, shaft_radius=0.02, head_radius=0.05, head_length=0.1, visible=False)
+        mesh, add = arrow_mesh(color), self._server.scene.add_mesh_simple
+        return add(name, mesh.vertices, mesh.faces, color=color, cast_shadow=False, receive_shadow=False, visible=False)
 
     def _go_along(self, base: Points) -> None:
         """Move every visitor's camera as the base has moved, if asked to follow."""
@@ -174,7 +173,9 @@ def _set_arrow(handle: Any, arrow: Points, *, shown: bool) -> None:
     """Put an arrow from one point to another, shape (2, 3); one without length is not shown."""
     shown = shown and bool(np.any(arrow[0] != arrow[1]))
     if shown:
-        handle.points = arrow[None].astype(np.float32)
+        handle.wxyz, length = arrow_pose(arrow[0], arrow[1])
+        handle.position = tuple(arrow[0])
+        handle.scale = (1.0, 1.0, length)
     handle.visible = shown
 
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qd.view.meshes import body_meshes, geom_mesh, terrain_mesh
+from qd.view.meshes import arrow_mesh, arrow_pose, body_meshes, geom_mesh, terrain_mesh
 from qd.view.playing import rotated
 from sim.mujoco_c import surface_heights
 from sim.skeleton import Geom, Skeleton
@@ -102,3 +102,14 @@ def test_colours_are_exported_in_linear_light():
     mesh = geom_mesh(make_geom("box", SIZES["box"]), (0, 188, 255))
     # sRGB 188 is ((188/255 + .055) / 1.055)^2.4 = .5029 of the light, 128 of 255
     assert mesh.as_trimesh().visual.vertex_colors[0].tolist() == [0, 128, 255, 255]
+
+
+@pytest.mark.parametrize("way", [(0.3, -0.4, 1.2), (0.0, 0.0, 2.0), (0.0, 0.0, -0.5), (1.0, 0.0, 0.0)])
+def test_an_arrow_points_from_its_beginning_to_its_end(way):
+    begin = np.array([1.0, 2.0, 3.0])
+    quaternion, length = arrow_pose(begin, begin + way)
+    vertices = arrow_mesh((9, 9, 9)).vertices.astype(float)
+    tip = vertices[np.argmax(vertices[:, 2])]
+    np.testing.assert_allclose(tip, [0.0, 0.0, 1.0], atol=1e-6)
+    assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(begin + rotated(quaternion, tip * [1.0, 1.0, length]), begin + way, atol=1e-5)
