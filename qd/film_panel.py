@@ -86,6 +86,7 @@ def _draw_curves(axes: Any, shot: Shot) -> None:
     axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("penalty so far,\nmultiples of its scale")
+    measured = set(shot.scales.values()) != {1.0}
+    axes.set_ylabel(f"penalty so far,\n{'multiples of its scale' if measured else 'raw'}")
     axes.grid(alpha=0.3)
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)

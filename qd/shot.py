@@ -22,7 +22,8 @@ class Shot:
     ghosts: tuple[int, ...] = ()
     """Indices of the others."""
     scales: dict[str, float]
-    """What each penalty is divided by, so that they compare; those not named are not drawn."""
+    """What each penalty is divided by, so that they compare; those not named are not drawn. All 1 where scales were
+    never measured."""
 
     @property
     def num_frames(self) -> int:

@@ -111,6 +111,14 @@ def test_the_panel_has_a_cursor_at_the_time_and_a_dot_at_the_place(recording):
     assert early[20:180, between].min() > 150 and late[20:180, between].min() < 120
 
 
+def test_the_panel_says_whether_penalties_are_scaled(recording):
+    scaled, raw = (
+        Panel(dataclasses.replace(shot_of(recording), scales=scales), WIDTH, PANEL_HEIGHT)._curves.get_ylabel()
+        for scales in (SCALES, {"yaw_rate": 1.0, "vel_x": 1.0})
+    )
+    assert scaled.endswith("multiples of its scale") and raw.endswith("raw")
+
+
 def test_the_camera_follows_and_rises_where_the_ground_would_hide_the_robot(recording):
     level = follow(shot_of(recording), 3.0)
     assert len(level) == FRAMES and level[0].elevation == level[-1].elevation == -22.0
