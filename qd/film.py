@@ -76,7 +76,7 @@ def caption(shot: Shot) -> tuple[str, str]:
         "fallen": recording.fallen[t] & valid,
     }
     rates = [f"{name} {_rate(int(flags.sum()), count)}" for name, flags in hits.items()] if count else ["none valid"]
-    of = f"{len(valid)} episode{'s' * (len(valid) != 1)}"
+    of = f"{len(valid)} episode{'s' * (len(valid) != 1)}" + f", {len(valid) - count} invalid" * (count < len(valid))
     return first, f"{of}: {', '.join(rates)}; in brackets 95 % intervals"
 
 

@@ -72,9 +72,9 @@ def test_the_caption_says_what_is_shown_and_how_all_ended(recording):
     outcome = recording.outcome.copy()
     outcome[0, 4] = Outcome.INVALID
     _, second = caption(shot_of(dataclasses.replace(recording, outcome=outcome)))
-    assert second.startswith("5 episodes: base collision 0% (0 to 49%), goal 25% (5 to 70%), fallen 0%")
+    assert second.startswith("5 episodes, 1 invalid: base collision 0% (0 to 49%), goal 25% (5 to 70%), fallen 0%")
     everything = dataclasses.replace(recording, outcome=np.full((1, 5), Outcome.INVALID, np.uint8))
-    assert caption(shot_of(everything))[1].startswith("5 episodes: none valid")
+    assert caption(shot_of(everything))[1].startswith("5 episodes, 5 invalid: none valid")
 
 
 def test_frames_are_shown_in_real_time_from_the_first_to_the_last(recording):
