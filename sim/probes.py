@@ -42,20 +42,23 @@ def capsule_strips(radius: float, half_height: float) -> list[Strip]:
 
 
 def box_strips(half: tuple[float, float, float]) -> list[Strip]:
-    """Parallel strips under the whole surface of a box, along z.
+    """Parallel strips under the whole surface of a box, along its longest side (z of a cube).
 
     Edges and corners are rounded by at most :data:`MAX_EDGE_RADIUS`; faces are exact at every probe.
     """
     radius = min(MAX_EDGE_RADIUS, *half)
     spacing = max_spacing(radius)
-    x, y, z = (_line(-h + radius, h - radius, spacing) for h in half)
+    # Contacts are made of the ends of a strip, so the fewer strips, the fewer contacts of a box that lies.
+    order = [*np.argsort(half, kind="stable")]
+    across, beside, along = (_line(-half[k] + radius, half[k] - radius, spacing) for k in order)
+    back = np.argsort(order)
     strips = []
-    for i, px in enumerate(x):
-        for j, py in enumerate(y):
-            rim = i in (0, len(x) - 1) or j in (0, len(y) - 1)
+    for i, px in enumerate(across):
+        for j, py in enumerate(beside):
+            rim = i in (0, len(across) - 1) or j in (0, len(beside) - 1)
             # Inside the cross-section only the two end faces have a surface.
-            for part in [z] if rim else [z[:1], z[-1:]]:
-                strips.append(Strip(centres=_along_z(float(px), float(py), part), radius=radius))
+            for part in [along] if rim else [along[:1], along[-1:]]:
+                strips.append(Strip(centres=_along_z(float(px), float(py), part)[:, back], radius=radius))
     return strips
 
 
@@ -102,7 +105,8 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     )
 
 
-def _place(pose: Any, point: np.ndarray) -> Any:
+def placed(pose: Any, point: np.ndarray) -> Any:
+    """A point [m] of a frame that stands at ``pose``, as a vec3 in the frame that the pose is in."""
     local: Any = wp.vec3(*point)
     return wp.transform_point(pose, local)
 
@@ -125,7 +129,7 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
         except ValueError as error:
             raise ValueError(f"geom {builder.shape_label[k]}: {error}") from error
         for strip in strips:
-            centres.append([_place(pose, centre) for centre in strip.centres])
+            centres.append([placed(pose, centre) for centre in strip.centres])
             radius.append(strip.radius)
             spread.append(strip.spread)
             body.append(builder.shape_body[k])

@@ -98,6 +98,18 @@ def test_box(half):
     assert s.max(initial=0) <= max_spacing(radii[0]) + 1e-12
 
 
+@pytest.mark.parametrize("longest", [0, 1, 2])
+def test_strips_of_a_box_run_along_its_longest_side(longest):
+    # 0.5 x 0.16 x 0.1 m, probes of 2 cm at most 26.5 mm apart: 19 along, 6 and 4 across. Of those 24 rows 16 are at the
+    # rim; each of the 8 within has a probe on both end faces.
+    half = np.roll([0.25, 0.08, 0.05], longest)
+    strips = box_strips(tuple(half))
+    lengths = [len(strip.centres) for strip in strips]
+    assert sorted(lengths) == [1] * 16 + [19] * 16
+    for strip in strips:
+        assert np.ptp(strip.centres, axis=0)[np.arange(3) != longest].max() < 1e-12
+
+
 @pytest.mark.parametrize(("radius", "half"), CYLINDERS)
 def test_cylinder(radius, half):
     strips = cylinder_strips(radius, half)
