@@ -1,6 +1,6 @@
 # Every target runs in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive compare ablation train finetune calibrate replay report view reevaluate evaluate video export tables crosscheck bench test lint clean
+.PHONY: help setup stand archive compare ablation train finetune calibrate replay report view reevaluate evaluate video export tables crosscheck bench test lint clean
 
 PYTHON ?= python3
 ROBOT ?= anymal
@@ -53,13 +53,14 @@ help: ## This list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo
 	@echo 'Variables (left out: the default of the command):'
-	@echo '  ROBOT=anymal     which robot'
-	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               archive compare ablation train finetune calibrate replay report reevaluate'
+	@echo '  ROBOT=anymal     which robot: anymal, cassie, or the settings file of one of your own, such as mine/dog.py'
+	@echo '  DEVICE=cpu       cpu, cuda or cuda:N               stand archive compare ablation train finetune calibrate replay report reevaluate'
 	@echo '                                                   evaluate video crosscheck bench'
 	@echo '  PRESET=small     size of the search: paper, small  archive compare ablation'
 	@echo '  ITERATIONS=N     stop after N iterations           archive compare ablation train finetune'
-	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript file, an'
-	@echo '                   ONNX file or module:callable      archive compare ablation finetune calibrate replay report reevaluate'
+	@echo '  POLICY=SPEC      controller other than the shipped one: a checkpoint, a TorchScript or ONNX file,'
+	@echo '                   file.py:callable, module:callable, or file.py:adapter@FILE for a file that'
+	@echo '                   expects another observation       archive compare ablation finetune calibrate replay report reevaluate'
 	@echo '                                                   evaluate video crosscheck'
 	@echo '  SEED=N           seed of everything drawn          archive compare ablation train finetune calibrate reevaluate'
 	@echo '                                                   evaluate video crosscheck bench'
@@ -67,7 +68,7 @@ help: ## This list
 	@echo '  MIX=generated    terrains to train on beside hand-crafted ones: generated, hard-random, or hand-crafted'
 	@echo '                   (nothing else)                    finetune'
 	@echo '  DRAW=failing     draw the elites to train on by how often they were not crossed; uniform   finetune'
-	@echo '  EXPORT=FILE      also write the controller there   finetune'
+	@echo '  EXPORT=FILE      also write the controller there   train finetune'
 	@echo '  METHOD=NAME      where terrains come from: cma_mae, cma_me, map_elites, directions, hard_random,'
 	@echo '                   uniform_random, or several with +  archive'
 	@echo '  INTERVALS=N      intervals of each ratio           archive'
@@ -82,6 +83,7 @@ help: ## This list
 	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
 	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
 	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate report'
+	@echo '                   (TERRAINS: calibrate too)'
 	@echo '  TERRAIN=FILE     cross a heightmap of your own: an .npz with heights (rows along y) [m], or a .png of'
 	@echo '                   8 or 16 bits seen from above      evaluate video'
 	@echo '  SIZE="X Y" SCALE=M OFFSET=M   of that map: metres along x and y; a gray level; gray level 0; those of'
@@ -115,6 +117,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet -e '.[dev,cluster]' -c .venv/constraints.txt
 	@touch $@
 
+stand: setup ## Look at ROBOT: its joints and geoms, whether it stands, what lying on rough ground takes
+	$(BIN)/python -m sim.stand --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE SEED)
+
 archive: setup ## Search the terrains on which the controller of ROBOT fails; writes a run under runs/
 	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS PROCESSES WORKER_LIMIT_S METHOD INTERVALS WITHOUT REPRODUCE)
 
@@ -125,13 +130,13 @@ ablation: setup ## Search with and without the standard deviations in the fitnes
 	$(BIN)/python -m qd.ablation --robot $(call quoted,$(ROBOT)) $(call flags,RUN PRESET DEVICE ITERATIONS POLICY SEED WORKERS OUT)
 
 train: setup ## Train the base controller of ROBOT from scratch
-	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME)
+	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME EXPORT)
 
 finetune: setup ## Train the controller of ROBOT further, on the terrains of an archive that broke it
 	$(BIN)/python -m train.finetune --robot $(call quoted,$(ROBOT)) $(call flags,MIX ARCHIVE POLICY DRAW TASK DEVICE ITERATIONS SEED RESUME EXPORT)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
-	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED OUT WORKERS)
+	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY TERRAINS SEED OUT WORKERS)
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
 	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
