@@ -158,7 +158,7 @@ def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
     again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert again.returncode == 2 and f"port {port} of 127.0.0.1 is in use" in again.stderr
     process.send_signal(signal.SIGINT)
-    rest = process.communicate(timeout=60)[0]
+    rest = process.communicate(timeout=180)[0]
     assert process.returncode == 0 and "Stopped." in rest and "Traceback" not in rest
     assert any("459 elites of anymal, ready after" in line for line in lines)
 
