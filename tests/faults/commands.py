@@ -25,20 +25,21 @@ SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
 
 def resume_search(path: Path) -> None:
     """One iteration more than the search had."""
-    searches.run(["--resume", str(path), "--device", "cpu", "--iterations", "3"])
+    searches.run(["--resume", str(path), "--device", "cpu", "--iterations", "3", "--policy", searches.POLICY])
 
 
 def reevaluate_search(path: Path) -> None:
     """All elites again."""
     searches.without_figures()
     main = partial(reevaluate.reevaluate_run, open_evaluator=stand_in.open_stand_in)
-    run_command(reevaluate.ReevaluateCfg, main, ["--run", str(path), "--device", "cpu"])
+    run_command(reevaluate.ReevaluateCfg, main, ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY])
 
 
 def replay_elite(path: Path) -> None:
     """The worst elite again."""
     rollout.Rollout = _StandInRollout
-    run_command(replay.ReplayCfg, replay.main, ["--run", str(path), "--device", "cpu", "--replicas", "4"])
+    argv = ["--run", str(path), "--device", "cpu", "--replicas", "4", "--policy", searches.POLICY]
+    run_command(replay.ReplayCfg, replay.main, argv)
 
 
 def resume_training(run_dir: Path) -> int:

@@ -23,10 +23,10 @@ _TIMES = ("wall_s", "episodes_per_s", "rollout_s")
 
 def arguments(path: Path, iterations: int, *, policy: str = POLICY) -> list[str]:
     """Command line that begins a search, or goes on with what is left of it."""
-    common = ["--device", "cpu", "--iterations", str(iterations)]
+    common = ["--device", "cpu", "--iterations", str(iterations), "--policy", policy]
     if (path / CONFIG_FILE).exists():
         return ["--resume", str(path), *common]
-    return ["--run-dir", str(path), "--policy", policy, *SIZE, *common]
+    return ["--run-dir", str(path), *SIZE, *common]
 
 
 def search(path: Path, *, iterations: int) -> None:
