@@ -34,7 +34,7 @@ class AblationCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
     """A run with alpha 1 whose first iterations are taken; left out, one is made too."""
     preset: str | None = None

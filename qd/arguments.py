@@ -35,7 +35,8 @@ class Arguments:
     iterations: int | None = None
     """Iterations to reach; with --resume, more than before extend a finished run."""
     policy: str | None = None
-    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript or ONNX file, or module:callable."""
+    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
+    module:callable, or file.py:adapter@FILE for a file that expects another observation."""
     seed: int | None = None
     """Seed of everything drawn; 0."""
     resume: Path | None = None

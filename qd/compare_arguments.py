@@ -47,7 +47,7 @@ class Arguments:
     """
 
     robot: str | None = None
-    """Which robot: anymal, unless resuming."""
+    """Which robot: anymal, unless resuming; anymal, cassie, or the settings file of another (my_robot.py)."""
     preset: str | None = None
     """Size of an iteration: paper (a GPU's work) or small; by default what the device can do."""
     methods: tuple[str, ...] | None = None

@@ -35,7 +35,7 @@ class CrossCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     terrain: Path
     """The heightmap: an .npz or a .png."""
     size: tuple[str, ...] = ()
@@ -45,7 +45,8 @@ class CrossCfg:
     offset: float | None = None
     """Height of gray level 0 [m]; its file's, or 0."""
     policy: str | None = None
-    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript or ONNX file, or module:callable."""
+    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
+    module:callable, or file.py:adapter@FILE for a file that expects another observation."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     episodes: int = 20

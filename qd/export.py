@@ -33,7 +33,7 @@ class ExportCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
     """Run directory or archive.npz; the newest of this robot under runs/."""
     elite: str = "0"

@@ -28,7 +28,7 @@ class ReevaluateCfg:
     """
 
     robot: str | None = None
-    """Which robot the run is of; left out, whatever --run is of."""
+    """Which robot the run is of; left out, whatever shipped one --run is of. The settings file of one that is not."""
     run: Path | None = None
     """Run directory; the newest of the robot, or of anymal, under runs/."""
     device: str | None = None

@@ -25,7 +25,7 @@ class Arguments:
     """Time evaluations on hard-random terrains by different numbers of workers, against one process without Ray."""
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     device: str | None = None
     """cpu or cuda; CUDA where there is one."""
     workers: tuple[int, ...] = (1, 2, 4)

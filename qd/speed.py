@@ -37,7 +37,7 @@ class Arguments:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     preset: str = "paper"
     """Whose iteration is timed."""
     device: str | None = None

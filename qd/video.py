@@ -36,7 +36,7 @@ class VideoCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
     """Run directory or archive.npz; the newest of this robot under runs/."""
     elite: str = "0"

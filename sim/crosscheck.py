@@ -46,9 +46,9 @@ class CrosscheckCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     policy: str | None = None
-    """An rsl_rl checkpoint, a TorchScript or ONNX file, or module:callable; the shipped controller."""
+    """A checkpoint, a TorchScript or ONNX file, file.py:callable or module:callable; the shipped controller."""
     device: str | None = None
     """Of the parallel simulation: cpu, cuda or cuda:N; CUDA where there is one. Plain MuJoCo always runs on the CPU."""
     genes: Path | None = None

@@ -26,7 +26,7 @@ class OptionsCfg:
     """Time the crossings of the paper preset under several solver and capacity options."""
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     policy: str | None = None
     """An rsl_rl checkpoint, a TorchScript or ONNX file, or module:callable; the shipped controller."""
     device: str | None = None

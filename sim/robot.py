@@ -69,7 +69,8 @@ class RobotCfg:
     armature: tuple[float, ...] | None = None
     """Inertia of each joint's rotor, behind its gears [kg m^2]; the file's if None."""
     friction: float | None = None
-    """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF."""
+    """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF. Less than the ground's .3 counts as
+    .3."""
     contact_time_constant_s: float | None = None
     """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
     training: TrainingCfg = field(default_factory=TrainingCfg)

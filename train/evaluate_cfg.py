@@ -23,12 +23,14 @@ class EvaluateCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     policy: str | None = None
-    """Without tables, the controller: a checkpoint, a TorchScript or ONNX file, or module:callable; the shipped one."""
+    """Without tables, the controller: a checkpoint, a TorchScript or ONNX file, file.py:callable, module:callable, or
+    file.py:adapter@FILE; the shipped one."""
     policies: tuple[str, ...] = ()
-    """Controllers of the tables, each NAME=FILE, NAME=module:callable or NAME=shipped; the first is the one that the
-    others are held against; base=shipped. C-G, C-G@1, C-G@2 are one kind of several seeds, whose mean is shown too."""
+    """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped; the first
+    is the one that the others are held against; base=shipped. C-G, C-G@1, C-G@2 are one kind of several seeds, whose
+    mean is shown too."""
     archive: Path | None = None
     """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
     split_seed: int = 0

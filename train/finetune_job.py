@@ -40,7 +40,7 @@ class FinetuneCfg:
     """
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     policy: Path | None = None
     """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one. A checkpoint.pt of
     train.base brings its critic too."""

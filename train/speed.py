@@ -27,7 +27,7 @@ class SpeedCfg:
     """Time training iterations, simulation and learning together."""
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: tuple[int, ...] = (4096, 8192)

@@ -22,7 +22,7 @@ class Arguments:
     """Time the kernels against torch, torch.compile and the device's ceilings, and the step against bare physics."""
 
     robot: str = "anymal"
-    """Which robot."""
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     out: Path | None = None
