@@ -123,14 +123,10 @@ def job_of(args: Arguments) -> Job:
         FileNotFoundError: If there is no run to resume.
         ValueError: If robot, preset, device, controller, a setting or the run directory is not as it must be.
     """
-    from sim.robot import get_robot, robot_of
-
     if args.resume and args.run_dir:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
     there = RunDirectory(args.resume).read_cfg() if args.resume else None
-    robot = (
-        robot_of(there.robot, args.robot, args.resume) if args.resume and there else get_robot(args.robot or "anymal")
-    )
+    robot = _robot_of(args, there)
     device = resolve_device(args.device, args.workers)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
     if args.without is not None:
@@ -158,6 +154,14 @@ def job_of(args: Arguments) -> Job:
         resume_command=_resume_command(robot.spec, path, args, named),
         reevaluate_command=next_command("reevaluate", args, robot=robot.spec, run=path, policy=named),
     )
+
+
+def _robot_of(args: Arguments, there: SearchCfg | None) -> "RobotCfg":
+    from sim.robot import get_robot, robot_of
+
+    if args.resume and there:
+        return robot_of(there.robot, args.robot, args.resume)
+    return get_robot(args.robot or "anymal")
 
 
 def _resume_command(robot: str, path: Path, args: Arguments, policy: str | None) -> str:
