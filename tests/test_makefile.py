@@ -2,10 +2,8 @@
 
 import dataclasses
 import importlib
-import os
 import re
 import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -16,8 +14,8 @@ from qd.compare_arguments import Arguments as CompareArguments
 from qd.cross import CrossCfg
 from qd.next_commands import next_command
 from qd.reevaluate import ReevaluateCfg
+from tests.dry_run import ROOT, run_by
 
-ROOT = Path(__file__).parents[1]
 ARGUMENTS = {
     "archive": ("qd.arguments", "Arguments"),
     "compare": ("qd.compare_arguments", "Arguments"),
@@ -38,16 +36,6 @@ def command_of(target: str, **variables: str) -> list[str]:
     """What a target with some variables runs."""
     given = [shlex.quote(f"{name}={value.replace('$', '$$')}") for name, value in variables.items()]
     return run_by(" ".join(["make", target, *given]))
-
-
-def run_by(line: str) -> list[str]:
-    """What a line that is typed into a shell makes ``make`` run, word by word."""
-    done = subprocess.run(
-        ["sh", "-c", f"{line} --dry-run"],
-        env={"PATH": os.environ["PATH"]},  # without what a make that runs this test hands on
-        cwd=ROOT, capture_output=True, text=True, check=True, timeout=60,
-    )  # fmt: skip
-    return shlex.split(done.stdout.splitlines()[-1])
 
 
 @pytest.mark.parametrize("target", ARGUMENTS)

@@ -1,19 +1,16 @@
 """What README shows of code of one's own works as it stands there."""
 
 import re
-import shlex
-import subprocess
-from pathlib import Path
 
 import pytest
 import torch
 
 from sim.policy import load_policy
 from sim.robot import get_robot
+from tests.dry_run import ROOT, run_by
 from tests.sim.dogs import mjcf
 from tests.sim.test_policy import rsl_rl_actor, save_checkpoint
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -58,9 +55,8 @@ def test_the_adapter_of_readme_adapts(tmp_path, anymal):
     if line.startswith("make ")
 ])  # fmt: skip
 def test_commands_of_readme_are_taken(line):
-    done = subprocess.run([*shlex.split(line), "--dry-run"], cwd=ROOT, capture_output=True, text=True, check=True)
-    last = shlex.split(done.stdout.splitlines()[-1])
-    assert last[1] == "-m" and "mine/dog.py" in last
+    command = run_by(line)
+    assert command[1] == "-m" and "mine/dog.py" in command
     for given in line.split()[3:]:
         name, value = given.split("=")
-        assert f"--{name.lower()}={value}" in last
+        assert f"--{name.lower()}={value}" in command
