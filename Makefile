@@ -80,7 +80,7 @@ help: ## This list
 	@echo '                   (video, export: or several, ELITE="0 3", or ELITE=all)'
 	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables or the page, each NAME=SPEC   evaluate view'
 	@echo '  ARCHIVE=DIR      run of a search: elites to train on, and those held out to evaluate on   finetune evaluate'
-	@echo '  SPLIT_SEED=N     which elites are held out         evaluate'
+	@echo '  SPLIT_SEED=N     which elites are held out         finetune evaluate'
 	@echo '  SETS="A B"       hand_crafted, hard_random, generated, generated_far               evaluate'
 	@echo '  TERRAINS=N EPISODES=N   terrains a set, episodes a terrain                         evaluate report'
 	@echo '                   (TERRAINS: calibrate too)'
@@ -133,7 +133,7 @@ train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME EXPORT)
 
 finetune: setup ## Train the controller of ROBOT further, on the terrains of an archive that broke it
-	$(BIN)/python -m train.finetune --robot $(call quoted,$(ROBOT)) $(call flags,MIX ARCHIVE POLICY DRAW TASK DEVICE ITERATIONS SEED RESUME EXPORT)
+	$(BIN)/python -m train.finetune --robot $(call quoted,$(ROBOT)) $(call flags,MIX ARCHIVE SPLIT_SEED POLICY DRAW TASK DEVICE ITERATIONS SEED RESUME EXPORT)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
 	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY TERRAINS SEED OUT WORKERS)

@@ -34,6 +34,7 @@ from train.run import (
     RESERVE_S,
     StopRequest,
     changes,
+    claimed,
     finish,
     iterate,
     plain,
@@ -141,7 +142,7 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     for change in changes(saved["extra"]["settings"], settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     print(f"Training '{robot.name}': {num_envs} robots on {device}, {iterations} iterations, in {run_dir}", flush=True)
-    with StopRequest() as stop:
+    with StopRequest() as stop, claimed(run_dir):
         task = CommandTask(robot, cfg.task, num_envs=num_envs, device=device, seed=seed + 1_000_003 * ranks.rank)
         env = CommandVecEnv(task)
         learner = Learner(env, cfg.ppo, seed=seed)

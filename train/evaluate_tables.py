@@ -11,6 +11,7 @@ from sim.named_controllers import controllers_of
 from sim.own_robot import robot_digest
 from train.crossings import Open, cross_all
 from train.evaluate_cfg import EvaluateCfg, Size, size_of, split_words
+from train.held_out import check_held_out
 from train.kept import KeptCrossings, controller_hash
 from train.measures import measure
 from train.sets import FROM_ARCHIVE, SETS, EliteSplit, TerrainSet, check_names, make_sets, split_elites
@@ -56,12 +57,16 @@ def _plan_of(cfg: EvaluateCfg) -> _Plan:
     scales = robot.read_penalty_scales()
     for policy in controllers.values():
         check_policy(policy, robot, size.device)
+    sets = make_sets(names, size.terrains, cfg.seed, archive=archive, split=split)
+    for name in FROM_ARCHIVE:
+        if name in sets:
+            check_held_out(controllers, sets[name].terrains, cfg.split_seed)
     return _Plan(
         size=size,
         evaluator=_evaluator_of(size, cfg),
         scales=scales,
         controllers=controllers,
-        sets=make_sets(names, size.terrains, cfg.seed, archive=archive, split=split),
+        sets=sets,
         archive=_about(cfg, archive, split),
         kept=kept,
         out=out,

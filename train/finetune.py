@@ -15,6 +15,7 @@ from sim.files import to_json, write_atomically
 from sim.policy import MlpPolicy, load_policy
 from sim.provenance import provenance
 from train.finetune_job import FinetuneCfg, Job, job_of
+from train.held_out import TRAINED_ON
 from train.learner import Learner
 from train.ppo import CapturedPPO
 from train.progress import Progress
@@ -24,6 +25,7 @@ from train.run import (
     POLICY,
     RESERVE_S,
     StopRequest,
+    claimed,
     finish,
     iterate,
     plain,
@@ -43,11 +45,12 @@ class Tuning:
         self.task = CommandTask(
             job.robot, job.task, num_envs=job.num_envs, device=job.device, seed=job.seed, tiles=tiles
         )
-        self.learner = Learner(CommandVecEnv(self.task), job.cfg.ppo, seed=job.seed)
-        if job.saved is None:
-            self.learner.start_from(job.actor, job.critic)
-        else:
+        # Every episode is whole, at the beginning as after an exchange: who crossed which terrain is counted.
+        self.learner = Learner(CommandVecEnv(self.task), job.cfg.ppo, seed=job.seed, random_ages=False)
+        if job.saved is not None:
             self.learner.resume(job.saved)
+        elif job.start is not None:
+            self.learner.start_from(job.start.actor, job.start.critic)
         about = {**provenance(job.device, job.seed), "settings": job.settings}
         saved = job.saved and job.saved["extra"]
         rows = job.cfg.rows
@@ -63,7 +66,7 @@ class Tuning:
         assert isinstance(alg, CapturedPPO)
         alone = self.job.settings["critic_iterations"]
         alg.let_actor_learn(iteration >= alone)
-        if 0 < alone == iteration:
+        if iteration == alone:
             alg.begin_actor()
 
     def save(self) -> None:
@@ -101,7 +104,13 @@ def finetune(cfg: FinetuneCfg) -> int:
         f"{job.num_envs} robots on {job.device}, {job.iterations} iterations, in {run_dir}",
         flush=True,
     )
-    with StopRequest() as stop:
+    alone = job.settings["critic_iterations"]
+    if alone >= job.iterations:
+        print(
+            f"The critic learns alone for the first {alone} iterations: the controller stays as it is. To change it, "
+            "give more --iterations or fewer --critic-iterations."
+        )
+    with StopRequest() as stop, claimed(run_dir):
         tuning = Tuning(job)
         write_atomically(run_dir / CONFIG, to_json({**plain(asdict(job.cfg)), "device": job.device}))
         deadline = began + cfg.max_seconds - RESERVE_S if cfg.max_seconds else float("inf")
@@ -111,7 +120,8 @@ def finetune(cfg: FinetuneCfg) -> int:
                 learner, progress, save=save, save_every_s=cfg.save_every_s, stop=stop, deadline=deadline,
                 before=tuning.before_iteration,
             )  # fmt: skip
-            finish(learner, progress, save=save, policies=[run_dir / POLICY, *([cfg.export] if cfg.export else [])])
+            policies = [run_dir / POLICY, *([cfg.export] if cfg.export else [])]
+            finish(learner, progress, save=save, policies=policies, about={TRAINED_ON: job.trained_on})
             _write_onnx(job)
         except OSError as error:
             raise resumable(run_dir, error) from error

@@ -6,27 +6,27 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from qd.archive import read_archive
 from sim.files import read_json
 from sim.own_robot import own_hash
-from sim.policy import MlpPolicy, load_policy, read_weights
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
+from train.held_out import marks_of, recorded_marks
 from train.learner import check_entries
 from train.mix import Mix, MixCfg
 from train.ppo import PpoCfg
 from train.run import CHECKPOINT, CONFIG, changes, plain, prepare_run_dir, read_saved
-from train.sets import split_elites
+from train.sets import elites_sha256, split_elites
+from train.start import Start, read_start
 from train.task_cfg import TaskCfg
 
 _PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
 _PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}
 _SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 4, "iterations": 10}
-_DEFAULTS = {
-    "mix": "generated", "split_seed": 0, "draw": "uniform", "task": "crossing", "critic_iterations": 50, "seed": 0,
-}  # fmt: skip
+_DEFAULTS = {"mix": "generated", "split_seed": 0, "draw": "uniform", "task": "crossing", "seed": 0}
+_CRITIC_ITERATIONS = 50
+_NUMBERS = (*_PAPER_OTHERS, "critic_iterations")
 _TASKS = ("crossing", "commands")
 _PPO = PpoCfg(steps_per_env=24)
 _STATE = {"mix": (dict,)}
@@ -66,7 +66,7 @@ class FinetuneCfg:
     iterations: int | None = None
     """Iterations in all, those before a resume included; 1200 (Cassie: 3000), 10."""
     critic_iterations: int | None = None
-    """Iterations at first in which the critic learns alone, where the controller comes without one; 50."""
+    """Iterations at first in which the critic learns alone, where the controller comes without one; 50, or half."""
     max_seconds: float | None = None
     """Save and stop in time to be done this many seconds after the start."""
     run_dir: Path | None = None
@@ -96,9 +96,8 @@ class Job:
     iterations: int
     num_envs: int
     seed: int
-    actor: dict[str, torch.Tensor]
-    """Where it starts, under rsl_rl's keys."""
-    critic: dict[str, torch.Tensor] | None
+    start: Start | None
+    """Networks it begins with; none where it goes on from a checkpoint."""
     mix: Mix
     task: TaskCfg
     settings: dict[str, Any]
@@ -106,6 +105,11 @@ class Job:
     saved: dict[str, Any] | None
     """The checkpoint it goes on from."""
     run_dir: Path
+
+    @property
+    def trained_on(self) -> list[str]:
+        """Marks of all elites that the controller has been trained on in the end (:mod:`train.held_out`)."""
+        return sorted({*marks_of(self.mix.genes), *self.settings.get("trained_before", [])})
 
 
 def job_of(cfg: FinetuneCfg) -> Job:
@@ -117,9 +121,15 @@ def job_of(cfg: FinetuneCfg) -> Job:
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
     cfg = _filled(cfg, robot.name, device)
-    actor, critic = _start(cfg.policy or robot.policy_file, robot)
-    hidden = [len(actor[f"mlp.{k}.bias"]) for k in _layers(actor)[:-1]]
-    cfg = replace(cfg, ppo=replace(_ppo(cfg, saved), hidden_dims=tuple(hidden)))
+    if saved is None:
+        path = cfg.policy or robot.policy_file
+        start = read_start(path, robot)
+        hidden, before = start.hidden_dims, sorted(recorded_marks(str(path)))
+        cfg = cfg if start.critic is None else replace(cfg, critic_iterations=0)
+    else:  # all of it is in the checkpoint: the file it began with may be gone
+        start, hidden = None, _saved_ppo(cfg.resume, saved).hidden_dims
+        before = saved["extra"]["settings"].get("trained_before", [])
+    cfg = replace(cfg, ppo=replace(_ppo(cfg, saved), hidden_dims=hidden))
     values: Any = cfg  # whose numbers and names are all there now
     mix_cfg = MixCfg(mix=values.mix, terrains=values.terrains, swap_every=values.swap_every, draw=values.draw)
     if values.num_envs < mix_cfg.terrains:
@@ -136,10 +146,11 @@ def job_of(cfg: FinetuneCfg) -> Job:
             "policy": str(cfg.policy or "shipped"),
             "mix": asdict(mix_cfg),
             "archive": about,
-            "critic_iterations": 0 if critic else cfg.critic_iterations,
+            "critic_iterations": cfg.critic_iterations,
             "task": asdict(task),
             "ppo": asdict(cfg.ppo),
             **own_hash(robot),
+            **({"trained_before": before} if before else {}),
         }
     )
     if saved is not None:
@@ -151,8 +162,7 @@ def job_of(cfg: FinetuneCfg) -> Job:
         iterations=values.iterations,
         num_envs=values.num_envs,
         seed=values.seed,
-        actor=actor,
-        critic=critic,
+        start=start,
         mix=mix,
         task=task,
         settings=settings,
@@ -177,6 +187,8 @@ def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
         )
     defaults = {**_DEFAULTS, **sizes, **before}
     cfg = replace(cfg, **{name: value for name, value in defaults.items() if getattr(cfg, name) is None})
+    if cfg.critic_iterations is None and cfg.iterations is not None:
+        cfg = replace(cfg, critic_iterations=min(_CRITIC_ITERATIONS, cfg.iterations // 2))
     for name, least in (("num_envs", 1), ("iterations", 1), ("critic_iterations", 0), ("seed", 0)):
         if getattr(cfg, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(cfg, name)}")
@@ -186,7 +198,7 @@ def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
 def _settings_of(run: Path) -> dict[str, Any]:
     """What a run was begun with, as far as a command line may leave it out."""
     config = read_json(run / CONFIG)
-    found = {name: config.get(name) for name in (*_DEFAULTS, *_PAPER_OTHERS)}
+    found = {name: config.get(name) for name in (*_DEFAULTS, *_NUMBERS)}
     paths = {name: Path(config[name]) for name in ("policy", "archive") if isinstance(config.get(name), str)}
     wrong = [name for name, value in found.items() if value is not None and type(value) not in (int, str)]
     if wrong:
@@ -208,52 +220,44 @@ def _elites(cfg: FinetuneCfg, robot: RobotCfg) -> tuple[np.ndarray, dict[str, An
     split_seed = cfg.split_seed or 0
     rows = split_elites(archive, robot.name, split_seed).train
     about = {"archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows)}
-    return archive.genes[rows], {"path": str(path), **about, "split_seed": split_seed}
-
-
-def _layers(actor: dict[str, torch.Tensor]) -> list[int]:
-    """Numbers of an actor's linear layers in rsl_rl's keys, in order."""
-    return sorted(int(key.split(".")[1]) for key in actor if key.startswith("mlp.") and key.endswith(".weight"))
-
-
-def _start(path: Path, robot: RobotCfg) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor] | None]:
-    """Actor and, where the file has one, critic to begin with.
-
-    A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear.
-    """
-    policy = load_policy(path, robot, "cpu")
-    if not isinstance(policy, MlpPolicy):
-        raise ValueError(
-            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: {path}"
-        )
-    content = read_weights(path)
-    actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
-    if policy.normalised:
-        weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
-        actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
-    return actor, None if policy.normalised else content.get("critic_state_dict")
+    return archive.genes[rows], {
+        "path": str(path), **about, "split_seed": split_seed, "elites_sha256": elites_sha256(archive)
+    }  # fmt: skip
 
 
 def _ppo(cfg: FinetuneCfg, saved: dict[str, Any] | None) -> PpoCfg:
     """Settings of the learner: the resumed run's, unless others are asked for."""
     if not cfg.ppo.captured:
         raise ValueError("rsl_rl's own PPO cannot let the critic learn alone at first: leave --ppo.captured on")
-    if saved is None or cfg.ppo != _PPO:
-        return cfg.ppo
+    return cfg.ppo if saved is None or cfg.ppo != _PPO else _saved_ppo(cfg.resume, saved)
+
+
+def _saved_ppo(run: Path | None, saved: dict[str, Any]) -> PpoCfg:
     try:
-        return PpoCfg(**saved["extra"]["settings"]["ppo"])
+        ppo = PpoCfg(**saved["extra"]["settings"]["ppo"])
+        return replace(ppo, hidden_dims=tuple(ppo.hidden_dims))
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{cfg.resume} is damaged: {error} in its settings of ppo; put a copy of it back") from error
+        raise ValueError(f"{run} is damaged: {error} in its settings of ppo; put a copy of it back") from error
 
 
 def _check_resumed(cfg: FinetuneCfg, saved: dict[str, Any], settings: dict[str, Any]) -> None:
     assert cfg.resume is not None
     check_entries(saved["extra"], _STATE, cfg.resume / CHECKPOINT)
-    different = changes(saved["extra"]["settings"], settings)
+    before = saved["extra"]["settings"]
+    different = changes(_wherever_elites_lie(before), _wherever_elites_lie(settings))
     if different:
         raise ValueError(
-            f"{cfg.resume} was begun with other settings ({'; '.join(different)}): leave them out, or begin a new run"
+            f"{cfg.resume} was begun with other settings ({'; '.join(different)}): leave out what is given otherwise, "
+            "put an archive that has changed back, or begin a new run"
         )
+
+
+def _wherever_elites_lie(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings without the place of the archive, which may have moved: its hash says whether it is the same."""
+    archive = settings.get("archive")
+    if not isinstance(archive, dict):
+        return settings
+    return {**settings, "archive": {key: value for key, value in archive.items() if key != "path"}}
 
 
 def _run_dir(cfg: FinetuneCfg, robot: str) -> Path:

@@ -47,12 +47,21 @@ class Learner:
         ranks: Which process of a training this is.
     """
 
-    def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int) -> None:
-        """Draw the networks from ``seed`` and begin episodes at random ages, so that they do not end together."""
+    def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int, random_ages: bool = True) -> None:
+        """Draw the networks from ``seed``.
+
+        Args:
+            env: What is learned.
+            cfg: Settings.
+            seed: Of networks and actions.
+            random_ages: Begin episodes with clocks set forward, so that they do not end together; such an episode is
+                shorter than its length says, and ends by the clock without having had its time.
+        """
         torch.manual_seed(seed)
         torch.set_float32_matmul_precision("high")  # TF32 on CUDA: half the learning time, no measurable loss
         self.env = env
         self.cfg = cfg
+        self._random_ages = random_ages
         self.iteration = 0
         self.ranks = Ranks.of_environment()
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
@@ -69,15 +78,16 @@ class Learner:
         torch.manual_seed((seed + 1) * 1_000_003 + self.iteration * 1009 + self.ranks.rank)
 
     def _begin(self) -> None:
-        ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
-        self.env.episode_length_buf = ages
+        if self._random_ages:
+            ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
+            self.env.episode_length_buf = ages
         self._observations = self.env.get_observations()
 
     def iterate(self) -> Iteration:
         """Collect ``steps_per_env`` control steps of every environment, then update the networks.
 
         Raises:
-            FloatingPointError: If the losses are not finite: the networks are beyond use, the last checkpoint is not.
+            FloatingPointError: If losses or networks are not finite: they are beyond use, the last checkpoint is not.
         """
         alg = self.alg
         began = time.perf_counter()
@@ -94,6 +104,10 @@ class Learner:
         losses = alg.update()
         if not all(map(torch.isfinite, torch.tensor(list(losses.values())))):
             raise FloatingPointError(f"iteration {self.iteration}: losses are not finite, got {losses}")
+        # The last step may have spoiled the networks after their losses were computed.
+        parameters = [*alg.actor.parameters(), *alg.critic.parameters()]
+        if not torch.isfinite(torch.stack([parameter.detach().sum() for parameter in parameters])).all():
+            raise FloatingPointError(f"iteration {self.iteration}: the networks' weights are not finite")
         self.iteration += 1
         return Iteration(collection_s=collected - began, learning_s=time.perf_counter() - collected, losses=losses)
 

@@ -81,7 +81,7 @@ class Mix:
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Which elites are trained on, in the order of their terrains after the hand-crafted ones."""
     episodes: NDArray[np.int64] = field(init=False)
-    """Episodes that ended on each elite when it was last trained on before the present exchange, shape (E,)."""
+    """Valid episodes that ended on each elite when it was last trained on before the present exchange, shape (E,)."""
     crossed: NDArray[np.int64] = field(init=False)
     """How many of them reached the goal; where robots do not cross, the end of the time."""
 
@@ -90,6 +90,7 @@ class Mix:
             raise ValueError("mix generated needs elites to train on, got none: give an archive that has some")
         self.episodes = np.zeros(len(self.genes), np.int64)
         self.crossed = np.zeros(len(self.genes), np.int64)
+        self._before_resume = np.zeros((2, len(self.genes)), np.int64)
 
     def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
         """The terrains of the next exchange.
@@ -117,13 +118,15 @@ class Mix:
         return Tiles(heights=heights, type_of_column=types)
 
     def state(self, counts: dict[str, NDArray[Any]]) -> dict[str, Any]:
-        """Plain values for a checkpoint; what was counted on the present terrains is taken as remembered."""
-        episodes, crossed = self._added(counts)
+        """Plain values for a checkpoint, with what was counted on the present terrains so far."""
+        present = self._present(counts)
         return {
             "swap": self.swap,
             "rows": self.rows.tolist(),
-            "episodes": episodes.tolist(),
-            "crossed": crossed.tolist(),
+            "episodes": self.episodes.tolist(),
+            "crossed": self.crossed.tolist(),
+            "present_episodes": present[0].tolist(),
+            "present_crossed": present[1].tolist(),
         }
 
     def restore(self, state: dict[str, Any]) -> Tiles:
@@ -134,8 +137,9 @@ class Mix:
         """
         count = len(self.genes)
         expected = self.cfg.terrains - self.cfg.hand_crafted if self.cfg.mix == "generated" else 0
-        whole = {key: np.asarray(state.get(key, ()), np.int64) for key in ("rows", "episodes", "crossed")}
-        shapes = {"rows": (expected,), "episodes": (count,), "crossed": (count,)}
+        of_elites = ("episodes", "crossed", "present_episodes", "present_crossed")
+        whole = {key: np.asarray(state.get(key, ()), np.int64) for key in ("rows", *of_elites)}
+        shapes = {"rows": (expected,), **dict.fromkeys(of_elites, (count,))}
         rows = whole["rows"]
         if type(state.get("swap")) is not int or any(whole[key].shape != shape for key, shape in shapes.items()):
             raise ValueError(f"the terrains of the checkpoint are not those of a mix of {count} elites")
@@ -143,6 +147,7 @@ class Mix:
             raise ValueError(f"the terrains of the checkpoint name elites beyond the {count} there are")
         self.swap, self.rows = state["swap"], rows
         self.episodes, self.crossed = whole["episodes"], whole["crossed"]
+        self._before_resume = np.stack([whole["present_episodes"], whole["present_crossed"]])
         return self.terrains()
 
     def success(self) -> NDArray[np.float64]:
@@ -179,21 +184,21 @@ class Mix:
         return np.concatenate([whole, rest])
 
     def _remember(self, counts: dict[str, NDArray[Any]]) -> None:
-        self.episodes, self.crossed = self._added(counts)
+        """What became of the present elites replaces what was known of them: the controller was another then."""
+        episodes, crossed = self._present(counts)
+        known = episodes > 0
+        self.episodes[known], self.crossed[known] = episodes[known], crossed[known]
+        self._before_resume[:] = 0
 
-    def _added(self, counts: dict[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Episodes and crossings of each elite.
-
-        What became of those on the present terrains replaces what was known of them: the controller was another then.
-        """
-        episodes, crossed = self.episodes.copy(), self.crossed.copy()
+    def _present(self, counts: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+        """Valid episodes on each elite since the last exchange, and those that crossed it, shape (2, E)."""
+        present = self._before_resume.copy()
         if self.cfg.mix == "generated":
-            good = counts["goal" if self.crosses else "time_out"]
-            num_envs = len(good)
+            num_envs = len(counts["episodes"])
             terrain = np.arange(num_envs) * self.cfg.terrains // num_envs  # as Tiles.columns_of deals them out
             on_elite = terrain >= self.cfg.hand_crafted
             rows = self.rows[terrain[on_elite] - self.cfg.hand_crafted]
-            now = [np.bincount(rows, part[on_elite], len(episodes)) for part in (counts["episodes"], good)]
-            known = now[0] > 0
-            episodes[known], crossed[known] = now[0][known], now[1][known]
-        return episodes, crossed
+            valid = counts["episodes"] - counts["invalid"]
+            for sums, part in zip(present, (valid, counts["goal" if self.crosses else "time_out"]), strict=True):
+                sums += np.bincount(rows, part[on_elite], len(self.genes)).astype(np.int64)
+        return present

@@ -1,9 +1,12 @@
 """What all trainings share: a run directory, iterating until told to stop, checkpoints, the controller at the end."""
 
+import fcntl
 import io
+import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +70,25 @@ def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) 
     for folder in {run_dir, export.parent if export else run_dir}:
         check_writable(folder)
     return run_dir
+
+
+@contextmanager
+def claimed(run_dir: Path) -> Iterator[None]:
+    """Keeps other trainings out of a run directory for the duration of a ``with`` block.
+
+    Raises:
+        ValueError: If another training works in it.
+    """
+    handle = os.open(run_dir, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process, however that ends
+    except BlockingIOError:
+        os.close(handle)
+        raise ValueError(f"another training works in {run_dir}: let it end, or name another --run-dir") from None
+    try:
+        yield
+    finally:
+        os.close(handle)
 
 
 def plain(value: Any) -> Any:
@@ -147,12 +169,19 @@ def iterate(
             last_save = time.monotonic()
 
 
-def finish(learner: Learner, progress: Progress, *, save: Callable[[], None], policies: list[Path]) -> None:
-    """The last checkpoint, and the controller with its record at every place asked for."""
+def finish(
+    learner: Learner,
+    progress: Progress,
+    *,
+    save: Callable[[], None],
+    policies: list[Path],
+    about: dict[str, Any] | None = None,
+) -> None:
+    """The last checkpoint, and the controller with its record, ``about`` added, at every place asked for."""
     learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
     progress.close()
     save()
-    record = progress.record()
+    record = {**progress.record(), **(about or {})}
     for path in policies:
         export_policy(path, learner, record)
         print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")

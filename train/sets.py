@@ -101,10 +101,15 @@ def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
         num_test = round(_HELD_OUT_SHARE * len(archive))
         num_train = len(archive) - num_test
     by_genes = np.lexsort(archive.genes.T[::-1])
-    digest = hashlib.sha256(np.ascontiguousarray(archive.genes[by_genes]).tobytes()).digest()
-    rng = np.random.default_rng([_SPLIT_KEY, seed, int.from_bytes(digest[:8], "big")])
+    rng = np.random.default_rng([_SPLIT_KEY, seed, int(elites_sha256(archive)[:16], 16)])
     drawn = by_genes[rng.permutation(len(archive))]
     return EliteSplit(train=drawn[num_test : num_test + num_train], test=drawn[:num_test])
+
+
+def elites_sha256(archive: Archive) -> str:
+    """Hash of an archive's genes, whatever their order."""
+    genes = archive.genes[np.lexsort(archive.genes.T[::-1])]
+    return hashlib.sha256(np.ascontiguousarray(genes).tobytes()).hexdigest()
 
 
 def set_rng(name: str, seed: int) -> np.random.Generator:

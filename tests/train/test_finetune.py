@@ -17,6 +17,7 @@ from train.finetune import finetune, main
 from train.finetune_job import FinetuneCfg, job_of
 from train.learner import read_checkpoint
 from train.ppo import PpoCfg
+from train.run import claimed
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
@@ -104,12 +105,34 @@ def test_a_critic_that_comes_along_is_taken(places):
     tuning = command.Tuning(job)
     expected = torch.load(path, weights_only=True)["critic_state_dict"]
     assert all(value.equal(expected[key]) for key, value in tuning.learner.alg.critic.state_dict().items())
+    assert float(tuning.learner.alg._lr) == pytest.approx(1e-3)
+    tuning.before_iteration()
+    assert float(tuning.learner.alg._lr) == pytest.approx(1e-4)  # a trained actor's first steps are small here too
+
+
+@pytest.mark.parametrize(("iterations", "alone"), [(1, 0), (3, 1), (10, 5), (99, 49), (1200, 50)])
+def test_left_out_the_critic_alone_has_at_most_half_of_the_iterations(iterations, alone, places):
+    job = job_of(config(places, critic_iterations=None, iterations=iterations, run_dir=places / "none"))
+    assert job.settings["critic_iterations"] == alone
+
+
+def test_it_says_where_the_controller_will_stay_as_it_is(places, capsys):
+    assert finetune(config(places, run_dir=places / "stays", iterations=1, critic_iterations=1)) == 0
+    assert "learns alone for the first 1 iterations: the controller stays as it is" in capsys.readouterr().out
+    assert finetune(FinetuneCfg(resume=places / "stays", device="cpu", iterations=2)) == 0
+    assert "stays as it is" not in capsys.readouterr().out
+
+
+def test_every_episode_is_whole(places):
+    # With clocks set forward, some would end by the clock without having had the time to cross.
+    task = command.Tuning(job_of(config(places, run_dir=places / "none"))).task
+    assert task.episode_steps.tolist() == [0] * 6
 
 
 def test_a_normaliser_becomes_part_of_the_first_layer(places):
     normaliser = {"obs_normalizer._mean": torch.randn(1, 235), "obs_normalizer._std": torch.rand(1, 235) + 0.5}
     path = write_actor(places / "normalised.pt", **normaliser)
-    actor = job_of(config(places, policy=path, run_dir=places / "none")).actor
+    actor = job_of(config(places, policy=path, run_dir=places / "none")).start.actor
     torch.save({"actor_state_dict": actor}, places / "folded.pt")
     rows = torch.randn(5, 235)
     expected = load_policy(path, ROBOT, "cpu")(rows)
@@ -140,6 +163,29 @@ def test_resume_needs_the_directory_alone_and_goes_on_with_the_same_terrains(fin
     assert later["extra"]["settings"] == read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["settings"]
 
 
+def test_resume_needs_neither_the_first_controller_nor_the_archives_place(places):
+    start, archive, moved, run = (places / name for name in ("gone.pt", "gone.npz", "moved.npz", "moving"))
+    start.write_bytes((places / "start.pt").read_bytes())
+    write_archive(archive, make_archive(10))
+    finetune(config(places, policy=start, archive=archive, run_dir=run, iterations=1))
+    start.unlink()
+    archive.rename(moved)
+    with pytest.raises(ValueError, match=r"no archive at .*gone.npz.*name it with --archive"):
+        finetune(FinetuneCfg(resume=run, device="cpu", iterations=2))
+    assert finetune(FinetuneCfg(resume=run, device="cpu", iterations=2, archive=moved)) == 0
+    assert finetune(FinetuneCfg(resume=run, device="cpu", iterations=3)) == 0  # it remembers where they lie now
+    write_archive(moved, make_archive(10, seed=1))  # as many others
+    with pytest.raises(ValueError, match=r"archive.elites_sha256 \w+ -> \w+.*put an archive that has changed back"):
+        finetune(FinetuneCfg(resume=run, device="cpu", iterations=4))
+
+
+def test_a_run_directory_takes_one_training_at_a_time(finished):
+    before = (finished / "checkpoint.pt").read_bytes()
+    with claimed(finished), pytest.raises(ValueError, match="another training works in"):
+        finetune(FinetuneCfg(resume=finished, device="cpu", iterations=4))
+    assert (finished / "checkpoint.pt").read_bytes() == before
+
+
 def test_a_resume_of_other_settings_is_refused(finished, places):
     before = (finished / "checkpoint.pt").read_bytes()
     with pytest.raises(ValueError, match=r"was begun with other settings .*mix.swap_every 2 -> 3"):
@@ -159,6 +205,19 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
     assert (run / "checkpoint.pt").read_bytes() == kept
 
 
+def write_bad_starts(folder):
+    """Controllers that walk, and cannot be trained on."""
+    write_actor(folder / "std_nan.pt", **{"distribution.std_param": torch.full((12,), float("nan"))})
+    write_actor(folder / "std_negative.pt", **{"distribution.std_param": torch.full((12,), -1.0)})
+    write_actor(folder / "std_short.pt", **{"distribution.std_param": torch.full((2,), 0.3)})
+    whole = torch.load(write_actor(folder / "whole.pt", critic=True), weights_only=True)
+    critic = whole["critic_state_dict"]
+    others = {"other": {**critic, "mlp.0.weight": torch.ones(3, 3)}, "none": 5}
+    others["nan"] = {**critic, "mlp.0.bias": torch.full((16,), float("nan"))}
+    for name, other in others.items():
+        torch.save({**whole, "critic_state_dict": other}, folder / f"critic_{name}.pt")
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
@@ -171,6 +230,18 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
         (["--policy", "{dir}/nowhere.pt"], "no such file"),
         (["--policy", "{dir}/narrow.pt"], "maps 100 observations to 12 actions"),
         (["--policy", "{dir}/script.pt"], "a fine-tuning starts from an rsl_rl checkpoint"),
+        (["--policy", "{dir}/std_nan.pt"], "must be 12 numbers above 0, got tensor([nan"),
+        (["--policy", "{dir}/std_negative.pt"], "must be 12 numbers above 0, got tensor([-1."),
+        (["--policy", "{dir}/std_short.pt"], "must be 12 numbers above 0, got tensor([0.3000, 0.3000])"),
+        (
+            ["--policy", "{dir}/critic_other.pt"],
+            "must have the actor's hidden layers [16, 8], 235 inputs and one output",
+        ),
+        (
+            ["--policy", "{dir}/critic_none.pt"],
+            "must have the actor's hidden layers [16, 8], 235 inputs and one output",
+        ),
+        (["--policy", "{dir}/critic_nan.pt"], "has weights that are not finite"),
         (["--terrains", "1"], "terrains must be at least 2"),
         (["--terrains", "30", "--num-envs", "6"], "num_envs must be at least as many as terrains, 30, got 6"),
         (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
@@ -186,6 +257,7 @@ def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeyp
     state = torch.load(places / "start.pt", weights_only=True)["actor_state_dict"]
     state["mlp.0.weight"] = state["mlp.0.weight"][:, :100]
     torch.save({"actor_state_dict": state}, places / "narrow.pt")
+    write_bad_starts(places)
     torch.jit.script(torch.nn.Linear(235, 12)).save(places / "script.pt")
     monkeypatch.setattr("train.finetune.CommandTask", None)  # building anything would fail with another error
     monkeypatch.chdir(places)

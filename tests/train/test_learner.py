@@ -85,6 +85,21 @@ def test_losses_that_are_not_finite_stop_training(learner, monkeypatch):
     assert learner.iteration == 0
 
 
+def test_weights_that_the_last_step_spoiled_stop_training(learner, monkeypatch):
+    update = learner.alg.update
+
+    def spoil():
+        losses = update()
+        with torch.no_grad():
+            learner.alg.critic.state_dict()["mlp.0.weight"][3, 5] = float("nan")
+        return losses
+
+    monkeypatch.setattr(learner.alg, "update", spoil)
+    with pytest.raises(FloatingPointError, match="iteration 0: the networks' weights are not finite"):
+        learner.iterate()
+    assert learner.iteration == 0
+
+
 def bad_files(folder, learner):
     whole = folder / "whole.pt"
     learner.save(whole, {})

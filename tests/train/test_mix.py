@@ -22,12 +22,13 @@ def heights_of(genes):
     return bank.heights.numpy()
 
 
-def counts(goals, episodes, time_outs=None):
+def counts(goals, episodes, time_outs=None, invalid=None):
     """What became of the episodes of 12 robots on 6 terrains, two on each."""
     return {
         "goal": np.repeat(np.float32(goals), 2),
         "time_out": np.repeat(np.float32(goals if time_outs is None else time_outs), 2),
         "episodes": np.repeat(np.float32(episodes), 2),
+        "invalid": np.repeat(np.float32([0] * 6 if invalid is None else invalid), 2),
     }
 
 
@@ -86,6 +87,28 @@ def test_what_is_remembered_of_an_elite_is_its_last_exchange():
     mix.next(counts([0, 0, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]))  # no episode ended on the second of them
     assert mix.episodes[second[0]] == 2 and mix.crossed[second[0]] == 2
     assert mix.episodes[second[1]] == dict(zip(first, [8, 10, 8], strict=True)).get(second[1], 0)  # as before
+
+
+def test_invalid_episodes_say_nothing_of_an_elite():
+    mix = make_mix()
+    mix.next()
+    first = mix.rows.copy()
+    mix.next(counts([0, 0, 0, 1, 0, 2], [4] * 6, invalid=[0, 0, 0, 3, 4, 0]))
+    np.testing.assert_array_equal(mix.episodes[first], [2, 0, 8])
+    np.testing.assert_allclose(mix.success()[first], [1.0, 0.0, 0.5])
+
+
+def test_a_resume_between_exchanges_counts_what_was_before_it_too():
+    straight, cut, again = make_mix(), make_mix(), make_mix()
+    straight.next(), cut.next()
+    again.restore(cut.state(counts([0, 0, 0, 3, 2, 1], [4] * 6)))
+    again.next(counts([0, 0, 0, 1, 0, 0], [1] * 6))
+    straight.next(counts([0, 0, 0, 4, 2, 1], [5] * 6))
+    np.testing.assert_array_equal(again.episodes, straight.episodes)
+    np.testing.assert_array_equal(again.crossed, straight.crossed)
+    assert again.episodes.max() == 10 and again.crossed.max() == 8
+    later = counts([1] * 6, [2] * 6)
+    assert again.state(later) == straight.state(later)  # and nothing of it is left for the next
 
 
 def test_without_a_goal_it_is_the_end_of_the_time_that_counts():
