@@ -24,7 +24,7 @@ from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
 from train.learner import Learner
-from train.ppo import PpoCfg
+from train.ppo import PpoCfg, check_ppo
 from train.progress import Progress
 from train.ranks import Ranks
 from train.run import (
@@ -34,6 +34,7 @@ from train.run import (
     RESERVE_S,
     StopRequest,
     changes,
+    check_limits,
     claimed,
     finish,
     iterate,
@@ -130,6 +131,8 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
+    check_ppo(cfg.ppo, num_envs)
+    check_limits(rows=cfg.rows, save_every_s=cfg.save_every_s, max_seconds=cfg.max_seconds)
     run_dir = prepare_run_dir(_run_dir(cfg, robot.name), resume=cfg.resume, export=cfg.export)
     settings = {
         "seed": seed,

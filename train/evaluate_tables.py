@@ -14,6 +14,7 @@ from train.evaluate_cfg import EvaluateCfg, Size, size_of, split_words
 from train.held_out import check_held_out
 from train.kept import KeptCrossings, controller_hash
 from train.measures import measure
+from train.seeds import check_seeds
 from train.sets import FROM_ARCHIVE, SETS, EliteSplit, TerrainSet, check_names, make_sets, split_elites
 from train.table_figure import write_figure
 from train.table_print import print_tables
@@ -57,6 +58,7 @@ def _plan_of(cfg: EvaluateCfg) -> _Plan:
     scales = robot.read_penalty_scales()
     for policy in controllers.values():
         check_policy(policy, robot, size.device)
+    check_seeds(controllers)
     sets = make_sets(names, size.terrains, cfg.seed, archive=archive, split=split)
     for name in FROM_ARCHIVE:
         if name in sets:

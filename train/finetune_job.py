@@ -15,8 +15,8 @@ from sim.simulation import resolve_device
 from train.held_out import marks_of, recorded_marks
 from train.learner import check_entries
 from train.mix import Mix, MixCfg
-from train.ppo import PpoCfg
-from train.run import CHECKPOINT, CONFIG, changes, plain, prepare_run_dir, read_saved
+from train.ppo import PpoCfg, check_ppo
+from train.run import CHECKPOINT, CONFIG, changes, check_limits, plain, prepare_run_dir, read_saved
 from train.sets import elites_sha256, split_elites
 from train.start import Start, read_start
 from train.task_cfg import TaskCfg
@@ -132,6 +132,10 @@ def job_of(cfg: FinetuneCfg) -> Job:
     cfg = replace(cfg, ppo=replace(_ppo(cfg, saved), hidden_dims=hidden))
     values: Any = cfg  # whose numbers and names are all there now
     mix_cfg = MixCfg(mix=values.mix, terrains=values.terrains, swap_every=values.swap_every, draw=values.draw)
+    check_ppo(cfg.ppo, values.num_envs)
+    check_limits(rows=cfg.rows, save_every_s=cfg.save_every_s, max_seconds=cfg.max_seconds)
+    if saved is not None and saved["iter"] > values.iterations:
+        raise ValueError(f"{cfg.resume} has done {saved['iter']} iterations already: give at least as many in all")
     if values.num_envs < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {values.num_envs}")
     if values.task not in _TASKS:

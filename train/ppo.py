@@ -1,5 +1,6 @@
 """PPO settings as a fresh dict per call, and rsl_rl's PPO with its minibatch step captured as one CUDA graph."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +40,44 @@ class PpoCfg:
     """Standard deviation of the actions before the first update."""
     captured: bool = True
     """Update with :class:`CapturedPPO`; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
+
+
+def check_ppo(cfg: PpoCfg, num_envs: int) -> None:
+    """Refuse settings that nothing can be learned with.
+
+    Args:
+        cfg: Settings of the learner.
+        num_envs: Environments of one process.
+
+    Raises:
+        ValueError: Naming all that are out of range.
+    """
+    ranges = {
+        "hidden_dims": (
+            bool(cfg.hidden_dims) and min(cfg.hidden_dims) >= 1,
+            "at least one layer, each at least 1 wide",
+        ),
+        "steps_per_env": (cfg.steps_per_env >= 1, "at least 1"),
+        "epochs": (cfg.epochs >= 1, "at least 1"),
+        "mini_batches": (
+            1 <= cfg.mini_batches <= max(num_envs * cfg.steps_per_env // 2, 1),
+            f"at least 1, and at most half of the {num_envs} x {cfg.steps_per_env} transitions of an iteration",
+        ),
+        "learning_rate": (0.0 < cfg.learning_rate < math.inf, "above 0"),
+        "desired_kl": (0.0 < cfg.desired_kl < math.inf, "above 0"),
+        "gamma": (0.0 <= cfg.gamma <= 1.0, "in 0..1"),
+        "lam": (0.0 <= cfg.lam <= 1.0, "in 0..1"),
+        "clip": (0.0 < cfg.clip < math.inf, "above 0"),
+        "entropy": (0.0 <= cfg.entropy < math.inf, "at least 0"),
+        "init_noise_std": (0.0 < cfg.init_noise_std < math.inf, "above 0"),
+    }
+    wrong = [
+        f"ppo.{name} must be {range_}, got {getattr(cfg, name)}" for name, (ok, range_) in ranges.items() if not ok
+    ]
+    if num_envs * cfg.steps_per_env == 1:
+        wrong.append("an iteration must have at least 2 transitions, got 1: more num_envs or ppo.steps_per_env")
+    if wrong:
+        raise ValueError("; ".join(wrong))
 
 
 def runner_settings(cfg: PpoCfg) -> dict[str, Any]:

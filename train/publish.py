@@ -11,6 +11,7 @@ import tyro
 from sim.command import exit_code_of
 from sim.files import read_json, write_atomically
 from train.paper import PAPER_ARCHIVES, published
+from train.seeds import firsts, kind_of
 
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"
 _NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}
@@ -124,24 +125,24 @@ def _tables(found: dict[str, Any], robot: str) -> str:
     paper = published(robot) or {}
     rows = []
     for name, label in _SETS.items():
-        for who in found["success"].get(name, {}):
-            if "@" in who:
-                continue
+        count = found["terrains"].get(name)
+        for who in firsts(found["success"].get(name, {})):
+            kind = kind_of(who)
             cells = [_rate(found, measure, name, who) for measure in ("success", "goal")]
             reward = _rate(found, "reward", name, who, digits=1)
-            theirs = [paper.get(measure, {}).get(name, {}).get(who) for measure in ("success", "reward")]
+            theirs = [paper.get(measure, {}).get(name, {}).get(kind) for measure in ("success", "reward")]
             beside = _NONE if None in theirs else f"{theirs[0]:.3f}, {theirs[1]:.1f}"
-            rows.append((label, who, *cells, reward, beside))
+            rows.append((f"{label} ({count})", kind, *cells, reward, beside))
     header = ("terrains", "controller", "success (95 %)", "goal (95 %)", "reward (95 %)", "paper: success, reward")
     about = found["archive"]
     where = f"; elites of the archive after {about['iterations']:,} iterations" if about else ""
-    title = f"{max(found['terrains'].values())} terrains a set, {found['episodes']} episodes each{where}."
+    title = f"In brackets the terrains of a set; {found['episodes']} episodes each{where}."
     return f"{title}\n\n{table(header, rows)}"
 
 
 def _rate(found: dict[str, Any], measure: str, name: str, who: str, digits: int = 3) -> str:
     """A mean with its interval over seeds where there are several, else over terrains."""
-    several = found["over_seeds"].get(measure, {}).get(name, {}).get(who)
+    several = found["over_seeds"].get(measure, {}).get(name, {}).get(kind_of(who))
     mean, limits = found[measure][name][who], found["intervals"][measure][name][who]
     if several is not None:
         mean, limits = several["mean"], several["interval"]

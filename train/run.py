@@ -43,6 +43,20 @@ class StopRequest:
         signal.signal(kind, signal.SIG_DFL)
 
 
+def check_limits(*, rows: int, save_every_s: float, max_seconds: float | None) -> None:
+    """Refuse limits that mean nothing.
+
+    Raises:
+        ValueError: If there is no row, or a time is negative or none.
+    """
+    if rows < 1:
+        raise ValueError(f"rows must be at least 1, got {rows}")
+    if not save_every_s >= 0.0:
+        raise ValueError(f"save_every_s must be at least 0 s, got {save_every_s}")
+    if max_seconds is not None and not max_seconds > 0.0:
+        raise ValueError(f"max_seconds must be above 0 s, got {max_seconds}; leave it out for no limit")
+
+
 def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) -> Path:
     """The run directory, made and fit to be written to.
 

@@ -1,11 +1,12 @@
 """Controllers of one kind that were trained from different seeds: what their kind is worth, whatever the seed."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from sim.intervals import MAX_T_VALUES, t_interval
+from sim.provenance import controller_hash
 
 RATES = ("success", "goal", "fallen")
 """Measures that lie between 0 and 1, and so do their intervals."""
@@ -16,6 +17,26 @@ MARK = "@"
 def kind_of(name: str) -> str:
     """The kind of a controller by its name."""
     return name.split(MARK)[0]
+
+
+def check_seeds(controllers: Mapping[str, str]) -> None:
+    """Refuse one training as several: the interval over its "seeds" would be none.
+
+    Args:
+        controllers: Policy of each controller by its name.
+
+    Raises:
+        ValueError: If two of a kind are the same controller.
+    """
+    known: dict[tuple[str, str], str] = {}
+    for name, policy in controllers.items():
+        key = (kind_of(name), controller_hash(policy) or policy)
+        if key in known:
+            raise ValueError(
+                f"{known[key]} and {name} must be of one kind from different seeds, got the same controller twice: "
+                "name another file, or leave one out"
+            )
+        known[key] = name
 
 
 def firsts(names: Iterable[str]) -> list[str]:

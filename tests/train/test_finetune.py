@@ -179,6 +179,13 @@ def test_resume_needs_neither_the_first_controller_nor_the_archives_place(places
         finetune(FinetuneCfg(resume=run, device="cpu", iterations=4))
 
 
+def test_fewer_iterations_than_are_done_are_refused(finished):
+    before = (finished / "policy.pt").stat().st_mtime_ns
+    with pytest.raises(ValueError, match="has done 3 iterations already: give at least as many in all"):
+        finetune(FinetuneCfg(resume=finished, device="cpu", iterations=2))
+    assert (finished / "policy.pt").stat().st_mtime_ns == before
+
+
 def test_a_run_directory_takes_one_training_at_a_time(finished):
     before = (finished / "checkpoint.pt").read_bytes()
     with claimed(finished), pytest.raises(ValueError, match="another training works in"):
@@ -246,6 +253,10 @@ def write_bad_starts(folder):
         (["--terrains", "30", "--num-envs", "6"], "num_envs must be at least as many as terrains, 30, got 6"),
         (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
         (["--iterations", "-1"], "iterations must be at least 1, got -1"),
+        (["--ppo.mini-batches", "0"], "ppo.mini_batches must be at least 1"),
+        (["--rows", "0"], "rows must be at least 1, got 0"),
+        (["--max-seconds", "0"], "max_seconds must be above 0 s, got 0.0"),
+        (["--save-every-s", "-1"], "save_every_s must be at least 0 s, got -1.0"),
         (["--seed", "-1"], "seed must be at least 0, got -1"),
         (["--resume", "{dir}/nowhere"], "no checkpoint at"),
         (["--ppo.no-captured"], "leave --ppo.captured on"),

@@ -1,5 +1,6 @@
 """The captured PPO against rsl_rl's own, and its settings."""
 
+import re
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from train.ppo import CapturedPPO, PpoCfg, runner_settings
+from train.ppo import CapturedPPO, PpoCfg, check_ppo, runner_settings
 
 NUM_ENVS, NUM_OBS, NUM_ACTIONS = 6, 5, 2
 
@@ -110,3 +111,29 @@ def test_unsupported_features_are_refused() -> None:
     settings["algorithm"]["normalize_advantage_per_mini_batch"] = True
     with pytest.raises(ValueError, match="leave these three settings"):
         OnPolicyRunner(DummyEnv(), settings, log_dir=None, device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps_per_env": 0}, "ppo.steps_per_env must be at least 1, got 0"),
+        ({"epochs": 0}, "ppo.epochs must be at least 1, got 0"),
+        ({"mini_batches": 0}, "ppo.mini_batches must be at least 1, and at most half of the 6 x 16 transitions"),
+        ({"mini_batches": 49}, "at most half of the 6 x 16 transitions of an iteration, got 49"),
+        ({"learning_rate": float("nan")}, "ppo.learning_rate must be above 0, got nan"),
+        ({"gamma": 2.0}, "ppo.gamma must be in 0..1, got 2.0"),
+        ({"lam": -0.1, "clip": 0.0}, "ppo.lam must be in 0..1, got -0.1; ppo.clip must be above 0, got 0.0"),
+        ({"desired_kl": 0.0, "entropy": -1.0}, "ppo.desired_kl must be above 0, got 0.0; ppo.entropy must be at least"),
+        ({"hidden_dims": (8, 0)}, "ppo.hidden_dims must be at least one layer, each at least 1 wide, got (8, 0)"),
+        ({"init_noise_std": -1.0}, "ppo.init_noise_std must be above 0, got -1.0"),
+    ],
+)
+def test_settings_that_nothing_is_learned_with_are_named(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_ppo(PpoCfg(**changes), NUM_ENVS)
+
+
+def test_an_iteration_has_at_least_two_transitions() -> None:
+    check_ppo(PpoCfg(steps_per_env=2, mini_batches=1), 1)
+    with pytest.raises(ValueError, match="an iteration must have at least 2 transitions, got 1"):
+        check_ppo(PpoCfg(steps_per_env=1, mini_batches=1), 1)

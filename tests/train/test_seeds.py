@@ -2,7 +2,7 @@
 
 import pytest
 
-from train.seeds import firsts, over_seeds, print_over_seeds
+from train.seeds import check_seeds, firsts, over_seeds, print_over_seeds
 
 TABLES = {
     "success": {"near": {"base": 0.5, "C-G": 0.8, "C-G@1": 0.9, "C-G@2": 1.0, "C-HC@7": 0.4}},
@@ -24,6 +24,17 @@ def test_mean_and_interval_of_a_kind_with_several():
     rewards = over_seeds({"reward": {"near": {"C-G": 8.0, "C-G@1": 9.0, "C-G@2": 10.0}}}, ["reward"])
     assert rewards["reward"]["near"]["C-G"]["interval"] == pytest.approx([9.0 - 2.484, 9.0 + 2.484], abs=1e-3)
     assert found["goal"]["near"]["C-G"]["mean"] is None
+
+
+def test_one_training_is_not_several(tmp_path):
+    for name, content in (("a.pt", b"1"), ("b.pt", b"1"), ("c.pt", b"2")):
+        (tmp_path / name).write_bytes(content)
+    a, b, c = (str(tmp_path / name) for name in ("a.pt", "b.pt", "c.pt"))
+    check_seeds({"base": a, "C-G": c, "C-G@1": b})  # of different kinds, the same may stand twice
+    with pytest.raises(ValueError, match=r"C-G and C-G@2 must be of one kind from different seeds, got the same"):
+        check_seeds({"C-G": a, "C-G@1": c, "C-G@2": b})
+    with pytest.raises(ValueError, match=r"C-G@1 and C-G@2 must be"):
+        check_seeds({"C-G@1": "no.such:code", "C-G@2": "no.such:code"})
 
 
 def test_more_than_an_interval_is_known_for():
