@@ -35,7 +35,7 @@ def run_file(path: Path) -> ModuleType:
     sys.modules[name] = module
     try:
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)  # no .pyc that an edit could outrun
-    except Exception as error:  # a file can fail with anything
+    except (Exception, SystemExit) as error:  # a file can fail with anything
         del sys.modules[name]
         raise ValueError(f"{path} fails: {in_one_line(error)}") from error
     return module

@@ -13,15 +13,14 @@ import warp as wp
 from kernels.penalties import PENALTIES
 from sim.model_files import read_model_files
 from sim.named_code import run_file
-from sim.probes import make_probes
 from sim.robot import ROBOTS, RobotCfg
-from sim.robot_model import build_robot
-from sim.training import TrainingCfg
+from sim.training import TrainingCfg, training_problems
 
 _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 _POSITIVE = ("default_base_height", "contact_force_limit", "action_scale", "physics_dt")
 _COUNTS = ("decimation", "nconmax", "njmax")
 _PER_JOINT = {"stiffness": "positive", "damping": "0 or more", "effort_limit": "positive", "armature": "0 or more"}
+_LONGEST_STEP_S = 0.05
 _NOT_IN_DIGEST = ("model_file", "settings_file", "training")
 
 
@@ -32,6 +31,9 @@ def load_robot(path: Path) -> RobotCfg:
         ValueError: If the file is missing or fails, sets no ``ROBOT``, or something in the settings or the model is
             wrong; as much of it as can be told at once is named.
     """
+    from sim.probes import make_probes
+    from sim.robot_model import build_robot  # which import Newton, and take seconds
+
     robot: Any = getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
@@ -57,6 +59,8 @@ def settings_problems(robot: RobotCfg) -> list[str]:
         problems.append(f"model_file must be a path, got {robot.model_file!r}")
     if not isinstance(robot.training, TrainingCfg):
         problems.append(f"training must be a TrainingCfg, got {type(robot.training).__name__}")
+    else:
+        problems += training_problems(robot.training)
     if not isinstance(robot.collision_bit, bool):
         problems.append(f"collision_bit must be True or False, got {robot.collision_bit!r}")
     wrong_names = [f"{name} must be a tuple of names, each once, got {getattr(robot, name)!r}" for name in _NAMES
@@ -101,6 +105,8 @@ def _number_problems(robot: RobotCfg) -> list[str]:
     for name in ("friction", "contact_time_constant_s"):
         if getattr(robot, name) is not None and not _is_number(getattr(robot, name), above=0.0):
             problems.append(f"{name} must be a positive number or None, got {getattr(robot, name)!r}")
+    if _is_number(robot.physics_dt, above=_LONGEST_STEP_S):
+        problems.append(f"physics_dt must be at most {_LONGEST_STEP_S:g} s, got {robot.physics_dt:g}")
     if not problems and (robot.contact_time_constant_s or 1.0) < 2.0 * robot.physics_dt * (1.0 - 1e-9):
         problems.append(
             f"contact_time_constant_s must be at least twice physics_dt, {2.0 * robot.physics_dt:g} s, got "

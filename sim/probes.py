@@ -14,6 +14,10 @@ MAX_SAG = 0.005
 """Deepest that a sharp ridge may sink between two neighbouring probes [m]."""
 MAX_EDGE_RADIUS = 0.02
 """Largest probe radius on boxes and cylinders, whose edges the probes round off [m]."""
+MAX_SIDE = 10.0
+"""Longest side of a shape [m]; a longer one is in other units."""
+_MESHES = (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH)
+_NUM_SIZES = {newton.GeoType.SPHERE: 1, newton.GeoType.CAPSULE: 2, newton.GeoType.CYLINDER: 2, newton.GeoType.BOX: 3}
 
 
 def max_spacing(radius: float, sag: float = MAX_SAG) -> float:
@@ -87,8 +91,17 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
         mesh: Newton's mesh, which collides as its convex hull.
 
     Raises:
-        ValueError: For any other shape, or a mesh without volume.
+        ValueError: For any other shape, one without size or longer than :data:`MAX_SIDE`, or a mesh without volume.
     """
+    sizes = np.asarray(scale, dtype=np.float64)[: _NUM_SIZES.get(shape_type, 0)]
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) * scale if shape_type in _MESHES else np.zeros((1, 3))
+    if not (np.isfinite(vertices).all() and (sizes > 0.0).all()):
+        raise ValueError(f"its sizes must be positive numbers, got {', '.join(f'{size:g}' for size in sizes)} m")
+    longest = max(2.0 * sizes.max(initial=0.0), float(np.ptp(vertices, axis=0).max()))
+    if not longest <= MAX_SIDE:
+        raise ValueError(
+            f"it is {longest:g} m long, at most {MAX_SIDE:g} m are taken: a mesh in millimetres has a scale"
+        )
     if shape_type == newton.GeoType.SPHERE:
         return [Strip(centres=np.zeros((1, 3)), radius=float(scale[0]))]
     if shape_type == newton.GeoType.CAPSULE:
@@ -97,8 +110,8 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
         return box_strips((float(scale[0]), float(scale[1]), float(scale[2])))
     if shape_type == newton.GeoType.CYLINDER:
         return cylinder_strips(float(scale[0]), float(scale[1]))
-    if shape_type in (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH):
-        return list(hull_probes(np.asarray(mesh.vertices, dtype=np.float64) * scale).strips)
+    if shape_type in _MESHES:
+        return list(hull_probes(vertices).strips)
     raise ValueError(
         f"no probes for a {newton.GeoType(shape_type).name} collision shape: "
         "expected SPHERE, CAPSULE, BOX, CYLINDER or MESH; replace it in the robot's file"

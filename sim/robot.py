@@ -176,6 +176,7 @@ ROBOTS = {
         contact_force_limit=500.0,
         penalties=PENALTIES,
         collision_bit=False,
+        training=TrainingCfg(added_base_mass=(-5.0, 5.0)),
     ),
     "cassie": RobotCfg(
         name="cassie",
@@ -213,7 +214,6 @@ ROBOTS = {
             only_positive=False,
             soft_joint_limit=0.95,
             steady_joints=tuple(f"hip_{joint}_{side}" for side in _SIDES for joint in ("abduction", "rotation")),
-            added_base_mass=(0.0, 0.0),
         ),
     ),
 }

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from sim.model_files import ModelFiles, read_model_files
+from sim.model_numbers import drive_problems, number_problems
 from sim.robot import RobotCfg
 
 _URDF_FRICTION = 1.0
@@ -50,9 +51,13 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
         _add_model(builder, robot, files)
     except Exception as error:  # an importer can fail with anything
         raise ValueError(f"robot '{robot.name}': {' '.join(str(error).split()) or type(error).__name__}") from error
-    problems = [*_structure_problems(builder), *_name_problems(builder, robot)]
+    # The rest is only told of a tree of single joints, where joints and their columns are one.
+    problems = _structure_problems(builder)
     if not problems:
-        problems = [*_set_drives(builder, robot)]
+        bodies = [leaf_name(label) for label in builder.body_label]
+        problems = number_problems(builder, bodies, joint_names(builder)) + _name_problems(builder, robot)
+    if not problems:
+        problems = _set_drives(builder, robot) or drive_problems(builder, files.root, robot.joint_names)
     if problems:
         raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
     _set_contact(builder, robot, is_urdf=files.is_urdf)
@@ -202,12 +207,6 @@ def _set_drives(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
             f"no gains for {', '.join(limp)}: give stiffness and damping in the settings, or <position> actuators in "
             f"{robot.model_file}"
         ]
-    pulling = _pulling_actuators(builder)
-    if pulling:
-        return [
-            f"{robot.model_file} has actuators that pull by themselves (number {', '.join(pulling)}): <position> and "
-            "<motor> are understood"
-        ]
     for name, gains in (("joint_target_ke", robot.stiffness), ("joint_target_kd", robot.damping),
                         ("joint_effort_limit", robot.effort_limit), ("joint_armature", robot.armature)):  # fmt: skip
         if gains is not None:
@@ -215,14 +214,6 @@ def _set_drives(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
     if robot.stiffness is not None:
         builder.joint_target_mode[6:] = [int(newton.JointTargetMode.POSITION)] * len(joints)
     return []
-
-
-def _pulling_actuators(builder: newton.ModelBuilder) -> list[str]:
-    """Actuators that nothing here controls and that do not rest at a control of 0, by number."""
-    sources: Any = builder.custom_attributes["mujoco:ctrl_source"].values
-    biases: Any = builder.custom_attributes["mujoco:actuator_biasprm"].values
-    direct = newton.solvers.SolverMuJoCo.CtrlSource.CTRL_DIRECT
-    return [str(k) for k, source in enumerate(sources or ()) if source == direct and any(biases[k])]
 
 
 def _set_contact(builder: newton.ModelBuilder, robot: RobotCfg, *, is_urdf: bool) -> None:

@@ -145,6 +145,11 @@ class Simulation:
             model.shape_material_mu.assign(mu)
         if added_base_mass is not None:
             mass = model.body_mass.numpy()
+            if not (mass[::bodies] + added_base_mass > 0.0).all():
+                raise ValueError(
+                    f"added_base_mass must leave some of the base's {mass[0]:g} kg, got {added_base_mass.min():g} kg: "
+                    "narrow its range in the robot's training settings"
+                )
             mass[::bodies] += added_base_mass
             model.body_mass.assign(mass)
             model.body_inv_mass.assign(1.0 / mass)

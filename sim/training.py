@@ -1,6 +1,8 @@
 """What the training of a controller takes of its robot: the rewards, and how its starts and its body are varied."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +35,7 @@ class RewardCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingCfg:
-    """The settings of the training task that belong to the robot; the defaults are legged_gym's for ANYmal."""
+    """The settings of the training task that belong to the robot; the defaults are legged_gym's."""
 
     rewards: RewardCfg = field(default_factory=RewardCfg)
     only_positive: bool = True
@@ -44,9 +46,32 @@ class TrainingCfg:
     """Soft joint limits span this share of the range between the hard ones, about its middle."""
     steady_joints: tuple[str, ...] = ()
     """Joints that are to keep near their default angle."""
-    added_base_mass: tuple[float, float] = (-5.0, 5.0)
-    """Range of the mass added to the bases [kg]."""
+    added_base_mass: tuple[float, float] = (0.0, 0.0)
+    """Range of the mass added to the bases [kg]; ANYmal's is -5 to 5."""
     push_speed: float = 1.0
     """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
     start_joint_range: float = 0.5
     """Joints start at the default pose times 1 +- this."""
+
+
+def training_problems(cfg: TrainingCfg) -> list[str]:
+    """What is wrong with the settings of a training by themselves, one line each."""
+    weights: dict[str, Any] = asdict(cfg.rewards) if isinstance(cfg.rewards, RewardCfg) else {}
+    problems = [f"training.rewards.{name} must be a number, got {weight!r}" for name, weight in weights.items()
+                if not _is_number(weight)]  # fmt: skip
+    if not weights:
+        problems.append(f"training.rewards must be a RewardCfg, got {type(cfg.rewards).__name__}")
+    for name in ("min_air_time_s", "push_speed", "start_joint_range"):
+        value = getattr(cfg, name)
+        if not _is_number(value) or value < 0.0:
+            problems.append(f"training.{name} must be a number from 0 on, got {value!r}")
+    if not _is_number(cfg.soft_joint_limit) or not 0.0 < cfg.soft_joint_limit <= 1.0:
+        problems.append(f"training.soft_joint_limit must be a share in 0..1, got {cfg.soft_joint_limit!r}")
+    mass: Any = cfg.added_base_mass
+    if not isinstance(mass, tuple) or len(mass) != 2 or not all(map(_is_number, mass)) or mass[0] > mass[1]:
+        problems.append(f"training.added_base_mass must be a least and a largest mass [kg], got {mass!r}")
+    return problems
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

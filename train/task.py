@@ -18,6 +18,7 @@ from sim.motion import make_motion
 from sim.policy import prepare_torch
 from sim.robot import RobotCfg
 from sim.simulation import Simulation
+from sim.training import training_problems
 from train.curriculum import Tiles, first_levels, make_tiles
 from train.task_cfg import TaskCfg, fill, make_rules, make_start_ranges
 
@@ -55,6 +56,9 @@ class CommandTask:
         """
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        problems = training_problems(cfg)
+        if problems:
+            raise ValueError("; ".join(problems))
         prepare_torch(device)
         self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
         tile_seed, level_seed, model_seed, count_seed = np.random.SeedSequence(seed).generate_state(4)

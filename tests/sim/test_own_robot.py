@@ -55,6 +55,7 @@ CHANGES = [
     ("collision_bit=False,", "collision_bit=False," + GAINS, "has position actuators for FL_hip.*take one of them out"),
     ("collision_bit=False,", "collision_bit=False, effort_limit=(0.0,) * 8,", "effort_limit must be .* positive"),
     ("collision_bit=False,", "collision_bit=False, effort_limit=(1.0,) * 4,", r"effort_limit needs 8 limits.*got 4"),
+    ("collision_bit=False,", "collision_bit=False, physics_dt=1.0,", "physics_dt must be at most 0.05 s, got 1"),
     ("collision_bit=False,", "collision_bit=False, friction=-1.0,", "friction must be a positive number or None"),
     (
         "collision_bit=False,", "collision_bit=False, contact_time_constant_s=0.004,",
@@ -89,6 +90,7 @@ FLOOR = '<worldbody><geom name="floor" type="plane" size="1 1 1"/>'
 HIP = '<joint name="FL_hip"'
 BALL = 'type="sphere" size="0.025"'
 EGG = 'type="ellipsoid" size="0.02 0.02 0.03"'
+DRIVE = '<position name="FL_hip"'
 MODELS = [
     (mjcf(actuators="general"), "no gains for FL_hip, .*<position> actuators"),
     (mjcf(actuators="motor"), "no gains for FL_hip"),
@@ -99,6 +101,20 @@ MODELS = [
     (mjcf().replace("</mujoco>", ""), "cannot be read as XML"),
     ("<sdf/>", r"must be an MJCF \(<mujoco>\) or a URDF \(<robot>\), got <sdf>"),
     (mjcf(asset='<mesh name="m" file="gone.stl"/>'), r"names files that are not there: .*gone\.stl"),
+    (mjcf().replace(HIP, f'{HIP} type="ball"'), "hinge or slide on a body of its own.*unlike FL_hip"),
+    (mjcf().replace(HIP, f'{HIP} ref="0.3"'), r"a ref other than 0 \(FL_hip\) is not understood"),
+    (mjcf().replace(HIP, f'{HIP} armature="-1"'), r"armature must be a number, 0 or more, got FL_hip \(-1\)"),
+    (mjcf().replace('axis="0 1 0"', 'axis="0 0 0"', 1), "axis must be a direction, unlike that of FL_hip"),
+    (mjcf().replace(DRIVE, f'{DRIVE} gear="2"'), r"a gear other than 1 on an actuator \(number 0\)"),
+    (mjcf().replace(DRIVE, f'{DRIVE} timeconst="0.1"'), "an actuator with a timeconst .* is not understood"),
+    (mjcf().replace("</actuator>", '<velocity joint="FL_hip" kv="9"/></actuator>'), r"on a joint \(FL_hip\)"),
+    (mjcf().replace('kv="2"', 'kv="-2"'), r"kv must be a number, 0 or more, got FL_hip \(-2\)"),
+    (mjcf().replace('mass="8"', 'mass="0"'), "every body must have a mass above 0, unlike trunk"),
+    (mjcf().replace('mass="8"', 'mass="nan"'), "every body must have a mass above 0, unlike trunk"),
+    (mjcf().replace("0.03 0.2 0.2", "0 0 0"), "inertia above 0 about every axis, unlike trunk"),
+    (mjcf().replace('pos="0.2 0.12 0"', 'pos="0.2 nan 0"'), "position and rotation must be numbers, .* FL_hip"),
+    (mjcf().replace(BALL, 'type="sphere" size="0"', 1), "FL_foot: its sizes must be positive numbers, got 0 m"),
+    (mjcf().replace(BALL, 'type="sphere" size="25"', 1), "FL_foot: it is 50 m long.*in millimetres has a scale"),
     (urdf(), "no gains for FL_hip"),
     (urdf(trunk='<mesh filename="package://other/trunk.stl"/>'), "in package other, but none of the folders above"),
     (urdf(trunk='<mesh filename="https://example.org/trunk.stl"/>'), "nothing is downloaded"),
@@ -113,7 +129,7 @@ def test_what_is_wrong_with_the_model_is_named(tmp_path, model, message):
 
 
 def test_actuators_that_would_pull_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"pull by themselves \(number 0, 1, .*<position> and <motor>"):
+    with pytest.raises(ValueError, match=r"pulls by itself \(number 0, number 1, .*<motor> are\)"):
         get_robot(str(write_dog(tmp_path, model=mjcf(actuators="general"), more=GAINS)))
 
 
@@ -128,11 +144,36 @@ def test_geoms_without_a_name_are_called_by_their_body(tmp_path):
     assert get_robot(str(file)).limb_geoms[0] == "FL_thigh_geom_0"
 
 
+def test_what_is_wrong_in_the_training_settings_is_named(tmp_path):
+    file = write_dog(tmp_path)
+    wrong = (
+        'training=TrainingCfg(rewards=RewardCfg(torques=float("nan")), soft_joint_limit=2.0, push_speed=None, '
+        "added_base_mass=(1.0, 0.0)), collision_bit"
+    )
+    head = "from sim.training import RewardCfg, TrainingCfg\n"
+    file.write_text(head + file.read_text().replace("collision_bit", wrong))
+    with pytest.raises(
+        ValueError, match=r"rewards.torques.*push_speed.*soft_joint_limit.*added_base_mass must be a le"
+    ):
+        get_robot(str(file))
+
+
+def test_a_mesh_in_millimetres_is_told_so(tmp_path):
+    file = with_mesh(tmp_path, "mjcf")
+    (mesh,) = (path for path in read_model_files(get_robot(str(file)).model_file).files if path.suffix == ".stl")
+    mesh.write_bytes(stl(1000.0 * np.array(TRUNK)))
+    with pytest.raises(ValueError, match="trunk: it is 500 m long, at most 10 m are taken"):
+        get_robot(str(file))
+
+
 def test_a_file_that_is_not_there_or_fails_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"gone\.py: no such file"):
         get_robot(str(tmp_path / "gone.py"))
     (tmp_path / "bad.py").write_text("1 / 0")
     with pytest.raises(ValueError, match=r"bad\.py fails: ZeroDivisionError"):
+        get_robot(str(tmp_path / "bad.py"))
+    (tmp_path / "bad.py").write_text("raise SystemExit(0)")
+    with pytest.raises(ValueError, match=r"bad\.py fails: SystemExit: 0"):
         get_robot(str(tmp_path / "bad.py"))
 
 

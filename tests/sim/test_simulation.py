@@ -167,6 +167,11 @@ def test_friction_and_mass_of_each_robot(anymal, device):
     assert friction.min() > GROUND_FRICTION
 
 
+def test_no_base_loses_more_mass_than_it_has(anymal, device):
+    with pytest.raises(ValueError, match=r"leave some of the base's [\d.]+ kg, got -60 kg"):
+        Simulation(anymal, TerrainBank(1, device=device), np.zeros(2, int), added_base_mass=np.array([0.0, -60.0]))
+
+
 def test_contacts_past_the_capacity_are_counted(anymal, device):
     # Room for one contact a robot: the count goes on, so that the crossing can call the episodes invalid.
     bank = TerrainBank(1, device=device)

@@ -18,8 +18,8 @@ CONTROL_DT = 0.02
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
 
 
-def test_the_defaults_are_anymals():
-    assert TaskCfg.of(get_robot("anymal")) == TaskCfg()
+def test_the_defaults_are_anymals_but_for_its_load():
+    assert TaskCfg.of(get_robot("anymal")) == TaskCfg(added_base_mass=(-5.0, 5.0))
 
 
 def test_cassies_rewards_are_the_published_ones():
@@ -43,7 +43,7 @@ def test_the_command_line_begins_with_the_robots_settings(named):
     assert (cfg.robot, cfg.iterations, cfg.task.push_speed) == ("cassie", 7, 0.25)
     assert asdict(cfg.task.rewards) == asdict(own.rewards) | {"no_fly": 0.5}
     assert not cfg.task.only_positive
-    assert read_arguments([]).task == TaskCfg()
+    assert read_arguments([]).task == TaskCfg.of(get_robot("anymal"))
 
 
 def test_falls_are_paid_for_and_clipped_nowhere(make_task):
