@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.own_terrain import own_seeds
-from qd.replay import REPLAY_STREAM, as_searched
+from qd.replay import REPLAY_STREAM, as_searched, check_penalties
 from qd.resuming import refuse_unnamed_code
 from qd.run_directory import newest_run
 from qd.settings import SHIPPED
@@ -56,7 +56,9 @@ def archive_of_robot(named: "RobotCfg | str", run: Path | None) -> Found:
 
     run = run or newest_run(get_robot(named))
     archive = read_archive(run)
-    return Found(run=run, archive=archive, robot=robot_of(archive.robot, named, run))
+    robot = robot_of(archive.robot, named, run)
+    check_penalties(archive, robot, run)
+    return Found(run=run, archive=archive, robot=robot)
 
 
 def chosen_elites(text: str, found: Found) -> list[int]:

@@ -114,7 +114,22 @@ def _archive_with(cfg: ReplayCfg, robot: "RobotCfg", run: Path) -> Archive:
     if not 0 <= cfg.elite < len(archive):
         valid = f"expected 0 to {len(archive) - 1}" if len(archive) else "the archive is empty"
         raise ValueError(f"{run} has no elite {cfg.elite}: {valid}")
+    check_penalties(archive, robot, run)
     return archive
+
+
+def check_penalties(archive: Archive, robot: "RobotCfg", run: Path) -> None:
+    """Makes sure that a robot's crossings have the penalties that an archive was searched by.
+
+    Raises:
+        ValueError: If one is not among the robot's, whose settings may have changed since the search.
+    """
+    unknown = [name for name in archive.penalties if name not in robot.penalties]
+    if unknown:
+        raise ValueError(
+            f"{run} was searched by penalties that robot {robot.name} does not have: {', '.join(unknown)}; expected "
+            f"some of {', '.join(robot.penalties)}: give the settings that it was searched with, or another --run"
+        )
 
 
 def as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:

@@ -55,9 +55,20 @@ def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, An
 
 def save_figure(path: Path, figure: "Figure") -> None:
     """Writes a figure, atomically."""
+    write_atomically(path, as_png(figure))
+
+
+def as_png(figure: "Figure") -> bytes:
+    """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)  # a file may be called $x$.npz, or something that is no formula
+        text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or hold bytes that are no text
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def new_figure(width: float, height: float) -> "Figure":

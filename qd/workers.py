@@ -162,9 +162,9 @@ def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
     """
     from sim.policy import load_policy
     from sim.robot import get_robot
-    from sim.simulation import resolve_device as resolve
 
-    here = resolve(None)  # a cluster's GPUs need not be this machine's
+    # A cluster's GPUs need not be this machine's; for the CPU no simulation need be loaded.
+    here = device if device == "cpu" else resolve_device(None)
     load_policy(policy, get_robot(robot), device if here.startswith("cuda") else "cpu")
 
 

@@ -8,7 +8,7 @@ the state at ``k * dt``: frame 0 the start, the last one the end of the control 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,9 @@ from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.provenance import controller_hash, provenance
 from sim.robot import RobotCfg
-from sim.rollout import Rollout, RolloutResult
+
+if TYPE_CHECKING:  # who reads a recording has no simulation to wait for
+    from sim.rollout import Rollout, RolloutResult
 
 FRAME_ARRAYS: dict[str, type[np.floating]] = {
     "base_position": np.float32,
@@ -124,7 +126,7 @@ class Recording:
 class _Frames:
     """Collects the frames of the chosen episodes of every terrain of a rollout."""
 
-    def __init__(self, rollout: Rollout, chosen: NDArray[np.int64]) -> None:
+    def __init__(self, rollout: "Rollout", chosen: NDArray[np.int64]) -> None:
         self._rollout = rollout
         robot = rollout.robot
         self._shape = (rollout.num_terrains, len(chosen))
@@ -169,7 +171,7 @@ class _Frames:
 
 
 def record(
-    rollout: Rollout,
+    rollout: "Rollout",
     terrains: NDArray[Any],
     seeds: NDArray[Any],
     *,
@@ -178,7 +180,7 @@ def record(
     labels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[RolloutResult, Recording]:
+) -> "tuple[RolloutResult, Recording]":
     """Runs a rollout's episodes and records some of them; the episodes are those that ``rollout.evaluate`` would run.
 
     On the host a frame of an episode takes some 110 bytes: 4,000 whole episodes are half a gigabyte.

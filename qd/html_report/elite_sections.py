@@ -49,14 +49,10 @@ def modes_section(shown: Shown) -> Section:
 
 def _described(mode: Mode) -> str:
     return (
-        f"the robot {_ending(mode)} (goal {percent(mode.goal_rate)}, base collision "
+        f"the robot {mode.deed} (goal {percent(mode.goal_rate)}, base collision "
         f"{percent(mode.collision_rate)}, neither {percent(mode.other_rate)}), and the share that stands out is that "
         f"of {label_of(mode.marked_by)}"
     )
-
-
-def _ending(mode: Mode) -> str:
-    return mode.ending.replace("strikes the terrain", "strikes the terrain with its base")
 
 
 def _how(shown: Shown) -> str:

@@ -24,6 +24,8 @@ class Elites:
     """Whether the values are of fresh episodes."""
     numbers: NDArray[np.int64]
     """Number of each elite in the archive, shape (N,), ascending."""
+    cell: NDArray[np.int64]
+    """Cell that these episodes fall into, shape (N,); elites whose luck put them apart may share one."""
     fitness: NDArray[np.float64]
     """Shape (N,)."""
     ratios: NDArray[np.float64]
@@ -51,6 +53,11 @@ class Elites:
         return self.goal_rate < FAILING_BELOW
 
     @property
+    def failing_cells(self) -> int:
+        """Different ways to fail: cells that the failing elites fall into."""
+        return len(np.unique(self.cell[self.failing]))
+
+    @property
     def other_rate(self) -> NDArray[np.float64]:
         """Share that neither arrived nor collided: out of time or off the terrain, shape (N,)."""
         return np.clip(1.0 - self.goal_rate - self.collision_rate, 0.0, 1.0)
@@ -71,6 +78,7 @@ def elites_of(archive: Archive) -> Elites:
         penalties=archive.penalties,
         fresh=fresh is not None,
         numbers=kept.astype(np.int64),
+        cell=values.cell[kept],
         fitness=values.fitness[kept],
         ratios=values.ratios[kept],
         variation=stds / np.maximum(means, np.finfo(float).tiny),

@@ -7,7 +7,7 @@ from typing import Any
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
 from qd.html_report.tables import read_tables
 from qd.next_commands import make_command
-from qd.replay import as_searched
+from qd.replay import as_searched, check_penalties
 from qd.report import summary
 from qd.run_directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory, newest_run
 from qd.settings import SHIPPED, SearchCfg
@@ -69,6 +69,8 @@ class Material:
     search: SearchCfg | None
     origin: dict[str, Any]
     """Command, commit, device, versions, seed and date of the search, as far as they are known."""
+    reproduced_by: dict[str, Any]
+    """Where the fresh episodes come from, likewise; empty if there are none or that is not on record."""
     gpus: int | None
     tables: dict[str, Any] | None
     tables_file: Path
@@ -106,6 +108,7 @@ def gather(cfg: HtmlReportCfg) -> Material:
     folder = RunDirectory(run if run.is_dir() else run.parent)
     search = folder.read_cfg() if (folder.path / CONFIG_FILE).exists() else None
     numbers = folder.read_summary()
+    again = numbers.get("reproduced_by")
     config = {} if search is None else folder.read_config()
     tables_file = cfg.tables or RESULTS / robot.name / "tables.json"
     has_tables = cfg.tables is not None or tables_file.exists()
@@ -119,6 +122,7 @@ def gather(cfg: HtmlReportCfg) -> Material:
         searched=searched,
         search=search,
         origin={key: config[key] for key in _ORIGIN if key in config},
+        reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
         tables=read_tables(tables_file, robot.name) if has_tables else None,
         tables_file=tables_file,
@@ -149,6 +153,7 @@ def _archive_of(run: Path, robot: RobotCfg) -> Archive:
         raise ValueError(
             f"{run} is of robot {archive.robot}, got --robot {robot.spec}: give that robot or another --run"
         )
+    check_penalties(archive, robot, run)
     if not len(archive):
         raise ValueError(
             f"{run} must have elites to report on, got an archive of none after {archive.iterations} iterations: "

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.html_report.elites import Elites
+from qd.html_report.elites import FAILING_BELOW, Elites
 
 MAX_MODES = 7
 """Most groups that are tried: as many as colours and markers stay apart."""
@@ -44,6 +44,11 @@ class Mode:
     """Penalty whose share stands out most against all elites."""
 
     @property
+    def failing(self) -> bool:
+        """Whether under half of its robots reach the goal."""
+        return self.goal_rate < FAILING_BELOW
+
+    @property
     def ending(self) -> str:
         """How most of its crossings end, in words; both ways of two that are common."""
         ends = {
@@ -53,6 +58,11 @@ class Mode:
         }
         first, second, _ = sorted(ends, key=lambda end: -ends[end])
         return first if ends[second] < _COMMON else f"{first} or {second}"
+
+    @property
+    def deed(self) -> str:
+        """The same of the robot, in a sentence."""
+        return self.ending.replace("strikes the terrain", "strikes the terrain with its base")
 
 
 @dataclass(frozen=True, kw_only=True)

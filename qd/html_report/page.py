@@ -64,6 +64,8 @@ class Table:
     """What rows are sorted by, cell by cell, where the text would not do."""
     links: Sequence[str] | None = None
     """Anchor that the first cell of each row leads to; empty: none."""
+    words: bool = False
+    """Whether cells are sentences and not numbers: they are broken into lines."""
     folded: str = ""
     """If any, what stands on the fold that hides it at first."""
 
@@ -136,7 +138,7 @@ def _with_commands(text: str) -> str:
 def _table(table: Table) -> str:
     head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.head)
     rows = "".join(_row(table, k) for k in range(len(table.rows)))
-    kind = ' class="sortable"' if table.sortable else ""
+    kind = ' class="sortable"' if table.sortable else ' class="words"' if table.words else ""
     text = f'<div class="scroll"><table{kind}><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     return f"<details><summary>{escape(table.folded)}</summary>{text}</details>" if table.folded else text
 

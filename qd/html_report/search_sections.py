@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from qd.fresh import FRESH_EPISODES
 from qd.html_report.elites import FAILING_BELOW, Elites
 from qd.html_report.figures import draw_pairs, label_of
 from qd.html_report.page import Absent, Block, Facts, Section, Table, Text
@@ -13,11 +14,14 @@ from qd.settings import SHIPPED
 from sim.controller_spec import ControllerSpec
 from sim.intervals import bootstrap_interval
 
+_AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes
+_MIN_TERRAINS = 10  # that an interval of a mean is resampled from
+
 
 def outcome_section(shown: Shown) -> Section:
     """What was searched, at what cost, and in how many ways the controller breaks how often."""
     elites, archive = shown.elites, shown.material.archive
-    failing = int(elites.failing.sum())
+    failing, ways = int(elites.failing.sum()), elites.failing_cells
     basis = (
         f"by {int(elites.counted.max(initial=0))} fresh episodes each, free of the luck that made them elites"
         if elites.fresh
@@ -25,32 +29,48 @@ def outcome_section(shown: Shown) -> Section:
     )
     facts = Facts(
         [
-            ("cells whose terrain under half of the robots cross", f"{failing:,}"),
-            ("elites: filled cells, each with the hardest terrain found", f"{len(archive):,}"),
-            ("failure modes: groups that the elites fall into", f"{len(shown.modes.modes)}"),
+            ("terrains, the hardest of each cell, that under half of the robots cross", f"{failing:,}"),
+            ("different ways of failing: cells that these fall into", f"{ways:,}"),
+            ("failure modes: kinds of these ways", f"{sum(mode.failing for mode in shown.modes.modes)}"),
             ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
             ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
         ]
     )
     text = (
-        f"The controller fails in {counted(failing, 'different way')}: of the {counted(len(elites), 'elite')} judged "
-        f"({basis}), under half of the robots reach the goal on {failing:,} ({percent(failing / len(elites))}), and "
-        f"none on {int((elites.goal_rate == 0.0).sum()):,}. Over all of them {_rate(elites.goal_rate)} of the robots "
-        f"reach the goal, the base of {_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
+        f"The controller fails on {failing:,} of {counted(len(elites), 'elite')} judged ({basis}): there under half of "
+        f"the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
+    )
+    if failing:
+        text += f"They fall into {counted(ways, 'cell')}: so many different ways of failing were found. "
+    text += (
+        f"Over all elites {_rate(elites.goal_rate)} of the robots reach the goal, the base of "
+        f"{_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
     )
     explained = (
         f"A cell is a combination of shares of the penalties, each in {archive.intervals} intervals; terrains in "
         "different cells make the robot struggle differently. A terrain counts as failed if under "
-        f"{percent(FAILING_BELOW)} of the robots reach the goal; the rates "
-        "are means over terrains with 95 % intervals (bootstrap over terrains)."
+        f"{percent(FAILING_BELOW)} of the robots reach the goal. The rates are means over terrains"
+        f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
-    return Section("What breaks the controller", "outcome", [_searched(shown), facts, Text(text), Text(explained)])
+    blocks = [_searched(shown), facts, Text(_common(shown)), Text(text), Text(explained)]
+    return Section("What breaks the controller", "outcome", blocks)
+
+
+def _common(shown: Shown) -> str:
+    """What happens to the robot on how many elites: what fails before what does not, the most common first."""
+    modes = sorted(shown.modes.modes, key=lambda mode: (not mode.failing, -len(mode.members)))
+    told = [
+        f"{mode.deed} on {counted(len(mode.members), 'elite')} (mode {mode.number}; goal {percent(mode.goal_rate)})"
+        for mode in modes
+    ]
+    return f"The robot {'; '.join(told)}. The chapters Failure modes and Terrains worth a look show where and how."
 
 
 def _rate(rates: np.ndarray) -> str:
-    """Mean over terrains with its interval."""
-    low, high = bootstrap_interval(rates, np.random.default_rng(0)) or (0.0, 1.0)
-    return f"{percent(float(rates.mean()))} ({percent(low)} to {percent(high)})"
+    """Mean over terrains with its interval; of few terrains without, since resampling them says too little."""
+    mean = percent(float(rates.mean()))
+    limits = bootstrap_interval(rates, np.random.default_rng(0)) if len(rates) >= _MIN_TERRAINS else None
+    return mean if limits is None else f"{mean} ({percent(limits[0])} to {percent(limits[1])})"
 
 
 def _searched(shown: Shown) -> Block:
@@ -99,6 +119,12 @@ def curves_section(shown: Shown) -> Section:
         tail = rows[-max(1, len(rows) // 5) - 1 :]
         gained = tail[-1]["elites"] - tail[0]["elites"]
         text += f" The last {counted(len(tail) - 1, 'iteration')} added {counted(gained, 'elite')}."
+    if any(row.get("mean_std") is not None for row in rows):
+        text += (
+            " On the right the mean STD: the standard deviations of the scaled penalties over "
+            f"{FRESH_EPISODES} fresh episodes, summed, and averaged over elites looked at during the search, with its "
+            "95 % interval."
+        )
     shows = "QD score, number of elites with reachable coverage, and mean fitness over the iterations"
     section.blocks += [Text(text), picture("curves", draw_curves(archive, rows), shows)]
     return section
@@ -181,5 +207,8 @@ def origin_section(shown: Shown) -> Section:
     versions = origin.get("versions")
     if isinstance(versions, dict):
         rows.append(["versions", ", ".join(f"{name} {version}" for name, version in versions.items())])
-    section.blocks += [Text(f"The archive read is {shown.material.run}; its search:"), Table(["", ""], rows)]
+    again = shown.material.reproduced_by
+    rows += [[f"fresh episodes: {name}", str(again[name])] for name in _AGAIN if name in again]
+    text = f"The archive read is {shown.material.run}. Its search began with:"
+    section.blocks += [Text(text), Table(["", ""], rows, words=True)]
     return section

@@ -1,6 +1,5 @@
 """What a page is written from: the material, and what was worked out and crossed for it."""
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -12,11 +11,10 @@ from qd.html_report.outcomes import Crossed
 from qd.html_report.page import Picture
 from qd.html_report.tables import Change, Changes
 from qd.progress import clock
+from qd.report import as_png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_DPI = 150  # as fine as print needs at the width of the page, and small
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +52,7 @@ def picture(name: str, figure: "Figure", shows: str) -> Picture:
         figure: What to draw.
         shows: What it shows, for who cannot see it.
     """
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI)
-    return Picture(f"{name}.png", buffer.getvalue(), shows)
+    return Picture(f"{name}.png", as_png(figure), shows)
 
 
 def percent(share: float) -> str:

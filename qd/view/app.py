@@ -69,7 +69,7 @@ class App:
         gui.configure_theme(show_logo=False, show_share_button=False)
         bodies, num_feet = body_meshes(self._skeleton, show.robot), len(show.robot.foot_geoms)
         self._scene = Scene(self.page, bodies, num_feet, CrossingCfg())
-        title = f"**{show.robot.name}** · `{show.found.folder}` · {len(self._elites):,} elites"
+        title = f"{show.robot.name} · {show.found.folder} · {len(self._elites):,} elites"
         self._list = ArchivePanel(self.page, self._elites, title, self.emit)
         self._panel = CrossingPanel(self.page, list(show.controllers), show.cfg.replicas, self.emit)
         self._selection.pick(show.cfg.elite)
@@ -245,18 +245,18 @@ class App:
 
     def _show_episode(self) -> None:
         assert self._recording is not None
-        archive, labels = self._archive, self._archive.penalties
-        crossing = crossing_of(self._recording, self._replica, self._skeleton, labels, archive.scales)
+        archive = self._archive
+        crossing = crossing_of(self._recording, self._replica, self._skeleton, archive.penalties, archive.scales)
         self._crossing = crossing
         origin = self._recording.origin
-        made = f"recorded {str(origin.get('date', ''))[:10]} at {str(origin.get('commit', ''))[:8]}"
+        made = escape(f"recorded {str(origin.get('date', ''))[:10]} at {str(origin.get('commit', ''))[:8]}")
         all_of_them = f"All {self._recording.num_episodes}: {endings(self._recording)} ({made})."
         if crossing is None:
             self._clock.load(0.0)
             self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
         else:
             self._clock.load(crossing.duration_s)
-            self._curves = Curves(crossing.times_s, crossing.penalties, labels)
+            self._curves = Curves(crossing.times_s, crossing.penalties, self._elites.labels)
             ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
             self._panel.show_status(f"{ended} {all_of_them}")
             self._show_frame()
@@ -271,7 +271,5 @@ class App:
         crossing, curves = self._crossing, self._curves
         if crossing is not None and curves is not None:
             frame = self._clock.frame(crossing.dt, crossing.num_frames)
-            self._panel.show_moment(
-                curves.at(self._clock.time_s), moment_text(crossing, frame, self._archive.penalties)
-            )
+            self._panel.show_moment(curves.at(self._clock.time_s), moment_text(crossing, frame, self._elites.labels))
         self._panel.show_time(self._clock)

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "results"
 """What came with the project, a folder a robot."""
+SEARCHED = "as searched"
+"""What the page calls the controller of the search, if no other is named."""
 _CACHE = Path("runs") / "view-cache"
 _LOOK_AHEAD = 50
 """Ports looked at for a free one."""
@@ -93,9 +95,9 @@ def show_of(cfg: ViewCfg) -> Show:
         for policy in controllers.values():
             check_policy(policy, robot, "cpu")
     else:
-        controllers = {"searched": policy_of(found, robot, None)}
+        controllers = {SEARCHED: policy_of(found, robot, None)}
         try:
-            check_policy(controllers["searched"], robot, "cpu")
+            check_policy(controllers[SEARCHED], robot, "cpu")
         except ValueError as error:  # the terrains can be looked at all the same
             controllers, note = {}, f"{error}; name a controller with POLICIES to see crossings"
     published = PUBLISHED / robot.name / "view"

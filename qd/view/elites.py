@@ -51,6 +51,11 @@ class Elites:
         """The axis of a name."""
         return next(axis for axis in self.axes if axis.name == name)
 
+    @property
+    def labels(self) -> list[str]:
+        """The penalties in words, in the archive's order."""
+        return [self.axis(name).label for name in self.archive.penalties]
+
     def within(self, ranges: dict[str, tuple[float, float]]) -> NDArray[np.int64]:
         """Numbers of the elites that lie in all ranges, limits included, worst first.
 

@@ -1,6 +1,7 @@
 """The panels of the page: the archive left, the crossing right. They tell what a visitor does, and do nothing of it."""
 
 from collections.abc import Callable, Sequence
+from html import escape
 from typing import Any
 
 import viser
@@ -13,7 +14,7 @@ Emit = Callable[[str, Any], None]
 """Called with what a visitor did, and its value."""
 
 SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
-_WIDTH = 430  # of a panel [pixels]
+_WIDTH = 380  # of a panel [pixels]: between two of them a window of 1,400 shows the terrain from start to goal
 _PICKED, _OTHER = (213, 94, 0), (73, 80, 87)
 _CONTROL_DT = 0.02  # step of the time slider [s]
 
@@ -27,7 +28,7 @@ class ArchivePanel:
         Args:
             server: The page.
             elites: All of them.
-            title: What archive it is, as Markdown.
+            title: What archive it is.
             emit: Told of ``brush`` (axis, low, high), ``clear``, ``turn`` (pages), ``line`` (of the list), ``step``
                 (-1 or 1) and ``pick`` (number).
         """
@@ -36,7 +37,8 @@ class ArchivePanel:
         self._panel.dock_left()
         self._panel.set_width(_WIDTH)
         with self._panel.add_tab("Archive"):
-            server.gui.add_markdown(title)
+            words = escape(title)  # of a folder called anything
+            self._title = server.gui.add_html(f'<div style="padding:0.2em 0.6em">{words}</div>')
             self._plot = server.gui.add_html("")
             self._count = server.gui.add_markdown("")
             tabs = server.gui.add_tab_group()
@@ -125,7 +127,7 @@ class CrossingPanel:
         self._told(self._speed, "speed", SPEEDS.__getitem__)
         for label, name, initial in (
             ("Follow", "follow", False),
-            ("Foot forces", "forces", True),
+            ("Foot forces (1 m: 1,000 N)", "forces", True),
             ("All ways", "paths", True),
         ):
             self._told(gui.add_checkbox(label, initial), name, bool)

@@ -94,7 +94,7 @@ class Curves:
         Args:
             times_s: Time of each frame [s], shape (num_frames,).
             sums: Scaled penalty sums so far, shape (num_frames, num_penalties).
-            labels: Name of each penalty.
+            labels: Each penalty in words.
         """
         self._end = max(float(times_s[-1]), 1e-9)
         most = max(float(np.max(sums)), 1e-9)
@@ -106,6 +106,7 @@ class Curves:
             f'<line x1="{_MARGIN + 8}" y1="{bottom}" x2="{_WIDTH - 8}" y2="{bottom}" stroke="#444"/>',
             _text(_MARGIN + 4, top + 4, f"{most:.3g}", "end"),
             _text(_MARGIN + 4, bottom, "0", "end"),
+            _text(_MARGIN + 8, bottom + 13, "penalties so far, in multiples of their scales", "start"),
             _text(_WIDTH - 8, bottom + 13, f"{self._end:.1f} s", "end"),
         ]
         for column, label in enumerate(labels):

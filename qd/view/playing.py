@@ -159,7 +159,7 @@ def moment_text(crossing: Crossing, frame: int, penalties: Sequence[str]) -> str
     Args:
         crossing: The crossing.
         frame: Which frame.
-        penalties: Name of each penalty.
+        penalties: Each penalty in words.
     """
     v_x, v_y, yaw_rate = crossing.command_values[frame]
     forces = " · ".join(f"{newtons:,.0f}" for newtons in crossing.force_newtons[frame])
@@ -167,7 +167,7 @@ def moment_text(crossing: Crossing, frame: int, penalties: Sequence[str]) -> str
     rows = [f"| {name} | {value:.2f} |" for name, value in zip(penalties, crossing.penalties[frame], strict=True)]
     return "\n".join(
         [
-            "| penalty so far | in its scale |",
+            "| penalty so far | multiples of its scale |",
             "|---|---|",
             *rows,
             "",

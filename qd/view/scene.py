@@ -12,7 +12,7 @@ from qd.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.terrain import SPACING
 
-_CAMERA, _LOOK_AT = (8.0, -5.0, 11.0), (8.0, 3.4, 0.0)
+_CAMERA, _LOOK_AT = (8.0, -6.3, 12.7), (8.0, 3.4, 0.0)
 _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
 _START_COLOR, _GOAL_COLOR, _FORCE_COLOR = (240, 200, 60), (0, 158, 115), (215, 25, 28)

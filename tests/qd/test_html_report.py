@@ -17,7 +17,7 @@ from qd.html_report import __main__ as command
 from qd.html_report.elites import elites_of
 from qd.html_report.material import HtmlReportCfg, gather
 from qd.html_report.page import Absent, Facts, Heading, Section, Table, Text, render
-from qd.report import summary
+from qd.report import as_png, new_figure, summary
 from qd.settings import as_settings, preset
 from sim.files import to_json
 from sim.robot import get_robot
@@ -138,7 +138,7 @@ def test_the_sentences_have_the_numbers_of_the_files(whole):
     archive = gather(HtmlReportCfg(run=whole[0].parent)).archive
     elites, numbers = elites_of(archive), summary(archive, rows(4), gpus=0, origin={})
     failing = int((archive.fresh.goal_rate < 0.5).sum())
-    assert f"The controller fails in {failing} different ways: of the {len(archive)} elites judged" in text
+    assert f"The controller fails on {failing} of {len(archive)} elites judged (by 40 fresh episodes each" in text
     assert f"from {numbers['terrains_evaluated']} terrains and {numbers['episodes']} episodes" in text
     assert f"{numbers['invalid_episodes']} episodes were invalid" in text
     assert "(40 min of walking, simulated)" in text  # 160 episodes of 15 s
@@ -155,6 +155,41 @@ def test_the_sentences_have_the_numbers_of_the_files(whole):
     assert f"Its fitness is {elites.fitness[0]:.1f} by 40 fresh episodes" in text
     assert "1 of 4 25 % 5 to 70 %" in text  # Wilson
     assert "Show 20 elites" in text
+
+
+def test_the_first_chapter_says_what_breaks_the_controller_and_in_how_many_ways(reported, run):
+    archive, _ = grouped_archive()  # 6 stuck, 9 collided, 5 across
+    fresh = dataclasses.replace(
+        fresh_values(archive),
+        **{
+            name: getattr(archive, name) for name in ("ratios", "goal_rate", "collision_rate", "fallen_rate", "fitness")
+        },
+    )
+    # afresh, the six land in two cells and the nine in one, which is that of the five too
+    fresh.cell[:] = [0, 0, 0, 1, 1, 1, *[2] * 14]
+    write_archive(run / "archive.npz", dataclasses.replace(archive, iterations=4, fresh=fresh))
+    text = Page(reported()[0].read_bytes()).text
+    first = text[: text.index("From iteration 1")]
+    assert "The controller fails on 15 of 20 elites" in first and "They fall into 3 cells" in first
+    assert "different ways of failing: cells that these fall into 3 failure modes: kinds of these ways 2" in first
+    told = ("strikes the terrain with its base on 9 elites", "gets stuck on 6 elites", "reaches the goal on 5 elites")
+    assert [first.index(part) for part in told] == sorted(first.index(part) for part in told)
+
+
+def test_where_it_comes_from_names_who_made_the_fresh_episodes_too(reported, run):
+    again = {"command": "python -m qd.search --resume <b>", "commit": "def", "seed": 7}
+    (run / "archive.json").write_bytes(to_json({"reproduced_by": again}))
+    content = reported()[0].read_bytes()
+    assert "Its search began with: command python <script>" in Page(content).text
+    assert "fresh episodes: command python -m qd.search --resume <b> fresh episodes: commit def" in Page(content).text
+    assert b'<table class="words">' in content  # a command of any length leaves the other cells in sight
+
+
+@pytest.mark.parametrize("name", ["$\\foo$", "a\udcff"])
+def test_names_that_are_no_formula_or_no_text_are_drawn_as_they_are(name):
+    figure = new_figure(2.0, 1.0)
+    figure.suptitle(name)
+    assert as_png(figure).startswith(DOT)
 
 
 def test_what_comes_from_files_is_escaped(whole):
@@ -211,7 +246,9 @@ def test_archives_of_any_size_and_without_fresh_values(reported, run, count):
     archive, _ = grouped_archive((count, 0, 0))
     write_archive(run / "archive.npz", dataclasses.replace(archive, iterations=4))
     page = Page(reported()[0].read_bytes())
-    assert f"of the {count} elite{'s' * (count > 1)} judged (by the episodes that found them" in page.text
+    assert f"of {count} elite{'s' * (count > 1)} judged (by the episodes that found them" in page.text
+    assert ("95 % intervals (bootstrap over terrains)" in page.text) == (count == 11)
+    assert "Over all elites 0 % of the robots" in page.text or count == 11
     assert page.open == []
 
 
@@ -360,6 +397,9 @@ def test_bad_input_is_refused_before_any_work(reported, run, tmp_path, monkeypat
     (run / "metrics.jsonl").write_text("".join(lines))
     write_archive(run / "archive.npz", dataclasses.replace(grouped_archive((0, 0, 0))[0], iterations=4))
     refused(ValueError, "must have elites to report on, got an archive of none after 4 iterations")
+    other = dataclasses.replace(grouped_archive()[0], iterations=4, penalties=("yaw_rate", "<b>"))
+    write_archive(run / "archive.npz", other)
+    refused(ValueError, "by penalties that robot anymal does not have: <b>; expected some of yaw_rate, vel_x")
 
 
 def test_a_page_is_whole_or_as_it_was(reported, run, monkeypatch):

@@ -62,6 +62,37 @@ def test_the_worst_elite_is_there_with_its_crossing(app):
     assert app._clock.duration_s == pytest.approx(20.0)
 
 
+def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
+    folder = tmp_path / "a`<img src=x onerror=alert(1)>"
+    folder.mkdir()
+    (folder / "archive.npz").write_bytes((PUBLISHED / "anymal" / "archive" / "archive.npz").read_bytes())
+    odd = show_of(dataclasses.replace(show.cfg, run=folder, port=free_port()))
+    app = App(odd, Crossings(odd.robot, cache=tmp_path / "cache"))
+    try:
+        assert "a`&lt;img src=x onerror=alert(1)&gt;" in app._list._title.content
+    finally:
+        app.close()
+
+
+def test_penalties_are_called_alike_on_axes_curves_and_in_numbers(app):
+    for shown in (app._list._plot, app._panel._curves, app._panel._numbers):
+        assert "yaw-rate error" in shown.content and "yaw_rate" not in shown.content
+    assert "multiples of its scale" in app._panel._numbers.content
+
+
+def test_opening_waits_for_no_simulation():
+    command = (
+        "import sys, pathlib; from qd.view.arguments import ViewCfg, show_of;"
+        "show_of(ViewCfg(run=pathlib.Path(sys.argv[1])));"
+        "import qd.view.app, qd.view.crossings; print('newton' in sys.modules)"
+    )
+    archive = str(PUBLISHED / "anymal" / "archive")
+    done = subprocess.run(
+        [sys.executable, "-c", command, archive], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.split()[-1:] == ["False"], done.stderr
+
+
 def test_a_pick_shows_its_terrain_within_a_second(app):
     for number in (160, 0, 160):
         began = time.perf_counter()

@@ -18,7 +18,7 @@ ARCHIVE = PUBLISHED / "anymal" / "archive"
 def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypatch, anymal):
     monkeypatch.chdir(tmp_path)
     show = show_of(ViewCfg())
-    assert show.found.run == ARCHIVE and show.controllers == {"searched": str(anymal.policy_file)}
+    assert show.found.run == ARCHIVE and show.controllers == {"as searched": str(anymal.policy_file)}
     write_archive(make_folder(tmp_path / "runs" / "mine") / "archive.npz", small_archive())
     assert show_of(ViewCfg()).found.run == Path("runs/mine")
 
