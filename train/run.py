@@ -66,8 +66,12 @@ def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) 
         export: Where else the controller goes.
 
     Raises:
-        ValueError: If it holds another run, or one of the places cannot be written to.
+        ValueError: If it holds another run, one of the places cannot be written to, or the controller has another name.
     """
+    if export is not None and export.suffix != ".pt":
+        raise ValueError(
+            f"export must be a file named *.pt, got {export}: python -m train.export makes ONNX files of it"
+        )
     if (run_dir / CHECKPOINT).exists() and (resume is None or run_dir.resolve() != resume.resolve()):
         raise ValueError(
             f"{run_dir} already holds a training run: go on with --resume {run_dir}, or name another --run-dir"

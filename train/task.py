@@ -141,12 +141,10 @@ class CommandTask:
         self.sim.launch(self._graph)
 
     def restart_all(self, levels: torch.Tensor) -> None:
-        """Begin every episode anew on the given terrain levels, shape (num_envs,)."""
-        self.levels.copy_(levels)
-        self._terrain_of_env.copy_(self.levels * self.tiles.num_columns + self._column)
-        self.end.fill_(int(End.TIME_OUT))
-        self._begin_episodes()
+        """Begin every episode anew on the given terrain levels, shape (num_envs,), with nothing counted yet."""
+        self._restart_on(levels)
         self.read_statistics()
+        self._counted.zero_()
 
     def exchange(self, tiles: Tiles) -> None:
         """Put other terrains, as many, in place of the present ones, and begin every episode anew on its first level.
@@ -156,8 +154,14 @@ class CommandTask:
         """
         self.sim.bank.set_heights(tiles.heights)
         self.tiles = tiles
-        self.restart_all(torch.zeros_like(self.levels))
-        self._counted.zero_()
+        self._restart_on(torch.zeros_like(self.levels))
+        torch.neg(self._statistics, out=self._counted)  # what read_statistics has yet to tell is of the terrains before
+
+    def _restart_on(self, levels: torch.Tensor) -> None:
+        self.levels.copy_(levels)
+        self._terrain_of_env.copy_(self.levels * self.tiles.num_columns + self._column)
+        self.end.fill_(int(End.TIME_OUT))
+        self._begin_episodes()
 
     def counts(self) -> dict[str, np.ndarray]:
         """Since the terrains were last exchanged, of each environment: :data:`STATISTICS`, shape (num_envs,) each.

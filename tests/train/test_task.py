@@ -52,6 +52,24 @@ def test_only_ended_episodes_restart(shared_task):
     assert task.levels.tolist()[4] == 3  # an invalid state says nothing of the level
 
 
+def test_an_exchange_counts_anew_and_forgets_nothing_that_is_yet_to_be_told(shared_task):
+    task = shared_task
+    task.restart_all(torch.zeros(task.num_envs))
+    for _ in range(3):
+        task.step(torch.zeros(task.num_envs, 12))
+    task.read_statistics()
+    joint_q(task)[1, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # on its back
+    task.step(torch.zeros(task.num_envs, 12))
+    assert task.counts()["steps"].tolist() == [4] * 6 and task.counts()["episodes"].sum() == 1
+    task.exchange(task.tiles)
+    assert all((values == 0).all() for values in task.counts().values())
+    task.step(torch.zeros(task.num_envs, 12))
+    assert task.counts()["steps"].tolist() == [1] * 6 and task.counts()["episodes"].sum() == 0
+    sums = task.read_statistics()
+    assert sums["steps"] == 2 * 6 and sums["episodes"] == 1  # one step before the exchange, one after
+    assert task.counts()["steps"].tolist() == [1] * 6
+
+
 def test_robots_stand_on_the_tile_of_their_level(shared_task):
     task = shared_task
     levels = torch.arange(task.num_envs)
