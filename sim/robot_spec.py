@@ -14,7 +14,8 @@ _mj: Any = mujoco  # its types are not written down
 def robot_spec(robot: RobotCfg) -> Any:
     """An ``MjSpec`` with the robot's joints in the robot's order behind that of its base.
 
-    Shapes of a URDF are named as :func:`sim.robot_model.build_robot` names them, by their link.
+    Shapes without a name are named as the simulation names them: those of a URDF by their link, those of an MJCF that
+    touch anything ``<body>_geom_<k>``.
 
     Args:
         robot: Robot settings.
@@ -24,7 +25,7 @@ def robot_spec(robot: RobotCfg) -> Any:
     """
     try:
         files = read_model_files(robot.model_file)
-        spec = _urdf_spec(files.root) if files.is_urdf else _mj.MjSpec.from_file(str(robot.model_file))
+        spec = _urdf_spec(files.root) if files.is_urdf else _mjcf_spec(robot)
     except Exception as error:  # MuJoCo's own type has no name
         reason = " ".join(str(error).split())
         raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {reason}") from None
@@ -34,6 +35,28 @@ def robot_spec(robot: RobotCfg) -> Any:
             f"robot '{robot.name}': {robot.model_file} has joints {', '.join(found)} for MuJoCo, expected a free base "
             f"and {', '.join(robot.joint_names)}"
         )
+    return spec
+
+
+def robot_model(spec: Any, robot: RobotCfg) -> Any:
+    """The ``MjModel`` of a specification of the robot, which may have been added to.
+
+    Raises:
+        ValueError: If MuJoCo cannot make one.
+    """
+    try:
+        return spec.compile()
+    except Exception as error:  # MuJoCo's own type has no name
+        reason = " ".join(str(error).split())
+        raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {reason}") from None
+
+
+def _mjcf_spec(robot: RobotCfg) -> Any:
+    spec = _mj.MjSpec.from_file(str(robot.model_file))
+    for body in spec.bodies:
+        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+        for number, geom in enumerate(touching):
+            geom.name = geom.name or f"{body.name}_geom_{number}"
     return spec
 
 

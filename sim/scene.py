@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim.crossing import CrossingCfg
 from sim.hfield import as_hfield
 from sim.robot import RobotCfg
-from sim.robot_spec import robot_spec
+from sim.robot_spec import robot_model, robot_spec
 from sim.terrain import SPACING
 
 _mj: Any = mujoco  # its types are not written down
@@ -77,10 +77,7 @@ def scene_model(
     _add_goal(spec, heights, cfg or CrossingCfg())
     _add_light(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    try:
-        model = spec.compile()
-    except Exception as error:  # MuJoCo's own type has no name
-        raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {error}") from None
+    model = robot_model(spec, robot)
     model.vis.map.shadowclip = _SHADOWED / model.stat.extent
     texture = model.texture(_GROUND)
     first = int(texture.adr[0])

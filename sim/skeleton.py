@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.robot import RobotCfg
+from sim.robot_spec import robot_model, robot_spec
 
 _mj: Any = mujoco  # its types are not written down
 _KINDS = {
@@ -26,7 +27,7 @@ class Geom:
     """One shape, fixed to a body."""
 
     name: str
-    """Empty if the file gives none."""
+    """As the simulation calls it; may be empty of one that touches nothing."""
     body: int
     """Index into the skeleton's bodies."""
     kind: str
@@ -55,18 +56,9 @@ class Skeleton:
         Raises:
             ValueError: If MuJoCo cannot read the file, or its joints are not a free one and the robot's.
         """
-        try:
-            self._model: Any = _mj.MjSpec.from_file(str(robot.model_file)).compile()
-        except Exception as error:  # MuJoCo's own type has no name
-            raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {error}") from None
+        self._model = model = robot_model(robot_spec(robot), robot)
         self.num_coordinates = _FREE_COORDINATES + robot.num_joints
         """Columns of ``qpos``."""
-        if self._model.nq != self.num_coordinates:
-            raise ValueError(
-                f"robot '{robot.name}': {robot.model_file} must have a free joint and {robot.num_joints} hinges to be "
-                f"shown ({self.num_coordinates} coordinates), got {self._model.nq}"
-            )
-        model = self._model
         self.body_names: tuple[str, ...] = tuple(model.body(k).name for k in range(1, model.nbody))
         self.parents: tuple[int, ...] = tuple(int(parent) - 1 for parent in model.body_parentid[1:])
         """Index of each body's parent; -1 of one that hangs on the world."""
@@ -76,13 +68,13 @@ class Skeleton:
         """What is to be seen of it, in the file's order."""
 
     def geom(self, name: str) -> Geom:
-        """A shape by its name, to be seen or not; one without a name goes by that of its body.
+        """A shape by the name that the simulation has for it, to be seen or not.
 
         Raises:
             ValueError: If there is none of that name.
         """
         model = self._model
-        names = [model.geom(k).name or model.body(model.geom_bodyid[k]).name for k in range(model.ngeom)]
+        names = [model.geom(k).name for k in range(model.ngeom)]
         if name not in names:
             raise ValueError(f"no geom named {name}: the robot's file has {', '.join(filter(None, names))}")
         return self._geom(names.index(name))

@@ -24,7 +24,7 @@ def main(cfg: ViewCfg) -> None:
     try:
         took = time.perf_counter() - began
         address = f"http://{cfg.host}:{cfg.port}"
-        print(f"{show.found.run}: {len(show.found.archive):,} elites of {cfg.robot}, ready after {took:.1f} s.")
+        print(f"{show.found.run}: {len(show.found.archive):,} elites of {show.robot.name}, ready after {took:.1f} s.")
         print(f"Open {address} in a browser; Ctrl-C ends.", flush=True)
         app.run()
     except KeyboardInterrupt:

@@ -35,12 +35,17 @@ class Mesh:
     def as_trimesh(self) -> trimesh.Trimesh:
         """The same for trimesh: normals that round the edges, and colours in linear light, as glTF wants them."""
         colors = self.colors.copy()
-        share = colors[:, :3] / 255.0
-        linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # sRGB's own curve
-        colors[:, :3] = np.rint(255.0 * linear)
+        colors[:, :3] = in_linear_light(colors[:, :3])
         mesh = trimesh.Trimesh(self.vertices, self.faces, vertex_colors=colors, process=False)
         _ = mesh.vertex_normals  # computed now, an export has them
         return mesh
+
+
+def in_linear_light(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Colours as on a screen (sRGB) as the browser takes those of vertices, in the same shape."""
+    share = colors / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # sRGB's own curve
+    return np.rint(255.0 * linear).astype(np.uint8)
 
 
 def terrain_mesh(heights: NDArray[np.floating]) -> Mesh:

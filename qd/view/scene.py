@@ -7,7 +7,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from qd.view.meshes import Color, Mesh, arrow_mesh, arrow_pose, terrain_mesh
+from qd.view.meshes import Color, Mesh, arrow_mesh, arrow_pose, in_linear_light, terrain_mesh
 from qd.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.terrain import SPACING
@@ -112,7 +112,7 @@ class Scene:
         """
         segments = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
         colors = [
-            np.tile(np.array(color, np.uint8), (len(part), 2, 1))
+            np.tile(in_linear_light(np.array(color, np.uint8)), (len(part), 2, 1))
             for part, (_, color) in zip(segments, paths, strict=True)
         ]
         if sum(map(len, segments)):

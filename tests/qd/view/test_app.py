@@ -74,6 +74,13 @@ def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
         app.close()
 
 
+def test_paths_have_the_colours_of_the_words(app):
+    assert "rgb(0, 114, 178)" in app._panel._status.content and "rgb(213, 94, 0)" in app._panel._status.content
+    # the browser takes a vertex's colour c as ((c / 255 + 0.055) / 1.055)^2.4 of full light
+    found = np.unique(np.asarray(app._scene._paths.colors).reshape(-1, 3), axis=0)
+    assert found.tolist() == [[0, 43, 114], [170, 29, 0]]
+
+
 def test_penalties_are_called_alike_on_axes_curves_and_in_numbers(app):
     for shown in (app._list._plot, app._panel._curves, app._panel._numbers):
         assert "yaw-rate error" in shown.content and "yaw_rate" not in shown.content
