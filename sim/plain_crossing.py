@@ -16,7 +16,8 @@ from kernels.penalties import BASE, PENALTIES
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
 from sim.mujoco_c import Array, crossing_model, goal_commands, observations, step_penalties
-from sim.policy import Policy, forget
+from sim.policy import Policy
+from sim.policy_runner import forget
 from sim.robot import RobotCfg
 from sim.robot_model import build_robot
 

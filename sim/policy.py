@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from sim.controller_spec import ControllerSpec
 from sim.files import check_zip
 from sim.named_code import find_named
 from sim.onnx_policy import load_onnx
+from sim.policy_runner import action_problem
 from sim.robot import RobotCfg
 
 _FORMATS = (
@@ -175,7 +177,9 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
     except ValueError as error:
         raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back; expected {_FORMATS}") from error
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of TorchScript files, which are none of the matter here
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         return _load_script(path, device, error)
     state = content.get("actor_state_dict") if isinstance(content, dict) else None
@@ -213,72 +217,19 @@ def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None
     try:
         with torch.inference_mode():
             action = policy(observation)
-    except Exception as error:  # a controller can fail with anything
+    except (Exception, SystemExit) as error:  # a controller can fail with anything
         raise ValueError(
             f"policy '{spec}' failed on observations of shape {tuple(observation.shape)}, which robot '{robot.name}' "
             f"gives: {reason_of(error)}"
         ) from error
-    if not isinstance(action, torch.Tensor) or tuple(action.shape) != expected:
-        got = tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__
+    problem = action_problem(action, expected)
+    if problem is not None:
         raise ValueError(
             f"policy '{spec}' must return actions of shape (num_envs, {robot.num_joints}) for robot '{robot.name}', "
-            f"got {got} for 4 environments"
+            f"{problem} for 4 environments"
         )
     if not torch.isfinite(action).all():
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
-
-
-def forget(policy: Any) -> bool:
-    """Let a policy that remembers forget; returns whether it is one."""
-    reset = getattr(policy, "reset", None)
-    if callable(reset):
-        reset()
-    return callable(reset)
-
-
-class PolicyRunner:
-    """Runs a policy between two Warp buffers: captured as a CUDA graph where it is a torch module without memory."""
-
-    def __init__(self, policy: Policy, observation: Any, action: Any) -> None:
-        """Bind the buffers.
-
-        Args:
-            policy: The controller.
-            observation: Warp array, shape (num_envs, observation_size).
-            action: Warp array the actions are written to, shape (num_envs, num_joints).
-        """
-        self._policy = policy
-        self._observation = wp.to_torch(observation)
-        self._action = wp.to_torch(action)
-        self._graph: torch.cuda.CUDAGraph | None = None
-        # A graph would repeat its first memory for ever.
-        if self._observation.is_cuda and isinstance(policy, torch.nn.Module) and not forget(policy):
-            self._graph = self._capture()
-
-    def reset(self) -> None:
-        """Let a policy that remembers forget."""
-        forget(self._policy)
-
-    def _call(self) -> None:
-        self._action.copy_(self._policy(self._observation))
-
-    @torch.inference_mode()
-    def _capture(self) -> torch.cuda.CUDAGraph:
-        for _ in range(3):
-            self._call()
-        torch.cuda.synchronize()
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=torch.cuda.current_stream()):
-            self._call()
-        return graph
-
-    @torch.inference_mode()
-    def __call__(self) -> None:
-        """Write the actions of the present observations."""
-        if self._graph is not None:
-            self._graph.replay()
-        else:
-            self._call()
 
 
 PolicySpec = str | Path | Callable[[torch.Tensor], torch.Tensor]

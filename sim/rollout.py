@@ -12,7 +12,8 @@ from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_episode_state, make_start_ranges, make_task
-from sim.policy import PolicyRunner, PolicySpec, load_policy, prepare_torch
+from sim.policy import PolicySpec, load_policy, prepare_torch
+from sim.policy_runner import PolicyRunner
 from sim.reward import RewardSum
 from sim.robot import RobotCfg
 from sim.rollout_result import RolloutResult, RolloutState

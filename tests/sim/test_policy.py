@@ -5,13 +5,15 @@ import os
 import pickle
 import sys
 
+import numpy as np
 import pytest
 import torch
 import warp as wp
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from sim.policy import MlpPolicy, PolicyRunner, load_policy
+from sim.policy import MlpPolicy, load_policy
+from sim.policy_runner import PolicyRunner
 
 OBSERVATIONS, ACTIONS = 235, 12
 
@@ -258,3 +260,44 @@ def test_the_runner_writes_actions_into_its_buffer(anymal, device):
     observation.fill_(-1.0)
     runner()
     assert not torch.allclose(wp.to_torch(action), expected)
+
+
+def test_a_controller_may_keep_and_change_its_row(anymal):
+    kept = []
+
+    def policy(row):
+        kept.append(row)
+        row += 1.0
+        return row[:, :ACTIONS]
+
+    observation = wp.full((5, OBSERVATIONS), 0.5, dtype=float, device="cpu")
+    action = wp.zeros((5, ACTIONS), dtype=float, device="cpu")
+    runner = PolicyRunner(policy, observation, action)
+    runner()
+    np.testing.assert_array_equal(observation.numpy(), 0.5)
+    observation.fill_(-1.0)
+    runner()
+    assert [float(row[0, 0]) for row in kept] == [1.5, 0.0]
+    np.testing.assert_array_equal(action.numpy(), 0.0)
+
+
+def fails(_):
+    raise RuntimeError("enough\nof it")
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (lambda row: torch.zeros(1, ACTIONS), r"shape \(5, 12\), got \(1, 12\)"),
+        (lambda row: torch.zeros(5, ACTIONS, dtype=torch.int64), "plain floats, got torch.int64"),
+        (lambda row: torch.zeros(5, ACTIONS, dtype=torch.complex64), "plain floats, got torch.complex64"),
+        (lambda row: torch.zeros(5, ACTIONS, device="meta"), "plain floats, got .* on meta"),
+        (lambda row: torch.zeros(5, ACTIONS).to_sparse(), "plain floats, got .*sparse"),
+        (lambda row: None, "got NoneType"),
+        (fails, "failed in the middle of a crossing: RuntimeError: enough$"),
+    ],
+)
+def test_what_goes_wrong_in_a_crossing_is_named(policy, message):
+    observation, action = (wp.zeros((5, size), dtype=float, device="cpu") for size in (OBSERVATIONS, ACTIONS))
+    with pytest.raises(ValueError, match=message):
+        PolicyRunner(policy, observation, action)()
