@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from qd.arguments import Arguments, job_of
-from qd.beside import LOOKS
+from qd.beside import LOOKS, prepare_numbers
 from qd.cli import naming_what_is_next, run_command
 from qd.fresh import FRESH_EPISODES, Open
 from qd.report import new_figure, save_figure
@@ -16,7 +16,7 @@ from qd.run_directory import CONFIG_FILE, Metrics, RunDirectory, differences
 from qd.search import run_search
 from qd.settings import SearchCfg, as_settings
 from qd.workers import open_evaluator, origin_of, resolve_device
-from sim.files import prepare_output, to_json, write_atomically
+from sim.files import to_json, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,13 +76,15 @@ def ablation(args: AblationCfg, *, open_evaluator: Open = open_evaluator) -> dic
     device = resolve_device(args.device, args.workers)
     asked = _asked(args, "paper" if device.startswith("cuda") else "small")
     if args.out is not None:
-        prepare_output(out)
+        prepare_numbers(out)
     with naming_what_is_next("finished iterations are saved", lambda: "The same command goes on"):
         if args.run is None:
+            _check_looks(asked)
             cfg = _search(asked, 1.0, folder, open_evaluator)
         else:
             cfg = _checked(RunDirectory(args.run).read_cfg(), args)
             asked = _of_run(cfg, asked, args)
+            _check_looks(asked)
         other = _search(asked, 0.0, folder, open_evaluator)
     _check_alike(cfg, other)
     metrics = {
@@ -104,6 +106,16 @@ def _asked(args: AblationCfg, preset: str) -> dict[str, Any]:
     iterations, every = _DEFAULTS.get(name, (1, 1))  # an unknown preset is refused where it is looked up
     given = {key: getattr(args, key) for key in ("robot", "seed", "policy", "device", "workers")}
     return {**given, "preset": name, "iterations": args.iterations or iterations, "reevaluate_every": every}
+
+
+def _check_looks(asked: dict[str, Any]) -> None:
+    """Refuse searches at the end of which nothing could be compared."""
+    iterations, every = asked["iterations"], asked["reevaluate_every"]
+    if iterations < every:
+        raise ValueError(
+            f"no iteration up to {iterations} at which elites are looked at again, which is every {every}: give at "
+            f"least {every} --iterations"
+        )
 
 
 def _checked(cfg: SearchCfg, args: AblationCfg) -> SearchCfg:

@@ -41,6 +41,18 @@ class BesideCfg:
     """Where to write the numbers; the figure goes beside it as .png."""
 
 
+def prepare_numbers(out: Path) -> None:
+    """Find out whether a file of numbers and its figure, ``.png`` in place of ``.json``, can be written.
+
+    Raises:
+        ValueError: If they cannot, or it has another name: the figure would take its place.
+    """
+    if out.suffix != ".json":
+        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
+    for file in (out, out.with_suffix(".png")):
+        prepare_output(file)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Side:
     """One of the searches."""
@@ -160,7 +172,7 @@ def beside(cfg: BesideCfg) -> dict[str, Any]:
         ValueError: If runs cannot be compared, or the file cannot be written.
     """
     sides = sides_of(cfg.runs)
-    prepare_output(cfg.out)
+    prepare_numbers(cfg.out)
     report = {
         **provenance("cpu", 0),
         "robot": sides[0].archive.robot,

@@ -1,5 +1,6 @@
 """Controllers of one kind that were trained from different seeds: what their kind is worth, whatever the seed."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -26,8 +27,11 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
         controllers: Policy of each controller by its name.
 
     Raises:
-        ValueError: If two of a kind are the same controller.
+        ValueError: If two of a kind are the same controller, or a name is no kind with at most one seed.
     """
+    for name in controllers:
+        if not re.fullmatch(f"[^{MARK}]+({MARK}[^{MARK}]+)?", name):
+            raise ValueError(f"a controller is named KIND or KIND{MARK}SEED, as C-G{MARK}1, got '{name}'")
     known: dict[tuple[str, str], str] = {}
     for name, policy in controllers.items():
         key = (kind_of(name), controller_hash(policy) or policy)

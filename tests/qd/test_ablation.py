@@ -2,6 +2,7 @@
 
 import json
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -87,6 +88,7 @@ def test_stopped_the_same_command_goes_on(finished, tmp_path):
         ({"run": "{folder}/both/alpha_1", "robot": "cassie"}, "is a run of robot anymal, got cassie"),
         ({"run": "{folder}/both/alpha_1", "preset": "paper"}, "preset small, got paper"),
         ({"preset": "huge"}, "unknown preset 'huge'"),
+        ({"out": Path("numbers.png")}, "out must be a file named *.json"),
         ({"iterations": 1}, "no iteration up to 1 at which elites"),
     ],
 )
@@ -98,6 +100,12 @@ def test_what_cannot_be_compared_is_named(finished, tmp_path, changes, message):
     with pytest.raises((ValueError, FileNotFoundError)) as error:
         ablation(config(tmp_path, **given), open_evaluator=open_stand_in)
     assert message in str(error.value)
+
+
+def test_too_few_iterations_are_refused_before_any_search(tmp_path):
+    with pytest.raises(ValueError, match="no iteration up to 1 .* which is every 2: give at least 2 --iterations"):
+        ablation(config(tmp_path, iterations=1), open_evaluator=never)
+    assert not (tmp_path / "both").exists()
 
 
 def test_intervals_that_do_not_overlap():

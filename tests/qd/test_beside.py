@@ -58,6 +58,12 @@ def test_figure_has_a_line_a_run_in_every_panel(runs):
     assert [text.get_text().split(":")[0] for text in figure.legends[0].get_texts()] == ["base", "C-G"]
 
 
+def test_the_figure_does_not_take_the_place_of_the_numbers(runs, tmp_path):
+    with pytest.raises(ValueError, match=r"out must be a file named \*.json, .* got .*both.png"):
+        beside(BesideCfg(runs=(f"a={runs / 'base'}", f"b={runs / 'tuned'}"), out=tmp_path / "both.png"))
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("runs_asked", "message"),
     [

@@ -37,6 +37,12 @@ def test_one_training_is_not_several(tmp_path):
         check_seeds({"C-G@1": "no.such:code", "C-G@2": "no.such:code"})
 
 
+@pytest.mark.parametrize("name", ["@1", "C-G@", "C-G@1@2", "@"])
+def test_a_name_is_a_kind_and_at_most_one_seed(name):
+    with pytest.raises(ValueError, match=f"a controller is named KIND or KIND@SEED, as C-G@1, got '{name}'"):
+        check_seeds({"base": "no.such:code", name: "no.other:code"})
+
+
 def test_more_than_an_interval_is_known_for():
     row = {f"C-G@{k}": 0.5 for k in range(11)}
     assert over_seeds({"goal": {"near": row}}, ["goal"])["goal"]["near"]["C-G"]["interval"] is None
