@@ -103,7 +103,7 @@ def test_what_cannot_be_compared_is_named(finished, tmp_path, changes, message):
 
 
 def test_too_few_iterations_are_refused_before_any_search(tmp_path):
-    with pytest.raises(ValueError, match="no iteration up to 1 .* which is every 2: give at least 2 --iterations"):
+    with pytest.raises(ValueError, match=r"no iteration up to 1 .* which is every 2: give at least 2 --iterations"):
         ablation(config(tmp_path, iterations=1), open_evaluator=never)
     assert not (tmp_path / "both").exists()
 
