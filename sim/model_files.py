@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PACKAGE = "package://"
+_SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf")  # .msh: MuJoCo's own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +37,13 @@ def read_model_files(model_file: Path) -> ModelFiles:
     if root.tag == "robot":
         files += [_take_urdf_mesh(mesh, model_file) for mesh in root.iter("mesh") if mesh.get("filename")]
     else:
-        files += _mjcf_files(root, model_file.parent, model_file.parent)
+        files += _mjcf_files(root, (Path(os.path.abspath(model_file)),), model_file.parent)
     missing = sorted({str(file) for file in files if not file.is_file()})
     if missing:
         raise ValueError(f"{model_file} names files that are not there: {', '.join(missing)}")
+    foreign = sorted({str(file) for file in files if file.suffix.lower() not in _SUFFIXES and file != model_file})
+    if foreign:
+        raise ValueError(f"{model_file}: meshes must be STL or OBJ files, got {', '.join(foreign)}: convert them")
     return ModelFiles(root=root, files=tuple(dict.fromkeys(Path(os.path.abspath(file)) for file in files)))
 
 
@@ -76,14 +80,15 @@ def _take_urdf_mesh(mesh: ET.Element, model_file: Path) -> Path:
     return path
 
 
-def _mjcf_files(root: ET.Element, folder: Path, main_folder: Path) -> list[Path]:
+def _mjcf_files(root: ET.Element, within: tuple[Path, ...], main_folder: Path) -> list[Path]:
     """Files that an MJCF names: what it includes, with what that names, and meshes.
 
     Args:
         root: Of the XML.
-        folder: Where its file lies.
+        within: Its file, behind those that include it.
         main_folder: Where the file that includes it all lies, in which meshes are looked for first.
     """
+    folder = within[-1].parent
     compiler: dict[str, str] = {}
     for element in root.iter("compiler"):
         compiler |= element.attrib
@@ -96,8 +101,10 @@ def _mjcf_files(root: ET.Element, folder: Path, main_folder: Path) -> list[Path]
             places = [place / folder_of_meshes / name for place in (main_folder, folder)] + [folder / name]
             found.append(next((place for place in places if place.is_file()), places[0]))
     for include in root.iter("include"):
-        included = folder / include.get("file", "")
+        included = Path(os.path.abspath(folder / include.get("file", "")))
         found.append(included)
+        if included in within:
+            raise ValueError(f"{included} includes itself")
         if included.is_file():
-            found += _mjcf_files(_parse(included), included.parent, main_folder)
+            found += _mjcf_files(_parse(included), (*within, included), main_folder)
     return found

@@ -41,7 +41,7 @@ def load_robot(path: Path) -> RobotCfg:
     problems = settings_problems(robot)
     if problems:
         raise ValueError(f"{path}: {'; '.join(problems)}")
-    path = Path(os.path.abspath(path))
+    path = path.resolve()  # of a link, the model lies beside what it points to
     robot = replace(robot, model_file=path.parent / robot.model_file, settings_file=path)
     with wp.ScopedDevice("cpu"):
         make_probes(build_robot(robot))

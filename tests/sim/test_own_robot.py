@@ -100,6 +100,8 @@ MODELS = [
     (mjcf().replace(BALL, EGG, 1), "FL_foot: no probes for a ELLIPSOID"),
     (mjcf().replace("</mujoco>", ""), "cannot be read as XML"),
     ("<sdf/>", r"must be an MJCF \(<mujoco>\) or a URDF \(<robot>\), got <sdf>"),
+    (mjcf().replace("<worldbody>", '<include file="dog.xml"/><worldbody>'), r"dog\.xml includes itself"),
+    (mjcf(asset='<mesh name="m" file="dog.py"/>'), r"meshes must be STL or OBJ files, got .*dog\.py: convert them"),
     (mjcf(asset='<mesh name="m" file="gone.stl"/>'), r"names files that are not there: .*gone\.stl"),
     (mjcf().replace(HIP, f'{HIP} type="ball"'), "hinge or slide on a body of its own.*unlike FL_hip"),
     (mjcf().replace(HIP, f'{HIP} ref="0.3"'), r"a ref other than 0 \(FL_hip\) is not understood"),
@@ -175,6 +177,12 @@ def test_a_file_that_is_not_there_or_fails_is_named(tmp_path):
     (tmp_path / "bad.py").write_text("raise SystemExit(0)")
     with pytest.raises(ValueError, match=r"bad\.py fails: SystemExit: 0"):
         get_robot(str(tmp_path / "bad.py"))
+
+
+def test_a_link_to_the_settings_is_the_robot(tmp_path):
+    file = write_dog(tmp_path / "mine")
+    (tmp_path / "link.py").symlink_to(file)
+    assert get_robot(str(tmp_path / "link.py")) == get_robot(str(file))
 
 
 def test_a_variant_of_a_shipped_robot_is_a_robot(tmp_path, anymal):
