@@ -86,6 +86,8 @@ def replay(cfg: ReplayCfg) -> Replay:
     from sim.rollout import Rollout
 
     robot = get_robot(cfg.robot)
+    if cfg.replicas < 1 or cfg.seed < 0:
+        raise ValueError(f"replicas must be at least 1 and seed at least 0, got {cfg.replicas} and {cfg.seed}")
     run = cfg.run or newest_run(robot)
     archive = _archive_with(cfg, robot, run)
     device = resolve_device(cfg.device)

@@ -34,6 +34,7 @@ Metrics = list[dict[str, Any]]
 
 
 _RUNS = Path("runs")
+_PUBLISHED = Path("results")
 
 
 def newest_run(robot: "RobotCfg | str") -> Path:
@@ -47,8 +48,10 @@ def newest_run(robot: "RobotCfg | str") -> Path:
     for file in files:
         if read_archive(file).robot == name:
             return file.parent
+    published = _PUBLISHED / name / "archive"
+    such = f", such as the published {published}" if (published / ARCHIVE_FILE).exists() else ""
     raise FileNotFoundError(
-        f"no archive of {name} under {_RUNS}/: make one with `make archive ROBOT={spec}`, or give --run"
+        f"no archive of {name} under {_RUNS}/: make one with `make archive ROBOT={spec}`, or give --run{such}"
     )
 
 

@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qd.recordings import Found, archive_of_robot, policy_of
+from qd.replay import as_searched
 from qd.run_directory import newest_run
+from qd.settings import SHIPPED
 from qd.workers import check_policy
+from sim.controller_spec import ControllerSpec
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
@@ -95,10 +98,13 @@ def show_of(cfg: ViewCfg) -> Show:
         for policy in controllers.values():
             check_policy(policy, robot, "cpu")
     else:
-        controllers = {SEARCHED: policy_of(found, robot, None)}
-        try:
+        searched, _ = as_searched(found.run, found.archive)
+        try:  # without a controller the terrains can be looked at all the same
+            if searched != SHIPPED and ControllerSpec.parse(searched).runs_code:
+                raise ValueError(f"the search's controller {searched} is code, and what a run names is never run")
+            controllers = {SEARCHED: policy_of(found, robot, None)}
             check_policy(controllers[SEARCHED], robot, "cpu")
-        except ValueError as error:  # the terrains can be looked at all the same
+        except ValueError as error:
             controllers, note = {}, f"{error}; name a controller with POLICIES to see crossings"
     published = PUBLISHED / robot.name / "view"
     return Show(cfg=cfg, found=found, robot=robot, controllers=controllers, note=note, published=published)

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
+from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
+from qd.recordings import archive_of_robot
 from qd.replay import Replay, ReplayCfg, describe, draw, replay
 from qd.run_directory import RunDirectory, newest_run
 from qd.settings import as_settings
@@ -109,3 +111,25 @@ def test_no_run_yet(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`make archive ROBOT=anymal`"):
         newest_run("anymal")
     assert ReplayCfg().elite == 0
+
+
+def test_a_run_that_is_published_is_named_where_there_is_none(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    published = tmp_path / "results" / "anymal" / "archive"
+    published.mkdir(parents=True)
+    write_archive(published / "archive.npz", small_archive())
+    with pytest.raises(FileNotFoundError, match=r"or give --run, such as the published results/anymal/archive$"):
+        newest_run("anymal")
+
+
+@pytest.mark.parametrize("changes", [{"replicas": 0}, {"seed": -1}])
+def test_numbers_of_no_episodes_are_refused(changes):
+    with pytest.raises(ValueError, match="replicas must be at least 1 and seed at least 0, got"):
+        replay(ReplayCfg(**changes))
+
+
+def test_an_archive_of_penalties_that_the_robot_lacks_is_refused(tmp_path):
+    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), penalties=("yaw_rate", "<b>")))
+    for refused in (lambda: replay(ReplayCfg(run=tmp_path)), lambda: archive_of_robot("anymal", tmp_path)):
+        with pytest.raises(ValueError, match="penalties that robot anymal does not have: <b>; expected some of yaw_"):
+            refused()

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 import shutil
 import socket
 from pathlib import Path
@@ -64,6 +65,20 @@ def test_a_run_without_elites_is_refused(tmp_path):
     write_archive(tmp_path / "archive.npz", small_archive().rows(np.array([], dtype=int)))
     with pytest.raises(ValueError, match="has no elites yet"):
         show_of(ViewCfg(run=tmp_path))
+
+
+def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path):
+    shutil.copytree(ARCHIVE, tmp_path / "run")
+    config = tmp_path / "run" / "config.json"
+    settings = json.loads(config.read_text())
+    settings["settings"] |= {"policy": "tests.sim.policies:stand", "policy_sha256": None}
+    config.write_text(json.dumps(settings))
+    show = show_of(ViewCfg(run=tmp_path / "run"))
+    assert show.controllers == {}
+    assert "tests.sim.policies:stand is code" in show.note and "name a controller with POLICIES" in show.note
+    assert "--policy" not in show.note  # which this command does not have
+    named = show_of(ViewCfg(run=tmp_path / "run", policies=("mine=tests.sim.policies:stand",)))
+    assert named.controllers == {"mine": "tests.sim.policies:stand"}
 
 
 @pytest.mark.parametrize("name", ["archive.npz", "config.json"])
