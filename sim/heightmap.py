@@ -30,6 +30,7 @@ MAX_SIDE_M = 100.0
 MAX_HEIGHT_M = 10.0
 """Largest height, above or below 0."""
 _MAX_NODES = 10_000  # along one side
+_MAX_BYTES = 8 * _MAX_NODES**2 + 1024  # of as many float64, and a header
 _GRAY_MODES = ("L", "I", "I;16", "I;16B", "I;16L", "I;16N")
 
 
@@ -95,7 +96,7 @@ def read_heightmap(
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
     try:
         found = sorted(array_names(path))
-        arrays = read_arrays(path, [name for name in ("heights", "size_m") if name in found])
+        arrays = read_arrays(path, [name for name in ("heights", "size_m") if name in found], max_bytes=_MAX_BYTES)
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
         raise ValueError(f"{path} must be an .npz file of arrays, but it is damaged or another file: {error}") from None
     if "heights" not in arrays:

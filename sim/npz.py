@@ -2,7 +2,7 @@
 
 import io
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,21 @@ def array_names(path: Path) -> list[str]:
         return [name.removesuffix(_ENDING) for name in members.namelist()]
 
 
-def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, names: Sequence[str], *, max_bytes: float = float("inf")) -> dict[str, NDArray[Any]]:
     """Some arrays of an npz file by name.
 
     Args:
         path: The file.
         names: Which.
+        max_bytes: Most that one of them may hold; a file of zeros is small whatever it holds.
 
     Raises:
         Exception: Anything, if it is damaged, another file, or lacks one: zip, zlib and npy headers fail with a dozen
             types.
     """
     with zipfile.ZipFile(path) as members:
+        large = {name: size for name in names if (size := members.getinfo(name + _ENDING).file_size) > max_bytes}
+        if large:
+            raise ValueError(f"{', '.join(large)} of {max(large.values()):,} bytes, at most {max_bytes:,} are read")
         data = {name: members.read(name + _ENDING) for name in names}  # np.load would leave some checksums unread
     return {name: np.lib.format.read_array(io.BytesIO(part), allow_pickle=False) for name, part in data.items()}

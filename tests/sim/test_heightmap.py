@@ -176,3 +176,11 @@ def test_damaged_and_foreign_files(tmp_path):
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(ValueError, match="must be a JSON file"):
         read_heightmap(tmp_path / "a.png")
+
+
+def test_an_npz_that_would_fill_the_memory_is_not_read(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "bomb.npz", heights=np.zeros((200, 200)), size_m=[16.0, 8.0])
+    assert read_heightmap(tmp_path / "bomb.npz").heights.shape == (200, 200)
+    monkeypatch.setattr("sim.heightmap._MAX_BYTES", 300_000)
+    with pytest.raises(ValueError, match=r"heights of 320,128 bytes, at most 300,000 are read"):
+        read_heightmap(tmp_path / "bomb.npz")
