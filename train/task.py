@@ -18,9 +18,8 @@ from sim.motion import make_motion
 from sim.policy import prepare_torch
 from sim.robot import RobotCfg
 from sim.simulation import Simulation
-from sim.training import training_problems
 from train.curriculum import Tiles, first_levels, make_tiles
-from train.task_cfg import TaskCfg, fill, make_rules, make_start_ranges
+from train.task_cfg import TaskCfg, fill, make_rules, make_start_ranges, task_problems
 
 
 class CommandTask:
@@ -56,7 +55,7 @@ class CommandTask:
         """
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        problems = training_problems(cfg)
+        problems = task_problems(cfg, robot.control_dt)
         if problems:
             raise ValueError("; ".join(problems))
         prepare_torch(device)

@@ -1,6 +1,6 @@
 """Settings of the command-following task, and what the kernels take of them."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from kernels.training import Rules
 from sim import crossing
 from sim.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS
-from sim.training import TrainingCfg
+from sim.training import TrainingCfg, training_problems
 from train.curriculum import CurriculumCfg
 
 _TILE_SIDE = 8.0
@@ -78,6 +78,34 @@ class TaskCfg(TrainingCfg):
         """
         own = {setting.name: getattr(robot.training, setting.name) for setting in fields(TrainingCfg)}
         return cls(**{**own, **changes})
+
+
+_RANGES = ("friction", "lin_vel_x", "lin_vel_y")
+_FROM_0 = (
+    "episode_s", "command_interval_s", "min_speed", "yaw_gain", "max_yaw_rate", "push_interval_s",
+    "start_position_range", "start_yaw_range", "start_velocity_range", "base_force", "max_speed",
+)  # fmt: skip
+
+
+def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
+    """What is wrong with the settings of a task, one line each.
+
+    Args:
+        cfg: The settings.
+        control_dt: Control step of the robot [s].
+    """
+    problems = training_problems(cfg)
+    for name in _RANGES:
+        low, high = getattr(cfg, name)
+        if not -np.inf < low <= high < np.inf or (name == "friction" and low < 0.0):
+            problems.append(f"task.{name} must be a least and a largest number, got {low:g} and {high:g}")
+    for name in _FROM_0:
+        least = control_dt if name in ("episode_s", "command_interval_s") else 0.0
+        if not least <= getattr(cfg, name) < np.inf:
+            problems.append(f"task.{name} must be a number from {least:g} on, got {getattr(cfg, name):g}")
+    noise = {name: value for name, value in asdict(cfg.noise).items() if not 0.0 <= value < np.inf}
+    problems += [f"task.noise.{name} must be a number from 0 on, got {value:g}" for name, value in noise.items()]
+    return problems
 
 
 def fill(struct: Any, **values: Any) -> Any:

@@ -6,6 +6,7 @@ import torch
 
 from kernels.training import End
 from train.task import CommandTask
+from train.task_cfg import NoiseCfg
 
 BASE, JOINTS, RATES, ACTION = slice(0, 12), slice(12, 24), slice(24, 36), slice(36, 48)
 
@@ -115,3 +116,19 @@ def test_bad_input_is_refused(shared_task, make_task):
         shared_task.step(torch.zeros(6, 11))
     with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         make_task(num_envs=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"friction": (np.nan, 1.0)}, "task.friction must be a least and a largest number, got nan and 1"),
+        ({"lin_vel_x": (1.0, -1.0)}, "task.lin_vel_x must be"),
+        ({"episode_s": 0.0}, "task.episode_s must be a number from 0.02 on, got 0"),
+        ({"push_interval_s": np.inf}, "task.push_interval_s must be a number from 0 on, got inf"),
+        ({"start_joint_range": -0.1}, "training.start_joint_range must be a number from 0 on, got -0.1"),
+        ({"noise": NoiseCfg(scan=-1.0)}, "task.noise.scan must be a number from 0 on, got -1"),
+    ],
+)
+def test_settings_that_no_task_can_have_are_named(make_task, changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_task(**changes)
