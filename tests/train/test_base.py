@@ -13,7 +13,7 @@ from sim.robot import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import BaseCfg, main, train
 from train.ppo import PpoCfg
-from train.run import StopRequest
+from train.run import StopRequest, claimed
 from train.task_cfg import TaskCfg
 
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
@@ -65,6 +65,13 @@ def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
     assert [piece["from_iteration"] for piece in record["pieces"]] == [0, 2]
     assert train(config(None, resume=tmp_path / "second", iterations=4)) == 0
     assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
+
+
+def test_a_run_directory_takes_one_training_at_a_time(finished):
+    before = (finished / "checkpoint.pt").read_bytes()
+    with claimed(finished), pytest.raises(ValueError, match="another training works in"):
+        train(config(None, resume=finished, iterations=3))
+    assert (finished / "checkpoint.pt").read_bytes() == before
 
 
 def test_changed_settings_are_named(finished, tmp_path, capsys):
