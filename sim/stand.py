@@ -71,8 +71,9 @@ class Standing:
 
     @property
     def stands(self) -> bool:
-        """Whether it is upright, off its belly."""
-        return self.finite and self.tilt_deg < _UPRIGHT_DEG and self.height[1] > 0.5 * self.height[0]
+        """Whether it is upright, off its belly, and on the ground."""
+        upright = self.finite and self.tilt_deg < _UPRIGHT_DEG and self.height[1] > 0.5 * self.height[0]
+        return upright and sum(self.carried.values()) > 0.5
 
 
 def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32, seed: int = 0) -> Standing:

@@ -41,6 +41,14 @@ def test_what_was_read_is_listed(dog):
     assert rows["trunk"][1] == "base" and rows["HL_thigh"][1] == "limb"
 
 
+def test_who_is_off_the_ground_does_not_stand(dog, device):
+    found = stand(dog, device=device, seconds=0.5, drops=1)
+    assert found.stands
+    assert not dataclasses.replace(found, carried={}).stands
+    assert not dataclasses.replace(found, height=(0.29, 0.1)).stands
+    assert not dataclasses.replace(found, tilt_deg=16.0).stands
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
