@@ -62,7 +62,7 @@ help: ## This list
 	@echo '                   file.py:callable, module:callable, or file.py:adapter@FILE for a file that'
 	@echo '                   expects another observation       archive compare ablation finetune calibrate replay report reevaluate'
 	@echo '                                                   evaluate video crosscheck'
-	@echo '  SEED=N           seed of everything drawn          archive compare ablation train finetune calibrate reevaluate'
+	@echo '  SEED=N           seed of everything drawn          archive compare ablation train finetune calibrate replay reevaluate'
 	@echo '                                                   evaluate video crosscheck bench'
 	@echo '  RESUME=DIR       go on with this run               archive compare train finetune'
 	@echo '  MIX=generated    terrains to train on beside hand-crafted ones: generated, hard-random, or hand-crafted'
@@ -74,8 +74,8 @@ help: ## This list
 	@echo '  INTERVALS=N      intervals of each ratio           archive'
 	@echo '  WITHOUT="A B"    penalties to leave out            archive'
 	@echo '  REPRODUCE=yes    evaluate elites again at the end: yes, no; auto: of preset paper  archive'
-	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/ if left out    replay report view reevaluate'
-	@echo '                                                   video export'
+	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/, else the published one, if left out'
+	@echo '                                                   replay report view reevaluate video export'
 	@echo '  ELITE=N          which elite of it, 0 the worst    replay view video export'
 	@echo '                   (video, export: or several, ELITE="0 3", or ELITE=all)'
 	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables or the page, each NAME=SPEC   evaluate view'
@@ -93,7 +93,7 @@ help: ## This list
 	@echo '  TABLES=FILE      tables of make evaluate to show; results/ROBOT/tables.json         report'
 	@echo '  PORT=N HOST=ADDRESS   where the page is served: port 8080 for this machine alone      view'
 	@echo '  OUT=FILE         where to write the numbers        compare ablation calibrate report evaluate crosscheck bench'
-	@echo '                   or the film, or the folder        video export'
+	@echo '                   or figure, film, folder           replay video export'
 	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
 	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
@@ -139,7 +139,7 @@ calibrate: setup ## Measure the penalty scales of ROBOT
 	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY TERRAINS SEED OUT WORKERS)
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
-	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY)
+	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY SEED OUT)
 
 report: setup ## Write one HTML page about an archive: how the controller breaks, on which terrains, in figures
 	$(BIN)/python -m qd.html_report --robot $(call quoted,$(ROBOT)) $(call flags,RUN TABLES OUT DEVICE POLICY EPISODES)

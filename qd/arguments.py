@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qd.next_commands import Placed, next_command
+from qd.places import RUNS, numbered
 from qd.resuming import code_of, moved_policy, origin_in, own_file, refuse_changes, refuse_unnamed_code, resumed
-from qd.run_directory import CONFIG_FILE, RunDirectory, differences, numbered
+from qd.run_directory import CONFIG_FILE, RunDirectory, differences
 from qd.settings import SearchCfg, as_settings, changed, kept_penalties, measured_now, policy_spec, preset
 from qd.workers import EvaluatorCfg, check_policy, origin_of, resolve_device
 from sim.files import is_leftover
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
-
-_RUNS = Path("runs")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +201,7 @@ def _free_path(args: Arguments, cfg: SearchCfg, robot: "RobotCfg") -> Path:
     """Directory of a new run; never one that holds something."""
     if args.run_dir is None:
         name = f"{cfg.robot}-{cfg.preset}-{cfg.seed}"
-        path = next(path for path in numbered(_RUNS, name) if not path.exists())
+        path = next(path for path in numbered(RUNS, name) if not path.exists())
         _mention_unfinished(name, cfg, args, robot)
         return path
     if (args.run_dir / CONFIG_FILE).exists():
@@ -219,7 +218,7 @@ def _free_path(args: Arguments, cfg: SearchCfg, robot: "RobotCfg") -> Path:
 
 def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments, robot: "RobotCfg") -> None:
     """Says so where the new run repeats one that was stopped; starting over is still the user's to choose."""
-    for path in itertools.takewhile(Path.exists, numbered(_RUNS, name)):
+    for path in itertools.takewhile(Path.exists, numbered(RUNS, name)):
         run = RunDirectory(path)
         try:
             there, done = run.read_cfg(), run.iterations_done()

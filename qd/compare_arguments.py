@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from qd.arguments import evaluator_of
 from qd.next_commands import next_command
+from qd.places import RUNS, numbered
 from qd.resuming import code_of, moved_policy, origin_in, own_file, refuse_changes, refuse_unnamed_code, resumed
-from qd.run_directory import numbered
 from qd.scheduler_cfg import SchedulerCfg
 from qd.settings import SearchCfg, Settings, as_settings, changed, from_settings, measured_now, policy_spec, preset
 from qd.workers import EvaluatorCfg, origin_of, resolve_device
@@ -34,7 +34,6 @@ METHODS: dict[str, dict[str, Any]] = {
 """What is compared: changes of the search's settings."""
 
 COMPARE_CONFIG_FILE = "compare.config.json"
-_RUNS = Path("runs")
 _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a directory can be called, with a seed behind it
 _DEFAULTS = {"methods": tuple(METHODS), "seeds": 3, "iterations": 33, "reevaluate_every": 11}
 
@@ -262,7 +261,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 def _free_path(given: Path | None, robot: str) -> Path:
     """Directory of a new comparison; never one that holds something."""
     if given is None:
-        return next(path for path in numbered(_RUNS, f"{robot}-compare") if not path.exists())
+        return next(path for path in numbered(RUNS, f"{robot}-compare") if not path.exists())
     if (given / COMPARE_CONFIG_FILE).exists():
         raise ValueError(f"{given} holds a comparison already: go on with --resume {given}, or give another --run-dir")
     if given.is_dir() and not all(is_leftover(path) or _is_empty(path) for path in given.iterdir()):

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from qd.archive import Archive
 from qd.cli import run_command
+from qd.places import folder_for
 from qd.recordings import archive_of_robot, chosen_elites
 from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
@@ -35,11 +36,11 @@ class ExportCfg:
     robot: str = "anymal"
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
-    """Run directory or archive.npz; the newest of this robot under runs/."""
+    """Run directory or archive.npz; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
     """Number of the elite, 0 the worst; several apart by spaces, or all."""
     out: Path | None = None
-    """Folder to write to; terrains/ in the run directory."""
+    """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published."""
     formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
     """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
 
@@ -62,7 +63,7 @@ def export(cfg: ExportCfg) -> list[Path]:
     elites = chosen_elites(cfg.elite, found)
     formats = list(dict.fromkeys(" ".join(cfg.formats).replace(",", " ").split()))
     check_formats(formats)
-    folder = cfg.out or found.folder / _FOLDER
+    folder = cfg.out or folder_for(found.run, found.robot.name) / _FOLDER
     prepare_output(folder / INDEX_FILE)
     _check_room(folder, len(elites), formats)
     origin = {"run": str(found.run), **provenance("cpu", 0)}

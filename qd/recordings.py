@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.own_terrain import own_seeds
+from qd.places import newest_or_published
 from qd.replay import REPLAY_STREAM, as_searched, check_penalties
 from qd.resuming import refuse_unnamed_code
-from qd.run_directory import newest_run
 from qd.settings import SHIPPED
 from qd.workers import episode_seeds
 
@@ -42,7 +42,7 @@ class Found:
 
 
 def archive_of_robot(named: "RobotCfg | str", run: Path | None) -> Found:
-    """The archive of a run, the robot's newest one if none is given.
+    """The archive of a run, the robot's newest one, else its published one, if none is given.
 
     Args:
         named: The robot, as the command line names it or as settings.
@@ -54,7 +54,7 @@ def archive_of_robot(named: "RobotCfg | str", run: Path | None) -> Found:
     """
     from sim.robot import get_robot, robot_of
 
-    run = run or newest_run(get_robot(named))
+    run = run or newest_or_published(get_robot(named))
     archive = read_archive(run)
     robot = robot_of(archive.robot, named, run)
     check_penalties(archive, robot, run)

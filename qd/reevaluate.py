@@ -9,8 +9,9 @@ from qd.arguments import evaluator_of
 from qd.cli import naming_what_is_next, run_command
 from qd.fresh import Open, corrected
 from qd.next_commands import next_command
+from qd.places import newest_run
 from qd.resuming import origin_in, refuse_unnamed_code
-from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed, newest_run
+from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed
 from qd.search import write_results
 from qd.settings import SHIPPED, SearchCfg, as_settings, file_hash, policy_spec
 from qd.workers import open_evaluator, origin_of, resolve_device

@@ -11,11 +11,13 @@ from qd.archive import Archive, read_archive
 from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.paths_figure import draw_paths
+from qd.places import folder_for, newest_or_published
 from qd.report import save_figure
 from qd.resuming import refuse_unnamed_code
-from qd.run_directory import CONFIG_FILE, RunDirectory, newest_run
+from qd.run_directory import CONFIG_FILE, RunDirectory
 from qd.settings import SHIPPED
 from qd.workers import check_policy, episode_seeds, resolve_device
+from sim.files import prepare_output
 from sim.intervals import wilson_interval
 
 if TYPE_CHECKING:
@@ -47,7 +49,7 @@ class ReplayCfg:
     robot: str = "anymal"
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
-    """Run directory; the newest of this robot under runs/."""
+    """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: int = 0
     """Number of the elite."""
     policy: str | None = None
@@ -58,14 +60,18 @@ class ReplayCfg:
     """Episodes to run."""
     seed: int = 0
     """Seed of the fresh episodes."""
+    out: Path | None = None
+    """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
     """An elite and what became of it this time."""
 
-    folder: Path
-    """Where the archive lies."""
+    run: Path
+    """Run directory or archive file."""
+    out: Path
+    """Figure to write."""
     archive: Archive
     elite: int
     heights: NDArray[np.float32]
@@ -88,8 +94,12 @@ def replay(cfg: ReplayCfg) -> Replay:
     robot = get_robot(cfg.robot)
     if cfg.replicas < 1 or cfg.seed < 0:
         raise ValueError(f"replicas must be at least 1 and seed at least 0, got {cfg.replicas} and {cfg.seed}")
-    run = cfg.run or newest_run(robot)
+    run = cfg.run or newest_or_published(robot)
     archive = _archive_with(cfg, robot, run)
+    out = cfg.out or folder_for(run, robot.name) / f"elite-{cfg.elite}.png"
+    if out.suffix != ".png":
+        raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
+    prepare_output(out)
     device = resolve_device(cfg.device)
     policy, fitness = as_searched(run, archive)
     refuse_unnamed_code(policy, cfg.policy, run)
@@ -99,7 +109,8 @@ def replay(cfg: ReplayCfg) -> Replay:
     seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=REPLAY_STREAM)
     result = rollout.evaluate(archive.genes[cfg.elite : cfg.elite + 1], seeds, record_paths=True)
     return Replay(
-        folder=run if run.is_dir() else run.parent,
+        run=run,
+        out=out,
         archive=archive,
         elite=cfg.elite,
         heights=rollout.sim.bank.heights.numpy()[0],
@@ -176,8 +187,8 @@ def describe(replay: Replay) -> str:
     table = [f"  {label:22}" + "".join(f"{cell:>34}" for cell in row) for label, row in rows.items()]
     return "\n".join(
         [
-            f"Elite {n} of {len(archive):,} of {archive.robot}, found in iteration {archive.iteration[n]}, with ratios "
-            f"in {cells.describe(int(archive.cell[n]))}",
+            f"{replay.run}, elite {n} of {len(archive):,} of {archive.robot}, found in iteration "
+            f"{archive.iteration[n]}, with ratios in {cells.describe(int(archive.cell[n]))}",
             *table,
             "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
             f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} "
@@ -220,9 +231,8 @@ def main(cfg: ReplayCfg) -> None:
     """The command."""
     done = replay(cfg)
     print(describe(done))
-    path = done.folder / f"elite-{cfg.elite}.png"
-    save_figure(path, draw(done))
-    print(f"Figure: {path}")
+    save_figure(done.out, draw(done))
+    print(f"Figure: {done.out}")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ that a kill between any two writes leaves a run that goes on as if nothing had b
 """
 
 import fcntl
-import itertools
 import json
 import os
 from collections.abc import Iterator
@@ -21,7 +20,6 @@ from sim.files import check_writable, read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
-    from sim.robot import RobotCfg
 
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
@@ -31,34 +29,6 @@ _REMEDY = "put a copy of it back, or start a new run"
 
 Metrics = list[dict[str, Any]]
 """One row an iteration."""
-
-
-_RUNS = Path("runs")
-_PUBLISHED = Path("results")
-
-
-def newest_run(robot: "RobotCfg | str") -> Path:
-    """The run of a robot under runs/ whose archive changed last.
-
-    Raises:
-        FileNotFoundError: If there is none.
-    """
-    name, spec = (robot, robot) if isinstance(robot, str) else (robot.name, robot.spec)
-    files = sorted(_RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
-    for file in files:
-        if read_archive(file).robot == name:
-            return file.parent
-    published = _PUBLISHED / name / "archive"
-    such = f", such as the published {published}" if (published / ARCHIVE_FILE).exists() else ""
-    raise FileNotFoundError(
-        f"no archive of {name} under {_RUNS}/: make one with `make archive ROBOT={spec}`, or give --run{such}"
-    )
-
-
-def numbered(root: Path, name: str) -> Iterator[Path]:
-    """Directories a run may be put in: ``name``, ``name-2``, ``name-3`` and so on."""
-    yield root / name
-    yield from (root / f"{name}-{number}" for number in itertools.count(2))
 
 
 def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from qd.cli import run_command
 from qd.own_terrain import read_own_terrain
+from qd.places import RUNS, folder_for
 from qd.progress import share_bar
 from qd.recordings import archive_of_robot, chosen_elites, policy_of, record_elites, record_heights
 from qd.workers import check_policy, resolve_device
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from sim.recording import Recording
     from sim.robot import RobotCfg
 
-OWN_FOLDER = Path("runs") / "terrains"
+OWN_FOLDER = RUNS / "terrains"
 """Where what is made of a user's own terrains goes."""
 _RECORDING = ".recording.npz"
 _DISTANCE = 4.6  # of the camera, in standing heights of the robot
@@ -38,7 +39,7 @@ class VideoCfg:
     robot: str = "anymal"
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
-    """Run directory or archive.npz; the newest of this robot under runs/."""
+    """Run directory or archive.npz; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
     """Number of the elite, 0 the worst; several apart by spaces, or all."""
     terrain: Path | None = None
@@ -56,7 +57,8 @@ class VideoCfg:
     device: str | None = None
     """Where to cross: cpu, cuda or cuda:N; CUDA where there is one."""
     out: Path | None = None
-    """File of the film, or with several elites their folder; elite-<number>.mp4 beside the archive."""
+    """File of the film, or with several elites their folder; elite-<number>.mp4 in the run, or of a published one
+    in runs/<robot>-published."""
     replicas: int = 20
     """Episodes to run."""
     replica: int | None = None
@@ -126,7 +128,7 @@ def _elite_orders(cfg: VideoCfg, robot: "RobotCfg") -> Iterator[Order]:
     found = archive_of_robot(cfg.robot, cfg.run)
     elites = chosen_elites(cfg.elite, found)
     single = cfg.out is not None and len(elites) == 1 and not cfg.out.is_dir()
-    folder = cfg.out or found.folder
+    folder = cfg.out or folder_for(found.run, robot.name)
     outs = [cfg.out] if single and cfg.out else [folder / f"elite-{elite}.mp4" for elite in elites]
     prepare_output(outs[0])
     device, policy = resolve_device(cfg.device), policy_of(found, robot, cfg.policy)

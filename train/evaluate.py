@@ -1,7 +1,7 @@
 """How well controllers cross terrains that they were not trained on.
 
 ``python -m train.evaluate --robot anymal`` says how often one controller gets through, by terrain type and level, and
-its velocity error on flat ground (``base.json``). With ``--policies``, ``--archive`` or ``--sets`` it makes the tables
+its velocity error on flat ground (``rates.json``). With ``--policies``, ``--archive`` or ``--sets`` it makes the tables
 of the paper instead: any controllers on the same hand-crafted, hard-random and held-out generated terrains, with
 rewards, penalties and intervals (``tables.json``, ``tables.png``). The terrains are drawn from seeds used nowhere else:
 not in training, calibration or search.
@@ -18,7 +18,7 @@ from sim.command import exit_code_of
 from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output, to_json, write_atomically
 from train.base_rates import VELOCITY_FROM_S, evaluate_sets, print_rates
-from train.evaluate_cfg import FULL, EvaluateCfg, size_of
+from train.evaluate_cfg import EvaluateCfg, size_of
 from train.evaluate_tables import evaluate_tables
 
 
@@ -31,10 +31,8 @@ def evaluate_base(cfg: EvaluateCfg) -> dict[str, Any]:
     size = size_of(cfg)
     robot = size.robot
     policy = str(cfg.policy or robot.policy_file)
-    published = cfg.policy is None and (size.terrains, size.episodes) == FULL
-    out = cfg.out or (Path("results") / robot.name / "base.json" if published else None)
-    if out is not None:
-        prepare_output(out)
+    out = cfg.out or Path("runs") / f"{robot.name}-rates.json"
+    prepare_output(out)
     check_policy(policy, robot, size.device)
     evaluator = EvaluatorCfg(
         robot=robot,
@@ -50,9 +48,8 @@ def evaluate_base(cfg: EvaluateCfg) -> dict[str, Any]:
     about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
     report = {**origin_of(size.device, cfg.seed, cfg.workers), **about, **sets}
     print_rates(report)
-    if out is not None:
-        write_atomically(out, to_json(report))
-        print(f"written to {out}")
+    write_atomically(out, to_json(report))
+    print(f"written to {out}")
     return report
 
 

@@ -7,16 +7,15 @@ from typing import Any
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
 from qd.html_report.tables import read_tables
 from qd.next_commands import make_command
+from qd.places import RESULTS, folder_for, newest_or_published
 from qd.replay import as_searched, check_penalties
 from qd.report import summary
-from qd.run_directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory, newest_run
+from qd.run_directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory
 from qd.settings import SHIPPED, SearchCfg
 from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output
 from sim.robot import RobotCfg, get_robot
 
-RESULTS = Path("results")
-"""Where published archives and tables lie."""
 _ORIGIN = ("command", "commit", "device", "versions", "seed", "date")
 
 
@@ -35,7 +34,7 @@ class HtmlReportCfg:
     tables: Path | None = None
     """File of the evaluation tables; results/<robot>/tables.json if it is there."""
     out: Path | None = None
-    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-report."""
+    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published."""
     policy: str | None = None
     """Controller other than the one the archive was made with; that one too, if it is code."""
     device: str | None = None
@@ -102,7 +101,7 @@ def gather(cfg: HtmlReportCfg) -> Material:
         ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
     """
     robot = get_robot(cfg.robot)
-    run = cfg.run or _default_run(robot.name)
+    run = cfg.run or newest_or_published(robot)
     archive = _archive_of(run, robot)
     searched, _ = as_searched(run, archive)
     folder = RunDirectory(run if run.is_dir() else run.parent)
@@ -116,7 +115,7 @@ def gather(cfg: HtmlReportCfg) -> Material:
         cfg=cfg,
         robot=robot,
         run=run,
-        out=cfg.out or _default_out(run, robot.name),
+        out=cfg.out or folder_for(run, robot.name) / "report.html",
         archive=archive,
         metrics=_metrics_of(folder, archive),
         searched=searched,
@@ -129,17 +128,6 @@ def gather(cfg: HtmlReportCfg) -> Material:
     )
     _check_out(material.out)
     return material
-
-
-def _default_run(robot: str) -> Path:
-    """The newest run, or the published one."""
-    published = RESULTS / robot / "archive"
-    try:
-        return newest_run(robot)
-    except FileNotFoundError:
-        if (published / ARCHIVE_FILE).exists():
-            return published
-        raise
 
 
 def _archive_of(run: Path, robot: RobotCfg) -> Archive:
@@ -175,13 +163,6 @@ def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
             f"run is half-written; `{again}` writes both again"
         )
     return rows[: archive.iterations]
-
-
-def _default_out(run: Path, robot: str) -> Path:
-    """In the run itself, unless it is published."""
-    folder = run if run.is_dir() else run.parent
-    published = RESULTS.resolve() in folder.resolve().parents
-    return (Path("runs") / f"{robot}-report" if published else folder) / "report.html"
 
 
 def _check_out(out: Path) -> None:

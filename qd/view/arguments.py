@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from qd.places import RESULTS, newest_or_published
 from qd.recordings import Found, archive_of_robot, policy_of
 from qd.replay import as_searched
-from qd.run_directory import newest_run
 from qd.settings import SHIPPED
 from qd.workers import check_policy
 from sim.controller_spec import ControllerSpec
@@ -16,8 +16,6 @@ from sim.controller_spec import ControllerSpec
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
 
-PUBLISHED = Path(__file__).resolve().parents[2] / "results"
-"""What came with the project, a folder a robot."""
 SEARCHED = "as searched"
 """What the page calls the controller of the search, if no other is named."""
 _CACHE = Path("runs") / "view-cache"
@@ -84,7 +82,7 @@ def show_of(cfg: ViewCfg) -> Show:
     from sim.named_controllers import controllers_of
     from sim.robot import get_robot
 
-    found = archive_of_robot(cfg.robot, cfg.run or _newest_or_published(get_robot(cfg.robot)))
+    found = archive_of_robot(cfg.robot, cfg.run or newest_or_published(get_robot(cfg.robot)))
     robot = found.robot
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: let its search go on, or give another --run")
@@ -106,19 +104,8 @@ def show_of(cfg: ViewCfg) -> Show:
             check_policy(controllers[SEARCHED], robot, "cpu")
         except ValueError as error:
             controllers, note = {}, f"{error}; name a controller with POLICIES to see crossings"
-    published = PUBLISHED / robot.name / "view"
+    published = RESULTS / robot.name / "view"
     return Show(cfg=cfg, found=found, robot=robot, controllers=controllers, note=note, published=published)
-
-
-def _newest_or_published(robot: "RobotCfg") -> Path:
-    """The newest run of a robot, else its published one."""
-    try:
-        return newest_run(robot)
-    except FileNotFoundError:
-        published = PUBLISHED / robot.name / "archive"
-        if not published.is_dir():
-            raise
-        return published
 
 
 def check_port(host: str, port: int) -> None:

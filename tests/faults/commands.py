@@ -61,7 +61,8 @@ def evaluate_with(policy: Path) -> int:
     """Crossings with a controller, up to where the simulation would be built."""
     evaluate.open_evaluator = stand_in.open_stand_in
     evaluate.evaluate_sets = lambda crossings, count, seed: (_ for _ in ()).throw(SystemExit(0))
-    cfg = evaluate.EvaluateCfg(policy=str(policy), device="cpu", terrains=2, episodes=1)
+    out = policy.parent / "rates.json"
+    cfg = evaluate.EvaluateCfg(policy=str(policy), device="cpu", terrains=2, episodes=1, out=out)
     return exit_code_of(lambda: int(evaluate.evaluate(cfg) is None))
 
 

@@ -422,4 +422,4 @@ def test_published_results_are_not_written_to(monkeypatch, tmp_path, run):
     run.rename(published)
     material = gather(HtmlReportCfg())
     assert str(material.run) == "results/anymal/archive"
-    assert str(material.out) == "runs/anymal-report/report.html"
+    assert str(material.out) == "runs/anymal-published/report.html"

@@ -1,4 +1,5 @@
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,10 +9,12 @@ from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
+from qd.places import folder_for, newest_or_published, newest_run
 from qd.recordings import archive_of_robot
 from qd.replay import Replay, ReplayCfg, describe, draw, replay
-from qd.run_directory import RunDirectory, newest_run
+from qd.run_directory import RunDirectory
 from qd.settings import as_settings
+from sim.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import make_result
 from tests.qd.test_archive import fresh_values, small_archive
@@ -42,7 +45,8 @@ def done(tmp_path):
     outcome = np.array([[Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]])
     shown = SimpleNamespace(**vars(result), outcome=outcome, paths=paths, final_position=paths[:, :, 19])
     heights = np.random.default_rng(0).normal(size=(161, 321)).astype(np.float32)
-    return Replay(folder=tmp_path, archive=archive, elite=0, heights=heights, result=shown, fresh=fresh)  # pyright: ignore
+    out = tmp_path / "elite-0.png"
+    return Replay(run=tmp_path, out=out, archive=archive, elite=0, heights=heights, result=shown, fresh=fresh)  # pyright: ignore
 
 
 def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
@@ -109,17 +113,27 @@ def test_a_config_of_another_search_is_refused(tmp_path, change):
 def test_no_run_yet(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`make archive ROBOT=anymal`"):
-        newest_run("anymal")
-    assert ReplayCfg().elite == 0
+        newest_run(get_robot("anymal"))
+    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/"):
+        newest_or_published(get_robot("anymal"))
 
 
-def test_a_run_that_is_published_is_named_where_there_is_none(monkeypatch, tmp_path):
+def test_the_published_run_is_taken_where_there_is_none_and_nothing_is_written_into_it(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     published = tmp_path / "results" / "anymal" / "archive"
     published.mkdir(parents=True)
     write_archive(published / "archive.npz", small_archive())
     with pytest.raises(FileNotFoundError, match=r"or give --run, such as the published results/anymal/archive$"):
-        newest_run("anymal")
+        newest_run(get_robot("anymal"))
+    found = newest_or_published(get_robot("anymal"))
+    assert found == Path("results/anymal/archive")
+    for named in (found, published, published / "archive.npz", published / ".." / "archive"):
+        assert folder_for(named, "anymal") == Path("runs/anymal-published")
+    own = Path("runs/anymal-small-0")
+    own.mkdir(parents=True)
+    write_archive(own / "archive.npz", small_archive())
+    assert newest_or_published(get_robot("anymal")) == own
+    assert folder_for(own, "anymal") == folder_for(own / "archive.npz", "anymal") == own
 
 
 @pytest.mark.parametrize("changes", [{"replicas": 0}, {"seed": -1}])
@@ -133,3 +147,11 @@ def test_an_archive_of_penalties_that_the_robot_lacks_is_refused(tmp_path):
     for refused in (lambda: replay(ReplayCfg(run=tmp_path)), lambda: archive_of_robot("anymal", tmp_path)):
         with pytest.raises(ValueError, match="penalties that robot anymal does not have: <b>; expected some of yaw_"):
             refused()
+
+
+@pytest.mark.parametrize("out", ["a.jpg", "/proc/nowhere/a.png"])
+def test_a_place_for_the_figure_is_looked_for_before_the_crossing(tmp_path, monkeypatch, out):
+    run(tmp_path / "run")
+    monkeypatch.setattr("sim.rollout.Rollout", None)  # crossing anything would fail with another error
+    with pytest.raises(ValueError, match=r"out must be a file named \*\.png|cannot write to /proc/nowhere"):
+        replay(ReplayCfg(run=tmp_path / "run", device="cpu", out=Path(out)))

@@ -3,7 +3,8 @@ import os
 
 import pytest
 
-from qd.run_directory import RunDirectory, claimed, differences, numbered
+from qd.places import numbered
+from qd.run_directory import RunDirectory, claimed, differences
 
 
 def test_differences_name_every_key():

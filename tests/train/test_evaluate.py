@@ -18,7 +18,7 @@ from sim.rollout import Rollout
 from tests.train.archives import make_archive
 from train import evaluate_tables as tables
 from train.crossings import cross_all
-from train.evaluate import main
+from train.evaluate import evaluate_base, main
 from train.evaluate_cfg import EvaluateCfg, size_of, split_words
 from train.evaluate_tables import evaluate_tables
 from train.kept import KeptCrossings
@@ -39,7 +39,6 @@ class Crossings:
     @contextmanager
     def open(self, cfg: EvaluatorCfg):
         self.opened.append(cfg)
-        assert cfg.reward
         rollout = Rollout(
             get_robot(cfg.robot), cfg.policy, num_terrains=cfg.num_terrains, num_replicas=cfg.num_replicas,
             device=cfg.device, cfg=CrossingCfg(max_duration_s=0.1, start=(13.6, 4.0), reward=cfg.reward),
@@ -93,6 +92,7 @@ def test_the_tables_from_end_to_end(tmp_path, archive, capsys):
     assert set(groups["crossed"]["terrains"]) | set(groups["never_crossed"]["terrains"]) == held_out
     # Each controller crossed three sets, in one simulation since they are of one size; the far ones are among them.
     assert crossings.sets == [(STANDER, 4)] * 3 + [(PROTOTYPE, 4)] * 3 and len(crossings.opened) == 2
+    assert all(cfg.reward for cfg in crossings.opened)
     said = capsys.readouterr().out
     assert "base on hand_crafted: success 1.000" in said and "written to" in said
 
@@ -104,6 +104,16 @@ def test_all_controllers_meet_the_same_terrains_and_starts(tmp_path, archive):
     for name in ("success", "goal", "fallen", "reward", "penalties"):
         assert all(row["a"] == row["b"] for row in report[name].values())
     assert report["reward"]["hand_crafted"]["a"] > 0.0
+
+
+def test_rates_of_one_controller_go_under_runs(tmp_path, monkeypatch, capsys):
+    # Never under results/, where the published ones stand.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("train.evaluate.open_evaluator", Crossings().open)
+    report = evaluate_base(EvaluateCfg(policy=STANDER, device="cpu", terrains=2, episodes=1))
+    assert json.loads(Path("runs/anymal-rates.json").read_text()) == json.loads(json.dumps(report))
+    assert set(report) >= {"hand_crafted", "hard_random", "flat", "command", "commit", "seed"}
+    assert "written to runs/anymal-rates.json" in capsys.readouterr().out
 
 
 def test_a_killed_evaluation_goes_on(tmp_path, archive, capsys):

@@ -11,14 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qd.places import RESULTS
 from qd.view.app import App
-from qd.view.arguments import PUBLISHED, ViewCfg, show_of
+from qd.view.arguments import ViewCfg, show_of
 from qd.view.crossings import Crossings
 from qd.view.recorder import Report
 
 ROOT = Path(__file__).parents[3]
 PICK_LIMIT_S = 1.0
 """From a click to the terrain on its way to the browser; it takes 0.15 s."""
+
+ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
 
 
 def free_port() -> int:
@@ -30,7 +33,7 @@ def free_port() -> int:
 @pytest.fixture(scope="module")
 def show(anymal):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return show_of(ViewCfg(run=PUBLISHED / "anymal" / "archive", port=free_port(), policies=policies))
+    return show_of(ViewCfg(run=ARCHIVE, port=free_port(), policies=policies))
 
 
 @pytest.fixture
@@ -65,7 +68,7 @@ def test_the_worst_elite_is_there_with_its_crossing(app):
 def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
     folder = tmp_path / "a`<img src=x onerror=alert(1)>"
     folder.mkdir()
-    (folder / "archive.npz").write_bytes((PUBLISHED / "anymal" / "archive" / "archive.npz").read_bytes())
+    (folder / "archive.npz").write_bytes((ARCHIVE / "archive.npz").read_bytes())
     odd = show_of(dataclasses.replace(show.cfg, run=folder, port=free_port()))
     app = App(odd, Crossings(odd.robot, cache=tmp_path / "cache"))
     try:
@@ -93,7 +96,7 @@ def test_opening_waits_for_no_simulation():
         "show_of(ViewCfg(run=pathlib.Path(sys.argv[1])));"
         "import qd.view.app, qd.view.crossings; print('newton' in sys.modules)"
     )
-    archive = str(PUBLISHED / "anymal" / "archive")
+    archive = str(ARCHIVE)
     done = subprocess.run(
         [sys.executable, "-c", command, archive], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
@@ -182,7 +185,7 @@ def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
 
 def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
     port = free_port()
-    command = [sys.executable, "-m", "qd.view", "--run", str(PUBLISHED / "anymal" / "archive"), "--port", str(port)]
+    command = [sys.executable, "-m", "qd.view", "--run", str(ARCHIVE), "--port", str(port)]
     command += ["--cache", str(tmp_path)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None

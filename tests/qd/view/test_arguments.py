@@ -9,17 +9,19 @@ import pytest
 import tyro
 
 from qd.archive import write_archive
-from qd.view.arguments import PUBLISHED, ViewCfg, check_port, show_of
+from qd.places import RESULTS
+from qd.view.arguments import ViewCfg, check_port, show_of
 from tests.qd.test_archive import small_archive
 from tests.test_makefile import command_of
 
-ARCHIVE = PUBLISHED / "anymal" / "archive"
+ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
 
 
 def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypatch, anymal):
+    (tmp_path / "results").symlink_to(RESULTS.resolve())
     monkeypatch.chdir(tmp_path)
     show = show_of(ViewCfg())
-    assert show.found.run == ARCHIVE and show.controllers == {"as searched": str(anymal.policy_file)}
+    assert show.found.run == RESULTS / "anymal" / "archive" and show.controllers == {"as searched": str(anymal.policy_file)}
     write_archive(make_folder(tmp_path / "runs" / "mine") / "archive.npz", small_archive())
     assert show_of(ViewCfg()).found.run == Path("runs/mine")
 

@@ -98,10 +98,10 @@ def test_a_cache_that_cannot_be_written_to_is_named(anymal, tmp_path):
 
 def test_the_published_recordings_are_those_of_the_published_archive(anymal, tmp_path):
     from qd.archive import read_archive
-    from qd.view.arguments import PUBLISHED
+    from qd.places import RESULTS
 
-    archive = read_archive(PUBLISHED / "anymal" / "archive")
-    crossings = Crossings(anymal, cache=tmp_path, published=PUBLISHED / "anymal" / "view")
+    archive = read_archive(RESULTS.resolve() / "anymal" / "archive")
+    crossings = Crossings(anymal, cache=tmp_path, published=RESULTS.resolve() / "anymal" / "view")
     policy = str(anymal.policy_file)
     found = [
         crossings.read(Wanted(elite=k, controller="", policy=policy, replicas=20, genes=archive.genes[k : k + 1]))
