@@ -21,7 +21,8 @@ def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypa
     (tmp_path / "results").symlink_to(RESULTS.resolve())
     monkeypatch.chdir(tmp_path)
     show = show_of(ViewCfg())
-    assert show.found.run == RESULTS / "anymal" / "archive" and show.controllers == {"as searched": str(anymal.policy_file)}
+    assert show.found.run == RESULTS / "anymal" / "archive"
+    assert show.controllers == {"as searched": str(anymal.policy_file)}
     write_archive(make_folder(tmp_path / "runs" / "mine") / "archive.npz", small_archive())
     assert show_of(ViewCfg()).found.run == Path("runs/mine")
 
