@@ -43,7 +43,15 @@ def test_figure_and_replay_show_the_penalties_that_are_kept():
     result = stand_in.evaluate(found.genes[:1], np.zeros(1, np.uint32))
     fresh = evaluation_of(result, found.cells, FITNESS)
     text = describe(
-        Replay(folder=Path("a"), archive=found, elite=0, heights=np.zeros((2, 2)), result=result, fresh=fresh)
+        Replay(
+            run=Path("a"),
+            out=Path("a.png"),
+            archive=found,
+            elite=0,
+            heights=np.zeros((2, 2)),
+            result=result,
+            fresh=fresh,
+        )
     )
     assert all(f"  {name} [" in text for name in FITNESS.penalties)
     assert "stumble" not in text and "vel_y" not in text
