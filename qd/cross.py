@@ -14,7 +14,7 @@ from qd.report import save_figure
 from qd.video import OWN_FOLDER
 from qd.workers import check_policy, origin_of, resolve_device
 from sim.files import prepare_output, to_json, write_atomically
-from sim.intervals import wilson_interval
+from sim.intervals import rate_words, wilson_interval
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
@@ -153,23 +153,16 @@ def _rate(hits: int, count: int) -> dict[str, Any]:
 _LABELS = {"success": "success (no base collision)", "goal": "goal reached", "fallen": "fallen"}
 
 
-def _said(rate: dict[str, Any], count: int) -> str:
-    if rate["rate"] is None:
-        return "no valid episode"
-    low, high = rate["interval"]
-    return f"{rate['hits']} of {count} ({rate['rate']:.0%}, {100 * low:.0f} to {high:.0%})"
-
-
 def _headline(report: dict[str, Any]) -> str:
     count = report["episodes"] - report["invalid_episodes"]
-    return ", ".join(f"{name} {_said(report['rates'][name], count)}" for name in ("success", "goal"))
+    return ", ".join(f"{name} {rate_words(report['rates'][name]['hits'], count)}" for name in ("success", "goal"))
 
 
 def describe(report: dict[str, Any]) -> str:
     """The numbers of a terrain, in words."""
     count = report["episodes"] - report["invalid_episodes"]
     lines = [f"{report['robot']} on {report['terrain']}, {report['episodes']} episodes:"]
-    lines += [f"  {_LABELS[name]:30}{_said(rate, count):>30}" for name, rate in report["rates"].items()]
+    lines += [f"  {_LABELS[name]:30}{rate_words(rate['hits'], count):>30}" for name, rate in report["rates"].items()]
     for name, cost in report["penalties"].items():
         label = f"{name} [{cost['unit']}]"
         lines.append(f"  {label:30}{cost['mean']:>17.2f} +- {cost['std']:<9.2f}")

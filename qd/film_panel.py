@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.report import PENALTY_LABELS
+from qd.report import label_of
 from qd.shot import Shot
 
 _DPI = 100
@@ -80,8 +80,7 @@ def _draw_map(axes: Any, shot: Shot) -> None:
 def _draw_curves(axes: Any, shot: Shot) -> None:
     times = shot.recording.times_s[: shot.num_frames]
     for (name, values), color in zip(shot.penalties.items(), _COLORS, strict=False):
-        words = PENALTY_LABELS.get(name, name).replace("-\n", "-").replace("\n", " ")
-        label = f"{words} {values[-1]:.1f}"
+        label = f"{label_of(name)} {values[-1]:.1f}"
         axes.plot(times, values, color=color, linewidth=1.8, label=label)
     axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))
     axes.set_ylim(bottom=0.0)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.workers import episode_seeds
+from sim.command import split_words
 
 _STREAM = 4  # of the seeds: no other episodes are drawn from it
 
@@ -56,7 +57,7 @@ def read_own_terrain(path: Path, args: Mapped) -> OwnTerrain:
 
 
 def _size_of(words: Sequence[str]) -> tuple[float, ...] | None:
-    sides = " ".join(words).replace(",", " ").split()
+    sides = split_words(words)
     try:
         return tuple(float(side) for side in sides) or None
     except ValueError:

@@ -49,13 +49,7 @@ def draw_paths(heights: NDArray[np.float32], result: "RolloutResult", title: str
 
 def _ends(result: "RolloutResult") -> dict[str, tuple[str, str, NDArray[np.bool_]]]:
     """Label, colour, marker and episodes of each way to end that happened."""
-    from kernels.episode import Outcome
+    from qd.endings import ENDINGS  # with Warp, which takes a moment
 
-    styles = {
-        Outcome.GOAL: ("reached the goal", "#009e73", "o"),
-        Outcome.BASE_COLLISION: ("base collision", "#d55e00", "X"),
-        Outcome.TIME_OUT: ("out of time", "#0072b2", "s"),
-        Outcome.OUT: ("left the terrain", "#cc79a7", "^"),
-    }
-    chosen = {outcome: result.outcome[0] == outcome for outcome in styles}
-    return {styles[o][0]: (*styles[o][1:], mask) for o, mask in chosen.items() if mask.any()}
+    chosen = {ending: result.outcome[0] == outcome for outcome, ending in ENDINGS.items()}
+    return {ending.words: (ending.color, ending.marker, mask) for ending, mask in chosen.items() if mask.any()}

@@ -49,6 +49,11 @@ def _published(name: str) -> Path | None:
     return folder if (folder / ARCHIVE_FILE).exists() else None
 
 
+def directory_of(run: Path) -> Path:
+    """The directory of a run that is given as such or as its archive file."""
+    return run if run.is_dir() else run.parent
+
+
 def folder_for(run: Path, robot: str) -> Path:
     """Where what is made from a run goes: into its directory, or of a published one to runs/<robot>-published.
 
@@ -56,7 +61,7 @@ def folder_for(run: Path, robot: str) -> Path:
         run: Run directory or archive file.
         robot: Name of its robot.
     """
-    folder = run if run.is_dir() else run.parent
+    folder = directory_of(run)
     published = RESULTS.resolve() in folder.resolve().parents
     return RUNS / f"{robot}-published" if published else folder
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from qd.settings import SHIPPED, SearchCfg
+from qd.settings import SearchCfg
+from sim.controller_spec import SHIPPED
 
 _EPISODE_STEPS = 4000  # 20 s at 200 Hz
 _STEPS_PER_S = {"cpu": 15_000.0, "cuda": 3_500_000.0}  # of one process on one core, and of a large GPU

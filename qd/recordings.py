@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.own_terrain import own_seeds
-from qd.places import newest_or_published
+from qd.places import directory_of, newest_or_published
 from qd.replay import REPLAY_STREAM, as_searched, check_penalties
 from qd.resuming import refuse_unnamed_code
-from qd.settings import SHIPPED
 from qd.workers import episode_seeds
+from sim.command import split_words
+from sim.controller_spec import spec_of
 
 if TYPE_CHECKING:
     from sim.recording import Recording
@@ -38,7 +39,7 @@ class Found:
     @property
     def folder(self) -> Path:
         """The directory."""
-        return self.run if self.run.is_dir() else self.run.parent
+        return directory_of(self.run)
 
 
 def archive_of_robot(named: "RobotCfg | str", run: Path | None) -> Found:
@@ -72,7 +73,7 @@ def chosen_elites(text: str, found: Found) -> list[int]:
         ValueError: If it is something else, or there is no such elite.
     """
     count = len(found.archive)
-    words = text.replace(",", " ").split()
+    words = split_words([text])
     if words == [ALL]:
         words = list(map(str, range(count)))
     unknown = [word for word in words if not (word.isascii() and word.isdigit() and int(word) < count)]
@@ -90,7 +91,7 @@ def policy_of(found: Found, robot: "RobotCfg", given: str | None) -> str:
     """
     searched, _ = as_searched(found.run, found.archive)
     refuse_unnamed_code(searched, given, found.run)
-    return given or (str(robot.policy_file) if searched == SHIPPED else searched)
+    return given or spec_of(searched, robot)
 
 
 def record_elites(

@@ -13,8 +13,9 @@ from qd.places import newest_run
 from qd.resuming import origin_in, refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed
 from qd.search import write_results
-from qd.settings import SHIPPED, SearchCfg, as_settings, file_hash, policy_spec
+from qd.settings import SearchCfg, as_settings, file_hash, policy_spec
 from qd.workers import open_evaluator, origin_of, resolve_device
+from sim.controller_spec import SHIPPED
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg

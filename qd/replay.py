@@ -11,14 +11,14 @@ from qd.archive import Archive, read_archive
 from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.paths_figure import draw_paths
-from qd.places import folder_for, newest_or_published
+from qd.places import directory_of, folder_for, newest_or_published
 from qd.report import save_figure
 from qd.resuming import refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, RunDirectory
-from qd.settings import SHIPPED
 from qd.workers import check_policy, episode_seeds, resolve_device
+from sim.controller_spec import SHIPPED, spec_of
 from sim.files import prepare_output
-from sim.intervals import wilson_interval
+from sim.intervals import rate_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,7 +103,7 @@ def replay(cfg: ReplayCfg) -> Replay:
     device = resolve_device(cfg.device)
     policy, fitness = as_searched(run, archive)
     refuse_unnamed_code(policy, cfg.policy, run)
-    policy = cfg.policy or (str(robot.policy_file) if policy == SHIPPED else policy)
+    policy = cfg.policy or spec_of(policy, robot)
     check_policy(policy, robot, device)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.replicas, device=device)
     seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=REPLAY_STREAM)
@@ -151,7 +151,7 @@ def as_searched(run: Path, archive: Archive) -> tuple[str, FitnessCfg]:
     Raises:
         ValueError: If the config is not that of the archive, or damaged.
     """
-    folder = run if run.is_dir() else run.parent
+    folder = directory_of(run)
     if (folder / CONFIG_FILE).exists():
         cfg = RunDirectory(folder).read_cfg()
         there = (cfg.fitness.penalties, cfg.fitness.scales)
@@ -183,7 +183,8 @@ def describe(replay: Replay) -> str:
             for _, values, k in columns
         ]
     for label, name in (("base collision", "collision_rate"), ("goal reached", "goal_rate"), ("fallen", "fallen_rate")):
-        rows[label] = [_rate(getattr(values, name)[k], _counted(values, k)) for _, values, k in columns]
+        counted = [(getattr(values, name)[k], _counted(values, k)) for _, values, k in columns]
+        rows[label] = [rate_words(round(rate * count) if count else 0, count) for rate, count in counted]
     table = [f"  {label:22}" + "".join(f"{cell:>34}" for cell in row) for label, row in rows.items()]
     return "\n".join(
         [
@@ -205,14 +206,6 @@ def _counted(values: Archive | Evaluation, number: int) -> int:
     """Episodes that a terrain's rates are of: none of a terrain that is invalid as a whole."""
     valid = isinstance(values, Archive) or values.valid[number]  # what is found is valid, or it were no elite
     return int(values.episodes[number] - values.invalid_episodes[number]) if valid else 0
-
-
-def _rate(rate: float, count: int) -> str:
-    if not count:
-        return "no valid episode"
-    hits = round(rate * count)
-    low, high = wilson_interval(hits, count)
-    return f"{hits} of {count} ({rate:.0%}, {100 * low:.0f} to {high:.0%})"
 
 
 def draw(replay: Replay) -> "Figure":

@@ -29,6 +29,12 @@ PENALTY_LABELS = {
 }
 """Penalties as axis labels."""
 
+
+def label_of(penalty: str) -> str:
+    """A penalty in words, on one line; a word broken at a hyphen stays one."""
+    return PENALTY_LABELS.get(penalty, penalty).replace("-\n", "-").replace("\n", " ")
+
+
 _BLUE, _RED = "#0072b2", "#d55e00"  # apart for every kind of colour blindness
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qd.run_directory import differences
-from qd.settings import SHIPPED, SearchCfg, Settings, changed, file_hash, measured_now, policy_spec
+from qd.settings import SearchCfg, Settings, changed, file_hash, measured_now, policy_spec
 from sim.controller_spec import ControllerSpec
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def refuse_unnamed_code(policy: str, given: str | None, path: Path) -> None:
     Raises:
         ValueError: If the run's is code and none is given.
     """
-    if given is None and policy != SHIPPED and ControllerSpec.parse(policy).runs_code:
+    if given is None and ControllerSpec.parse(policy).runs_code:
         raise ValueError(
             f"{path} was searched with the controller {policy}, which is code: name it again (--policy), since no code "
             "runs that the command line does not name"
@@ -32,7 +32,7 @@ def refuse_unnamed_code(policy: str, given: str | None, path: Path) -> None:
 
 def code_of(cfg: SearchCfg) -> str | None:
     """The controller if it is code, which every command that goes on with the run must name; else None."""
-    return cfg.policy if cfg.policy != SHIPPED and ControllerSpec.parse(cfg.policy).runs_code else None
+    return cfg.policy if ControllerSpec.parse(cfg.policy).runs_code else None
 
 
 def own_file(robot: "RobotCfg") -> dict[str, Any]:

@@ -4,7 +4,6 @@ The checkpoint is the one truth and is written first; metrics and archive are ma
 that a kill between any two writes leaves a run that goes on as if nothing had been.
 """
 
-import fcntl
 import json
 import os
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from qd.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.settings import SearchCfg, Settings, as_settings, from_settings
-from sim.files import check_writable, read_json, to_json, write_atomically
+from sim.files import check_writable, locked, read_json, to_json, write_atomically
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
@@ -67,18 +66,12 @@ def claimed(path: Path) -> Iterator[None]:
     except OSError as error:
         raise ValueError(f"run directory {path} cannot be made: {error.strerror}: give another --run-dir") from None
     check_writable(path)
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise ValueError(f"another search works in {path}: let it end, or give another --run-dir") from None
-    try:
-        yield
-    finally:
-        os.close(handle)
-        if made and not any(path.iterdir()):
-            path.rmdir()
+    with locked(path, f"another search works in {path}: let it end, or give another --run-dir"):
+        try:
+            yield
+        finally:
+            if made and not any(path.iterdir()):
+                path.rmdir()
 
 
 class RunDirectory:

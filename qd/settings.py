@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_h
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from qd.scheduler_cfg import SchedulerCfg
-from sim.controller_spec import ControllerSpec
+from sim.command import split_words
+from sim.controller_spec import SHIPPED, ControllerSpec, spec_of
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
 
 _MAX_WHOLE = 1 << 53  # up to which whole numbers are floats too
 
-SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
 
 Built = TypeVar("Built")
@@ -182,7 +182,7 @@ def _brief(value: Any) -> str:
 
 def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
     """What to load the controller from, as :func:`sim.policy.load_policy` takes it."""
-    return str(robot.policy_file) if cfg.policy == SHIPPED else cfg.policy
+    return spec_of(cfg.policy, robot)
 
 
 def file_hash(policy: str | Path) -> str | None:
@@ -200,7 +200,7 @@ def kept_penalties(robot: "RobotCfg", without: Sequence[str]) -> tuple[str, ...]
     Raises:
         ValueError: If a name is unknown, or fewer than 2 penalties are left.
     """
-    names = " ".join(without).replace(",", " ").split()
+    names = split_words(without)
     _check_known(names, robot)
     kept = tuple(name for name in robot.penalties if name not in names)
     if len(kept) < 2:

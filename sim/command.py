@@ -1,11 +1,16 @@
-"""How commands end: an exit code, one line on stderr for what a user can mend, and a results file."""
+"""How commands begin and end: words of their arguments; an exit code, a line for what can be mended, a results file."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from sim.files import prepare_output, to_json, write_atomically
+
+
+def split_words(values: Sequence[str]) -> list[str]:
+    """Words of arguments of which make hands over several in one, apart by spaces or commas."""
+    return " ".join(values).replace(",", " ").split()
 
 
 def exit_code_of(

@@ -4,7 +4,13 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from sim.robot import RobotCfg
+
+SHIPPED = "shipped"
+"""Name of the controller that comes with the robot."""
 _NAMED = re.compile(
     r"(?P<place>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?",
     re.DOTALL,
@@ -69,3 +75,8 @@ class ControllerSpec:
         if self.place is None:
             return hashes[0]
         return hashlib.sha256(" ".join([str(self.name), *hashes]).encode()).hexdigest()
+
+
+def spec_of(policy: str, robot: "RobotCfg") -> str:
+    """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
+    return str(robot.policy_file) if policy == SHIPPED else policy

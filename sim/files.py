@@ -1,9 +1,11 @@
 """Files that are whole or absent: a reader never sees half of one, whenever the writer is killed."""
 
 import contextlib
+import fcntl
 import json
 import os
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -134,3 +136,26 @@ def check_zip(path: Path) -> None:
         raise ValueError(f"{type(error).__name__}: {error}") from None
     if damaged is not None:
         raise ValueError(f"its part '{damaged}' does not have its checksum")
+
+
+@contextlib.contextmanager
+def locked(folder: Path, busy: str) -> Iterator[None]:
+    """Keeps other processes that ask for the same out of a directory; ends with the process, however that ends.
+
+    Args:
+        folder: The directory.
+        busy: What to say if another process is in it.
+
+    Raises:
+        ValueError: If one is.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise ValueError(busy) from None
+    try:
+        yield
+    finally:
+        os.close(handle)

@@ -25,6 +25,14 @@ def wilson_interval(hits: int, count: int) -> tuple[float, float]:
     return (0.0 if hits == 0 else centre - half), (1.0 if hits == count else centre + half)
 
 
+def rate_words(hits: int, count: int) -> str:
+    """A rate with its 95 % Wilson interval in words, such as ``3 of 4 (75%, 30 to 95%)``."""
+    if not count:
+        return "no valid episode"
+    low, high = wilson_interval(hits, count)
+    return f"{hits} of {count} ({hits / count:.0%}, {100 * low:.0f} to {high:.0%})"
+
+
 def bootstrap_interval(values: NDArray[np.floating], rng: np.random.Generator) -> list[float] | None:
     """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains; None without any."""
     if len(values) == 0:

@@ -3,10 +3,8 @@
 import re
 from collections.abc import Sequence
 
+from sim.controller_spec import SHIPPED, spec_of
 from sim.robot import RobotCfg
-
-SHIPPED = "shipped"
-"""Name of the controller that comes with the robot."""
 
 
 def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
@@ -31,5 +29,5 @@ def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
             )
         if name in found:
             raise ValueError(f"policies must have different names, got '{name}' twice: rename one of them")
-        found[name] = str(robot.policy_file) if policy == SHIPPED else policy
+        found[name] = spec_of(policy, robot)
     return found

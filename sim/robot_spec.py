@@ -27,8 +27,7 @@ def robot_spec(robot: RobotCfg) -> Any:
         files = read_model_files(robot.model_file)
         spec = _urdf_spec(files.root) if files.is_urdf else _mjcf_spec(robot)
     except Exception as error:  # MuJoCo's own type has no name
-        reason = " ".join(str(error).split())
-        raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {reason}") from None
+        raise _not_shown(robot, error) from None
     found = tuple(joint.name for joint in spec.joints if joint.type != _mj.mjtJoint.mjJNT_FREE)
     if found != robot.joint_names or len(spec.joints) != len(found) + 1:
         raise ValueError(
@@ -47,8 +46,12 @@ def robot_model(spec: Any, robot: RobotCfg) -> Any:
     try:
         return spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
-        reason = " ".join(str(error).split())
-        raise ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {reason}") from None
+        raise _not_shown(robot, error) from None
+
+
+def _not_shown(robot: RobotCfg, error: Exception) -> ValueError:
+    reason = " ".join(str(error).split())
+    return ValueError(f"robot '{robot.name}': {robot.model_file} cannot be shown: {reason}")
 
 
 def _mjcf_spec(robot: RobotCfg) -> Any:

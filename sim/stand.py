@@ -15,7 +15,7 @@ from sim.probes import placed
 from sim.robot import RobotCfg, get_robot
 from sim.robot_model import build_robot, geom_names, leaf_name
 from sim.simulation import CAPACITY_OVERFLOWS, Simulation, resolve_device
-from sim.terrain import hard_random_genes
+from sim.terrain import SPACING, hard_random_genes
 
 _GRAVITY = 9.81
 _TERRAINS = 4
@@ -138,7 +138,7 @@ def _extent(sim: Simulation) -> tuple[dict[str, float], float]:
 
 def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
     """Highest ground round a point [m]."""
-    row, column, room = round(y / 0.05), round(x / 0.05), round(_ROOM / 0.05)
+    row, column, room = round(y / SPACING), round(x / SPACING), round(_ROOM / SPACING)
     return float(heights[max(row - room, 0) : row + room + 1, max(column - room, 0) : column + room + 1].max())
 
 

@@ -1,6 +1,5 @@
 """What a command line of the evaluation means."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -88,8 +87,3 @@ def size_of(cfg: EvaluateCfg) -> Size:
     if not device.startswith("cuda") and cfg.terrains is None and cfg.episodes is None:
         print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {full[0]} x {full[1]}.")
     return Size(robot=robot, device=device, terrains=cfg.terrains or terrains, episodes=cfg.episodes or episodes)
-
-
-def split_words(values: Sequence[str]) -> list[str]:
-    """Words of arguments of which make hands over several in one, apart by spaces or commas."""
-    return " ".join(values).replace(",", " ").split()

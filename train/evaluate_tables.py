@@ -6,11 +6,12 @@ from typing import Any
 
 from qd.archive import Archive, read_archive
 from qd.workers import EvaluatorCfg, check_policy, open_evaluator, origin_of
+from sim.command import split_words
 from sim.files import prepare_output, to_json, write_atomically
 from sim.named_controllers import controllers_of
 from sim.own_robot import robot_digest
 from train.crossings import Open, cross_all
-from train.evaluate_cfg import EvaluateCfg, Size, size_of, split_words
+from train.evaluate_cfg import EvaluateCfg, Size, size_of
 from train.held_out import check_held_out
 from train.kept import KeptCrossings, controller_hash
 from train.measures import measure

@@ -1,18 +1,16 @@
 """What all trainings share: a run directory, iterating until told to stop, checkpoints, the controller at the end."""
 
-import fcntl
 import io
-import os
 import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from sim.files import check_writable, read_json, to_json, write_atomically
+from sim.files import check_writable, locked, read_json, to_json, write_atomically
 from train.learner import Learner, check_entries, read_checkpoint
 from train.progress import STATE, Progress
 
@@ -90,23 +88,13 @@ def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) 
     return run_dir
 
 
-@contextmanager
-def claimed(run_dir: Path) -> Iterator[None]:
+def claimed(run_dir: Path) -> AbstractContextManager[None]:
     """Keeps other trainings out of a run directory for the duration of a ``with`` block.
 
     Raises:
-        ValueError: If another training works in it.
+        ValueError: On entering it, if another training works in the directory.
     """
-    handle = os.open(run_dir, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process, however that ends
-    except BlockingIOError:
-        os.close(handle)
-        raise ValueError(f"another training works in {run_dir}: let it end, or name another --run-dir") from None
-    try:
-        yield
-    finally:
-        os.close(handle)
+    return locked(run_dir, f"another training works in {run_dir}: let it end, or name another --run-dir")
 
 
 def plain(value: Any) -> Any:

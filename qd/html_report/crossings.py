@@ -113,8 +113,7 @@ def cross_all(wanted: Sequence[Wanted], place: Place, cross: Record) -> list[Rec
 
 def _files_of(wanted: Sequence[Wanted], place: Place) -> list[Path]:
     kind = "cuda" if place.device.startswith("cuda") else "cpu"  # which differ in their last bits
-    own = None if place.robot.settings_file is None else robot_digest(place.robot)
-    common = [place.robot.name, own, place.episodes, kind, code_fingerprint(_ROOMS)]
+    common = [place.robot.name, robot_digest(place.robot), place.episodes, kind, code_fingerprint(_ROOMS)]
     files = []
     for one in wanted:
         genes = hashlib.sha256(one.genes.astype(np.float32).tobytes()).hexdigest()

@@ -1,6 +1,6 @@
 """The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
 
-from qd.html_report.figures import draw_modes, label_of
+from qd.html_report.figures import draw_modes
 from qd.html_report.modes import MAX_MODES, TOLERANCE, Mode
 from qd.html_report.outcomes import ENDS, Crossed, Rate
 from qd.html_report.page import Absent, Block, Heading, Section, Table, Text
@@ -8,6 +8,7 @@ from qd.html_report.shown import Shown, counted, percent, picture
 from qd.html_report.terrain_figures import draw_crossing, draw_maps
 from qd.next_commands import make_command
 from qd.replay import PENALTY_UNITS
+from qd.report import label_of
 
 _ARRIVED = next(iter(ENDS.values()))
 

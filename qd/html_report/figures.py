@@ -9,7 +9,7 @@ import numpy as np
 
 from qd.html_report.elites import Elites
 from qd.html_report.modes import TOLERANCE, Modes
-from qd.report import PENALTY_LABELS, new_figure
+from qd.report import PENALTY_LABELS, label_of, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,11 +43,6 @@ def mode_looks(modes: Modes) -> list[tuple[str, str]]:
         own = max(free, key=lambda end: getattr(mode, end))
         chosen.append((free[own] or max(free.values(), key=len)).pop(0))
     return chosen
-
-
-def label_of(penalty: str) -> str:
-    """A penalty in words, on one line."""
-    return PENALTY_LABELS.get(penalty, penalty).replace("-\n", "-").replace("\n", " ")
 
 
 def look_of(penalty: str) -> tuple[str, str]:

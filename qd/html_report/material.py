@@ -7,12 +7,12 @@ from typing import Any
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
 from qd.html_report.tables import read_tables
 from qd.next_commands import make_command
-from qd.places import RESULTS, folder_for, newest_or_published
+from qd.places import RESULTS, directory_of, folder_for, newest_or_published
 from qd.replay import as_searched, check_penalties
 from qd.report import summary
 from qd.run_directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory
-from qd.settings import SHIPPED, SearchCfg
-from sim.controller_spec import ControllerSpec
+from qd.settings import SearchCfg
+from sim.controller_spec import ControllerSpec, spec_of
 from sim.files import prepare_output
 from sim.robot import RobotCfg, get_robot
 
@@ -64,7 +64,7 @@ class Material:
     metrics: Metrics | None
     """One row an iteration, up to those of the archive."""
     searched: str
-    """Controller of the search, :data:`qd.settings.SHIPPED` where it lies without its config."""
+    """Controller of the search, :data:`sim.controller_spec.SHIPPED` where it lies without its config."""
     search: SearchCfg | None
     origin: dict[str, Any]
     """Command, commit, device, versions, seed and date of the search, as far as they are known."""
@@ -83,14 +83,12 @@ class Material:
     @property
     def policy(self) -> str:
         """Controller to cross with: what was asked for, or that of the search."""
-        policy = self.cfg.policy or self.searched
-        return str(self.robot.policy_file) if policy == SHIPPED else policy
+        return spec_of(self.cfg.policy or self.searched, self.robot)
 
     @property
     def is_unnamed_code(self) -> bool:
         """Whether that is code which only the run names: what a file names is never run."""
-        code = self.searched != SHIPPED and ControllerSpec.parse(self.searched).runs_code
-        return self.cfg.policy is None and code
+        return self.cfg.policy is None and ControllerSpec.parse(self.searched).runs_code
 
 
 def gather(cfg: HtmlReportCfg) -> Material:
@@ -104,7 +102,7 @@ def gather(cfg: HtmlReportCfg) -> Material:
     run = cfg.run or newest_or_published(robot)
     archive = _archive_of(run, robot)
     searched, _ = as_searched(run, archive)
-    folder = RunDirectory(run if run.is_dir() else run.parent)
+    folder = RunDirectory(directory_of(run))
     search = folder.read_cfg() if (folder.path / CONFIG_FILE).exists() else None
     numbers = folder.read_summary()
     again = numbers.get("reproduced_by")

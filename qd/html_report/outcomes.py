@@ -6,15 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
+from qd.endings import ENDINGS
 from sim.intervals import wilson_interval
 from sim.recording import Recording
 
-ENDS = {
-    Outcome.GOAL: "reached the goal",
-    Outcome.BASE_COLLISION: "base collision",
-    Outcome.TIME_OUT: "out of time",
-    Outcome.OUT: "left the terrain",
-}
+ENDS = {outcome: ending.words for outcome, ending in ENDINGS.items()}
 """How a valid episode may end."""
 
 

@@ -4,14 +4,13 @@ import numpy as np
 
 from qd.fresh import FRESH_EPISODES
 from qd.html_report.elites import FAILING_BELOW, Elites
-from qd.html_report.figures import draw_pairs, label_of
+from qd.html_report.figures import draw_pairs
 from qd.html_report.page import Absent, Block, Facts, Section, Table, Text
 from qd.html_report.shown import Shown, counted, hours, percent, picture
 from qd.next_commands import make_command
 from qd.progress import clock
-from qd.report import draw_archive, draw_curves, draw_spread, spread
-from qd.settings import SHIPPED
-from sim.controller_spec import ControllerSpec
+from qd.report import draw_archive, draw_curves, draw_spread, label_of, spread
+from sim.controller_spec import SHIPPED, ControllerSpec
 from sim.intervals import bootstrap_interval
 
 _AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes

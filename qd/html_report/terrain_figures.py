@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kernels.episode import Outcome
+from qd.endings import ENDINGS
 from qd.html_report.figures import look_of
 from qd.html_report.outcomes import ENDS, Crossed, penalties_by_place
 from qd.report import PENALTY_LABELS, new_figure
@@ -17,13 +17,6 @@ if TYPE_CHECKING:
 _LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
 _START, _GOAL = (2.0, 4.0), (14.0, 4.0)
 _PLACE = 0.5  # length of the places that penalties are summed over [m]
-END_LOOKS = {
-    Outcome.GOAL: ("#009e73", "o", "-"),
-    Outcome.BASE_COLLISION: ("#d55e00", "X", "--"),
-    Outcome.TIME_OUT: ("#0072b2", "s", "-."),
-    Outcome.OUT: ("#cc79a7", "^", ":"),
-}
-"""Colour, marker and line of each way to end."""
 
 
 def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> "Figure":
@@ -69,14 +62,14 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
     image = axes.imshow(
         heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
     )
-    for end, (colour, marker, line) in END_LOOKS.items():
-        chosen = np.flatnonzero(crossed.outcome == end)
+    for outcome, end in ENDINGS.items():
+        chosen = np.flatnonzero(crossed.outcome == outcome)
         for k in chosen:
-            axes.plot(*crossed.path(int(k))[:, :2].T, color=colour, linestyle=line, linewidth=0.9, alpha=0.7)
+            axes.plot(*crossed.path(int(k))[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
         if len(chosen):
             places = crossed.ends[chosen]
-            label = f"{ENDS[end]} ({len(chosen)})"
-            axes.scatter(*places[:, :2].T, color=colour, marker=marker, s=55, edgecolors="white", label=label, zorder=3)
+            looks = {"color": end.color, "marker": end.marker, "s": 55, "edgecolors": "white", "zorder": 3}
+            axes.scatter(*places[:, :2].T, label=f"{end.words} ({len(chosen)})", **looks)
     white = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
     axes.plot(*_START, marker=">", markersize=11, label="start", **white)
     axes.plot(*_GOAL, marker="*", markersize=16, label="goal", **white)
@@ -89,7 +82,7 @@ def _legend(axes: "Axes") -> tuple[list[Any], list[str]]:
     """Markers with the lines of the paths that lead to them."""
     from matplotlib.lines import Line2D
 
-    lines = {ENDS[end]: (colour, marker, line) for end, (colour, marker, line) in END_LOOKS.items()}
+    lines = {end.words: (end.color, end.marker, end.line) for end in ENDINGS.values()}
     handles, labels = axes.get_legend_handles_labels()
     shown = []
     for handle, label in zip(handles, labels, strict=True):

@@ -111,7 +111,7 @@ class App:
                 name, value = self._events.get(timeout=left)
             except queue.Empty:
                 break
-            repeats = name in ("seek", "replica", "report") or name == "brush"
+            repeats = name in ("seek", "replica", "report", "brush")
             key = (name, value[0] if name == "brush" else None) if repeats else object()
             found.pop(key, None)
             found[key] = (name, value)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from qd.places import RESULTS, newest_or_published
+from qd.places import RESULTS
 from qd.recordings import Found, archive_of_robot, policy_of
 from qd.replay import as_searched
-from qd.settings import SHIPPED
 from qd.workers import check_policy
 from sim.controller_spec import ControllerSpec
 
@@ -80,9 +79,8 @@ def show_of(cfg: ViewCfg) -> Show:
         ValueError: If robot, archive, controllers or a number are not as they must be.
     """
     from sim.named_controllers import controllers_of
-    from sim.robot import get_robot
 
-    found = archive_of_robot(cfg.robot, cfg.run or newest_or_published(get_robot(cfg.robot)))
+    found = archive_of_robot(cfg.robot, cfg.run)
     robot = found.robot
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: let its search go on, or give another --run")
@@ -98,7 +96,7 @@ def show_of(cfg: ViewCfg) -> Show:
     else:
         searched, _ = as_searched(found.run, found.archive)
         try:  # without a controller the terrains can be looked at all the same
-            if searched != SHIPPED and ControllerSpec.parse(searched).runs_code:
+            if ControllerSpec.parse(searched).runs_code:
                 raise ValueError(f"the search's controller {searched} is code, and what a run names is never run")
             controllers = {SEARCHED: policy_of(found, robot, None)}
             check_policy(controllers[SEARCHED], robot, "cpu")

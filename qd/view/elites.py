@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.report import PENALTY_LABELS
+from qd.report import label_of
 from sim.intervals import wilson_interval
 
 _RATES = {"collision_rate": "base collision", "goal_rate": "goal reached", "fallen_rate": "fallen"}
@@ -111,7 +111,7 @@ def elites_of(archive: Archive) -> Elites:
             for name, values in found.items()
         }
     shares = [
-        _axis(name, _in_one_line(PENALTY_LABELS.get(name, name)), found["ratios"][:, column], _RATE_STEP)
+        _axis(name, label_of(name), found["ratios"][:, column], _RATE_STEP)
         for column, name in enumerate(archive.penalties)
     ]
     rates = [_axis(name, label, found[name], _RATE_STEP) for name, label in _RATES.items()]
@@ -126,8 +126,3 @@ def _axis(name: str, label: str, values: NDArray[np.float64], step: float) -> Ax
     if high <= low:
         high = low + step
     return Axis(name=name, label=label, values=values, low=round(low, 6), high=round(high, 6), step=step)
-
-
-def _in_one_line(label: str) -> str:
-    """A label without its line breaks; a word broken at a hyphen stays one."""
-    return label.replace("-\n", "-").replace("\n", " ")

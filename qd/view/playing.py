@@ -5,16 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ImageColor
 
 from kernels.episode import Outcome
+from qd.endings import ENDINGS
 from sim.recording import Recording
 from sim.skeleton import Skeleton
 
 OUTCOMES = {
-    Outcome.GOAL: ("reached the goal", (0, 158, 115)),
-    Outcome.BASE_COLLISION: ("base collision", (213, 94, 0)),
-    Outcome.TIME_OUT: ("out of time", (0, 114, 178)),
-    Outcome.OUT: ("left the terrain", (204, 121, 167)),
+    **{outcome: (ending.words, ImageColor.getrgb(ending.color)) for outcome, ending in ENDINGS.items()},
     Outcome.INVALID: ("invalid: the simulation broke", (90, 90, 90)),
 }
 """How an episode may end, in words, and the colour of its path."""

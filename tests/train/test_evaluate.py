@@ -11,6 +11,7 @@ import torch
 
 from qd.archive import write_archive
 from qd.workers import EvaluatorCfg
+from sim.command import split_words
 from sim.crossing import CrossingCfg
 from sim.named_controllers import controllers_of
 from sim.robot import get_robot
@@ -19,7 +20,7 @@ from tests.train.archives import make_archive
 from train import evaluate_tables as tables
 from train.crossings import cross_all
 from train.evaluate import evaluate_base, main
-from train.evaluate_cfg import EvaluateCfg, size_of, split_words
+from train.evaluate_cfg import EvaluateCfg, size_of
 from train.evaluate_tables import evaluate_tables
 from train.kept import KeptCrossings
 from train.sets import make_sets, split_elites
