@@ -102,6 +102,8 @@ class Episodes:
     """0 where the step ended in a state not to be trusted."""
     fallen: wp.array[int]
     """1 where the step ended the episode by a base collision or by tilt."""
+    base_force: wp.array[float]
+    """Largest contact force on the base noted since the last step was judged [N]."""
     steps: wp.array[int]
     """Control steps of the episode."""
     level: wp.array[int]
@@ -151,7 +153,7 @@ def make_episodes(
     episodes.start = wp.zeros(num_envs, dtype=wp.vec2, device=device)
     for name in ("end", "valid", "fallen", "steps"):
         setattr(episodes, name, wp.zeros(num_envs, dtype=int, device=device))
-    for name in ("heading", "reward", "total_reward"):
+    for name in ("heading", "reward", "total_reward", "base_force"):
         setattr(episodes, name, wp.zeros(num_envs, dtype=float, device=device))
     widths = {"command": 3, "observation": observation_size}
     widths |= {"statistics": len(STATISTICS), "reward_terms": len(REWARDS)}
@@ -183,6 +185,19 @@ def judge_state(
 
 
 @wp.kernel
+def _note_base_forces_kernel(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], episodes_out: Episodes):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    episodes_out.base_force[env] = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
+
+
+def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) -> None:
+    """Note how hard the bases are touched within a control step, for :func:`judge_steps` to see; arguments as there."""
+    inputs, device = [geom_force, geom_role], geom_force.device
+    wp.launch(_note_base_forces_kernel, geom_force.shape[0], inputs, outputs=[episodes_out], device=device)
+
+
+@wp.kernel
 def _judge_steps_kernel(
     joint_q: wp.array2d[float],
     joint_qd: wp.array2d[float],
@@ -194,7 +209,9 @@ def _judge_steps_kernel(
     """Grid (num_envs,)."""
     env = wp.tid()
     steps = episodes_out.steps[env] + 1
-    end = judge_state(joint_q, joint_qd, max_base_force(geom_force, geom_role, env), steps, rules, env)
+    base_force = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
+    end = judge_state(joint_q, joint_qd, base_force, steps, rules, env)
+    episodes_out.base_force[env] = 0.0
     episodes_out.steps[env] = steps
     episodes_out.end[env] = end
     episodes_out.valid[env] = wp.where(end == _INVALID, 0, 1)
@@ -212,7 +229,7 @@ def judge_steps(
         geom_force: Contact forces of the last physics step, world frame [N], shape (num_envs, num_geoms).
         geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
         rules: Limits.
-        episodes_out: Writes ``steps``, ``end``, ``valid`` and ``fallen``.
+        episodes_out: Writes ``steps``, ``end``, ``valid`` and ``fallen``; forgets what forces were noted.
     """
     wp.launch(
         _judge_steps_kernel,

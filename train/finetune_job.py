@@ -55,6 +55,9 @@ class FinetuneCfg:
     """How elites are drawn at each exchange: uniform; or failing, the likelier the less often they were crossed."""
     task: Literal["crossing", "commands"] | None = None
     """What robots are told: to cross, as in a search, the default; or random velocities, as in the base's training."""
+    termination: float | None = None
+    """Weight of the reward for an episode that ends by a fall, in force for one control step; the robot's own
+    (ANYmal: 0, Cassie: -200). The rewards of an evaluation keep the robot's own."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
@@ -120,7 +123,7 @@ def job_of(cfg: FinetuneCfg) -> Job:
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
-    cfg = _filled(cfg, robot.name, device)
+    cfg = _filled(cfg, robot, device)
     if saved is None:
         path = cfg.policy or robot.policy_file
         start = read_start(path, robot)
@@ -142,7 +145,8 @@ def job_of(cfg: FinetuneCfg) -> Job:
         raise ValueError(f"task must be one of {', '.join(_TASKS)}, got '{values.task}'")
     genes, about = _elites(cfg, robot)
     mix = Mix(cfg=mix_cfg, genes=genes, crosses=values.task == "crossing", seed=values.seed, device=device)
-    task = TaskCfg.of(robot, crosses=mix.crosses)
+    rewards = replace(robot.training.rewards, termination=float(values.termination))
+    task = TaskCfg.of(robot, crosses=mix.crosses, rewards=rewards)
     settings = plain(
         {
             "seed": values.seed,
@@ -175,21 +179,21 @@ def job_of(cfg: FinetuneCfg) -> Job:
     )
 
 
-def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
+def _filled(cfg: FinetuneCfg, robot: RobotCfg, device: str) -> FinetuneCfg:
     """Settings with all that was left out: as the resumed run has it, else as the device can do.
 
     Raises:
         ValueError: If a number is out of range, or the resumed run's settings cannot be read.
     """
     on_gpu = device.startswith("cuda")
-    sizes = _PAPER.get(robot, _PAPER_OTHERS) if on_gpu else _SMALL
+    sizes = _PAPER.get(robot.name, _PAPER_OTHERS) if on_gpu else _SMALL
     before = _settings_of(cfg.resume) if cfg.resume else {}
     if not on_gpu and not before and cfg.num_envs is None and cfg.iterations is None:
         print(
             f"No GPU: a small fine-tuning of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough "
             "to see that it runs. The paper's takes minutes on one GPU."
         )
-    defaults = {**_DEFAULTS, **sizes, **before}
+    defaults = {**_DEFAULTS, "termination": robot.training.rewards.termination, **sizes, **before}
     cfg = replace(cfg, **{name: value for name, value in defaults.items() if getattr(cfg, name) is None})
     if cfg.critic_iterations is None and cfg.iterations is not None:
         cfg = replace(cfg, critic_iterations=min(_CRITIC_ITERATIONS, cfg.iterations // 2))
@@ -202,9 +206,9 @@ def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
 def _settings_of(run: Path) -> dict[str, Any]:
     """What a run was begun with, as far as a command line may leave it out."""
     config = read_json(run / CONFIG)
-    found = {name: config.get(name) for name in (*_DEFAULTS, *_NUMBERS)}
+    found = {name: config.get(name) for name in (*_DEFAULTS, "termination", *_NUMBERS)}
     paths = {name: Path(config[name]) for name in ("policy", "archive") if isinstance(config.get(name), str)}
-    wrong = [name for name, value in found.items() if value is not None and type(value) not in (int, str)]
+    wrong = [name for name, value in found.items() if value is not None and type(value) not in (int, float, str)]
     if wrong:
         raise ValueError(f"{run / CONFIG} is damaged at {', '.join(wrong)}: put a copy of it back")
     return {name: value for name, value in {**found, **paths}.items() if value is not None}

@@ -12,7 +12,7 @@ import torch
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.restart import command_episodes, promote_episodes, remember_steps, restart_episodes
 from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
-from kernels.training import STATISTICS, End, judge_steps, make_episodes, record_steps
+from kernels.training import STATISTICS, End, judge_steps, make_episodes, note_base_forces, record_steps
 from sim.bank import TerrainBank
 from sim.motion import make_motion
 from sim.policy import prepare_torch
@@ -190,8 +190,13 @@ class CommandTask:
         sim, episodes = self.sim, self._episodes
         apply_action(episodes.action, sim.sensors, self.robot.action_scale, episodes.last_action, sim.targets)
         sim.refresh()
-        for _ in range(self.robot.decimation):
+        for step in range(self.robot.decimation):
             sim.physics_step()
+            if (
+                self.cfg.crosses and step < self.robot.decimation - 1
+            ):  # a crossing ends at the first touch, however short
+                sim.read_geom_forces()
+                note_base_forces(sim.geom_force, sim.geom_role, episodes)
         sim.read_geom_forces()
         judge_steps(sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, self._rules, episodes)
         reward_steps(

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from kernels.penalties import BASE, FOOT
-from kernels.training import STATISTICS, End, Rules, judge_steps, make_episodes, record_steps
+from kernels.training import STATISTICS, End, Rules, judge_steps, make_episodes, note_base_forces, record_steps
 
 ROLES = [BASE, FOOT]
 UPRIGHT = (0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 1.0, 0.1)
@@ -91,6 +91,23 @@ def test_steps_are_counted_and_validity_is_marked():
     episodes = judge([UPRIGHT, UPRIGHT], velocity=[0.0, np.nan], steps=[3, 4])
     assert episodes.steps.numpy().tolist() == [4, 5]
     assert episodes.valid.numpy().tolist() == [1, 0]
+
+
+def test_a_touch_noted_within_a_step_ends_it_and_not_the_next():
+    episodes = episodes_of(2)
+    rows, roles = wp.array(np.float32([UPRIGHT] * 2), dtype=float), wp.array(ROLES, dtype=int)
+    still, touched = np.zeros((2, 2, 3), np.float32), np.zeros((2, 2, 3), np.float32)
+    touched[1, 0, 2] = 40.0  # on the base
+    touched[0, 1, 2] = 500.0  # on a foot
+    for force in (touched, still):
+        note_base_forces(wp.array(force, dtype=wp.vec3), roles, episodes)
+    assert episodes.base_force.numpy().tolist() == [0.0, 40.0]
+    seen = []
+    for _ in range(2):
+        velocity = wp.zeros((2, 7), dtype=float)
+        judge_steps(rows, velocity, wp.array(still, dtype=wp.vec3), roles, make_rules(), episodes)
+        seen.append([End(end) for end in episodes.end.numpy()])
+    assert seen == [[End.RUNNING, End.BASE_COLLISION], [End.RUNNING] * 2]
 
 
 def test_a_fall_is_a_collision_of_the_base_or_a_tilt():

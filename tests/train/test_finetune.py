@@ -139,6 +139,16 @@ def test_a_normaliser_becomes_part_of_the_first_layer(places):
     torch.testing.assert_close(load_policy(places / "folded.pt", ROBOT, "cpu")(rows), expected, atol=1e-5, rtol=1e-5)
 
 
+def test_a_fall_may_cost_something_and_does_so_after_a_resume(places):
+    assert job_of(config(places, run_dir=places / "free")).task.rewards.termination == 0.0  # ANYmal's own
+    run = places / "costly"
+    assert finetune(config(places, run_dir=run, termination=-200.0)) == 0
+    resumed = job_of(FinetuneCfg(resume=run, device="cpu"))
+    assert resumed.task.rewards.termination == -200.0
+    with pytest.raises(ValueError, match=r"termination -200.0 -> -1.0"):
+        job_of(FinetuneCfg(resume=run, device="cpu", termination=-1.0))
+
+
 def test_terrains_are_exchanged_when_due(places, monkeypatch):
     seen = []
     exchange = command.CommandTask.exchange
