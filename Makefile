@@ -19,6 +19,7 @@ FLAG_RESUME := resume
 FLAG_RUN := run
 FLAG_MIX := mix
 FLAG_DRAW := draw
+FLAG_REWARDS := rewards
 FLAG_TASK := task
 FLAG_EXPORT := export
 FLAG_ELITE := elite
@@ -68,6 +69,7 @@ help: ## This list
 	@echo '  MIX=generated    terrains to train on beside hand-crafted ones: generated, hard-random, or hand-crafted'
 	@echo '                   (nothing else)                    finetune'
 	@echo '  DRAW=failing     draw the elites to train on by how often they were not crossed; uniform   finetune'
+	@echo '  REWARDS="NAME=W"  other weights of reward terms    finetune'
 	@echo '  EXPORT=FILE      also write the controller there   train finetune'
 	@echo '  METHOD=NAME      where terrains come from: cma_mae, cma_me, map_elites, directions, hard_random,'
 	@echo '                   uniform_random, or several with +  archive'
@@ -133,7 +135,7 @@ train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME EXPORT)
 
 finetune: setup ## Train the controller of ROBOT further, on the terrains of an archive that broke it
-	$(BIN)/python -m train.finetune --robot $(call quoted,$(ROBOT)) $(call flags,MIX ARCHIVE SPLIT_SEED POLICY DRAW TASK DEVICE ITERATIONS SEED RESUME EXPORT)
+	$(BIN)/python -m train.finetune --robot $(call quoted,$(ROBOT)) $(call flags,MIX ARCHIVE SPLIT_SEED POLICY DRAW REWARDS TASK DEVICE ITERATIONS SEED RESUME EXPORT)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
 	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY TERRAINS SEED OUT WORKERS)

@@ -232,7 +232,7 @@ def summary(
     Args:
         archive: The result archive.
         metrics: One row an iteration.
-        gpus: GPUs used.
+        gpus: Most GPUs used at a time.
         origin: Provenance.
 
     Returns:

@@ -8,10 +8,12 @@ from typing import Any, Literal
 import numpy as np
 
 from qd.archive import read_archive
+from sim.command import split_words
 from sim.files import read_json
 from sim.own_robot import own_hash
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
+from sim.training import RewardCfg
 from train.held_out import marks_of, recorded_marks
 from train.learner import check_entries
 from train.mix import Mix, MixCfg
@@ -24,7 +26,7 @@ from train.task_cfg import TaskCfg
 _PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
 _PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}
 _SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 4, "iterations": 10}
-_DEFAULTS = {"mix": "generated", "split_seed": 0, "draw": "uniform", "task": "crossing", "seed": 0}
+_DEFAULTS = {"mix": "generated", "split_seed": 0, "draw": "uniform", "task": "crossing", "seed": 0, "rewards": ()}
 _CRITIC_ITERATIONS = 50
 _NUMBERS = (*_PAPER_OTHERS, "critic_iterations")
 _TASKS = ("crossing", "commands")
@@ -55,9 +57,9 @@ class FinetuneCfg:
     """How elites are drawn at each exchange: uniform; or failing, the likelier the less often they were crossed."""
     task: Literal["crossing", "commands"] | None = None
     """What robots are told: to cross, as in a search, the default; or random velocities, as in the base's training."""
-    termination: float | None = None
-    """Weight of the reward for an episode that ends by a fall, in force for one control step; the robot's own
-    (ANYmal: 0, Cassie: -200). The rewards of an evaluation keep the robot's own."""
+    rewards: tuple[str, ...] | None = None
+    """Weights that reward terms have in this training, each NAME=WEIGHT, such as termination=-200 for a fall; the
+    others keep those of the robot, as all do in the rewards of an evaluation."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
@@ -145,8 +147,7 @@ def job_of(cfg: FinetuneCfg) -> Job:
         raise ValueError(f"task must be one of {', '.join(_TASKS)}, got '{values.task}'")
     genes, about = _elites(cfg, robot)
     mix = Mix(cfg=mix_cfg, genes=genes, crosses=values.task == "crossing", seed=values.seed, device=device)
-    rewards = replace(robot.training.rewards, termination=float(values.termination))
-    task = TaskCfg.of(robot, crosses=mix.crosses, rewards=rewards)
+    task = TaskCfg.of(robot, crosses=mix.crosses, rewards=_rewards(values.rewards, robot))
     settings = plain(
         {
             "seed": values.seed,
@@ -193,7 +194,7 @@ def _filled(cfg: FinetuneCfg, robot: RobotCfg, device: str) -> FinetuneCfg:
             f"No GPU: a small fine-tuning of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough "
             "to see that it runs. The paper's takes minutes on one GPU."
         )
-    defaults = {**_DEFAULTS, "termination": robot.training.rewards.termination, **sizes, **before}
+    defaults = {**_DEFAULTS, **sizes, **before}
     cfg = replace(cfg, **{name: value for name, value in defaults.items() if getattr(cfg, name) is None})
     if cfg.critic_iterations is None and cfg.iterations is not None:
         cfg = replace(cfg, critic_iterations=min(_CRITIC_ITERATIONS, cfg.iterations // 2))
@@ -206,12 +207,31 @@ def _filled(cfg: FinetuneCfg, robot: RobotCfg, device: str) -> FinetuneCfg:
 def _settings_of(run: Path) -> dict[str, Any]:
     """What a run was begun with, as far as a command line may leave it out."""
     config = read_json(run / CONFIG)
-    found = {name: config.get(name) for name in (*_DEFAULTS, "termination", *_NUMBERS)}
+    found = {name: config.get(name) for name in (*_DEFAULTS, *_NUMBERS)}
+    if isinstance(found["rewards"], list):
+        found["rewards"] = tuple(map(str, found["rewards"]))
     paths = {name: Path(config[name]) for name in ("policy", "archive") if isinstance(config.get(name), str)}
-    wrong = [name for name, value in found.items() if value is not None and type(value) not in (int, float, str)]
+    wrong = [name for name, value in found.items() if value is not None and type(value) not in (int, str, tuple)]
     if wrong:
         raise ValueError(f"{run / CONFIG} is damaged at {', '.join(wrong)}: put a copy of it back")
     return {name: value for name, value in {**found, **paths}.items() if value is not None}
+
+
+def _rewards(given: tuple[str, ...], robot: RobotCfg) -> RewardCfg:
+    """The robot's weights of reward terms but for those given, each NAME=WEIGHT."""
+    own = robot.training.rewards
+    weights = {}
+    for one in split_words(given):
+        name, _, weight = one.partition("=")
+        if not hasattr(own, name):
+            raise ValueError(f"rewards has no term '{name}': expected NAME=WEIGHT with one of {', '.join(asdict(own))}")
+        try:
+            weights[name] = float(weight)
+        except ValueError:
+            weights[name] = np.nan
+        if not np.isfinite(weights[name]):
+            raise ValueError(f"rewards must be NAME=WEIGHT with a number, such as {name}=-1, got '{one}'")
+    return replace(own, **weights)
 
 
 def _elites(cfg: FinetuneCfg, robot: RobotCfg) -> tuple[np.ndarray, dict[str, Any] | None]:

@@ -117,7 +117,7 @@ def _count(value: float | None) -> str:
 
 
 def _gpus(count: int) -> str:
-    return "one GPU" if count == 1 else f"{count} GPUs" if count else "the CPU"
+    return "one GPU" if count == 1 else f"up to {count} GPUs" if count else "the CPU"
 
 
 def _tables(found: dict[str, Any], robot: str) -> str:

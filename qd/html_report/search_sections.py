@@ -91,7 +91,7 @@ def _searched(shown: Shown) -> Block:
     walked = [row["episodes"] * row["mean_duration_s"] for row in material.metrics if "mean_duration_s" in row]
     if len(walked) == len(material.metrics):
         text += f" ({hours(sum(walked))} of walking, simulated)"
-    where = f" on {counted(material.gpus, 'GPU')}" if material.gpus else ""
+    where = f" on {'up to ' if material.gpus > 1 else ''}{counted(material.gpus, 'GPU')}" if material.gpus else ""
     invalid = counted(numbers["invalid_episodes"], "episode was", "episodes were")
     return Text(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
 

@@ -3,6 +3,7 @@
 import itertools
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -139,14 +140,15 @@ def test_a_normaliser_becomes_part_of_the_first_layer(places):
     torch.testing.assert_close(load_policy(places / "folded.pt", ROBOT, "cpu")(rows), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_a_fall_may_cost_something_and_does_so_after_a_resume(places):
-    assert job_of(config(places, run_dir=places / "free")).task.rewards.termination == 0.0  # ANYmal's own
-    run = places / "costly"
-    assert finetune(config(places, run_dir=run, termination=-200.0)) == 0
+def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
+    own = job_of(config(places, run_dir=places / "own")).task.rewards
+    assert own == ROBOT.training.rewards
+    run = places / "careful"
+    assert finetune(config(places, run_dir=run, rewards=("termination=-200 tracking_lin_vel=2",))) == 0
     resumed = job_of(FinetuneCfg(resume=run, device="cpu"))
-    assert resumed.task.rewards.termination == -200.0
-    with pytest.raises(ValueError, match=r"termination -200.0 -> -1.0"):
-        job_of(FinetuneCfg(resume=run, device="cpu", termination=-1.0))
+    assert resumed.task.rewards == replace(own, termination=-200.0, tracking_lin_vel=2.0)
+    with pytest.raises(ValueError, match=r"termination -200.0 -> -1.0; task.rewards.tracking_lin_vel 2.0 -> 1.0"):
+        job_of(FinetuneCfg(resume=run, device="cpu", rewards=("termination=-1",)))
 
 
 def test_terrains_are_exchanged_when_due(places, monkeypatch):
@@ -261,6 +263,10 @@ def write_bad_starts(folder):
         (["--policy", "{dir}/critic_nan.pt"], "has weights that are not finite"),
         (["--terrains", "1"], "terrains must be at least 2"),
         (["--terrains", "30", "--num-envs", "6"], "num_envs must be at least as many as terrains, 30, got 6"),
+        (["--rewards", "fall=-1"], "rewards has no term 'fall': expected NAME=WEIGHT with one of tracking_lin_vel,"),
+        (["--rewards", "termination=much"], "with a number, such as termination=-1, got 'termination=much'"),
+        (["--rewards", "termination"], "with a number, such as termination=-1, got 'termination'"),
+        (["--rewards", "termination=inf"], "with a number, such as termination=-1, got 'termination=inf'"),
         (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
         (["--iterations", "-1"], "iterations must be at least 1, got -1"),
         (["--ppo.mini-batches", "0"], "ppo.mini_batches must be at least 1"),

@@ -51,7 +51,7 @@ def test_what_the_results_say_stands_beside_the_papers(results):
         "| elites | 1,200 | 1,129 |",
         "| coverage of the reachable cells | 25.0% | 23.5% |",
         "| ... corrected by fresh episodes | - | - |",
-        "| search time | 50 min on 4 GPUs | about 8 h on two RTX 3070 Ti |",
+        "| search time | 50 min on up to 4 GPUs | about 8 h on two RTX 3070 Ti |",
         "In brackets the terrains of a set; 20 episodes each; elites of the archive after 1,000 iterations.",
         "| generated (300) | base | 0.700 (0.600 to 0.800) | - | 20.0 (19.0 to 21.0) | - |",
         # Over two seeds where that is known, else the first of them.
