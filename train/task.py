@@ -192,9 +192,8 @@ class CommandTask:
         sim.refresh()
         for step in range(self.robot.decimation):
             sim.physics_step()
-            if (
-                self.cfg.crosses and step < self.robot.decimation - 1
-            ):  # a crossing ends at the first touch, however short
+            # A crossing ends at the first touch of the base, however short.
+            if self.cfg.crosses and step < self.robot.decimation - 1:
                 sim.read_geom_forces()
                 note_base_forces(sim.geom_force, sim.geom_role, episodes)
         sim.read_geom_forces()
