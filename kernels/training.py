@@ -103,7 +103,7 @@ class Episodes:
     fallen: wp.array[int]
     """1 where the step ended the episode by a base collision or by tilt."""
     base_force: wp.array[float]
-    """Largest contact force on the base noted since the last step was judged [N]."""
+    """Largest contact force on the base noted since the last control step was judged [N]."""
     steps: wp.array[int]
     """Control steps of the episode."""
     level: wp.array[int]
@@ -192,7 +192,13 @@ def _note_base_forces_kernel(geom_force: wp.array2d[wp.vec3], geom_role: wp.arra
 
 
 def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) -> None:
-    """Note how hard the bases are touched within a control step, for :func:`judge_steps` to see; arguments as there."""
+    """Note how hard the bases are touched, for :func:`judge_steps`, after each physics step in which a touch counts.
+
+    Args:
+        geom_force: Contact forces of the physics step, world frame [N], shape (num_envs, num_geoms).
+        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
+        episodes_out: Raises ``base_force``.
+    """
     inputs, device = [geom_force, geom_role], geom_force.device
     wp.launch(_note_base_forces_kernel, geom_force.shape[0], inputs, outputs=[episodes_out], device=device)
 
@@ -201,16 +207,13 @@ def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) ->
 def _judge_steps_kernel(
     joint_q: wp.array2d[float],
     joint_qd: wp.array2d[float],
-    geom_force: wp.array2d[wp.vec3],
-    geom_role: wp.array[int],
     rules: Rules,
     episodes_out: Episodes,
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
     steps = episodes_out.steps[env] + 1
-    base_force = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
-    end = judge_state(joint_q, joint_qd, base_force, steps, rules, env)
+    end = judge_state(joint_q, joint_qd, episodes_out.base_force[env], steps, rules, env)
     episodes_out.base_force[env] = 0.0
     episodes_out.steps[env] = steps
     episodes_out.end[env] = end
@@ -218,23 +221,19 @@ def _judge_steps_kernel(
     episodes_out.fallen[env] = wp.where(end == _TILT, 1, wp.where(end == _BASE_COLLISION, 1, 0))
 
 
-def judge_steps(
-    joint_q: Any, joint_qd: Any, geom_force: Any, geom_role: Any, rules: Rules, episodes_out: Episodes
-) -> None:
+def judge_steps(joint_q: Any, joint_qd: Any, rules: Rules, episodes_out: Episodes) -> None:
     """Count a control step and judge which episodes end with it.
 
     Args:
         joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
         joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
-        geom_force: Contact forces of the last physics step, world frame [N], shape (num_envs, num_geoms).
-        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
         rules: Limits.
         episodes_out: Writes ``steps``, ``end``, ``valid`` and ``fallen``; forgets what forces were noted.
     """
     wp.launch(
         _judge_steps_kernel,
         dim=joint_q.shape[0],
-        inputs=[joint_q, joint_qd, geom_force, geom_role, rules],
+        inputs=[joint_q, joint_qd, rules],
         outputs=[episodes_out],
         device=joint_q.device,
     )

@@ -125,7 +125,7 @@ def job_of(cfg: FinetuneCfg) -> Job:
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
-    cfg = _filled(cfg, robot, device)
+    cfg = _filled(cfg, robot.name, device)
     if saved is None:
         path = cfg.policy or robot.policy_file
         start = read_start(path, robot)
@@ -180,14 +180,14 @@ def job_of(cfg: FinetuneCfg) -> Job:
     )
 
 
-def _filled(cfg: FinetuneCfg, robot: RobotCfg, device: str) -> FinetuneCfg:
+def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
     """Settings with all that was left out: as the resumed run has it, else as the device can do.
 
     Raises:
         ValueError: If a number is out of range, or the resumed run's settings cannot be read.
     """
     on_gpu = device.startswith("cuda")
-    sizes = _PAPER.get(robot.name, _PAPER_OTHERS) if on_gpu else _SMALL
+    sizes = _PAPER.get(robot, _PAPER_OTHERS) if on_gpu else _SMALL
     before = _settings_of(cfg.resume) if cfg.resume else {}
     if not on_gpu and not before and cfg.num_envs is None and cfg.iterations is None:
         print(
@@ -219,19 +219,18 @@ def _settings_of(run: Path) -> dict[str, Any]:
 
 def _rewards(given: tuple[str, ...], robot: RobotCfg) -> RewardCfg:
     """The robot's weights of reward terms but for those given, each NAME=WEIGHT."""
-    own = robot.training.rewards
-    weights = {}
+    weights = asdict(robot.training.rewards)
     for one in split_words(given):
         name, _, weight = one.partition("=")
-        if not hasattr(own, name):
-            raise ValueError(f"rewards has no term '{name}': expected NAME=WEIGHT with one of {', '.join(asdict(own))}")
+        if name not in weights:
+            raise ValueError(f"rewards has no term '{name}': expected NAME=WEIGHT with one of {', '.join(weights)}")
         try:
             weights[name] = float(weight)
         except ValueError:
             weights[name] = np.nan
         if not np.isfinite(weights[name]):
             raise ValueError(f"rewards must be NAME=WEIGHT with a number, such as {name}=-1, got '{one}'")
-    return replace(own, **weights)
+    return RewardCfg(**weights)
 
 
 def _elites(cfg: FinetuneCfg, robot: RobotCfg) -> tuple[np.ndarray, dict[str, Any] | None]:

@@ -192,12 +192,11 @@ class CommandTask:
         sim.refresh()
         for step in range(self.robot.decimation):
             sim.physics_step()
-            # A crossing ends at the first touch of the base, however short.
-            if self.cfg.crosses and step < self.robot.decimation - 1:
+            # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.
+            if self.cfg.crosses or step == self.robot.decimation - 1:
                 sim.read_geom_forces()
                 note_base_forces(sim.geom_force, sim.geom_role, episodes)
-        sim.read_geom_forces()
-        judge_steps(sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, self._rules, episodes)
+        judge_steps(sim.joint_q, sim.joint_qd, self._rules, episodes)
         reward_steps(
             self._motion,
             self._weights,

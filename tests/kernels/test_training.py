@@ -46,10 +46,9 @@ def judge(rows, *, velocity=0.0, base_force=0.0, steps=0, crosses=0):
     force = np.zeros((num_envs, 2, 3), np.float32)
     force[:, 0, 1] = base_force
     force[:, 1, 2] = 500.0  # the foot's force ends nothing
-    judge_steps(
-        wp.array(np.float32(rows), dtype=float), wp.array(joint_qd, dtype=float), wp.array(force, dtype=wp.vec3),
-        wp.array(ROLES, dtype=int), make_rules(crosses=crosses), episodes,
-    )  # fmt: skip
+    note_base_forces(wp.array(force, dtype=wp.vec3), wp.array(ROLES, dtype=int), episodes)
+    joint_q = wp.array(np.float32(rows), dtype=float)
+    judge_steps(joint_q, wp.array(joint_qd, dtype=float), make_rules(crosses=crosses), episodes)
     return episodes
 
 
@@ -104,8 +103,7 @@ def test_a_touch_noted_within_a_step_ends_it_and_not_the_next():
     assert episodes.base_force.numpy().tolist() == [0.0, 40.0]
     seen = []
     for _ in range(2):
-        velocity = wp.zeros((2, 7), dtype=float)
-        judge_steps(rows, velocity, wp.array(still, dtype=wp.vec3), roles, make_rules(), episodes)
+        judge_steps(rows, wp.zeros((2, 7), dtype=float), make_rules(), episodes)
         seen.append([End(end) for end in episodes.end.numpy()])
     assert seen == [[End.RUNNING, End.BASE_COLLISION], [End.RUNNING] * 2]
 
