@@ -142,12 +142,12 @@ def test_a_normaliser_becomes_part_of_the_first_layer(places):
 
 def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
     own = job_of(config(places, run_dir=places / "own")).task.rewards
-    assert own == ROBOT.training.rewards
+    assert own == replace(ROBOT.training.rewards, termination=-200.0, tracking_lin_vel=2.0)
     run = places / "careful"
-    assert finetune(config(places, run_dir=run, rewards=("termination=-200 tracking_lin_vel=2",))) == 0
+    assert finetune(config(places, run_dir=run, rewards=("termination=-100 tracking_ang_vel=2",))) == 0
     resumed = job_of(FinetuneCfg(resume=run, device="cpu"))
-    assert resumed.task.rewards == replace(own, termination=-200.0, tracking_lin_vel=2.0)
-    with pytest.raises(ValueError, match=r"termination -200.0 -> -1.0; task.rewards.tracking_lin_vel 2.0 -> 1.0"):
+    assert resumed.task.rewards == replace(ROBOT.training.rewards, termination=-100.0, tracking_ang_vel=2.0)
+    with pytest.raises(ValueError, match=r"termination -100.0 -> -1.0; task.rewards.tracking_ang_vel 2.0 -> 0.5"):
         job_of(FinetuneCfg(resume=run, device="cpu", rewards=("termination=-1",)))
 
 
