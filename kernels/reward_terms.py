@@ -77,13 +77,6 @@ def tracking_ang_vel(ang_vel_b: wp.vec3, command: wp.vec3) -> float:
 
 
 @wp.func
-def yaw_error(ang_vel_b: wp.vec3, command: wp.vec3) -> float:
-    """Square of the yaw rate's error [rad^2/s^2], base frame: has a slope where :func:`tracking_ang_vel` is flat."""
-    error = command[2] - ang_vel_b[2]
-    return error * error
-
-
-@wp.func
 def lin_vel_z(lin_vel_b: wp.vec3) -> float:
     """Square of the base's velocity along its own z axis [m^2/s^2]."""
     return lin_vel_b[2] * lin_vel_b[2]

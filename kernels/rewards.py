@@ -27,13 +27,12 @@ from kernels.reward_terms import (
     torques,
     tracking_ang_vel,
     tracking_lin_vel,
-    yaw_error,
 )
 
 REWARDS = (
     "tracking_lin_vel", "tracking_ang_vel", "lin_vel_z", "ang_vel_xy", "torques", "dof_acc",
     "feet_air_time", "collision", "action_rate", "stumble", "feet_contact_forces",
-    "dof_pos_limits", "no_fly", "orientation", "joint_deviation", "yaw_error", "termination",
+    "dof_pos_limits", "no_fly", "orientation", "joint_deviation", "termination",
 )  # fmt: skip
 """Terms in the order of the columns of ``terms_out``."""
 
@@ -61,7 +60,6 @@ class RewardWeights:
     no_fly: float
     orientation: float
     joint_deviation: float
-    yaw_error: float
     termination: float
 
 
@@ -88,8 +86,7 @@ def _weighted_terms(motion: Motion, weights: RewardWeights, feet: Feet, env: int
     terms[12] = weights.no_fly * no_fly(motion, env)
     terms[13] = weights.orientation * orientation(motion, env)
     terms[14] = weights.joint_deviation * joint_deviation(motion, env)
-    terms[15] = weights.yaw_error * yaw_error(ang_vel, command)
-    terms[16] = weights.termination * termination(motion, env)
+    terms[15] = weights.termination * termination(motion, env)
     return terms
 
 

@@ -29,8 +29,6 @@ class RewardCfg:
     """On the tilt of the base; Isaac Lab gives -2.5 to Cassie on flat ground, nothing on rough."""
     joint_deviation: float = 0.0
     """On the steady joints' distance from the default pose; Isaac Lab gives -.2 to Cassie's hips."""
-    yaw_error: float = 0.0
-    """On the square of the yaw rate's error, which tells a robot that turns far too fast which way is better."""
     termination: float = 0.0
     """On a fall, in the control step that it ends the episode with."""
 

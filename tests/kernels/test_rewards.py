@@ -113,7 +113,6 @@ def oracle(step: Step) -> dict[str, np.ndarray]:
         "no_fly": ((foot_force[..., 2] > 0.1).sum(1) == 1) & commanded,
         "orientation": (gravity[:, :2] ** 2).sum(1),
         "joint_deviation": (np.abs(angle - DEFAULT_POSE) * STEADY).sum(1),
-        "yaw_error": (w[:, 2] - a["command"][:, 2]) ** 2,
         "termination": step.fallen,
     }
 
@@ -180,7 +179,6 @@ def test_hand_computed_numbers():
     standing = Step(command=[[0.3, 0.4, 0.5]])
     assert standing.term("tracking_lin_vel") == pytest.approx(np.exp(-1.0))  # (.3^2 + .4^2) / .25 = 1
     assert standing.term("tracking_ang_vel") == pytest.approx(np.exp(-1.0))  # .5^2 / .25 = 1
-    assert standing.term("yaw_error") == pytest.approx(0.25)
     joints = Step(
         joint_torque=[[9, 9, 9, 9, 9, 9, 1, 2, 3]],
         joint_qd=[[0, 0, 0, 0, 0, 0, 0.1, 0, 0]],

@@ -29,7 +29,7 @@ def test_cassies_rewards_are_the_published_ones():
         "tracking_lin_vel": 1.0, "tracking_ang_vel": 1.0, "lin_vel_z": -0.5, "ang_vel_xy": 0.0, "torques": -5e-6,
         "dof_acc": -2e-7, "feet_air_time": 5.0, "collision": -1.0, "action_rate": -0.01, "stumble": -0.1,
         "feet_contact_forces": -2e-4, "dof_pos_limits": -1.0, "no_fly": 0.25, "orientation": 0.0,
-        "joint_deviation": 0.0, "yaw_error": 0.0, "termination": -200.0,
+        "joint_deviation": 0.0, "termination": -200.0,
     }  # fmt: skip
     assert not cfg.only_positive
     assert (cfg.soft_joint_limit, cfg.min_air_time_s, cfg.added_base_mass) == (0.95, 0.5, (0.0, 0.0))
