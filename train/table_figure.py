@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim.files import write_atomically
+from train.seeds import firsts, kind_of
 from train.table_print import published_value
 
 if TYPE_CHECKING:
@@ -89,16 +90,19 @@ def _draw_measure(axes: "Axes", report: dict[str, Any], measure: str, factor: fl
     """Points of all controllers side by side over each set."""
     names = list(report[measure])
     controllers = list(report[measure][names[0]])
+    kinds = firsts(controllers)
     step = min(0.16, 0.7 / len(controllers))
     for index, who in enumerate(controllers):
         shift = step * (index - (len(controllers) - 1) / 2)
-        colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+        kind = [kind_of(first) for first in kinds].index(kind_of(who))  # other seeds look like the first one
+        colour, marker = _COLOURS[kind % len(_COLOURS)], _MARKERS[kind % len(_MARKERS)]
         there = [place for place, name in enumerate(names) if report[measure][name][who] is not None]
         values = factor * np.array([report[measure][names[place]][who] for place in there])
         limits = factor * np.array([report["intervals"][measure][names[place]][who] for place in there]).reshape(-1, 2)
         lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)  # equal limits may be off by rounding
         places = np.array(there) + shift
-        axes.errorbar(places, values, lengths, linestyle="", marker=marker, color=colour, capsize=3, label=who)
+        label = _label(kind_of(who), controllers) if who in kinds else ""
+        axes.errorbar(places, values, lengths, linestyle="", marker=marker, color=colour, capsize=3, label=label)
         paper = [published_value(report, measure, name, who) for name in names]
         known = [place for place, value in enumerate(paper) if value is not None]
         if known:
@@ -108,6 +112,11 @@ def _draw_measure(axes: "Axes", report: dict[str, Any], measure: str, factor: fl
     axes.set_xticks(range(len(names)), [SET_LABELS[name] for name in names])
     axes.set_xlim(-0.5, len(names) - 0.5)
     axes.grid(axis="y", alpha=0.3)
+
+
+def _label(kind: str, controllers: Sequence[str]) -> str:
+    seeds = [kind_of(who) for who in controllers].count(kind)
+    return kind if seeds == 1 else f"{kind} ({seeds} seeds)"
 
 
 def _pairs_from_first(report: dict[str, Any]) -> list[str]:
