@@ -47,7 +47,7 @@ class Motion:
     joint_is_steady: wp.array[int]
     """1 for a joint that is to keep near its default angle, shape (num_joints,)."""
     fallen: wp.array[int]
-    """1 where the step ended the episode by a fall, shape (num_envs,)."""
+    """1 where the step ended the episode by a fall, in training also in an invalid state, shape (num_envs,)."""
 
 
 @wp.struct

@@ -102,8 +102,10 @@ def _reward_steps_kernel(
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
-    reward_out[env] = 0.0
     if valid[env] == 0:
+        fall = weights.termination * termination(motion, env)
+        reward_out[env] = motion.dt * fall
+        terms_out[env, _TERMINATION] += motion.dt * fall
         return
     terms = _weighted_terms(motion, weights, feet_out, env)
     reward = float(0.0)
@@ -126,7 +128,7 @@ def reward_steps(
         motion: What the step ended in.
         weights: Weight of each term per second.
         only_positive: Clip the sum of all terms but ``termination`` at 0, so that ending early never pays.
-        valid: 0 where the state is not to be trusted: no reward, no terms; shape (num_envs,).
+        valid: 0 where the state is not to be trusted: nothing but ``termination`` counts; shape (num_envs,).
         feet_out: Contact memory of the feet; updated.
         reward_out: Reward of the step, shape (num_envs,).
         terms_out: Each weighted term is added to it, columns :data:`REWARDS`; shape (num_envs, len(REWARDS)).

@@ -101,7 +101,7 @@ class Episodes:
     valid: wp.array[int]
     """0 where the step ended in a state not to be trusted."""
     fallen: wp.array[int]
-    """1 where the step ended the episode by a base collision or by tilt."""
+    """1 where the step ended the episode by a base collision, by tilt or in an invalid state."""
     base_force: wp.array[float]
     """Largest contact force on the base noted since the last control step was judged [N]."""
     steps: wp.array[int]
@@ -218,7 +218,9 @@ def _judge_steps_kernel(
     episodes_out.steps[env] = steps
     episodes_out.end[env] = end
     episodes_out.valid[env] = wp.where(end == _INVALID, 0, 1)
-    episodes_out.fallen[env] = wp.where(end == _TILT, 1, wp.where(end == _BASE_COLLISION, 1, 0))
+    # An invalid state costs what a fall does: were it free, a falling robot would learn to whip its legs beyond max_speed.
+    failed = end == _TILT or end == _BASE_COLLISION or end == _INVALID
+    episodes_out.fallen[env] = wp.where(failed, 1, 0)
 
 
 def judge_steps(joint_q: Any, joint_qd: Any, rules: Rules, episodes_out: Episodes) -> None:

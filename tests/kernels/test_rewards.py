@@ -280,12 +280,15 @@ def test_air_time_does_not_count_when_told_to_stand():
     assert air_times([False] * 40 + [True], command=(0.05, 0.05, 1.0)) == [0.0] * 41
 
 
-def test_invalid_environments_get_nothing():
-    step = Step(2, joint_qd=np.full((2, 9), np.nan))
-    step.valid = np.array([0, 1], np.int32)
-    reward, terms = step.reward(tracking_lin_vel=1.0)
+def test_of_an_invalid_state_nothing_but_the_fall_counts():
+    step = Step(3, joint_qd=np.full((3, 9), np.nan))
+    step.valid = np.array([0, 0, 1], np.int32)
+    step.fallen = np.array([0, 1, 0], np.int32)
+    reward, terms = step.reward(tracking_lin_vel=1.0, termination=-200.0)
     assert reward[0] == 0.0 and (terms[0] == 0.0).all()
-    assert np.isnan(reward[1])
+    assert reward[1] == pytest.approx(-4.0)
+    assert terms[1].tolist() == [0.0] * REWARDS.index("termination") + [pytest.approx(-200.0)]
+    assert np.isnan(reward[2])
 
 
 def test_wrong_shape_is_refused():

@@ -108,13 +108,13 @@ def test_a_touch_noted_within_a_step_ends_it_and_not_the_next():
     assert seen == [[End.RUNNING, End.BASE_COLLISION], [End.RUNNING] * 2]
 
 
-def test_a_fall_is_a_collision_of_the_base_or_a_tilt():
+def test_a_fall_is_a_collision_of_the_base_a_tilt_or_an_invalid_state():
     rows = [UPRIGHT, UPRIGHT, tilted(np.pi), UPRIGHT, (*UPRIGHT[:7], np.nan)]
     episodes = judge(rows, base_force=[0.0, 2.0, 0.0, 0.0, 2.0], steps=[3, 3, 3, 999, 3])
     assert [End(end) for end in episodes.end.numpy()] == [
         End.RUNNING, End.BASE_COLLISION, End.TILT, End.TIME_OUT, End.INVALID,
     ]  # fmt: skip
-    assert episodes.fallen.numpy().tolist() == [0, 1, 1, 0, 0]
+    assert episodes.fallen.numpy().tolist() == [0, 1, 1, 0, 1]
 
 
 def test_statistics_add_up():
