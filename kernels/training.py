@@ -218,9 +218,9 @@ def _judge_steps_kernel(
     episodes_out.steps[env] = steps
     episodes_out.end[env] = end
     episodes_out.valid[env] = wp.where(end == _INVALID, 0, 1)
-    # An invalid state costs what a fall does: were it free, a falling robot would learn to whip its legs beyond max_speed.
-    failed = end == _TILT or end == _BASE_COLLISION or end == _INVALID
-    episodes_out.fallen[env] = wp.where(failed, 1, 0)
+    # An invalid state costs what a fall does: were it free, falling robots would learn to whip their legs too fast.
+    stands = end != _TILT and end != _BASE_COLLISION and end != _INVALID
+    episodes_out.fallen[env] = wp.where(stands, 0, 1)
 
 
 def judge_steps(joint_q: Any, joint_qd: Any, rules: Rules, episodes_out: Episodes) -> None:
