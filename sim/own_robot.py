@@ -14,14 +14,14 @@ from kernels.penalties import PENALTIES
 from sim.model_files import read_model_files
 from sim.named_code import run_file
 from sim.robot import ROBOTS, RobotCfg
-from sim.training import TrainingCfg, training_problems
+from sim.training import LearningCfg, TrainingCfg, learning_problems, training_problems
 
 _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 _POSITIVE = ("default_base_height", "contact_force_limit", "action_scale", "physics_dt")
 _COUNTS = ("decimation", "nconmax", "njmax")
 _PER_JOINT = {"stiffness": "positive", "damping": "0 or more", "effort_limit": "positive", "armature": "0 or more"}
 _LONGEST_STEP_S = 0.05
-_NOT_IN_DIGEST = ("model_file", "settings_file", "training")
+_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning")
 
 
 def load_robot(path: Path) -> RobotCfg:
@@ -61,6 +61,10 @@ def settings_problems(robot: RobotCfg) -> list[str]:
         problems.append(f"training must be a TrainingCfg, got {type(robot.training).__name__}")
     else:
         problems += training_problems(robot.training)
+    if not isinstance(robot.learning, LearningCfg):
+        problems.append(f"learning must be a LearningCfg, got {type(robot.learning).__name__}")
+    else:
+        problems += learning_problems(robot.learning)
     if not isinstance(robot.collision_bit, bool):
         problems.append(f"collision_bit must be True or False, got {robot.collision_bit!r}")
     wrong_names = [f"{name} must be a tuple of names, each once, got {getattr(robot, name)!r}" for name in _NAMES

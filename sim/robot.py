@@ -10,7 +10,7 @@ import numpy as np
 from kernels.observation import NUM_BASE_COLUMNS
 from kernels.penalties import BASE, FOOT, LIMB, PENALTIES
 from sim.files import read_json
-from sim.training import RewardCfg, TrainingCfg
+from sim.training import LearningCfg, RewardCfg, TrainingCfg
 
 _ROBOTS_DIR = Path(__file__).parent / "robots"
 
@@ -75,6 +75,8 @@ class RobotCfg:
     """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
     training: TrainingCfg = field(default_factory=TrainingCfg)
     """What the training of its controller takes of the robot."""
+    learning: LearningCfg = field(default_factory=LearningCfg)
+    """How that training goes on a GPU."""
     settings_file: Path | None = None
     """The Python file of a robot of one's own, set by :func:`get_robot`; None of a shipped one."""
 
@@ -199,21 +201,28 @@ ROBOTS = {
         collision_bit=True,
         nconmax=7,  # the most there can be: a sphere, and 3 on each toe
         njmax=48,  # 3 rows a contact and 12 joint limits, in the solver's tiles of 16
-        training=TrainingCfg(  # legged_gym's for Cassie, and the paper's two penalties
+        training=TrainingCfg(  # README, Cassie, says what mattered
             rewards=RewardCfg(
-                tracking_ang_vel=1.0,
+                tracking_lin_vel=2.0,
+                tracking_ang_vel=2.0,
                 lin_vel_z=-0.5,
                 ang_vel_xy=0.0,
                 torques=-5e-6,
-                dof_acc=-2e-7,
-                feet_air_time=5.0,
+                dof_acc=-1e-7,
+                feet_air_time=2.5,
                 dof_pos_limits=-1.0,
                 no_fly=0.25,
+                orientation=-1.0,
+                joint_deviation=-0.2,
                 termination=-200.0,
             ),
             only_positive=False,
             soft_joint_limit=0.95,
             steady_joints=tuple(f"hip_{joint}_{side}" for side in _SIDES for joint in ("abduction", "rotation")),
+            start_joint_range=0.2,
+        ),
+        learning=LearningCfg(
+            num_envs=2048, iterations=3400, init_noise_std=0.5, desired_kl=0.02, entropy=0.005, final_share=0.26
         ),
     ),
 }

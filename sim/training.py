@@ -4,6 +4,8 @@ import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+_SIZES = ("num_envs", "iterations")
+
 
 @dataclass(frozen=True, kw_only=True)
 class RewardCfg:
@@ -52,6 +54,33 @@ class TrainingCfg:
     """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
     start_joint_range: float = 0.5
     """Joints start at the default pose times 1 +- this."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningCfg:
+    """How the robot's controller is learned from scratch on a GPU (:class:`train.ppo.PpoCfg`); ANYmal's by default."""
+
+    num_envs: int = 8192
+    iterations: int = 2240
+    init_noise_std: float = 1.0
+    """Standard deviation of the actions before the first update."""
+    desired_kl: float = 0.01
+    """KL divergence an update aims at."""
+    entropy: float = 0.01
+    """Weight of the entropy bonus."""
+    final_share: float = 0.0
+    """Share of the iterations, the last ones, with the two below in place of the two above."""
+    final_kl: float = 0.008
+    final_entropy: float = 0.002
+
+
+def learning_problems(cfg: LearningCfg) -> list[str]:
+    """What is wrong with the sizes and the types of settings, one line each; ranges are for PPO to say."""
+    values = asdict(cfg)
+    problems = [f"learning.{name} must be a whole number from 1 on, got {values[name]!r}" for name in _SIZES
+                if not isinstance(values[name], int) or values[name] < 1]  # fmt: skip
+    return problems + [f"learning.{name} must be a number, got {value!r}" for name, value in values.items()
+                       if name not in _SIZES and not _is_number(value)]  # fmt: skip
 
 
 def training_problems(cfg: TrainingCfg) -> list[str]:

@@ -23,6 +23,7 @@ from sim.own_robot import own_hash
 from sim.provenance import provenance
 from sim.robot import get_robot
 from sim.simulation import resolve_device
+from sim.training import LearningCfg
 from train.learner import Learner
 from train.ppo import PpoCfg, check_ppo
 from train.progress import Progress
@@ -59,13 +60,13 @@ class BaseCfg:
 
     robot: str = _ROBOT
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults of
-    task."""
+    task and ppo."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
-    """Robots trained at once; 8192 on CUDA, 32 on the CPU."""
+    """Robots trained at once; 8192 on CUDA (Cassie: 2048), 32 on the CPU."""
     iterations: int | None = None
-    """Iterations in all, those before a resume included; 2240 on CUDA, 20 on the CPU."""
+    """Iterations in all, those before a resume included; 2240 on CUDA (Cassie: 3400), 20 on the CPU."""
     max_seconds: float | None = None
     """Save and stop in time to be done this many seconds after the start."""
     run_dir: Path | None = None
@@ -86,7 +87,7 @@ class BaseCfg:
     ppo: PpoCfg = field(default_factory=PpoCfg)
 
 
-def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
+def _resolve_size(cfg: BaseCfg, learning: LearningCfg) -> tuple[str, int, int]:
     """Device, number of environments and iterations."""
     device = Ranks.of_environment().device(resolve_device(cfg.device))
     on_cuda = device.startswith("cuda")
@@ -95,8 +96,8 @@ def _resolve_size(cfg: BaseCfg) -> tuple[str, int, int]:
             f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build "
             "or use --device cpu"
         )
-    num_envs = cfg.num_envs or (8192 if on_cuda else 32)
-    iterations = cfg.iterations or (2240 if on_cuda else 20)
+    num_envs = cfg.num_envs or (learning.num_envs if on_cuda else 32)
+    iterations = cfg.iterations or (learning.iterations if on_cuda else 20)
     if not on_cuda and cfg.num_envs is None and cfg.iterations is None:
         print(
             f"No GPU: a small training of {num_envs} robots and {iterations} iterations, enough to see that it runs. "
@@ -127,7 +128,7 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     """What one process of a training does; only the first one's files are kept."""
     began = time.monotonic()
     robot = get_robot(cfg.robot)
-    device, num_envs, iterations = _resolve_size(cfg)
+    device, num_envs, iterations = _resolve_size(cfg, robot.learning)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
@@ -178,7 +179,8 @@ def read_arguments(arguments: Sequence[str]) -> BaseCfg:
     named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     named.add_argument("--robot", default=_ROBOT)
     name = named.parse_known_args(arguments)[0].robot
-    default = BaseCfg(robot=name, task=TaskCfg.of(get_robot(name)))
+    robot = get_robot(name)
+    default = BaseCfg(robot=name, task=TaskCfg.of(robot), ppo=PpoCfg.of(robot))
     return tyro.cli(BaseCfg, args=arguments, default=default, description=__doc__)
 
 

@@ -12,7 +12,7 @@ import torch
 
 from sim.files import write_atomically
 from sim.policy import read_weights, reason_of
-from train.ppo import PpoCfg, runner_settings
+from train.ppo import CapturedPPO, PpoCfg, runner_settings
 from train.ranks import Ranks, Runner
 from train.vec_env import CommandVecEnv
 
@@ -82,6 +82,18 @@ class Learner:
             ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
             self.env.episode_length_buf = ages
         self._observations = self.env.get_observations()
+
+    def set_pace(self, iterations: int) -> None:
+        """Take the final settings once their share of all ``iterations`` begins; to be called before each."""
+        cfg = self.cfg
+        if cfg.final_share == 0.0:
+            return
+        final = self.iteration >= (1.0 - cfg.final_share) * iterations
+        desired_kl, entropy = (cfg.final_kl, cfg.final_entropy) if final else (cfg.desired_kl, cfg.entropy)
+        if isinstance(self.alg, CapturedPPO):
+            self.alg.set_pace(desired_kl, entropy)
+        else:
+            self.alg.desired_kl, self.alg.entropy_coef = desired_kl, entropy
 
     def iterate(self) -> Iteration:
         """Collect ``steps_per_env`` control steps of every environment, then update the networks.

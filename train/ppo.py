@@ -1,12 +1,14 @@
 """PPO settings as a fresh dict per call, and rsl_rl's PPO with its minibatch step captured as one CUDA graph."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
 from torch import nn
+
+from sim.robot import RobotCfg
 
 _FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on
 _EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels
@@ -38,8 +40,19 @@ class PpoCfg:
     """Weight of the entropy bonus."""
     init_noise_std: float = 1.0
     """Standard deviation of the actions before the first update."""
+    final_share: float = 0.0
+    """Share of the iterations, the last ones, with final_kl and final_entropy in place of desired_kl and entropy:
+    smaller steps and less noise."""
+    final_kl: float = 0.008
+    final_entropy: float = 0.002
     captured: bool = True
     """Update with :class:`CapturedPPO`; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
+
+    @classmethod
+    def of(cls, robot: RobotCfg) -> "PpoCfg":
+        """The settings that a robot's controller is learned with."""
+        learning = asdict(robot.learning)
+        return cls(**{setting.name: learning[setting.name] for setting in fields(cls) if setting.name in learning})
 
 
 def check_ppo(cfg: PpoCfg, num_envs: int) -> None:
@@ -70,6 +83,9 @@ def check_ppo(cfg: PpoCfg, num_envs: int) -> None:
         "clip": (0.0 < cfg.clip < math.inf, "above 0"),
         "entropy": (0.0 <= cfg.entropy < math.inf, "at least 0"),
         "init_noise_std": (0.0 < cfg.init_noise_std < math.inf, "above 0"),
+        "final_share": (0.0 <= cfg.final_share <= 1.0, "in 0..1"),
+        "final_kl": (0.0 < cfg.final_kl < math.inf, "above 0"),
+        "final_entropy": (0.0 <= cfg.final_entropy < math.inf, "at least 0"),
     }
     wrong = [
         f"ppo.{name} must be {range_}, got {getattr(cfg, name)}" for name, (ok, range_) in ranges.items() if not ok
@@ -137,6 +153,7 @@ class CapturedPPO(PPO):
         on_cuda = torch.device(self.device).type == "cuda"
         self._lr = torch.tensor(float(self.learning_rate), device=self.device)
         self._actor_learns = torch.ones((), device=self.device)
+        self._kl, self._entropy_weight = self._lr.new_tensor(self.desired_kl), self._lr.new_tensor(self.entropy_coef)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=self._lr, fused=on_cuda or None, capturable=on_cuda)
         count = self.storage.num_envs * self.storage.num_transitions_per_env
@@ -146,6 +163,11 @@ class CapturedPPO(PPO):
         self._stream = torch.cuda.Stream(self.device) if on_cuda else None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._eager_steps = 0
+
+    def set_pace(self, desired_kl: float, entropy: float) -> None:
+        """From now on aim at another KL divergence, with another weight of the entropy bonus."""
+        self._kl.fill_(desired_kl)
+        self._entropy_weight.fill_(entropy)
 
     def let_actor_learn(self, learns: bool) -> None:
         """Whether updates change the actor; without, the critic alone learns, and the learning rate stays.
@@ -238,7 +260,7 @@ class CapturedPPO(PPO):
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
         value_loss = self._value_loss(observations)
-        actor_loss = surrogate_loss - self.entropy_coef * entropy
+        actor_loss = surrogate_loss - self._entropy_weight * entropy
         loss = self._actor_learns * actor_loss + self.value_loss_coef * value_loss
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -262,7 +284,7 @@ class CapturedPPO(PPO):
         if self.is_multi_gpu:
             torch.distributed.all_reduce(kl)
             kl = kl / self.gpu_world_size
-        lower = torch.where(kl > 2.0 * self.desired_kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
+        lower = torch.where(kl > 2.0 * self._kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
         higher = (self._lr * 1.5).clamp(max=1e-2)
-        adapted = torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), higher, lower)
+        adapted = torch.where((kl < 0.5 * self._kl) & (kl > 0.0), higher, lower)
         self._lr.copy_(torch.where(self._actor_learns > 0.0, adapted, self._lr))

@@ -166,6 +166,7 @@ def iterate(
 
     while learner.ranks.all_want(wanted(), learner.env.device):
         before()
+        learner.set_pace(progress.iterations)
         step = learner.iterate()
         if progress.warm:  # the first iteration compiles and is no measure
             slowest = max(slowest, step.collection_s + step.learning_s)

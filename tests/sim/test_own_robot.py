@@ -150,12 +150,13 @@ def test_what_is_wrong_in_the_training_settings_is_named(tmp_path):
     file = write_dog(tmp_path)
     wrong = (
         'training=TrainingCfg(rewards=RewardCfg(torques=float("nan")), soft_joint_limit=2.0, push_speed=None, '
-        "added_base_mass=(1.0, 0.0)), collision_bit"
+        'added_base_mass=(1.0, 0.0)), learning=LearningCfg(num_envs=0, entropy="some"), collision_bit'
     )
-    head = "from sim.training import RewardCfg, TrainingCfg\n"
+    head = "from sim.training import LearningCfg, RewardCfg, TrainingCfg\n"
     file.write_text(head + file.read_text().replace("collision_bit", wrong))
     with pytest.raises(
-        ValueError, match=r"rewards.torques.*push_speed.*soft_joint_limit.*added_base_mass must be a le"
+        ValueError,
+        match=r"rewards.torques.*push_speed.*soft_joint_limit.*added_base_mass must be a le.*num_envs must.*entropy",
     ):
         get_robot(str(file))
 

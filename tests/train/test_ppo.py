@@ -1,6 +1,7 @@
 """The captured PPO against rsl_rl's own, and its settings."""
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -66,6 +67,17 @@ def test_update_equals_rsl_rl(desired_kl: float) -> None:
         torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
 
 
+def test_a_pace_set_later_is_the_one_of_a_ppo_that_has_it() -> None:
+    ours, theirs = make_runner(CapturedPPO, CFG), make_runner(PPO, replace(CFG, desired_kl=1e-5, entropy=0.5))
+    ours.alg.set_pace(1e-5, 0.5)
+    for runner in (ours, theirs):
+        torch.manual_seed(5)
+        runner.learn(1)
+    assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-5)
+    for mine, other in zip(parameters(ours), parameters(theirs), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
+
+
 def test_losses_are_the_means_of_rsl_rl(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = make_runner(CapturedPPO, CFG), make_runner(PPO, CFG)
     losses = []
@@ -126,6 +138,7 @@ def test_unsupported_features_are_refused() -> None:
         ({"desired_kl": 0.0, "entropy": -1.0}, "ppo.desired_kl must be above 0, got 0.0; ppo.entropy must be at least"),
         ({"hidden_dims": (8, 0)}, "ppo.hidden_dims must be at least one layer, each at least 1 wide, got (8, 0)"),
         ({"init_noise_std": -1.0}, "ppo.init_noise_std must be above 0, got -1.0"),
+        ({"final_share": 1.5, "final_kl": 0.0}, "ppo.final_share must be in 0..1, got 1.5; ppo.final_kl must be above"),
     ],
 )
 def test_settings_that_nothing_is_learned_with_are_named(changes: dict[str, Any], message: str) -> None:
