@@ -9,7 +9,7 @@ from qd.workers import Evaluate
 from sim.intervals import bootstrap_interval
 from sim.rollout import RolloutResult
 from sim.terrain import CROSSING_TYPES
-from train.measures import count_outcomes, terrain_rates
+from train.measures import count_outcomes, invalid_lines, terrain_rates
 from train.sets import plain_set
 
 VELOCITY_FROM_S = 2.0
@@ -112,6 +112,5 @@ def print_rates(report: dict[str, Any]) -> None:
             print(f"{label:<24}{cells[0]:>16}{cells[1]:>16}{cells[2]:>8}{row['terrains']:>10}")
     error = report["flat"]["vx_error_mean"]
     print(f"flat ground: mean |v_x - command| {'-' if error is None else format(error, '.3f')} m/s")
-    invalid = {name: report[name]["outcomes"]["invalid"] for name in ("hand_crafted", "hard_random")}
-    if any(invalid.values()):
-        print(f"invalid episodes, left out: {invalid}")
+    for line in invalid_lines({name: report[name]["outcomes"] for name in ("hand_crafted", "hard_random")}):
+        print(line)

@@ -1,6 +1,6 @@
 """What crossings say of a controller, terrain by terrain: rates, reward and scaled penalties."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,27 @@ class Measured:
     def valid(self) -> NDArray[np.bool_]:
         """Whether a terrain's numbers mean anything, shape (T,)."""
         return self.episodes > 0
+
+
+def invalid_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """What to say of invalid episodes, one line for each crossing of a set that has some.
+
+    A falling robot may leave the valid states before it touches the ground: what is left out may be failures.
+
+    Args:
+        outcomes: Episodes by how they ended (:class:`kernels.episode.Outcome`, lower case), by what crossed.
+    """
+    lines = []
+    for what, counts in outcomes.items():
+        count, total = counts["invalid"], sum(counts.values())
+        if count:
+            goal = counts["goal"] / total
+            success = 1.0 - (counts["base_collision"] + count) / total
+            lines.append(
+                f"{what}: {count} of {total} episodes are invalid ({count / total:.1%}) and left out; counted as "
+                f"failures, success would be {success:.3f}, goal {goal:.3f}"
+            )
+    return lines
 
 
 def valid_episodes(result: RolloutResult) -> NDArray[np.bool_]:

@@ -10,8 +10,9 @@ import tyro
 
 from sim.command import exit_code_of
 from sim.files import read_json, write_atomically
+from sim.named_controllers import kind_of
 from train.paper import PAPER_ARCHIVES, published
-from train.seeds import firsts, kind_of
+from train.seeds import firsts
 
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"
 _NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}

@@ -7,17 +7,11 @@ from typing import Any
 import numpy as np
 
 from sim.intervals import MAX_T_VALUES, t_interval
+from sim.named_controllers import MARK, kind_of
 from sim.provenance import controller_hash
 
 RATES = ("success", "goal", "fallen")
 """Measures that lie between 0 and 1, and so do their intervals."""
-MARK = "@"
-"""Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""
-
-
-def kind_of(name: str) -> str:
-    """The kind of a controller by its name."""
-    return name.split(MARK)[0]
 
 
 def check_seeds(controllers: Mapping[str, str]) -> None:

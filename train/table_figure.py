@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim.files import write_atomically
-from train.seeds import firsts, kind_of
+from sim.named_controllers import kind_of
+from train.seeds import firsts
 from train.table_print import published_value
 
 if TYPE_CHECKING:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
+from train.measures import invalid_lines
 from train.seeds import print_over_seeds
 
 _DIGITS = {"success": 3, "goal": 3, "fallen": 3, "reward": 1}
@@ -29,10 +30,9 @@ def print_tables(report: dict[str, Any]) -> None:
     _print_differences(report)
     for name, groups in report["traversable"].items():
         _print_traversable(name, groups, wide)
-    ended = {f"{who} on {name}": counts["invalid"] for name, row in report["outcomes"].items()
-             for who, counts in row.items()}  # fmt: skip
-    if any(ended.values()):
-        print(f"\ninvalid episodes, left out: { ({where: count for where, count in ended.items() if count}) }")
+    ended = {f"{who} on {name}": counts for name, row in report["outcomes"].items() for who, counts in row.items()}
+    for line in invalid_lines(ended):
+        print(line)
 
 
 def _print_set(report: dict[str, Any], name: str, wide: int) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.train.results import BAD, GOAL, HIT, LATE, OUT, result_of
-from train.measures import count_outcomes, measure, terrain_rates
+from train.measures import count_outcomes, invalid_lines, measure, terrain_rates
 
 
 def test_rates_of_a_terrain():
@@ -41,3 +41,12 @@ def test_what_does_not_belong_together_is_refused():
         measure(result_of([[GOAL]]), (1.0, 1.0))
     with pytest.raises(ValueError, match=r"one a penalty .*, got 1"):
         measure(result_of([[GOAL]], reward=[[1.0]]), (1.0,))
+
+
+def test_invalid_episodes_may_be_failures():
+    counts = {"goal": 880, "base_collision": 77, "time_out": 0, "invalid": 43}
+    (line,) = invalid_lines({"hard_random": counts, "flat": {"goal": 5, "base_collision": 1, "invalid": 0}})
+    assert line == (
+        "hard_random: 43 of 1000 episodes are invalid (4.3%) and left out; counted as failures, success would be "
+        "0.880, goal 0.880"
+    )

@@ -96,7 +96,7 @@ def test_the_terminal_shows_everything(report, capsys):
     assert "generated: 2 terrains that some controller crossed" in said
     # C-G fails terrain 102, as base does; terrain 101 is not compared.
     assert "base -> C-G: 0 mended (0), 1 still failing, 0 newly broken (0) of 2; goal rate +0.000" in said
-    assert "invalid episodes, left out: {'C-G on generated': 4}" in said
+    assert "C-G on generated: 4 of 12 episodes are invalid (33.3%) and left out; counted as failures, success" in said
 
 
 def test_the_figure_shows_the_tables(report, tmp_path):
