@@ -6,6 +6,14 @@ from collections.abc import Sequence
 from sim.controller_spec import SHIPPED, spec_of
 from sim.robot import RobotCfg
 
+MARK = "@"
+"""Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""
+
+
+def kind_of(name: str) -> str:
+    """The kind of a controller by its name."""
+    return name.split(MARK)[0]
+
 
 def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
