@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from qd.cli import naming_what_is_next, run_command
+from qd.html_report.changes import Change, Changes, changes_of
 from qd.html_report.crossings import Place, Record, Wanted, cross_all, recorder
 from qd.html_report.elite_sections import all_section, detail_section, modes_section
 from qd.html_report.elites import elites_of, most_reproducible, worst
@@ -21,8 +22,8 @@ from qd.html_report.search_sections import (
 )
 from qd.html_report.shown import Shown, counted
 from qd.html_report.table_sections import before_after_section, tables_section
-from qd.html_report.tables import Change, Changes, changes_of
 from qd.workers import check_policy, resolve_device
+from sim.controller_spec import spec_of
 from sim.files import write_atomically
 from sim.provenance import controller_hash
 
@@ -80,7 +81,7 @@ def _with_crossings(shown: Shown, make_recorder: Callable[[Place], Record]) -> S
     crossed = dict(zip(shown.numbers, found, strict=True))
     if material.tables is None:
         return replace(shown, crossed=crossed)
-    changes = changes_of(material.tables)
+    changes = changes_of(material.tables, material.tables_file, material.robot)
     return replace(shown, crossed=crossed, changes=changes, pairs=_pairs(material, changes, place, cross))
 
 
@@ -118,7 +119,7 @@ def _pairs(material: Material, changes: Changes, place: Place, cross: Record) ->
             label=f"elite {change.number} with {who}",
             genes=changes.archive.genes[change.number],
             number=change.number,
-            policy=changes.policies[who],
+            policy=spec_of(changes.policies[who], material.robot),
         )
         for change in changes.chosen
         for who in (change.before, change.after)

@@ -1,5 +1,7 @@
 """The page's chapters about the search: what was done, what came out, its curves and its archive."""
 
+from typing import Any
+
 import numpy as np
 
 from qd.fresh import FRESH_EPISODES
@@ -7,6 +9,7 @@ from qd.html_report.elites import FAILING_BELOW, Elites
 from qd.html_report.figures import draw_pairs
 from qd.html_report.page import Absent, Block, Facts, Section, Table, Text
 from qd.html_report.shown import Shown, counted, hours, percent, picture
+from qd.html_report.table_sections import fates, most_mended
 from qd.next_commands import make_command
 from qd.progress import clock
 from qd.report import draw_archive, draw_curves, draw_spread, label_of, spread
@@ -26,6 +29,8 @@ def outcome_section(shown: Shown) -> Section:
         if elites.fresh
         else "by the episodes that found them, which flatter themselves"
     )
+    tables = _tables_of_these(shown)
+    mended = most_mended(tables) if tables else None
     facts = Facts(
         [
             ("terrains, the hardest of each cell, that under half of the robots cross", f"{failing:,}"),
@@ -33,6 +38,7 @@ def outcome_section(shown: Shown) -> Section:
             ("failure modes: kinds of these ways", f"{sum(mode.failing for mode in shown.modes.modes)}"),
             ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
             ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
+            *([mended] if mended else []),
         ]
     )
     text = (
@@ -51,8 +57,22 @@ def outcome_section(shown: Shown) -> Section:
         f"{percent(FAILING_BELOW)} of the robots reach the goal. The rates are means over terrains"
         f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
-    blocks = [_searched(shown), facts, Text(_common(shown)), Text(text), Text(explained)]
+    told = (_common(shown), text, _others(tables) if tables else "", explained)
+    blocks = [_searched(shown), facts, *(Text(words) for words in told if words)]
     return Section("What breaks the controller", "outcome", blocks)
+
+
+def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
+    """The evaluation's tables, if their elites are those of this archive."""
+    tables, archive = shown.material.tables, shown.material.archive
+    about = (tables or {}).get("archive") or {}
+    return tables if (about.get("elites"), about.get("iterations")) == (len(archive), archive.iterations) else None
+
+
+def _others(tables: dict[str, Any]) -> str:
+    """What other controllers make of elites of this archive, and where that is shown; may be empty."""
+    told = fates(tables)
+    return f"{told} The chapters Controllers compared and The same terrain before and after show how." if told else ""
 
 
 def _common(shown: Shown) -> str:

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from qd.html_report.changes import Change, Changes
 from qd.html_report.elites import Elites
 from qd.html_report.material import Material
 from qd.html_report.modes import Modes
 from qd.html_report.outcomes import Crossed
 from qd.html_report.page import Picture
-from qd.html_report.tables import Change, Changes
 from qd.progress import clock
 from qd.report import as_png
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.html_report.tables import MEASURES
+from qd.html_report.tables import LABELS, MEASURES
 from qd.report import new_figure
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ def draw_tables(tables: dict[str, Any]) -> "Figure":
     """Success, goal rate and reward of every controller by set, with 95 % intervals over terrains.
 
     Args:
-        tables: As ``tables.json`` has them.
+        tables: As :func:`qd.html_report.tables.by_kind` gives them.
     """
     figure = new_figure(13.0, 4.4)
     for axes, (measure, label) in zip(figure.subplots(1, 3), MEASURES.items(), strict=True):
@@ -31,18 +31,22 @@ def draw_tables(tables: dict[str, Any]) -> "Figure":
 
 
 def _draw_measure(axes: "Axes", tables: dict[str, Any], measure: str) -> None:
-    names, controllers = list(tables[measure]), list(tables["controllers"])
+    names: list[str] = list(tables[measure])
+    controllers = list(tables["controllers"])
     factor = 1.0 if measure == "reward" else 100.0
     step = min(0.16, 0.7 / len(controllers))
     for index, who in enumerate(controllers):
         there = [place for place, name in enumerate(names) if tables[measure][name][who] is not None]
         values = factor * np.array([tables[measure][names[place]][who] for place in there])
-        limits = factor * np.array([tables["intervals"][measure][names[place]][who] for place in there]).reshape(-1, 2)
+        rows = [tables["intervals"][measure][names[place]][who] for place in there]
+        limits = np.array([row or 2 * [value] for row, value in zip(rows, values / factor, strict=True)]).reshape(-1, 2)
+        limits *= factor
         lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)  # equal limits may be off by rounding
         shift = step * (index - (len(controllers) - 1) / 2)
         colour, marker = _LOOKS[index % len(_LOOKS)]
         style = {"linestyle": "", "marker": marker, "color": colour, "capsize": 3, "label": who}
         axes.errorbar(np.array(there) + shift, values, lengths, **style)
-    axes.set_xticks(range(len(names)), [name.replace("_", "\n") for name in names])
+    labels = [LABELS.get(name, name).replace(", ", ",\n").replace("-", "-\n") for name in names]
+    axes.set_xticks(range(len(names)), labels)
     axes.set_xlim(-0.5, len(names) - 0.5)
     axes.grid(axis="y", alpha=0.3)

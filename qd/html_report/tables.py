@@ -1,47 +1,25 @@
-"""The evaluation's ``tables.json``, read as data: what it must have, and which terrains to show before and after."""
+"""The evaluation's ``tables.json``, read as data: what it must have, and what it says of every kind of controller."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qd.archive import Archive, read_archive
-from sim.controller_spec import ControllerSpec
 from sim.files import read_json
-from sim.provenance import controller_hash
+from sim.named_controllers import kind_of
 
 MEASURES = {"success": "success (no base collision)", "goal": "goal reached", "reward": "training reward"}
 """Measures shown, in words; the first two are fractions."""
 CHANGES = ("mended", "still_failing", "newly_broken", "fine")
 """What may have become of a terrain between two controllers."""
+GENERATED, FAR = "generated", "generated_far"
+"""Sets of elites that were held out of training; the second is the part farthest from what was trained on."""
+LABELS = {
+    "hand_crafted": "hand-crafted",
+    "hard_random": "hard-random",
+    GENERATED: "generated, held out",
+    FAR: "generated, farthest third",
+}
+"""Sets in words."""
 _KEYS = ("robot", "episodes", "controllers", "terrains", "intervals", "differences", *MEASURES)
-_MENDED, _BROKEN = 2, 1  # terrains shown of each kind
-_GENERATED = "generated"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Change:
-    """A terrain that two controllers fare differently on."""
-
-    kind: str
-    """mended: the first controller fails it, the second does not; newly broken: the other way round."""
-    number: int
-    """Of the elite in the tables' archive."""
-    before: str
-    """Name of the first controller."""
-    after: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Changes:
-    """Terrains to show before and after, or why there are none to show."""
-
-    archive: Archive | None = None
-    """That the numbers count in."""
-    chosen: tuple[Change, ...] = ()
-    policies: dict[str, str] | None = None
-    """File of each controller by its name."""
-    reason: str = ""
-    """Why there are none."""
 
 
 def read_tables(file: Path, robot: str) -> dict[str, Any]:
@@ -82,6 +60,8 @@ def _problem_of(tables: dict[str, Any]) -> str:
         isinstance(pairs, dict) and all(map(_is_pair, pairs.values())) for pairs in tables["differences"].values()
     ):
         return "its differences are not such as that writes"
+    if not _are_over_seeds(tables.get("over_seeds", {})):
+        return "its means over seeds are not such as that writes"
     for measure in MEASURES:
         for name, row in tables[measure].items():
             limits = (tables["intervals"].get(measure) or {}).get(name)
@@ -120,50 +100,49 @@ def _is_measured(value: Any, limits: Any) -> bool:
     return all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers)
 
 
-def changes_of(tables: dict[str, Any]) -> Changes:
-    """Generated terrains that became passable from the first controller to another, and one that ceased to be.
+def _are_over_seeds(found: Any) -> bool:
+    """Whether these are means over the controllers of a kind: measure -> set -> kind."""
+    try:
+        kinds = [about for sets in found.values() for row in sets.values() for about in row.values()]
+        pairs = [(about["mean"], about["interval"]) for about in kinds]
+    except (AttributeError, KeyError, TypeError):
+        return False
+    # of very many seeds no interval is known
+    return all(_is_measured(*pair) or (pair[1] is None and _is_measured(pair[0], [pair[0]] * 2)) for pair in pairs)
+
+
+def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
+    """The tables with one column a kind of controller, where a kind was trained from several seeds.
 
     Args:
         tables: As :func:`read_tables` gives them.
+
+    Returns:
+        The same, but for ``controllers``, measures and ``intervals``: of a kind of several those are the mean over them
+        and the interval of that, under the kind's name with the number of its seeds.
     """
-    first, *others = tables["controllers"]
-    pairs = (tables["differences"].get(_GENERATED) or {}) if others else {}
-    pairs = {who: pairs.get(f"{first} -> {who}") for who in others}
-    pairs = {
-        who: pair for who, pair in pairs.items() if pair and pair["mended"]["count"] + pair["newly_broken"]["count"]
-    }
-    if not pairs:
-        return Changes(reason="No generated terrain of the tables is mended or newly broken between their controllers.")
-    best = max(pairs, key=lambda who: pairs[who]["mended"]["count"])
-    chosen = [Change(kind="mended", number=n, before=first, after=best) for n in _first(pairs[best], "mended", _MENDED)]
-    chosen += [
-        Change(kind="newly broken", number=n, before=first, after=best)
-        for n in _first(pairs[best], "newly_broken", _BROKEN)
-    ]
-    policies = {who: tables["controllers"][who] for who in (first, best)}
-    for who, about in policies.items():
-        if ControllerSpec.parse(about["policy"]).runs_code:  # what a file names is never run
-            return Changes(reason=f"Controller {who} of the tables is code, {about['policy']}, and is not run.")
-        if controller_hash(about["policy"]) != about["sha256"]:
-            return Changes(reason=f"Controller {who} of the tables is not at {about['policy']} as it was then.")
-    archive, reason = _archive_of(tables, chosen)
-    files = {who: about["policy"] for who, about in policies.items()}
-    return Changes(archive=archive, chosen=tuple(chosen) if archive else (), policies=files, reason=reason)
+    members: dict[str, list[str]] = {}
+    for who in tables["controllers"]:
+        members.setdefault(kind_of(who), []).append(who)
+    labels = {f"{kind} ({len(all_)} seeds)" if len(all_) > 1 else all_[0]: all_ for kind, all_ in members.items()}
+    found = {**tables, "controllers": {label: tables["controllers"][all_[0]] for label, all_ in labels.items()}}
+    found["intervals"] = dict(tables["intervals"])
+    for measure in MEASURES:
+        values, limits = {}, {}
+        for name in tables[measure]:
+            several = tables.get("over_seeds", {}).get(measure, {}).get(name, {})
+            pairs = {label: _of_kind(tables, measure, name, all_, several) for label, all_ in labels.items()}
+            values[name] = {label: value for label, (value, _) in pairs.items()}
+            limits[name] = {label: interval for label, (_, interval) in pairs.items()}
+        found[measure], found["intervals"][measure] = values, limits
+    return found
 
 
-def _first(pair: dict[str, Any], kind: str, count: int) -> list[int]:
-    return pair[kind]["terrains"][:count]
-
-
-def _archive_of(tables: dict[str, Any], chosen: list[Change]) -> tuple[Archive | None, str]:
-    """The archive that the tables' terrains are numbered in, or why it cannot be had."""
-    about = tables.get("archive") or {}
-    path = about.get("path", "")
-    try:
-        archive = read_archive(path)
-    except (OSError, ValueError) as error:
-        return None, f"The archive of the tables cannot be read: {error}"
-    same = (len(archive), archive.iterations) == (about.get("elites"), about.get("iterations"))
-    if not same or any(not 0 <= change.number < len(archive) for change in chosen):
-        return None, f"The archive at {path} has changed since the tables were made."
-    return archive, ""
+def _of_kind(
+    tables: dict[str, Any], measure: str, name: str, members: list[str], several: dict[str, Any]
+) -> tuple[float | None, list[float] | None]:
+    """Value and interval of a kind of controller on a set."""
+    if len(members) == 1:
+        return tables[measure][name][members[0]], tables["intervals"][measure][name][members[0]]
+    about = several.get(kind_of(members[0]), {"mean": None, "interval": None})
+    return about["mean"], about["interval"]

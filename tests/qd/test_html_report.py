@@ -1,7 +1,6 @@
 """The report's page from end to end, on small archives with made-up crossings: whole, true to its files, shut off."""
 
 import dataclasses
-import hashlib
 import json
 import re
 from html.parser import HTMLParser
@@ -25,10 +24,6 @@ from tests.qd.recordings import stand_in_recorder
 from tests.qd.test_archive import fresh_values
 from tests.qd.test_html_report_numbers import grouped_archive
 from tests.qd.test_report import rows
-from tests.train.results import GOAL, LATE, result_of
-from train.measures import measure
-from train.sets import TerrainSet
-from train.tables import make_tables
 
 DOT = bytes.fromhex("89504e470d0a1a0a")
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -272,101 +267,6 @@ def test_a_controller_that_cannot_be_loaded_leaves_its_crossings_out(reported, m
     assert "cannot be loaded: no such controller <x>" in Page(out.read_bytes()).text
     with pytest.raises(ValueError, match="no such controller"):
         reported(policy="lost.pt")
-
-
-@pytest.fixture
-def tables(run):
-    """Tables of two controllers on four elites, of which the second mends one and breaks another."""
-    first, second = ([[GOAL] * 4] * 2 + [[LATE] * 4] * 2), ([[GOAL] * 4, [LATE] * 4, [GOAL] * 4, [LATE] * 4])
-    crossed = {
-        "generated": {
-            who: measure(result_of(outcomes, reward=np.ones((4, 4))), (1.0, 1.0))
-            for who, outcomes in (("base", first), ("C-G", second))
-        }
-    }
-    numbers = np.array([3, 5, 7, 9])
-    chosen = TerrainSet(name="generated", terrains=np.zeros((4, 64), np.float32), seeds=np.zeros(4, np.uint32),
-                        numbers=numbers)  # fmt: skip
-    made = make_tables(crossed, {"generated": chosen}, get_robot("anymal"), 0)
-    about = {}
-    for who in ("base", "C-G"):
-        policy = run.parent / f"{who}.pt"
-        policy.write_text(who)
-        about[who] = {"policy": str(policy), "sha256": hashlib.sha256(who.encode()).hexdigest()}
-    archive = {"path": str(run), "elites": 20, "iterations": 4}
-    file = run.parent / "tables.json"
-    file.write_bytes(to_json({"robot": "anymal", "episodes": 4, "controllers": about, "archive": archive, **made}))
-    return file
-
-
-def changed(file, **changes):
-    file.write_bytes(to_json({**json.loads(file.read_text()), **changes}))
-
-
-def test_tables_and_the_same_terrain_before_and_after(reported, tables):
-    out, crossed = reported(tables=tables)
-    text = Page(out.read_bytes()).text
-    assert "base fares worst on generated: 50 % (0 % to 100 %) of its episodes reach the goal; C-G 50 %" in text
-    assert "generated: base -> C-G 1 1 1 1 4" in text  # mended, still failing, newly broken, fine, compared
-    assert "Elite 7, mended from base to C-G by the tables" in text
-    assert "Elite 5, newly broken from base to C-G" in text
-    assert [label for label in crossed if "with" in label] == [
-        "elite 7 with base", "elite 7 with C-G", "elite 5 with base", "elite 5 with C-G",
-    ]  # fmt: skip
-    assert (out.parent / "report-figures" / "change-7.png").exists()
-    assert (out.parent / "report-figures" / "tables.png").exists()
-
-
-def test_published_tables_are_taken_by_themselves(reported, tables):
-    there = tables.parent / "results" / "anymal"
-    there.mkdir(parents=True)
-    tables.rename(there / "tables.json")
-    assert "2 controllers on 1 set of terrains (generated: 4)" in Page(reported()[0].read_bytes()).text
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        (
-            {"controllers": {w: {"policy": "gone.pt", "sha256": "0"} for w in ("base", "C-G")}},
-            "base of the tables is not",
-        ),
-        (
-            {"controllers": {w: {"policy": "tests.sim.policies:stand", "sha256": None} for w in ("base", "C-G")}},
-            "base of the tables is code, tests.sim.policies:stand, and is not run",
-        ),
-        ({"archive": {"path": "gone", "elites": 20, "iterations": 4}}, "The archive of the tables cannot be read"),
-        ({"archive": None}, "The archive of the tables cannot be read"),
-        ({"differences": {"generated": {}}}, "No generated terrain of the tables is mended"),
-    ],
-)
-def test_without_what_they_need_terrains_before_and_after_are_left_out(reported, tables, changes, reason):
-    changed(tables, **changes)
-    out, crossed = reported(tables=tables)
-    assert reason in Page(out.read_bytes()).text
-    assert not any("with" in label for label in crossed)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"robot": "cassie"}, "is of robot cassie, got --robot anymal"),
-        ({"controllers": {"base": "x.pt", "C-G": "y.pt"}}, "its controllers are not such"),
-        (
-            {"differences": {"generated": {"base -> C-G": {"compared": 4, "mended": {"count": 1}}}}},
-            "its differences are",
-        ),
-        ({"goal": {}}, "its parts are not such"),
-        ({"goal": {"generated": {"base": "x", "C-G": 1.0}}}, "its goal of generated holds something else than numbers"),
-        ({"goal": {"generated": {"base": 1.0}}}, "its goal of generated is not of its controllers"),
-        ({"goal": {"<b>": {"base": 1.0}}}, "its goal of <b> has no values, intervals or number"),
-    ],
-)
-def test_tables_that_are_none_are_refused(reported, run, tables, changes, message):
-    changed(tables, **changes)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        reported(tables=tables)
-    assert not (run / "report.html").exists()
 
 
 def test_bad_input_is_refused_before_any_work(reported, run, tmp_path, monkeypatch):
