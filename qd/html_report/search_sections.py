@@ -72,7 +72,12 @@ def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
 def _others(tables: dict[str, Any]) -> str:
     """What other controllers make of elites of this archive, and where that is shown; may be empty."""
     told = fates(tables)
-    return f"{told} The chapters Controllers compared and The same terrain before and after show how." if told else ""
+    if not told:
+        return ""
+    return (
+        f"Other controllers crossed some of these terrains too. {told} The chapter Controllers compared says who they "
+        "are, The same terrain before and after shows how they fare."
+    )
 
 
 def _common(shown: Shown) -> str:

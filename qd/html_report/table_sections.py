@@ -16,7 +16,7 @@ _TRAINED_ON = {
     "C-HC": "hand-crafted terrains alone",
     "C-HR": "hand-crafted and hard-random ones",
     "C-G": "hand-crafted ones and elites",
-    "C-F": "hand-crafted ones and elites, those that fail more often",
+    "C-F": "hand-crafted ones and elites, drawn by how often it fails them",
 }
 """What controllers are trained further on that are named as the paper and the README name them."""
 
@@ -31,6 +31,7 @@ def tables_section(shown: Shown) -> Section:
     kinds = by_kind(tables)
     section.blocks += [
         Text(_told(tables, kinds)),
+        *([Text(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
         picture("tables", draw_tables(kinds), "Success, goal rate and reward of every controller on every set"),
         *(_measure_table(kinds, measure) for measure in MEASURES),
         *_changes_tables(tables),
@@ -92,8 +93,8 @@ def _command(shown: Shown) -> str:
 
 
 def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
-    """Who was compared on what, and how they fare on the hardest set, in a few sentences."""
-    first, *others = kinds["controllers"]
+    """Who was compared on what, in a sentence or two."""
+    first = next(iter(kinds["controllers"]))
     sets = ", ".join(f"{_label(name)}: {count}" for name, count in tables["terrains"].items())
     text = (
         f"{counted(len(tables['controllers']), 'controller')} on {counted(len(tables['terrains']), 'set')} of "
@@ -102,14 +103,19 @@ def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     several = len(kinds["controllers"]) < len(tables["controllers"])
     text += ", of several trainings that differ in their seed over these." if several else "."
     trained = [f"{who} on {what}" for who, what in _TRAINED_ON.items() if who in tables["controllers"]]
-    text += f" By their names these are {first} trained further: {'; '.join(trained)}." if trained else ""
+    return text + (f" By their names these are {first} trained further: {'; '.join(trained)}." if trained else "")
+
+
+def _worst(kinds: dict[str, Any]) -> str:
+    """How all fare on the first one's hardest set, in a sentence; empty if nothing is known of that one."""
+    first, *others = kinds["controllers"]
     known = {name: row for name, row in kinds["goal"].items() if row[first] is not None}
-    if known:
-        hardest = min(known, key=lambda name: known[name][first])
-        better = "".join(f"; {who} {_value(kinds, 'goal', hardest, who)}" for who in others)
-        rate = _value(kinds, "goal", hardest, first)
-        text += f" {first} fares worst on {_label(hardest)}: {rate} of its episodes reach the goal{better}."
-    return f"{text} {fates(tables)}".strip()
+    if not known:
+        return ""
+    hardest = min(known, key=lambda name: known[name][first])
+    rate = _value(kinds, "goal", hardest, first)
+    better = "".join(f"; {who} {_value(kinds, 'goal', hardest, who)}" for who in others)
+    return f"{first} fares worst on {_label(hardest)}: {rate} of its episodes reach the goal{better}."
 
 
 def _label(name: str) -> str:
