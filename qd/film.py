@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from qd.film_panel import Panel
 from qd.shot import Shot
+from sim.controller_spec import ControllerSpec
 from sim.intervals import wilson_interval
 
 if TYPE_CHECKING:
@@ -77,6 +78,8 @@ def caption(shot: Shot) -> tuple[str, str]:
     }
     rates = [f"{name} {_rate(int(flags.sum()), count)}" for name, flags in hits.items()] if count else ["none valid"]
     of = f"{len(valid)} episode{'s' * (len(valid) != 1)}" + f", {len(valid) - count} invalid" * (count < len(valid))
+    if policy := recording.origin.get("policy"):
+        of += f" with {ControllerSpec.parse(str(policy)).label}"
     return first, f"{of}: {', '.join(rates)}; in brackets 95 % intervals"
 
 

@@ -1,11 +1,13 @@
 """Where runs are, and where what is made from one goes."""
 
 import itertools
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qd.archive import ARCHIVE_FILE, read_archive
+from sim.controller_spec import ControllerSpec
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
@@ -64,6 +66,19 @@ def folder_for(run: Path, robot: str) -> Path:
     folder = directory_of(run)
     published = RESULTS.resolve() in folder.resolve().parents
     return RUNS / f"{robot}-published" if published else folder
+
+
+def elite_name(elite: int, policy: str | None) -> str:
+    """What a file about an elite is called: elite-3; of another controller than the search's elite-3-C-G.
+
+    Args:
+        elite: Its number.
+        policy: The other controller as it was named; None for that of the search.
+    """
+    if policy is None:
+        return f"elite-{elite}"
+    stem = Path(ControllerSpec.parse(policy).label).stem
+    return f"elite-{elite}-{re.sub(r'[^A-Za-z0-9_.-]+', '-', stem)}"
 
 
 def numbered(root: Path, name: str) -> Iterator[Path]:

@@ -91,7 +91,7 @@ def policy_of(found: Found, robot: "RobotCfg", given: str | None) -> str:
     """
     searched, _ = as_searched(found.run, found.archive)
     refuse_unnamed_code(searched, given, found.run)
-    return given or spec_of(searched, robot)
+    return spec_of(given or searched, robot)
 
 
 def record_elites(

@@ -11,14 +11,15 @@ from qd.archive import Archive, read_archive
 from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.paths_figure import draw_paths
-from qd.places import directory_of, folder_for, newest_or_published
+from qd.places import directory_of, elite_name, folder_for, newest_or_published
 from qd.report import save_figure
 from qd.resuming import refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, RunDirectory
 from qd.workers import check_policy, episode_seeds, resolve_device
-from sim.controller_spec import SHIPPED, spec_of
+from sim.controller_spec import SHIPPED, ControllerSpec, spec_of
 from sim.files import prepare_output
 from sim.intervals import rate_words
+from sim.provenance import controller_hash
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +62,8 @@ class ReplayCfg:
     seed: int = 0
     """Seed of the fresh episodes."""
     out: Path | None = None
-    """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published."""
+    """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published; with
+    another controller elite-<number>-<its name>.png."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +81,8 @@ class Replay:
     result: "RolloutResult"
     """One terrain, with paths."""
     fresh: Evaluation
+    controller: str = ""
+    """Who crossed it this time, if that is another controller than the search's."""
 
 
 def replay(cfg: ReplayCfg) -> Replay:
@@ -96,14 +100,15 @@ def replay(cfg: ReplayCfg) -> Replay:
         raise ValueError(f"replicas must be at least 1 and seed at least 0, got {cfg.replicas} and {cfg.seed}")
     run = cfg.run or newest_or_published(robot)
     archive = _archive_with(cfg, robot, run)
-    out = cfg.out or folder_for(run, robot.name) / f"elite-{cfg.elite}.png"
+    out = cfg.out or folder_for(run, robot.name) / f"{elite_name(cfg.elite, cfg.policy)}.png"
     if out.suffix != ".png":
         raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
     prepare_output(out)
     device = resolve_device(cfg.device)
-    policy, fitness = as_searched(run, archive)
-    refuse_unnamed_code(policy, cfg.policy, run)
-    policy = cfg.policy or spec_of(policy, robot)
+    searched, fitness = as_searched(run, archive)
+    refuse_unnamed_code(searched, cfg.policy, run)
+    searched = spec_of(searched, robot)
+    policy = spec_of(cfg.policy, robot) if cfg.policy else searched
     check_policy(policy, robot, device)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.replicas, device=device)
     seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=REPLAY_STREAM)
@@ -116,6 +121,7 @@ def replay(cfg: ReplayCfg) -> Replay:
         heights=rollout.sim.bank.heights.numpy()[0],
         result=result,
         fresh=evaluation_of(result, archive.cells, fitness),
+        controller="" if controller_hash(policy) == controller_hash(searched) else policy,
     )
 
 
@@ -185,6 +191,11 @@ def describe(replay: Replay) -> str:
     for label, name in (("base collision", "collision_rate"), ("goal reached", "goal_rate"), ("fallen", "fallen_rate")):
         counted = [(getattr(values, name)[k], _counted(values, k)) for _, values, k in columns]
         rows[label] = [rate_words(round(rate * count) if count else 0, count) for rate, count in counted]
+    again = (
+        f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} again."
+    )
+    if replay.controller:
+        again = f"  Now it was crossed with {replay.controller}; all else is of the controller that was searched."
     table = [f"  {label:22}" + "".join(f"{cell:>34}" for cell in row) for label, row in rows.items()]
     return "\n".join(
         [
@@ -192,8 +203,7 @@ def describe(replay: Replay) -> str:
             f"{archive.iteration[n]}, with ratios in {cells.describe(int(archive.cell[n]))}",
             *table,
             "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
-            f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} "
-            "again.",
+            again,
         ]
     )
 
@@ -217,6 +227,8 @@ def draw(replay: Replay) -> "Figure":
         f"{archive.fitness[n]:.2f} as found, {corrected}"
         f"{replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
     )
+    if replay.controller:
+        title += f"\nwith another controller than was searched: {ControllerSpec.parse(replay.controller).label}"
     return draw_paths(replay.heights, replay.result, title)
 
 

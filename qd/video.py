@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from qd.cli import run_command
 from qd.own_terrain import read_own_terrain
-from qd.places import RUNS, folder_for
+from qd.places import RUNS, elite_name, folder_for
 from qd.progress import share_bar
 from qd.recordings import archive_of_robot, chosen_elites, policy_of, record_elites, record_heights
 from qd.workers import check_policy, resolve_device
@@ -58,7 +58,7 @@ class VideoCfg:
     """Where to cross: cpu, cuda or cuda:N; CUDA where there is one."""
     out: Path | None = None
     """File of the film, or with several elites their folder; elite-<number>.mp4 in the run, or of a published one
-    in runs/<robot>-published."""
+    in runs/<robot>-published; with another controller elite-<number>-<its name>.mp4."""
     replicas: int = 20
     """Episodes to run."""
     replica: int | None = None
@@ -129,7 +129,7 @@ def _elite_orders(cfg: VideoCfg, robot: "RobotCfg") -> Iterator[Order]:
     elites = chosen_elites(cfg.elite, found)
     single = cfg.out is not None and len(elites) == 1 and not cfg.out.is_dir()
     folder = cfg.out or folder_for(found.run, robot.name)
-    outs = [cfg.out] if single and cfg.out else [folder / f"elite-{elite}.mp4" for elite in elites]
+    outs = [cfg.out] if single and cfg.out else [folder / f"{elite_name(elite, cfg.policy)}.mp4" for elite in elites]
     prepare_output(outs[0])
     device, policy = resolve_device(cfg.device), policy_of(found, robot, cfg.policy)
     check_policy(policy, robot, device)

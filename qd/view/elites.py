@@ -90,7 +90,7 @@ class Elites:
             f"**Elite {number}** of {len(self)} · fitness **{self.axis('fitness').values[number]:.2f}** "
             f"({archive.fitness[number]:.2f} as found in iteration {archive.iteration[number]})",
             "",
-            f"| rate | of {of}, 95 % interval |",
+            f"| as searched | of {of}, 95 % interval |",
             "|---|---|",
             *(f"| {label} | {self.rate_text(name, number)} |" for name, label in _RATES.items()),
         ]

@@ -69,6 +69,8 @@ def test_the_caption_says_what_is_shown_and_how_all_ended(recording):
     # Wilson, z^2 = 3.8415, of 1 of 5: (.2 + .3841 +- 1.96 sqrt(.032 + .0384)) / 1.7683 = .3303 +- .2941
     both = "base collision 20% (4 to 62%), goal 20% (4 to 62%), fallen 20% (4 to 62%)"
     assert second == f"5 episodes: {both}; in brackets 95 % intervals"
+    named = dataclasses.replace(recording, origin={"policy": "runs/tuned/C-G.pt"})
+    assert caption(shot_of(named))[1].startswith("5 episodes with C-G.pt: base collision")
     outcome = recording.outcome.copy()
     outcome[0, 4] = Outcome.INVALID
     _, second = caption(shot_of(dataclasses.replace(recording, outcome=outcome)))

@@ -9,7 +9,7 @@ from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.places import folder_for, newest_or_published, newest_run
+from qd.places import elite_name, folder_for, newest_or_published, newest_run
 from qd.recordings import archive_of_robot
 from qd.replay import Replay, ReplayCfg, describe, draw, replay
 from qd.run_directory import RunDirectory
@@ -75,6 +75,17 @@ def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
     assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) 1 of 4 (25%, 5 to 70%)" in lines
     title = draw(corrected).axes[0].get_title()
     assert title.endswith("fitness 3.25 as found, 1.62 corrected, 10.50 in 4 fresh episodes")
+
+
+def test_another_controller_than_was_searched_is_named(done):
+    other = dataclasses.replace(done, controller="runs/tuned/C-G.pt")
+    text = describe(other)
+    assert "Now it was crossed with runs/tuned/C-G.pt; all else is of the controller that was searched." in text
+    assert "in its cell" not in text
+    assert draw(other).axes[0].get_title().endswith("\nwith another controller than was searched: C-G.pt")
+    assert elite_name(3, None) == "elite-3"  # and what one wrote the other does not overwrite
+    assert elite_name(3, "runs/tuned/C-G.pt") == "elite-3-C-G"
+    assert elite_name(3, "mine/row.py:adapt@my model.pt") == "elite-3-row.py-adapt-my-model"
 
 
 def test_of_an_invalid_terrain_no_rate_is_known(done):
