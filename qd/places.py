@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from qd.archive import ARCHIVE_FILE, read_archive
 from sim.controller_spec import ControllerSpec
+from sim.provenance import controller_hash
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
@@ -68,17 +69,24 @@ def folder_for(run: Path, robot: str) -> Path:
     return RUNS / f"{robot}-published" if published else folder
 
 
-def elite_name(elite: int, policy: str | None) -> str:
+def elite_name(elite: int, policy: str, searched: str) -> str:
     """What a file about an elite is called: elite-3; of another controller than the search's elite-3-C-G.
 
     Args:
         elite: Its number.
-        policy: The other controller as it was named; None for that of the search.
+        policy: The controller that crosses it.
+        searched: That of the search.
     """
-    if policy is None:
+    if is_same(policy, searched):
         return f"elite-{elite}"
-    stem = Path(ControllerSpec.parse(policy).label).stem
-    return f"elite-{elite}-{re.sub(r'[^A-Za-z0-9_.-]+', '-', stem)}"
+    label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")
+    return f"elite-{elite}-{re.sub(r'[^A-Za-z0-9_.-]+', '-', label)}"
+
+
+def is_same(policy: str, other: str) -> bool:
+    """Whether two names are of the same controller, by name or by its files."""
+    digest = controller_hash(policy)
+    return policy == other or (digest is not None and digest == controller_hash(other))
 
 
 def numbered(root: Path, name: str) -> Iterator[Path]:

@@ -11,7 +11,7 @@ from qd.archive import Archive, read_archive
 from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.paths_figure import draw_paths
-from qd.places import directory_of, elite_name, folder_for, newest_or_published
+from qd.places import directory_of, elite_name, folder_for, is_same, newest_or_published
 from qd.report import save_figure
 from qd.resuming import refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, RunDirectory
@@ -19,7 +19,6 @@ from qd.workers import check_policy, episode_seeds, resolve_device
 from sim.controller_spec import SHIPPED, ControllerSpec, spec_of
 from sim.files import prepare_output
 from sim.intervals import rate_words
-from sim.provenance import controller_hash
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -100,15 +99,15 @@ def replay(cfg: ReplayCfg) -> Replay:
         raise ValueError(f"replicas must be at least 1 and seed at least 0, got {cfg.replicas} and {cfg.seed}")
     run = cfg.run or newest_or_published(robot)
     archive = _archive_with(cfg, robot, run)
-    out = cfg.out or folder_for(run, robot.name) / f"{elite_name(cfg.elite, cfg.policy)}.png"
-    if out.suffix != ".png":
-        raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
-    prepare_output(out)
-    device = resolve_device(cfg.device)
     searched, fitness = as_searched(run, archive)
     refuse_unnamed_code(searched, cfg.policy, run)
     searched = spec_of(searched, robot)
     policy = spec_of(cfg.policy, robot) if cfg.policy else searched
+    out = cfg.out or folder_for(run, robot.name) / f"{elite_name(cfg.elite, policy, searched)}.png"
+    if out.suffix != ".png":
+        raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
+    prepare_output(out)
+    device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.replicas, device=device)
     seeds = episode_seeds(cfg.seed, cfg.elite, 1, stream=REPLAY_STREAM)
@@ -121,7 +120,7 @@ def replay(cfg: ReplayCfg) -> Replay:
         heights=rollout.sim.bank.heights.numpy()[0],
         result=result,
         fresh=evaluation_of(result, archive.cells, fitness),
-        controller="" if controller_hash(policy) == controller_hash(searched) else policy,
+        controller="" if is_same(policy, searched) else policy,
     )
 
 

@@ -13,7 +13,9 @@ from qd.own_terrain import read_own_terrain
 from qd.places import RUNS, elite_name, folder_for
 from qd.progress import share_bar
 from qd.recordings import archive_of_robot, chosen_elites, policy_of, record_elites, record_heights
+from qd.replay import as_searched
 from qd.workers import check_policy, resolve_device
+from sim.controller_spec import spec_of
 from sim.files import prepare_output
 
 if TYPE_CHECKING:
@@ -127,11 +129,14 @@ def _elite_orders(cfg: VideoCfg, robot: "RobotCfg") -> Iterator[Order]:
     """Films of elites, whose recordings are written before the first is made."""
     found = archive_of_robot(cfg.robot, cfg.run)
     elites = chosen_elites(cfg.elite, found)
+    policy, searched = policy_of(found, robot, cfg.policy), spec_of(as_searched(found.run, found.archive)[0], robot)
     single = cfg.out is not None and len(elites) == 1 and not cfg.out.is_dir()
     folder = cfg.out or folder_for(found.run, robot.name)
-    outs = [cfg.out] if single and cfg.out else [folder / f"{elite_name(elite, cfg.policy)}.mp4" for elite in elites]
+    outs = (
+        [cfg.out] if single and cfg.out else [folder / f"{elite_name(elite, policy, searched)}.mp4" for elite in elites]
+    )
     prepare_output(outs[0])
-    device, policy = resolve_device(cfg.device), policy_of(found, robot, cfg.policy)
+    device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
     with share_bar("crossing") as progress:
         _, recording = record_elites(

@@ -83,9 +83,16 @@ def test_another_controller_than_was_searched_is_named(done):
     assert "Now it was crossed with runs/tuned/C-G.pt; all else is of the controller that was searched." in text
     assert "in its cell" not in text
     assert draw(other).axes[0].get_title().endswith("\nwith another controller than was searched: C-G.pt")
-    assert elite_name(3, None) == "elite-3"  # and what one wrote the other does not overwrite
-    assert elite_name(3, "runs/tuned/C-G.pt") == "elite-3-C-G"
-    assert elite_name(3, "mine/row.py:adapt@my model.pt") == "elite-3-row.py-adapt-my-model"
+
+
+def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
+    for name, content in (("a.pt", b"1"), ("b.pt", b"1"), ("C-G.pt", b"2")):
+        (tmp_path / name).write_bytes(content)
+    a, b, tuned = (str(tmp_path / name) for name in ("a.pt", "b.pt", "C-G.pt"))
+    assert elite_name(3, a, b) == elite_name(3, "no.such:code", "no.such:code") == "elite-3"
+    assert elite_name(3, tuned, a) == "elite-3-C-G"
+    assert elite_name(3, "no.such:code", "no.other:code") == "elite-3-no.such-code"
+    assert elite_name(3, "mine/row.py:adapt@my model.onnx", a) == "elite-3-row.py-adapt-my-model"
 
 
 def test_of_an_invalid_terrain_no_rate_is_known(done):

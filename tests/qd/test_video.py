@@ -92,13 +92,15 @@ def test_films_of_elites_and_of_their_recordings(opengl, run, capsys):
         elite="0 2", policy="tests.sim.policies:stand", device="cpu", replicas=4, fps=1, shadows=False, seed=3
     )
     films = make_videos(cfg)
-    assert films == [run / "elite-0.mp4", run / "elite-2.mp4"]
-    recording = read_recording(run / "elite-2.recording.npz")
+    name = "tests.sim.policies-stand"  # not the search's
+    assert films == [run / f"elite-0-{name}.mp4", run / f"elite-2-{name}.mp4"]
+    recording = read_recording(run / f"elite-2-{name}.recording.npz")
     assert recording.outcome.shape == (1, 4) and recording.origin["seed"] == 3
     # A robot that stands is out of time after 20 s, or has fallen before: a picture a second, its end, and that held.
     last = float(np.median(recording.num_frames)) - 1
-    assert abs(frames_in(run / "elite-2.mp4") - (np.ceil(last * 0.02) + 2)) <= 1
-    again = VideoCfg(recording=run / "elite-2.recording.npz", out=Path("again.mp4"), replica=1, fps=1, shadows=False)
+    assert abs(frames_in(run / f"elite-2-{name}.mp4") - (np.ceil(last * 0.02) + 2)) <= 1
+    kept = run / f"elite-2-{name}.recording.npz"
+    again = VideoCfg(recording=kept, out=Path("again.mp4"), replica=1, fps=1, shadows=False)
     assert make_videos(again) == [Path("again.mp4")]
     assert frames_in("again.mp4") >= 2
     assert "Film: again.mp4" in capsys.readouterr().out
