@@ -35,6 +35,7 @@ from train.run import (
     RESERVE_S,
     StopRequest,
     changes,
+    check_kind,
     check_limits,
     claimed,
     finish,
@@ -130,6 +131,8 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     robot = get_robot(cfg.robot)
     device, num_envs, iterations = _resolve_size(cfg, robot.learning)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
+    if saved is not None and cfg.resume is not None:
+        check_kind(cfg.resume, saved, finetuning=False)
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
     check_ppo(cfg.ppo, num_envs)

@@ -18,7 +18,7 @@ from train.held_out import marks_of, recorded_marks
 from train.learner import check_entries
 from train.mix import Mix, MixCfg
 from train.ppo import PpoCfg, check_ppo
-from train.run import CHECKPOINT, CONFIG, changes, check_limits, plain, prepare_run_dir, read_saved
+from train.run import CHECKPOINT, CONFIG, changes, check_kind, check_limits, plain, prepare_run_dir, read_saved
 from train.sets import elites_sha256, split_elites
 from train.start import Start, read_start
 from train.task_cfg import TaskCfg
@@ -128,6 +128,8 @@ def job_of(cfg: FinetuneCfg) -> Job:
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
+    if saved is not None and cfg.resume is not None:
+        check_kind(cfg.resume, saved, finetuning=True)
     cfg = _filled(cfg, robot.name, device)
     if saved is None:
         path = cfg.policy or robot.policy_file

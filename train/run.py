@@ -130,6 +130,30 @@ def read_saved(path: Path, robot: str) -> dict[str, Any]:
     return saved
 
 
+def check_kind(run: Path, saved: dict[str, Any], *, finetuning: bool) -> None:
+    """Refuse to go on from a run of the other kind of training.
+
+    Args:
+        run: Its directory.
+        saved: Its checkpoint.
+        finetuning: Whether it must be a fine-tuning, else the training of a base controller.
+
+    Raises:
+        ValueError: If it is the other; with the command that goes on from it.
+    """
+    extra = saved["extra"]
+    found = "mix" in extra or "mix" in extra["settings"]
+    if found and not finetuning:
+        raise ValueError(
+            f"{run} is a fine-tuning: go on with make finetune RESUME={run} (python -m train.finetune --resume {run})"
+        )
+    if finetuning and not found:
+        raise ValueError(
+            f"{run} is the training of a base controller, not a fine-tuning: go on with make train RESUME={run} "
+            f"(python -m train.base --resume {run}), or fine-tune what it made with --policy {run / CHECKPOINT}"
+        )
+
+
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
     buffer = io.BytesIO()

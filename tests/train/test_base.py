@@ -67,6 +67,17 @@ def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
     assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
 
 
+def test_a_fine_tuning_is_left_to_its_own_command(finished, tmp_path):
+    content = torch.load(finished / "checkpoint.pt", weights_only=True)
+    content["extra"]["mix"] = {}
+    torch.save(content, tmp_path / "checkpoint.pt")
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME=.*train.finetune --resume"):
+        train(config(None, resume=tmp_path, iterations=3))
+    assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+
+
 def test_a_run_directory_takes_one_training_at_a_time(finished):
     before = (finished / "checkpoint.pt").read_bytes()
     with claimed(finished), pytest.raises(ValueError, match="another training works in"):

@@ -18,7 +18,7 @@ from train.finetune import finetune, main
 from train.finetune_job import FinetuneCfg, job_of
 from train.learner import read_checkpoint
 from train.ppo import PpoCfg
-from train.run import claimed
+from train.run import check_kind, claimed
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
@@ -196,6 +196,19 @@ def test_fewer_iterations_than_are_done_are_refused(finished):
     with pytest.raises(ValueError, match="has done 3 iterations already: give at least as many in all"):
         finetune(FinetuneCfg(resume=finished, device="cpu", iterations=2))
     assert (finished / "policy.pt").stat().st_mtime_ns == before
+
+
+def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
+    run = places / "base"
+    run.mkdir()
+    content = torch.load(finished / "checkpoint.pt", weights_only=True)
+    del content["extra"]["mix"], content["extra"]["settings"]["mix"]
+    torch.save(content, run / "checkpoint.pt")
+    (run / "config.json").write_text('{"task": {}}')
+    with pytest.raises(ValueError, match=r"training of a base controller.*go on with make train RESUME=.*train.base"):
+        finetune(FinetuneCfg(resume=run, device="cpu", iterations=4))
+    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME="):
+        check_kind(finished, read_checkpoint(finished / "checkpoint.pt", "anymal"), finetuning=False)
 
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):
