@@ -71,7 +71,7 @@ class Tuning:
 
     def save(self) -> None:
         """A checkpoint of all of it."""
-        state = {**self.progress.state(), "mix": self.mix.state(self.task.counts())}
+        state = {**self.progress.state(), "mix": self.mix.state(self.task.counts()), TRAINED_ON: self.job.trained_on}
         self.learner.save(self.job.run_dir / CHECKPOINT, state)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from sim.files import check_writable, locked, read_json, to_json, write_atomically
+from train.held_out import TRAINED_ON
 from train.learner import Learner, check_entries, read_checkpoint
 from train.progress import STATE, Progress
 
@@ -157,7 +158,8 @@ def check_kind(run: Path, saved: dict[str, Any], *, finetuning: bool) -> None:
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
     buffer = io.BytesIO()
-    torch.save({"actor_state_dict": learner.actor_state(), "iter": learner.iteration}, buffer)
+    marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
+    torch.save({"actor_state_dict": learner.actor_state(), "iter": learner.iteration, **marks}, buffer)
     write_atomically(path, buffer.getvalue())
     write_atomically(path.with_suffix(".train.json"), to_json(record))
 

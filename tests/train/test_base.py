@@ -72,7 +72,7 @@ def test_a_fine_tuning_is_left_to_its_own_command(finished, tmp_path):
     content["extra"]["mix"] = {}
     torch.save(content, tmp_path / "checkpoint.pt")
     before = (tmp_path / "checkpoint.pt").read_bytes()
-    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME=.*train.finetune --resume"):
+    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME=.*finetune --resume"):
         train(config(None, resume=tmp_path, iterations=3))
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
     assert (tmp_path / "checkpoint.pt").read_bytes() == before

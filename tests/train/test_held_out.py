@@ -1,16 +1,19 @@
 """No controller is evaluated on elites that it was trained on without anybody noticing."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from qd.archive import write_archive
 from tests.train.archives import make_archive
-from tests.train.test_finetune import write_actor
+from tests.train.test_finetune import PPO, write_actor
 from train.evaluate_cfg import EvaluateCfg
 from train.evaluate_tables import evaluate_tables
+from train.finetune import finetune
 from train.finetune_job import FinetuneCfg, job_of
 from train.held_out import TRAINED_ON, check_held_out, marks_of, recorded_marks
 from train.sets import split_elites
@@ -60,6 +63,53 @@ def test_tables_refuse_a_controller_trained_on_what_they_hold_out(sets, tmp_path
     )
     with pytest.raises(ValueError, match=r"C-G was trained on . of the . elites"):
         evaluate_tables(cfg, open_evaluator=None)  # pyright: ignore[reportArgumentType] - nothing is crossed
+
+
+@pytest.mark.parametrize("inside", ["checkpoint", "controller"])
+def test_marks_in_the_file_itself_count_where_no_record_lies_beside_it(inside, tmp_path):
+    marks = marks_of(ARCHIVE.genes)
+    path = write_actor(tmp_path / "checkpoint.pt")
+    part = {TRAINED_ON: marks}
+    content = torch.load(path, weights_only=True) | ({"extra": part} if inside == "checkpoint" else part)
+    torch.save(content, path)
+    assert recorded_marks(str(path)) == recorded_marks(f"some.module:adapter@{path}") == set(marks)
+    with pytest.raises(ValueError, match=r"C-G was trained on 4 of the 4 elites"):
+        check_held_out({"C-G": str(path)}, ARCHIVE.genes[:4], 0)
+    (content["extra"] if inside == "checkpoint" else content)[TRAINED_ON] = [5]
+    torch.save(content, path)
+    with pytest.raises(ValueError, match=r"checkpoint.pt is damaged at trained_on"):
+        recorded_marks(str(path))
+
+
+def test_a_file_of_another_kind_has_no_marks(tmp_path):
+    torch.jit.script(torch.nn.Linear(2, 3)).save(tmp_path / "script.pt")
+    torch.save([1, 2], tmp_path / "list.pt")
+    torch.save({"extra": 5}, tmp_path / "number.pt")
+    (tmp_path / "text.pt").write_text("no weights")
+    for file in tmp_path.iterdir():
+        assert recorded_marks(str(file)) == set()
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "policy.pt"])
+def test_what_a_fine_tuning_leaves_says_what_it_was_trained_on(name, tmp_path):
+    write_archive(tmp_path / "archive.npz", ARCHIVE)
+    cfg = FinetuneCfg(
+        policy=write_actor(tmp_path / "start.pt"), archive=tmp_path / "archive.npz", device="cpu", ppo=PPO,
+        run_dir=tmp_path / "run", num_envs=6, terrains=4, swap_every=2, iterations=1,
+    )  # fmt: skip
+    assert finetune(cfg) == 0
+    left = (tmp_path / "run" / name).rename(tmp_path / name)  # away from the record
+    trained = marks_of(ARCHIVE.genes[split_elites(ARCHIVE, "anymal").train])
+    assert recorded_marks(str(left)) == set(trained)
+    tables = EvaluateCfg(
+        policies=(f"C-G={left}",), archive=tmp_path / "archive.npz", split_seed=1, device="cpu", run_dir=tmp_path / "t"
+    )
+    with pytest.raises(ValueError, match=r"C-G was trained on . of the 4 elites that split seed 1 holds out"):
+        evaluate_tables(tables, open_evaluator=None)  # pyright: ignore[reportArgumentType] - nothing is crossed
+    write_archive(tmp_path / "other.npz", make_archive(10, seed=2))
+    later = job_of(replace(cfg, policy=left, archive=tmp_path / "other.npz", run_dir=tmp_path / "later"))
+    assert later.settings["trained_before"] == sorted(trained)
+    assert set(trained) < set(later.trained_on)
 
 
 def test_a_fine_tuning_records_what_it_and_those_before_it_were_trained_on(tmp_path):
