@@ -152,7 +152,11 @@ view: setup ## Show an archive in the browser: its elites, their terrains, and t
 reevaluate: setup ## Evaluate every elite of an archive again with 40 fresh episodes
 	$(BIN)/python -m qd.reevaluate --robot $(call quoted,$(ROBOT)) $(call flags,RUN DEVICE POLICY SEED WORKERS PROCESSES WORKER_LIMIT_S)
 
+NO_MAP := POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS WORKERS# what says nothing of one map and one controller
+refused = $(if $(TERRAIN),$(strip $(foreach name,$(NO_MAP),$(if $($(name)),$(name)))))
+
 evaluate: setup ## Rates of the controller of ROBOT; with TERRAIN on a map of yours, with POLICIES or ARCHIVE the paper's tables
+	$(if $(refused),$(error make evaluate TERRAIN=FILE crosses one map with one controller, got $(refused) too: leave out one or the other, or name the controller with POLICY=FILE))
 	$(BIN)/python -m $(if $(TERRAIN),qd.cross,train.evaluate) --robot $(call quoted,$(ROBOT)) $(call flags,$(if $(TERRAIN),TERRAIN SIZE SCALE OFFSET DEVICE POLICY EPISODES SEED OUT,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS))
 
 video: setup ## Film the robot on elite ELITE=N of an archive, or on TERRAIN=FILE

@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -38,9 +39,14 @@ def command_of(target: str, **variables: str) -> list[str]:
     return run_by(" ".join(["make", target, *given]))
 
 
+NO_MAP = ("POLICIES", "ARCHIVE", "SPLIT_SEED", "SETS", "TERRAINS", "WORKERS")
+"""What `make evaluate` refuses beside TERRAIN."""
+
+
 @pytest.mark.parametrize("target", ARGUMENTS)
 def test_every_flag_of_a_target_is_one_of_its_command(target):
-    command = command_of(target, ROBOT="cassie", **dict.fromkeys(VARIABLES, "7"))
+    given = [name for name in VARIABLES if target != "evaluate" or name not in NO_MAP]
+    command = command_of(target, ROBOT="cassie", **dict.fromkeys(given, "7"))
     module, name = ARGUMENTS[target]
     known = {field.name for field in dataclasses.fields(getattr(importlib.import_module(module), name))}
     given = {word.split("=")[0].removeprefix("--").replace("-", "_") for word in command[3:] if word.startswith("--")}
@@ -81,6 +87,13 @@ def test_a_map_of_ones_own_is_handed_to_the_command_that_crosses_it():
     parsed = tyro.cli(CrossCfg, args=command[3:])
     given = {"terrain": Path("my hill.png"), "size": ("16 8",), "scale": 0.01, "episodes": 40, "out": Path("a.json")}
     assert parsed == CrossCfg(robot="anymal", **given)
+
+
+@pytest.mark.parametrize("name", NO_MAP)
+def test_a_map_of_ones_own_is_not_crossed_by_what_says_nothing_of_it(name):
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        command_of("evaluate", TERRAIN="my hill.png", **{name: "a b"})
+    assert f"crosses one map with one controller, got {name} too: leave out one or the other" in failed.value.stderr
 
 
 def test_several_words_in_one_variable_are_one_value():
