@@ -36,7 +36,9 @@ from train.run import (
     StopRequest,
     changes,
     check_kind,
+    check_least,
     check_limits,
+    check_more,
     claimed,
     finish,
     iterate,
@@ -97,12 +99,13 @@ def _resolve_size(cfg: BaseCfg, learning: LearningCfg) -> tuple[str, int, int]:
             f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build "
             "or use --device cpu"
         )
+    check_least(num_envs=(cfg.num_envs, 1), iterations=(cfg.iterations, 1), seed=(cfg.seed, 0))
     num_envs = cfg.num_envs or (learning.num_envs if on_cuda else 32)
     iterations = cfg.iterations or (learning.iterations if on_cuda else 20)
     if not on_cuda and cfg.num_envs is None and cfg.iterations is None:
         print(
             f"No GPU: a small training of {num_envs} robots and {iterations} iterations, enough to see that it runs. "
-            "A controller that walks takes about 6 minutes on one GPU."
+            "A controller that walks takes minutes on one GPU."
         )
     return device, num_envs, iterations
 
@@ -133,6 +136,7 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
     if saved is not None and cfg.resume is not None:
         check_kind(cfg.resume, saved, finetuning=False)
+    check_more(cfg.resume, saved, iterations)
     seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
     cfg = replace(cfg, seed=seed)
     check_ppo(cfg.ppo, num_envs)

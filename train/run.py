@@ -42,6 +42,17 @@ class StopRequest:
         signal.signal(kind, signal.SIG_DFL)
 
 
+def check_least(**numbers: tuple[int | None, int]) -> None:
+    """Refuse numbers below the least that they may be, each ``name=(number, least)``; none is left to a default.
+
+    Raises:
+        ValueError: Naming the first such.
+    """
+    for name, (number, least) in numbers.items():
+        if number is not None and number < least:
+            raise ValueError(f"{name} must be at least {least}, got {number}")
+
+
 def check_limits(*, rows: int, save_every_s: float, max_seconds: float | None) -> None:
     """Refuse limits that mean nothing.
 
@@ -129,6 +140,16 @@ def read_saved(path: Path, robot: str) -> dict[str, Any]:
     check_entries(saved["extra"], STATE, path)
     check_entries(saved["extra"]["settings"], {"seed": (int,)}, path)
     return saved
+
+
+def check_more(run: Path | None, saved: dict[str, Any] | None, iterations: int) -> None:
+    """Refuse fewer iterations in all than the resumed run, if any, has done.
+
+    Raises:
+        ValueError: If there are fewer.
+    """
+    if saved is not None and saved["iter"] > iterations:
+        raise ValueError(f"{run} has done {saved['iter']} iterations already: give at least as many in all")
 
 
 def check_kind(run: Path, saved: dict[str, Any], *, finetuning: bool) -> None:

@@ -67,6 +67,13 @@ def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
     assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
 
 
+def test_fewer_iterations_than_are_done_are_refused(finished):
+    before = (finished / "policy.pt").stat().st_mtime_ns
+    with pytest.raises(ValueError, match="has done 2 iterations already: give at least as many in all"):
+        train(config(None, resume=finished, iterations=1))
+    assert (finished / "policy.pt").stat().st_mtime_ns == before
+
+
 def test_a_fine_tuning_is_left_to_its_own_command(finished, tmp_path):
     content = torch.load(finished / "checkpoint.pt", weights_only=True)
     content["extra"]["mix"] = {}
@@ -127,6 +134,10 @@ def test_handlers_are_put_back():
         (["--device", "cuda"], "no CUDA device was found"),
         (["--device", "cpu", "--run-dir", "/proc/nowhere"], "cannot write to /proc/nowhere"),
         (["--device", "cpu", "--resume", "{empty}"], "no checkpoint at"),
+        (["--device", "cpu", "--iterations", "0"], "iterations must be at least 1, got 0"),
+        (["--device", "cpu", "--iterations", "-3"], "iterations must be at least 1, got -3"),
+        (["--device", "cpu", "--num-envs", "0"], "num_envs must be at least 1, got 0"),
+        (["--device", "cpu", "--seed", "-1"], "seed must be at least 0, got -1"),
     ],
 )
 @pytest.mark.skipif(torch.cuda.is_available(), reason="one of the errors is the absence of CUDA")
