@@ -84,7 +84,10 @@ def check_ppo(cfg: PpoCfg, num_envs: int) -> None:
         "entropy": (0.0 <= cfg.entropy < math.inf, "at least 0"),
         "init_noise_std": (0.0 < cfg.init_noise_std < math.inf, "above 0"),
         "final_share": (0.0 <= cfg.final_share <= 1.0, "in 0..1"),
-        "final_kl": (0.0 < cfg.final_kl < math.inf, "above 0"),
+        "final_kl": (
+            0.0 < cfg.final_kl < math.inf and (cfg.final_share == 0.0 or cfg.final_kl <= cfg.desired_kl),
+            f"above 0, and with a ppo.final_share at most ppo.desired_kl, {cfg.desired_kl}",
+        ),
         "final_entropy": (0.0 <= cfg.final_entropy < math.inf, "at least 0"),
     }
     wrong = [

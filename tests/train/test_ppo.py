@@ -139,6 +139,10 @@ def test_unsupported_features_are_refused() -> None:
         ({"hidden_dims": (8, 0)}, "ppo.hidden_dims must be at least one layer, each at least 1 wide, got (8, 0)"),
         ({"init_noise_std": -1.0}, "ppo.init_noise_std must be above 0, got -1.0"),
         ({"final_share": 1.5, "final_kl": 0.0}, "ppo.final_share must be in 0..1, got 1.5; ppo.final_kl must be above"),
+        (
+            {"final_share": 0.2, "desired_kl": 0.005},
+            "ppo.final_kl must be above 0, and with a ppo.final_share at most ppo.desired_kl, 0.005, got 0.008",
+        ),
     ],
 )
 def test_settings_that_nothing_is_learned_with_are_named(changes: dict[str, Any], message: str) -> None:
