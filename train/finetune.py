@@ -89,6 +89,16 @@ def _write_onnx(job: Job) -> None:
     print(f"The same as ONNX: {path.with_suffix('.onnx')}")
 
 
+def _weights(job: Job) -> str:
+    """Which reward terms weigh otherwise than the robot's own, in words."""
+    own = asdict(job.robot.training.rewards)
+    other = {name: weight for name, weight in asdict(job.task.rewards).items() if weight != own[name]}
+    if not other:
+        return "Rewards: the robot's own"
+    given = ", ".join(f"{name}={weight:g}" for name, weight in other.items())
+    return f"Rewards: {given} (the robot's own: {', '.join(f'{own[name]:g}' for name in other)})"
+
+
 def finetune(cfg: FinetuneCfg) -> int:
     """Fine-tune as told; returns the exit status: 0, or 130 after Ctrl-C.
 
@@ -104,6 +114,7 @@ def finetune(cfg: FinetuneCfg) -> int:
         f"{job.num_envs} robots on {job.device}, {job.iterations} iterations, in {run_dir}",
         flush=True,
     )
+    print(_weights(job))
     alone = job.settings["critic_iterations"]
     if alone >= job.iterations:
         print(

@@ -9,16 +9,15 @@ import numpy as np
 
 from qd.archive import read_archive
 from sim.command import split_words
-from sim.files import read_json
 from sim.own_robot import own_hash
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
 from sim.training import RewardCfg
+from train.finetune_resume import check_resumed, saved_ppo, settings_of
 from train.held_out import marks_of, recorded_marks
-from train.learner import check_entries
 from train.mix import Mix, MixCfg
 from train.ppo import PpoCfg, check_ppo
-from train.run import CHECKPOINT, CONFIG, changes, check_kind, check_limits, plain, prepare_run_dir, read_saved
+from train.run import CHECKPOINT, check_kind, check_least, check_limits, check_more, plain, prepare_run_dir, read_saved
 from train.sets import elites_sha256, split_elites
 from train.start import Start, read_start
 from train.task_cfg import TaskCfg
@@ -26,15 +25,15 @@ from train.task_cfg import TaskCfg
 _PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
 _PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}
 _SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 4, "iterations": 10}
-_REWARDS = ("termination=-200", "tracking_lin_vel=2")  # of six weightings the best (README, Fine-tuning)
+_REWARDS = ("termination=-200", "tracking_lin_vel=2")  # of six weightings the best (README, Training on what broke it)
 _DEFAULTS = {
     "mix": "generated", "split_seed": 0, "draw": "uniform", "task": "crossing", "seed": 0, "rewards": _REWARDS
 }  # fmt: skip
 _CRITIC_ITERATIONS = 50
 _NUMBERS = (*_PAPER_OTHERS, "critic_iterations")
+_KINDS = {name: type(value) for name, value in _DEFAULTS.items()} | dict.fromkeys(_NUMBERS, int)
 _TASKS = ("crossing", "commands")
-_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005)
-_STATE = {"mix": (dict,)}
+_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005, final_kl=0.002)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +61,8 @@ class FinetuneCfg:
     """What robots are told: to cross, as in a search, the default; or random velocities, as in the base's training."""
     rewards: tuple[str, ...] | None = None
     """Weights that reward terms have in this training, each NAME=WEIGHT; termination=-200 (a fall) and
-    tracking_lin_vel=2. The others keep those of the robot, as all do in the rewards of an evaluation."""
+    tracking_lin_vel=2. Giving any replaces these two: terms left out keep the robot's own weight, also these two, as
+    all do in the rewards of an evaluation."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
@@ -137,15 +137,14 @@ def job_of(cfg: FinetuneCfg) -> Job:
         hidden, before = start.hidden_dims, sorted(recorded_marks(str(path)))
         cfg = cfg if start.critic is None else replace(cfg, critic_iterations=0)
     else:  # all of it is in the checkpoint: the file it began with may be gone
-        start, hidden = None, _saved_ppo(cfg.resume, saved).hidden_dims
+        start, hidden = None, saved_ppo(cfg.resume, saved).hidden_dims
         before = saved["extra"]["settings"].get("trained_before", [])
     cfg = replace(cfg, ppo=replace(_ppo(cfg, saved), hidden_dims=hidden))
     values: Any = cfg  # whose numbers and names are all there now
     mix_cfg = MixCfg(mix=values.mix, terrains=values.terrains, swap_every=values.swap_every, draw=values.draw)
     check_ppo(cfg.ppo, values.num_envs)
     check_limits(rows=cfg.rows, save_every_s=cfg.save_every_s, max_seconds=cfg.max_seconds)
-    if saved is not None and saved["iter"] > values.iterations:
-        raise ValueError(f"{cfg.resume} has done {saved['iter']} iterations already: give at least as many in all")
+    check_more(cfg.resume, saved, values.iterations)
     if values.num_envs < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {values.num_envs}")
     if values.task not in _TASKS:
@@ -167,8 +166,8 @@ def job_of(cfg: FinetuneCfg) -> Job:
             **({"trained_before": before} if before else {}),
         }
     )
-    if saved is not None:
-        _check_resumed(cfg, saved, settings)
+    if saved is not None and cfg.resume is not None:
+        check_resumed(cfg.resume, saved, settings)
     return Job(
         cfg=cfg,
         robot=robot,
@@ -193,7 +192,7 @@ def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
     """
     on_gpu = device.startswith("cuda")
     sizes = _PAPER.get(robot, _PAPER_OTHERS) if on_gpu else _SMALL
-    before = _settings_of(cfg.resume) if cfg.resume else {}
+    before = settings_of(cfg.resume, {**_KINDS, "policy": Path, "archive": Path}) if cfg.resume else {}
     if not on_gpu and not before and cfg.num_envs is None and cfg.iterations is None:
         print(
             f"No GPU: a small fine-tuning of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough "
@@ -203,23 +202,9 @@ def _filled(cfg: FinetuneCfg, robot: str, device: str) -> FinetuneCfg:
     cfg = replace(cfg, **{name: value for name, value in defaults.items() if getattr(cfg, name) is None})
     if cfg.critic_iterations is None and cfg.iterations is not None:
         cfg = replace(cfg, critic_iterations=min(_CRITIC_ITERATIONS, cfg.iterations // 2))
-    for name, least in (("num_envs", 1), ("iterations", 1), ("critic_iterations", 0), ("seed", 0)):
-        if getattr(cfg, name) < least:
-            raise ValueError(f"{name} must be at least {least}, got {getattr(cfg, name)}")
+    check_least(num_envs=(cfg.num_envs, 1), iterations=(cfg.iterations, 1), seed=(cfg.seed, 0))
+    check_least(critic_iterations=(cfg.critic_iterations, 0))
     return cfg
-
-
-def _settings_of(run: Path) -> dict[str, Any]:
-    """What a run was begun with, as far as a command line may leave it out."""
-    config = read_json(run / CONFIG)
-    found = {name: config.get(name) for name in (*_DEFAULTS, *_NUMBERS)}
-    if isinstance(found["rewards"], list):
-        found["rewards"] = tuple(map(str, found["rewards"]))
-    paths = {name: Path(config[name]) for name in ("policy", "archive") if isinstance(config.get(name), str)}
-    wrong = [name for name, value in found.items() if value is not None and type(value) not in (int, str, tuple)]
-    if wrong:
-        raise ValueError(f"{run / CONFIG} is damaged at {', '.join(wrong)}: put a copy of it back")
-    return {name: value for name, value in {**found, **paths}.items() if value is not None}
 
 
 def _rewards(given: tuple[str, ...], robot: RobotCfg) -> RewardCfg:
@@ -261,35 +246,7 @@ def _ppo(cfg: FinetuneCfg, saved: dict[str, Any] | None) -> PpoCfg:
     """Settings of the learner: the resumed run's, unless others are asked for."""
     if not cfg.ppo.captured:
         raise ValueError("rsl_rl's own PPO cannot let the critic learn alone at first: leave --ppo.captured on")
-    return cfg.ppo if saved is None or cfg.ppo != _PPO else _saved_ppo(cfg.resume, saved)
-
-
-def _saved_ppo(run: Path | None, saved: dict[str, Any]) -> PpoCfg:
-    try:
-        ppo = PpoCfg(**saved["extra"]["settings"]["ppo"])
-        return replace(ppo, hidden_dims=tuple(ppo.hidden_dims))
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{run} is damaged: {error} in its settings of ppo; put a copy of it back") from error
-
-
-def _check_resumed(cfg: FinetuneCfg, saved: dict[str, Any], settings: dict[str, Any]) -> None:
-    assert cfg.resume is not None
-    check_entries(saved["extra"], _STATE, cfg.resume / CHECKPOINT)
-    before = saved["extra"]["settings"]
-    different = changes(_wherever_elites_lie(before), _wherever_elites_lie(settings))
-    if different:
-        raise ValueError(
-            f"{cfg.resume} was begun with other settings ({'; '.join(different)}): leave out what is given otherwise, "
-            "put an archive that has changed back, or begin a new run"
-        )
-
-
-def _wherever_elites_lie(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings without the place of the archive, which may have moved: its hash says whether it is the same."""
-    archive = settings.get("archive")
-    if not isinstance(archive, dict):
-        return settings
-    return {**settings, "archive": {key: value for key, value in archive.items() if key != "path"}}
+    return cfg.ppo if saved is None or cfg.ppo != _PPO else saved_ppo(cfg.resume, saved)
 
 
 def _run_dir(cfg: FinetuneCfg, robot: str) -> Path:

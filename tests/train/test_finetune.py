@@ -151,6 +151,28 @@ def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
         job_of(FinetuneCfg(resume=run, device="cpu", rewards=("termination=-1",)))
 
 
+def test_it_says_which_rewards_weigh_otherwise_than_the_robots_own(places, capsys):
+    own = ROBOT.training.rewards
+    finetune(config(places, run_dir=places / "weights", iterations=1))
+    expected = f"Rewards: tracking_lin_vel=2, termination=-200 (the robot's own: {own.tracking_lin_vel:g}, "
+    assert f"{expected}{own.termination:g})\n" in capsys.readouterr().out
+    finetune(config(places, run_dir=places / "own_weights", iterations=1, rewards=("tracking_lin_vel=1",)))
+    assert "Rewards: the robot's own\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("num_envs", "x"), ("iterations", 2.5), ("seed", True), ("draw", 3), ("rewards", "a=1"), ("archive", 5)],
+)
+def test_a_damaged_setting_of_the_resumed_run_is_named(key, value, finished, tmp_path):
+    for name in ("checkpoint.pt", "config.json"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    settings = json.loads((finished / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps({**settings, key: value}))
+    with pytest.raises(ValueError, match=f"config.json is damaged at {key}: put a copy of it back"):
+        job_of(FinetuneCfg(resume=tmp_path, device="cpu"))
+
+
 def test_terrains_are_exchanged_when_due(places, monkeypatch):
     seen = []
     exchange = command.CommandTask.exchange
