@@ -39,6 +39,11 @@ def command_of(target: str, **variables: str) -> list[str]:
     return run_by(" ".join(["make", target, *given]))
 
 
+def test_the_help_says_what_every_variable_is():
+    done = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert [name for name in VARIABLES if f"{name}=" not in done.stdout] == []
+
+
 NO_MAP = ("POLICIES", "ARCHIVE", "SPLIT_SEED", "SETS", "TERRAINS", "WORKERS")
 """What `make evaluate` refuses beside TERRAIN."""
 
