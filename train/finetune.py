@@ -99,6 +99,17 @@ def _weights(job: Job) -> str:
     return f"Rewards: {given} (the robot's own: {', '.join(f'{own[name]:g}' for name in other)})"
 
 
+def _comparison(job: Job) -> str:
+    """The command that holds the controller against the shipped one, on elites held out of its training too."""
+    policies = shlex.quote(f"base=shipped tuned={shlex.quote(str(job.run_dir / POLICY))}")
+    command = f"make evaluate ROBOT={shlex.quote(job.robot.spec)} POLICIES={policies}"
+    archive = job.settings["archive"]
+    if archive is None:
+        return command
+    split = f" SPLIT_SEED={archive['split_seed']}" if archive["split_seed"] else ""
+    return f"{command} ARCHIVE={shlex.quote(archive['path'])}{split}"
+
+
 def finetune(cfg: FinetuneCfg) -> int:
     """Fine-tune as told; returns the exit status: 0, or 130 after Ctrl-C.
 
@@ -141,6 +152,8 @@ def finetune(cfg: FinetuneCfg) -> int:
             raise FloatingPointError(f"{error}; {kept} in {run_dir}: lower --ppo.learning-rate") from error
     if learner.iteration < job.iterations:
         print(f"Stopped after {learner.iteration} of {job.iterations} iterations. Go on with: --resume {run_dir}")
+    else:
+        print(f"Next, see what it did:  {_comparison(job)}")
     return 130 if stop.requested else 0
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shlex
 import sys
 from dataclasses import replace
 
@@ -115,6 +116,16 @@ def test_a_critic_that_comes_along_is_taken(places):
 def test_left_out_the_critic_alone_has_at_most_half_of_the_iterations(iterations, alone, places):
     job = job_of(config(places, critic_iterations=None, iterations=iterations, run_dir=places / "none"))
     assert job.settings["critic_iterations"] == alone
+
+
+def test_it_ends_with_the_command_that_compares(places, capsys):
+    run = places / "a run"
+    assert finetune(config(places, run_dir=run, iterations=1, split_seed=3)) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Next, see what it did:"))
+    words = shlex.split(line.partition("  ")[2])
+    assert words[:3] == ["make", "evaluate", "ROBOT=anymal"]
+    assert shlex.split(words[3].removeprefix("POLICIES=")) == ["base=shipped", f"tuned={run / 'policy.pt'}"]
+    assert [word.partition("=")[0] for word in words[4:]] == ["ARCHIVE", "SPLIT_SEED"] and words[5] == "SPLIT_SEED=3"
 
 
 def test_it_says_where_the_controller_will_stay_as_it_is(places, capsys):
