@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from qd.cli import run_command
 from qd.own_terrain import OwnTerrain, own_seeds, read_own_terrain
 from qd.paths_figure import draw_paths
+from qd.places import controller_suffix
 from qd.progress import share_bar
 from qd.replay import PENALTY_UNITS
 from qd.report import save_figure
@@ -54,7 +55,8 @@ class CrossCfg:
     seed: int = 0
     """Draws their starts."""
     out: Path | None = None
-    """Where to write the numbers, runs/terrains/<map>-<robot>.json; the figure stands beside it as ...-paths.png."""
+    """Where to write the numbers, runs/terrains/<map>-<robot>[-<controller>].json; beside it the figure,
+    ...-paths.png."""
 
 
 def cross(cfg: CrossCfg) -> dict[str, Any]:
@@ -75,10 +77,11 @@ def cross(cfg: CrossCfg) -> dict[str, Any]:
     terrain = read_own_terrain(cfg.terrain, cfg)
     if cfg.episodes < 1 or cfg.seed < 0:
         raise ValueError(f"episodes must be at least 1 and seed at least 0, got {cfg.episodes} and {cfg.seed}")
-    out, figure = _outputs(cfg, robot.name)
-    prepare_output(out)
     device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
     check_policy(policy, robot, device)
+    who = robot.name + controller_suffix(policy, str(robot.policy_file))
+    out, figure = _outputs(cfg, who)
+    prepare_output(out)
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.episodes, device=device)
     with share_bar("crossing") as progress:
@@ -88,14 +91,14 @@ def cross(cfg: CrossCfg) -> dict[str, Any]:
     report = {**origin_of(device, cfg.seed, None), **_about(cfg, robot.name, terrain, policy), **numbers_of(result)}
     print(describe(report))
     write_atomically(out, to_json(report))
-    save_figure(figure, draw_paths(terrain.heights, result, f"{robot.name} on {terrain.label}: {_headline(report)}"))
+    save_figure(figure, draw_paths(terrain.heights, result, f"{who} on {terrain.label}: {_headline(report)}"))
     print(f"Numbers: {out}\nFigure: {figure}")
     return report
 
 
-def _outputs(cfg: CrossCfg, robot: str) -> tuple[Path, Path]:
+def _outputs(cfg: CrossCfg, who: str) -> tuple[Path, Path]:
     """Files of the numbers and of the figure, neither of which may be the map or what says its scale."""
-    out = cfg.out or OWN_FOLDER / f"{cfg.terrain.stem}-{robot}.json"
+    out = cfg.out or OWN_FOLDER / f"{cfg.terrain.stem}-{who}.json"
     figure = out.with_name(f"{out.stem}-paths.png")
     given = {cfg.terrain.resolve(), cfg.terrain.with_suffix(".json").resolve()}
     if given & {out.resolve(), figure.resolve()}:
@@ -161,7 +164,7 @@ def _headline(report: dict[str, Any]) -> str:
 def describe(report: dict[str, Any]) -> str:
     """The numbers of a terrain, in words."""
     count = report["episodes"] - report["invalid_episodes"]
-    lines = [f"{report['robot']} on {report['terrain']}, {report['episodes']} episodes:"]
+    lines = [f"{report['robot']} with {report['policy']} on {report['terrain']}, {report['episodes']} episodes:"]
     lines += [f"  {_LABELS[name]:30}{rate_words(rate['hits'], count):>30}" for name, rate in report["rates"].items()]
     for name, cost in report["penalties"].items():
         label = f"{name} [{cost['unit']}]"

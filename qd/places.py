@@ -77,10 +77,15 @@ def elite_name(elite: int, policy: str, searched: str) -> str:
         policy: The controller that crosses it.
         searched: That of the search.
     """
-    if is_same(policy, searched):
-        return f"elite-{elite}"
+    return f"elite-{elite}{controller_suffix(policy, searched)}"
+
+
+def controller_suffix(policy: str, usual: str) -> str:
+    """What the name of a file about a controller ends with: nothing for the usual one, else such as -C-G."""
+    if is_same(policy, usual):
+        return ""
     label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")
-    return f"elite-{elite}-{re.sub(r'[^A-Za-z0-9_.-]+', '-', label)}"
+    return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
 def is_same(policy: str, other: str) -> bool:

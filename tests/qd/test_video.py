@@ -113,8 +113,8 @@ def test_a_film_of_ones_own_terrain(opengl):
             terrain=Path("hill.npz"), policy="tests.sim.policies:stand", device="cpu", replicas=4, fps=1, shadows=False
         )
     )
-    assert films == [Path("runs/terrains/hill-anymal.mp4")]
-    recording = read_recording("runs/terrains/hill-anymal.recording.npz")
+    assert films == [Path("runs/terrains/hill-anymal-tests.sim.policies-stand.mp4")]
+    recording = read_recording("runs/terrains/hill-anymal-tests.sim.policies-stand.recording.npz")
     assert recording.labels == ("hill.npz",) and (recording.heights == 0).all()
 
 
@@ -212,8 +212,17 @@ def test_rates_of_ones_own_terrain_with_their_intervals(capsys):
     } <= report.keys()
     text = capsys.readouterr().out
     assert "wall.png: 161 x 81 nodes over 16 x 8 m" in text
+    assert "anymal with tests.sim.policies:stand on wall.png, 4 episodes" in text
     assert " ".join(text.split()).count("goal reached 0 of 4 (0%, 0 to 49%)") == 1
     assert Image.open("numbers-paths.png").size[0] > 1000
+
+
+def test_files_of_another_controller_are_named_after_it():
+    np.savez("hill.npz", heights=np.zeros((3, 5)), size_m=[16.0, 8.0])
+    cross(CrossCfg(terrain=Path("hill.npz"), policy="tests.sim.policies:stand", device="cpu", episodes=4))
+    assert sorted(path.name for path in Path("runs/terrains").iterdir()) == [
+        "hill-anymal-tests.sim.policies-stand-paths.png", "hill-anymal-tests.sim.policies-stand.json"
+    ]  # fmt: skip
 
 
 def test_invalid_episodes_are_left_out_of_the_rates():
@@ -229,12 +238,12 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["duration_s"] == 10.0 and numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "m"}
     assert numbers["invalid_episodes"] == 1 and numbers["outcomes"]["invalid"] == 1
-    text = describe({"robot": "anymal", "terrain": "hill.npz", **numbers})
+    text = describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
     assert "1 of 2 (50%, 9 to 91%)" in text and "1 invalid episodes are left out" in text
     result.invalid[:] = True
     numbers = numbers_of(result)
     assert numbers["rates"]["goal"] == {"rate": None, "hits": 0, "interval": None} and numbers["duration_s"] is None
-    assert "no valid episode" in describe({"robot": "anymal", "terrain": "hill.npz", **numbers})
+    assert "no valid episode" in describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
 
 
 def test_mistakes_with_ones_own_terrain(capsys):

@@ -1,6 +1,5 @@
 """The fine-tuning command: what it starts from, exchanges, resuming, what it leaves behind, and errors."""
 
-import itertools
 import json
 import shlex
 import sys
@@ -14,8 +13,9 @@ from qd.archive import write_archive
 from sim.policy import load_policy
 from sim.robot import get_robot
 from tests.train.archives import make_archive
+from tests.train.starts import make_places, write_actor
 from train import finetune as command
-from train.finetune import finetune, main
+from train.finetune import finetune
 from train.finetune_job import FinetuneCfg, job_of
 from train.learner import read_checkpoint
 from train.ppo import PpoCfg
@@ -25,29 +25,9 @@ PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
 
 
-def write_actor(path, *, hidden=(16, 8), critic=False, **extra):
-    """A controller of random layers, as rsl_rl writes it."""
-    torch.manual_seed(0)
-    state = {"distribution.std_param": torch.full((12,), 0.3)}
-    sizes = (235, *hidden, 12)
-    for k, (width, out) in enumerate(itertools.pairwise(sizes)):
-        state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
-    content = {"actor_state_dict": {**state, **extra}}
-    if critic:
-        shapes = {f"mlp.{2 * k}": (out, width) for k, (width, out) in enumerate(itertools.pairwise((235, *hidden, 1)))}
-        content["critic_state_dict"] = {f"{key}.weight": torch.randn(shape) for key, shape in shapes.items()}
-        content["critic_state_dict"] |= {f"{key}.bias": torch.zeros(shape[0]) for key, shape in shapes.items()}
-    torch.save(content, path)
-    return path
-
-
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("finetune")
-    (folder / "archive").mkdir()
-    write_archive(folder / "archive" / "archive.npz", make_archive(10))
-    write_actor(folder / "start.pt")
-    return folder
+    return make_places(tmp_path_factory.mktemp("finetune"))
 
 
 def config(places, **changes):
@@ -268,77 +248,3 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
     with pytest.raises(FloatingPointError, match=r"losses are not finite.*the last checkpoint is kept in"):
         finetune(FinetuneCfg(resume=run, device="cpu", iterations=3))
     assert (run / "checkpoint.pt").read_bytes() == kept
-
-
-def write_bad_starts(folder):
-    """Controllers that walk, and cannot be trained on."""
-    write_actor(folder / "std_nan.pt", **{"distribution.std_param": torch.full((12,), float("nan"))})
-    write_actor(folder / "std_negative.pt", **{"distribution.std_param": torch.full((12,), -1.0)})
-    write_actor(folder / "std_short.pt", **{"distribution.std_param": torch.full((2,), 0.3)})
-    whole = torch.load(write_actor(folder / "whole.pt", critic=True), weights_only=True)
-    critic = whole["critic_state_dict"]
-    others = {"other": {**critic, "mlp.0.weight": torch.ones(3, 3)}, "none": 5}
-    others["nan"] = {**critic, "mlp.0.bias": torch.full((16,), float("nan"))}
-    for name, other in others.items():
-        torch.save({**whole, "critic_state_dict": other}, folder / f"critic_{name}.pt")
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--robot", "spot"], "unknown robot 'spot'"),
-        (["--archive", "{dir}/nowhere"], "make one (make archive ROBOT=anymal) and name it with --archive"),
-        (["--archive", "{dir}/cassie.npz"], "the archive must be of robot 'anymal', got one of 'cassie'"),
-        (["--archive", "{dir}/empty.npz"], "needs at least 5 elites, got 0"),
-        (["--mix", "hand-crafted", "--archive", "{dir}/archive"], "takes no terrains from an archive"),
-        (["--mix", "hard-random", "--draw", "failing"], "draw failing chooses among elites"),
-        (["--policy", "{dir}/nowhere.pt"], "no such file"),
-        (["--policy", "{dir}/narrow.pt"], "maps 100 observations to 12 actions"),
-        (["--policy", "{dir}/script.pt"], "a fine-tuning starts from an rsl_rl checkpoint"),
-        (["--policy", "{dir}/std_nan.pt"], "must be 12 numbers above 0, got tensor([nan"),
-        (["--policy", "{dir}/std_negative.pt"], "must be 12 numbers above 0, got tensor([-1."),
-        (["--policy", "{dir}/std_short.pt"], "must be 12 numbers above 0, got tensor([0.3000, 0.3000])"),
-        (
-            ["--policy", "{dir}/critic_other.pt"],
-            "must have the actor's hidden layers [16, 8], 235 inputs and one output",
-        ),
-        (
-            ["--policy", "{dir}/critic_none.pt"],
-            "must have the actor's hidden layers [16, 8], 235 inputs and one output",
-        ),
-        (["--policy", "{dir}/critic_nan.pt"], "has weights that are not finite"),
-        (["--terrains", "1"], "terrains must be at least 2"),
-        (["--terrains", "30", "--num-envs", "6"], "num_envs must be at least as many as terrains, 30, got 6"),
-        (["--rewards", "fall=-1"], "rewards has no term 'fall': expected NAME=WEIGHT with one of tracking_lin_vel,"),
-        (["--rewards", "termination=much"], "with a number, such as termination=-1, got 'termination=much'"),
-        (["--rewards", "termination"], "with a number, such as termination=-1, got 'termination'"),
-        (["--rewards", "termination=inf"], "with a number, such as termination=-1, got 'termination=inf'"),
-        (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
-        (["--iterations", "-1"], "iterations must be at least 1, got -1"),
-        (["--ppo.mini-batches", "0"], "ppo.mini_batches must be at least 1"),
-        (["--export", "tuned.onnx"], "export must be a file named *.pt, got tuned.onnx: python -m train.export"),
-        (["--rows", "0"], "rows must be at least 1, got 0"),
-        (["--max-seconds", "0"], "max_seconds must be above 0 s, got 0.0"),
-        (["--save-every-s", "-1"], "save_every_s must be at least 0 s, got -1.0"),
-        (["--seed", "-1"], "seed must be at least 0, got -1"),
-        (["--resume", "{dir}/nowhere"], "no checkpoint at"),
-        (["--ppo.no-captured"], "leave --ppo.captured on"),
-    ],
-)
-def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeypatch, capsys):
-    write_archive(places / "cassie.npz", make_archive(10, robot="cassie"))
-    write_archive(places / "empty.npz", make_archive(0))
-    state = torch.load(places / "start.pt", weights_only=True)["actor_state_dict"]
-    state["mlp.0.weight"] = state["mlp.0.weight"][:, :100]
-    torch.save({"actor_state_dict": state}, places / "narrow.pt")
-    write_bad_starts(places)
-    torch.jit.script(torch.nn.Linear(235, 12)).save(places / "script.pt")
-    monkeypatch.setattr("train.finetune.CommandTask", None)  # building anything would fail with another error
-    monkeypatch.chdir(places)
-    given = ["--device", "cpu", *(flag.format(dir=places) for flag in flags)]
-    if "--archive" not in flags and not {"hand-crafted", "hard-random"} & set(flags) and "--resume" not in flags:
-        given += ["--archive", str(places / "archive" / "archive.npz")]
-    monkeypatch.setattr(sys, "argv", ["train.finetune", *given])
-    assert main() == 2
-    error = capsys.readouterr().err
-    assert message in error and error.startswith("error: ") and error.count("\n") == 1

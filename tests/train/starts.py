@@ -1,0 +1,46 @@
+"""Controllers and an archive that a fine-tuning begins with."""
+
+import itertools
+from pathlib import Path
+
+import torch
+
+from qd.archive import write_archive
+from tests.train.archives import make_archive
+
+
+def write_actor(path, *, hidden=(16, 8), critic=False, **extra):
+    """A controller of random layers, as rsl_rl writes it."""
+    torch.manual_seed(0)
+    state = {"distribution.std_param": torch.full((12,), 0.3)}
+    sizes = (235, *hidden, 12)
+    for k, (width, out) in enumerate(itertools.pairwise(sizes)):
+        state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
+    content = {"actor_state_dict": {**state, **extra}}
+    if critic:
+        shapes = {f"mlp.{2 * k}": (out, width) for k, (width, out) in enumerate(itertools.pairwise((235, *hidden, 1)))}
+        content["critic_state_dict"] = {f"{key}.weight": torch.randn(shape) for key, shape in shapes.items()}
+        content["critic_state_dict"] |= {f"{key}.bias": torch.zeros(shape[0]) for key, shape in shapes.items()}
+    torch.save(content, path)
+    return path
+
+
+def make_places(folder: Path) -> Path:
+    """A folder with an archive of ten elites and a controller."""
+    (folder / "archive").mkdir()
+    write_archive(folder / "archive" / "archive.npz", make_archive(10))
+    write_actor(folder / "start.pt")
+    return folder
+
+
+def write_bad_starts(folder):
+    """Controllers that walk, and cannot be trained on."""
+    write_actor(folder / "std_nan.pt", **{"distribution.std_param": torch.full((12,), float("nan"))})
+    write_actor(folder / "std_negative.pt", **{"distribution.std_param": torch.full((12,), -1.0)})
+    write_actor(folder / "std_short.pt", **{"distribution.std_param": torch.full((2,), 0.3)})
+    whole = torch.load(write_actor(folder / "whole.pt", critic=True), weights_only=True)
+    critic = whole["critic_state_dict"]
+    others = {"other": {**critic, "mlp.0.weight": torch.ones(3, 3)}, "none": 5}
+    others["nan"] = {**critic, "mlp.0.bias": torch.full((16,), float("nan"))}
+    for name, other in others.items():
+        torch.save({**whole, "critic_state_dict": other}, folder / f"critic_{name}.pt")
