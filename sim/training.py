@@ -57,11 +57,9 @@ class TrainingCfg:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningCfg:
-    """How the robot's controller is learned from scratch on a GPU (:class:`train.ppo.PpoCfg`); ANYmal's by default."""
+class PaceCfg:
+    """The settings of the learner that belong to the robot; the defaults are legged_gym's."""
 
-    num_envs: int = 8192
-    iterations: int = 2240
     init_noise_std: float = 1.0
     """Standard deviation of the actions before the first update."""
     desired_kl: float = 0.01
@@ -69,9 +67,18 @@ class LearningCfg:
     entropy: float = 0.01
     """Weight of the entropy bonus."""
     final_share: float = 0.0
-    """Share of the iterations, the last ones, with the two below in place of the two above."""
+    """Share of the iterations, the last ones, with final_kl and final_entropy in place of desired_kl and entropy:
+    smaller steps and less noise."""
     final_kl: float = 0.008
     final_entropy: float = 0.002
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningCfg(PaceCfg):
+    """How the robot's controller is learned from scratch on a GPU; the defaults are ANYmal's."""
+
+    num_envs: int = 8192
+    iterations: int = 2240
 
 
 def learning_problems(cfg: LearningCfg) -> list[str]:

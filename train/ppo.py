@@ -1,7 +1,7 @@
 """PPO settings as a fresh dict per call, and rsl_rl's PPO with its minibatch step captured as one CUDA graph."""
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -9,13 +9,14 @@ from rsl_rl.algorithms import PPO
 from torch import nn
 
 from sim.robot import RobotCfg
+from sim.training import PaceCfg
 
 _FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on
 _EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels
 
 
 @dataclass(frozen=True, kw_only=True)
-class PpoCfg:
+class PpoCfg(PaceCfg):
     """Settings of the learner; the defaults are legged_gym's but for the steps."""
 
     hidden_dims: tuple[int, ...] = (512, 256, 128)
@@ -28,31 +29,19 @@ class PpoCfg:
     """Minibatches a pass."""
     learning_rate: float = 1e-3
     """Learning rate at the start; adapted to the KL divergence from then on."""
-    desired_kl: float = 0.01
-    """KL divergence an update aims at."""
     gamma: float = 0.99
     """Discount per control step."""
     lam: float = 0.95
     """Lambda of generalised advantage estimation."""
     clip: float = 0.2
     """Clip range of the probability ratio and of the value."""
-    entropy: float = 0.01
-    """Weight of the entropy bonus."""
-    init_noise_std: float = 1.0
-    """Standard deviation of the actions before the first update."""
-    final_share: float = 0.0
-    """Share of the iterations, the last ones, with final_kl and final_entropy in place of desired_kl and entropy:
-    smaller steps and less noise."""
-    final_kl: float = 0.008
-    final_entropy: float = 0.002
     captured: bool = True
     """Update with :class:`CapturedPPO`; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
 
     @classmethod
     def of(cls, robot: RobotCfg) -> "PpoCfg":
         """The settings that a robot's controller is learned with."""
-        learning = asdict(robot.learning)
-        return cls(**{setting.name: learning[setting.name] for setting in fields(cls) if setting.name in learning})
+        return cls(**{setting.name: getattr(robot.learning, setting.name) for setting in fields(PaceCfg)})
 
 
 def check_ppo(cfg: PpoCfg, num_envs: int) -> None:
