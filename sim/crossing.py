@@ -32,8 +32,6 @@ class CrossingCfg:
     """Penalties are summed from this time on."""
     base_force: float = 1.0
     """Contact force on the base that counts as a collision [N]."""
-    max_speed: float = 100.0
-    """Any velocity beyond makes the episode invalid [m/s or rad/s]."""
     poll_every_s: float = 1.0
     """How often the host asks whether any episode still runs, in simulated time."""
     reward: bool = False
@@ -56,7 +54,7 @@ def make_task(cfg: CrossingCfg, robot: RobotCfg) -> Task:
     task.max_steps = round(cfg.max_duration_s / robot.physics_dt)
     task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
     task.base_force = cfg.base_force
-    task.max_speed = cfg.max_speed
+    task.max_speed = robot.max_speed
     task.overflow_mask = CAPACITY_OVERFLOWS
     return task
 

@@ -17,7 +17,7 @@ from sim.robot import ROBOTS, RobotCfg
 from sim.training import LearningCfg, TrainingCfg, learning_problems, training_problems
 
 _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
-_POSITIVE = ("default_base_height", "contact_force_limit", "action_scale", "physics_dt")
+_POSITIVE = ("default_base_height", "contact_force_limit", "action_scale", "physics_dt", "max_speed")
 _COUNTS = ("decimation", "nconmax", "njmax")
 _PER_JOINT = {"stiffness": "positive", "damping": "0 or more", "effort_limit": "positive", "armature": "0 or more"}
 _LONGEST_STEP_S = 0.05

@@ -146,7 +146,9 @@ class _Episodes:
             self.data[k].ctrl[:] = target
 
 
-def _judge(episodes: _Episodes, running: NDArray[np.intp], base: NDArray[np.bool_], cfg: CrossingCfg) -> Array:
+def _judge(
+    robot: RobotCfg, episodes: _Episodes, running: NDArray[np.intp], base: NDArray[np.bool_], cfg: CrossingCfg
+) -> Array:
     """Outcome of each running episode after a physics step, the gravest of several."""
     qpos, qvel = episodes.qpos[running], episodes.qvel[running]
     x, y = qpos[:, 0], qpos[:, 1]
@@ -156,7 +158,7 @@ def _judge(episodes: _Episodes, running: NDArray[np.intp], base: NDArray[np.bool
     outcome[np.hypot(cfg.goal[0] - x, cfg.goal[1] - y) < cfg.goal_radius] = Outcome.GOAL
     force = np.linalg.norm(episodes.forces[running][:, base], axis=2).max(axis=1)
     outcome[force > cfg.base_force] = Outcome.BASE_COLLISION
-    finite = np.isfinite(qpos).all(axis=1) & (np.abs(qvel) <= cfg.max_speed).all(axis=1)
+    finite = np.isfinite(qpos).all(axis=1) & (np.abs(qvel) <= robot.max_speed).all(axis=1)
     outcome[~finite | episodes.warned[running]] = Outcome.INVALID
     return outcome
 
@@ -206,7 +208,7 @@ def cross(
             last_action[running] = action
             episodes.hold(running, np.array(robot.default_joint_pos) + robot.action_scale * action)
         episodes.step(running)
-        judged = _judge(episodes, running, base, cfg)
+        judged = _judge(robot, episodes, running, base, cfg)
         judged[(judged == Outcome.RUNNING) & (step + 1 >= most)] = Outcome.TIME_OUT
         outcome[running] = judged
         steps[running] += 1

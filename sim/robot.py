@@ -56,6 +56,8 @@ class RobotCfg:
     physics_dt: float = 0.005
     decimation: int = 4
     """Physics steps per control step."""
+    max_speed: float = 100.0
+    """A state with a velocity beyond is invalid [m/s or rad/s]: what the robot cannot reach, not even when it falls."""
     nconmax: int = 40
     """Contacts an environment on average; the buffer is shared by all."""
     njmax: int = 100
@@ -201,6 +203,7 @@ ROBOTS = {
         collision_bit=True,
         nconmax=7,  # the most there can be: a sphere, and 3 on each toe
         njmax=48,  # 3 rows a contact and 12 joint limits, in the solver's tiles of 16
+        max_speed=300.0,  # its light ankles reach 140 rad/s in falls, by their motors alone
         training=TrainingCfg(  # README, Cassie, says what mattered
             rewards=RewardCfg(
                 tracking_lin_vel=2.0,

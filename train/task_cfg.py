@@ -65,8 +65,6 @@ class TaskCfg(TrainingCfg):
     """Contact force on the base that ends an episode [N]."""
     max_gravity_z: float = -0.1
     """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
-    max_speed: float = 100.0
-    """Any velocity beyond makes the state invalid [m/s or rad/s]."""
 
     @classmethod
     def of(cls, robot: RobotCfg, **changes: Any) -> "TaskCfg":
@@ -83,7 +81,7 @@ class TaskCfg(TrainingCfg):
 _RANGES = ("friction", "lin_vel_x", "lin_vel_y")
 _FROM_0 = (
     "episode_s", "command_interval_s", "min_speed", "yaw_gain", "max_yaw_rate", "push_interval_s",
-    "start_position_range", "start_yaw_range", "start_velocity_range", "base_force", "max_speed",
+    "start_position_range", "start_yaw_range", "start_velocity_range", "base_force",
 )  # fmt: skip
 
 
@@ -123,7 +121,7 @@ def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int)
         max_steps=round(cfg.episode_s / control_dt),
         base_force=cfg.base_force,
         max_gravity_z=cfg.max_gravity_z,
-        max_speed=cfg.max_speed,
+        max_speed=robot.max_speed,
         overflow_mask=CAPACITY_OVERFLOWS,
         num_levels=num_levels,
         num_columns=num_columns,
