@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 _TEMPORARY = ".tmp"
 _PROBE = ".write-test"
+_NUMBERS = re.compile(r"\[\n([^][{}\"]*)\]")  # a list without lists, objects or strings; no string holds a line break
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -92,8 +94,9 @@ def prepare_output(file: Path) -> None:
 
 
 def to_json(content: dict[str, Any]) -> bytes:
-    """A dictionary as indented JSON; a number that is not finite is an error, since JSON has none."""
-    return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+    """A dictionary as JSON, indented, lists of numbers on one line; a number that is not finite is an error."""
+    text = json.dumps(content, indent=2, allow_nan=False)
+    return (_NUMBERS.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n").encode()
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -29,11 +29,6 @@ def heights():
     return np.float32(0.3) * np.sin(np.arange(NUM_COLS) / 9.0, dtype=np.float32) * np.ones((NUM_ROWS, 1), np.float32)
 
 
-def walker(robot):
-    """The shipped controller; for Cassie, of which no test expects one, legs that move."""
-    return robot.policy_file if robot.name == "anymal" else "tests.sim.policies:sway"
-
-
 def states(robot, num=5):
     rng = np.random.default_rng(2)
     q = rng.normal(size=(num, 7 + robot.num_joints))
@@ -74,7 +69,7 @@ def test_observation_command_and_penalties_are_those_of_the_oracle(robot, height
 
 def test_starts_are_those_of_the_rollout(robot):
     genes = hard_random_genes(1, 5)
-    rollout = Rollout(robot, walker(robot), num_terrains=1, num_replicas=EPISODES, device="cpu")
+    rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
     rollout.begin(genes, np.array([77], np.uint32))
     expected = to_mujoco(
         rollout.sim.joint_q.numpy(), rollout.sim.joint_qd.numpy(), np.array(rollout.sim.sensors.base_com)
@@ -141,11 +136,11 @@ SETTINGS = pytest.mark.parametrize(
 )
 
 
-def side_by_side(robot, changes, time_constant_s):
+def side_by_side(robot, policy, changes, time_constant_s, cfg=None):
     """The robot in both simulators at the same start, MuJoCo's heightfield replaced by its plane: the same contacts."""
-    policy, robot = walker(robot), dataclasses.replace(robot, **changes)
+    robot = dataclasses.replace(robot, **changes)
     solver = SolverCfg(time_constant_s=time_constant_s)
-    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", solver=solver)
+    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg, solver=solver)
     flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
     rollout.begin(flat[None], np.array([1000], np.uint32))
     model = crossing_model(robot, flat, time_constant_s=time_constant_s)
@@ -156,36 +151,58 @@ def side_by_side(robot, changes, time_constant_s):
     return robot, rollout, _Episodes(robot, model, draw_starts(robot, flat, 1000, EPISODES, "cpu"))
 
 
-@SETTINGS
-def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_constant_s):
-    # ANYmal walks for 0.2 s; Cassie needs 0.15 s to come down and swings on its legs for 0.25 s. The softer a contact,
-    # the more of a toe lies on the ground, where MuJoCo has the two ends alone.
-    num_steps, metres, radians = {"anymal": (10, 2e-4, 6e-3), "cassie": (20, 3e-3, 0.04)}[robot.name]
-    if robot.name == "cassie" and time_constant_s == 0.003:
-        metres, radians = 5e-4, 0.01
-    robot, rollout, plain = side_by_side(robot, changes, time_constant_s)
-    policy, everyone = load_policy(walker(robot), robot, "cpu"), np.arange(EPISODES)
+def walk(robot, policy, plain, seconds):
+    """Let the plain robots walk on level ground; yields their command after each physics step."""
+    policy, everyone = load_policy(policy, robot, "cpu"), np.arange(EPISODES)
     flat, action = np.zeros((NUM_ROWS, NUM_COLS)), np.zeros((EPISODES, robot.num_joints))
-    pushed = np.zeros(EPISODES)
-    for _ in range(num_steps):
-        rows = observations(robot, flat, plain.qpos, plain.qvel, goal_commands(plain.qpos, CrossingCfg()), action)
+    for _ in range(round(seconds / robot.control_dt)):
+        command = goal_commands(plain.qpos, CrossingCfg())
+        rows = observations(robot, flat, plain.qpos, plain.qvel, command, action)
         with torch.inference_mode():
             action = policy(torch.as_tensor(rows, dtype=torch.float32)).numpy().astype(np.float64)
         plain.hold(everyone, np.array(robot.default_joint_pos) + robot.action_scale * action)
         for _ in range(robot.decimation):
             plain.step(everyone)
-        pushed += np.abs(plain.forces[:, :, 2]).sum(1)
+            yield command
+
+
+@SETTINGS
+def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_constant_s):
+    # ANYmal walks for 0.2 s. Cassie needs 0.15 s to come down, and swings on its legs for 0.25 s, since to balance it
+    # lets every difference grow. The softer a contact, the more of a toe lies on the ground, where MuJoCo has the two
+    # ends alone.
+    seconds, metres, radians = {"anymal": (0.2, 2e-4, 6e-3), "cassie": (0.4, 3e-3, 0.04)}[robot.name]
+    if robot.name == "cassie" and time_constant_s == 0.003:
+        metres, radians = 5e-4, 0.01
+    policy = robot.policy_file if robot.name == "anymal" else "tests.sim.policies:sway"
+    robot, rollout, plain = side_by_side(robot, policy, changes, time_constant_s)
+    pushed = sum(np.abs(plain.forces[:, :, 2]).sum(1) for _ in walk(robot, policy, plain, seconds))
+    for _ in range(round(seconds / robot.control_dt)):
         rollout.control_step()
     found = rollout.sim.joint_q.numpy()
     assert np.abs(plain.qpos[:, 2] - robot.default_base_height).max() > 0.003  # it moves
-    assert (pushed > 500.0).all()  # and the ground has a part in it
+    assert (pushed * robot.physics_dt > 10.0).all()  # and the ground has a part in it
     np.testing.assert_allclose(found[:, :3], plain.qpos[:, :3], atol=metres)
     np.testing.assert_allclose(found[:, 7:], plain.qpos[:, 7:], atol=radians)
 
 
+def test_walking_on_a_plane_costs_the_same_in_both(robot):
+    # 4 s: long enough for steps to fall otherwise, so that only what they cost can be held against each other.
+    cfg = CrossingCfg(max_duration_s=4.0)
+    _, rollout, plain = side_by_side(robot, robot.policy_file, {}, None, cfg)
+    sums = sum(
+        robot.physics_dt * step_penalties(robot, plain.qpos, plain.qvel, command, plain.forces)
+        for command in walk(robot, robot.policy_file, plain, cfg.max_duration_s)
+    )
+    ours = rollout.evaluate(np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([1000], np.uint32))
+    assert (ours.outcome == Outcome.TIME_OUT).all() and (plain.qpos[:, 0] > 4.0).all()
+    columns = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y", "contact_force")]
+    np.testing.assert_allclose(ours.penalties[0][:, columns].mean(0), np.mean(sums, axis=0)[columns], rtol=0.08)
+
+
 @SETTINGS
 def test_sliding_on_its_back_it_is_braked_alike_in_both(anymal, changes, time_constant_s):
-    robot, rollout, plain = side_by_side(anymal, changes, time_constant_s)
+    robot, rollout, plain = side_by_side(anymal, anymal.policy_file, changes, time_constant_s)
     everyone, sim = np.arange(EPISODES), rollout.sim
     q, qd = sim.joint_q.numpy().copy(), np.zeros(sim.joint_qd.shape, np.float32)
     q[:, 2], q[:, 3:7], q[:, 7:] = 0.1, (1.0, 0.0, 0.0, 0.0), robot.default_joint_pos
@@ -220,7 +237,7 @@ def test_what_ends_a_crossing(robot):
     starts.qpos[1, 1] = 10.5  # outside
     starts.qpos[2, 2] = 0.05  # its belly in the ground
     starts.qvel[3, 8] = 5000.0  # a joint far too fast
-    policy = load_policy(walker(robot), robot, "cpu")
+    policy = load_policy(robot.policy_file, robot, "cpu")
     found = cross(robot, policy, flat, starts, CrossingCfg(max_duration_s=0.1))
     assert found.outcome.tolist() == [Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]
     assert np.isnan(found.penalties[3]).all() and np.isfinite(found.penalties[:3]).all()
