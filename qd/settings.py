@@ -5,24 +5,19 @@ Nothing here imports pyribs, which takes seconds: `--help` and the worker proces
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from qd.scheduler_cfg import SchedulerCfg
 from sim.command import split_words
 from sim.controller_spec import SHIPPED, ControllerSpec, spec_of
+from sim.remembered import built
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
-
-_MAX_WHOLE = 1 << 53  # up to which whole numbers are floats too
-
-"""Name of the controller that comes with the robot."""
-
-Built = TypeVar("Built")
 
 Settings = dict[str, Any]
 """The settings that make a run what it is, as JSON values."""
@@ -149,35 +144,9 @@ def from_settings(settings: Settings, iterations: int) -> SearchCfg:
         ValueError: If they are not the settings of a search.
     """
     try:
-        return _built(SearchCfg, {**settings, "iterations": iterations}, "a search")
+        return built(SearchCfg, {**settings, "iterations": iterations}, "a search")
     except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
-
-
-def _built(kind: type[Built], values: Any, name: str) -> Built:
-    """A settings class from JSON values, each of the type its field is annotated with."""
-    if not isinstance(values, dict):
-        raise ValueError(f"{name} must be an object, got {_brief(values)}")
-    hints = get_type_hints(kind)
-    return kind(**{key: _typed(hints[key], value, key) if key in hints else value for key, value in values.items()})
-
-
-def _typed(hint: Any, value: Any, name: str) -> Any:
-    """A JSON value as a field wants it: a nested class, a tuple, or a value of just that type."""
-    if is_dataclass(hint):
-        return _built(hint, value, name)  # pyright: ignore[reportArgumentType] - a hint is a class, no instance
-    if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(_typed(get_args(hint)[0], item, name) for item in value)
-    kinds = get_args(hint) or (hint,)
-    if type(value) in kinds or (type(value) is int and float in kinds and abs(value) < _MAX_WHOLE):
-        return value
-    expected = " or ".join(getattr(kind, "__name__", str(kind)) for kind in kinds)
-    raise ValueError(f"{name} must be {expected}, got {_brief(value)}")
-
-
-def _brief(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:

@@ -28,6 +28,7 @@ from train.learner import Learner
 from train.ppo import PpoCfg, check_ppo
 from train.progress import Progress
 from train.ranks import Ranks
+from train.resumed import settings_of, task_and_ppo
 from train.run import (
     CHECKPOINT,
     CONFIG,
@@ -67,15 +68,16 @@ class BaseCfg:
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
-    """Robots trained at once; 8192 on CUDA (Cassie: 2048), 32 on the CPU."""
+    """Robots trained at once; those of the resumed run, or 8192 on CUDA (Cassie: 2048), 32 on the CPU."""
     iterations: int | None = None
-    """Iterations in all, those before a resume included; 2240 on CUDA (Cassie: 3400), 20 on the CPU."""
+    """Iterations in all, those before a resume included; those of the resumed run, or 2240 on CUDA (Cassie: 3400), 20
+    on the CPU."""
     max_seconds: float | None = None
     """Save and stop in time to be done this many seconds after the start."""
     run_dir: Path | None = None
     """Where to write; runs/<robot>-base-<date>, or the resumed run."""
     resume: Path | None = None
-    """Run directory to go on from."""
+    """Run directory to go on from, as it was begun but for what is given otherwise."""
     export: Path | None = None
     """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
     <name>.pt beside the settings file of another robot makes it that robot's own."""
@@ -110,6 +112,11 @@ def _resolve_size(cfg: BaseCfg, learning: LearningCfg) -> tuple[str, int, int]:
     return device, num_envs, iterations
 
 
+def _sizes_of(run: Path) -> dict[str, int]:
+    """Sizes that a run was begun with; none where there is no run, which its checkpoint is there to say."""
+    return settings_of(run, {"num_envs": int, "iterations": int}) if (run / CONFIG).exists() else {}
+
+
 def _run_dir(cfg: BaseCfg, robot: str) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     return cfg.run_dir or cfg.resume or Path("runs") / f"{robot}-base-{stamp}"
@@ -132,6 +139,8 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     """What one process of a training does; only the first one's files are kept."""
     began = time.monotonic()
     robot = get_robot(cfg.robot)
+    before = _sizes_of(cfg.resume) if cfg.resume else {}
+    cfg = replace(cfg, **{name: value for name, value in before.items() if getattr(cfg, name) is None})
     device, num_envs, iterations = _resolve_size(cfg, robot.learning)
     saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
     if saved is not None and cfg.resume is not None:
@@ -178,16 +187,20 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
 
 
 def read_arguments(arguments: Sequence[str]) -> BaseCfg:
-    """The settings that a command line asks for, those of the named robot where it says nothing.
+    """The settings that a command line asks for; where it says nothing, those of the resumed run, or of the robot.
 
     Raises:
-        ValueError: If there is no such robot.
+        ValueError: If there is no such robot, or the run's settings cannot be read.
     """
     named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     named.add_argument("--robot", default=_ROBOT)
-    name = named.parse_known_args(arguments)[0].robot
-    robot = get_robot(name)
-    default = BaseCfg(robot=name, task=TaskCfg.of(robot), ppo=PpoCfg.of(robot))
+    named.add_argument("--resume", type=Path)
+    known = named.parse_known_args(arguments)[0]
+    robot = get_robot(known.robot)
+    task, ppo = TaskCfg.of(robot), PpoCfg.of(robot)
+    if known.resume is not None and (known.resume / CONFIG).exists():
+        task, ppo = task_and_ppo(known.resume)
+    default = BaseCfg(robot=known.robot, task=task, ppo=ppo)
     return tyro.cli(BaseCfg, args=arguments, default=default, description=__doc__)
 
 

@@ -13,10 +13,10 @@ from sim.own_robot import own_hash
 from sim.robot import RobotCfg, get_robot
 from sim.simulation import resolve_device
 from sim.training import RewardCfg
-from train.finetune_resume import check_resumed, saved_ppo, settings_of
 from train.held_out import marks_of, recorded_marks
 from train.mix import Mix, MixCfg
 from train.ppo import PpoCfg, check_ppo
+from train.resumed import check_resumed, saved_ppo, settings_of
 from train.run import CHECKPOINT, check_kind, check_least, check_limits, check_more, plain, prepare_run_dir, read_saved
 from train.sets import elites_sha256, split_elites
 from train.start import Start, read_start

@@ -1,6 +1,7 @@
 """The training command: what a run leaves behind, resuming, stopping, and errors."""
 
 import json
+import shutil
 import signal
 import sys
 from dataclasses import replace
@@ -11,7 +12,7 @@ import torch
 from sim.policy import load_policy
 from sim.robot import get_robot
 from tests.train.conftest import CURRICULUM
-from train.base import BaseCfg, main, train
+from train.base import BaseCfg, main, read_arguments, train
 from train.ppo import PpoCfg
 from train.run import StopRequest, claimed
 from train.task_cfg import TaskCfg
@@ -20,8 +21,8 @@ PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
 
 
 def config(run_dir, **changes):
-    values = {"num_envs": 6, "iterations": 2, "rows": 2, "device": "cpu", "ppo": PPO, **changes}
-    return BaseCfg(run_dir=run_dir, task=TaskCfg(curriculum=CURRICULUM), **values)
+    values = {"num_envs": 6, "iterations": 2, "rows": 2, "device": "cpu", "ppo": PPO}
+    return BaseCfg(run_dir=run_dir, **{**values, "task": TaskCfg(curriculum=CURRICULUM), **changes})
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,40 @@ def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
     assert [piece["from_iteration"] for piece in record["pieces"]] == [0, 2]
     assert train(config(None, resume=tmp_path / "second", iterations=4)) == 0
     assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
+
+
+def test_a_resumed_run_goes_on_as_it_was_begun(finished, tmp_path, capsys):
+    # The robot's own settings may have changed since; what the command line gives counts.
+    begun = config(tmp_path / "begun", task=TaskCfg(curriculum=CURRICULUM, push_speed=0.3, friction=(0.7, 0.8)))
+    assert train(begun) == 0
+    resumed = read_arguments(["--resume", str(tmp_path / "begun"), "--task.friction", "0.6", "0.9"])
+    assert resumed.task == replace(begun.task, friction=(0.6, 0.9)) and resumed.ppo == PPO
+    assert (resumed.num_envs, resumed.iterations) == (None, None)  # until the run is looked at
+    capsys.readouterr()
+    assert train(replace(resumed, device="cpu", iterations=3)) == 0
+    said = capsys.readouterr().out
+    assert "6 robots on cpu, 3 iterations" in said
+    assert [line for line in said.splitlines() if "Changed since" in line] == [
+        "Changed since the checkpoint: task.friction (0.7, 0.8) -> (0.6, 0.9)"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda config: config["task"].update(gravity=3.0), "unexpected keyword argument 'gravity'"),
+        (lambda config: config["ppo"].update(gamma="a lot"), "gamma must be float, got 'a lot'"),
+        (lambda config: config.pop("ppo"), "ppo must be an object, got None"),
+    ],
+)
+def test_a_run_whose_settings_cannot_be_read_is_refused(finished, tmp_path, damage, message):
+    shutil.copytree(finished, tmp_path / "run")
+    file = tmp_path / "run" / "config.json"
+    content = json.loads(file.read_text())
+    damage(content)
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=f"config.json is damaged, or of another version: .*{message}"):
+        read_arguments(["--resume", str(tmp_path / "run")])
 
 
 def test_fewer_iterations_than_are_done_are_refused(finished):

@@ -1,13 +1,15 @@
-"""What a fine-tuning that is gone on with was begun with: its settings, out of its directory and its checkpoint."""
+"""What a training that is gone on with was begun with: its settings, out of its directory and its checkpoint."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sim.files import read_json
+from sim.remembered import built
 from train.learner import check_entries
 from train.ppo import PpoCfg
 from train.run import CHECKPOINT, CONFIG, changes
+from train.task_cfg import TaskCfg
 
 _STATE = {"mix": (dict,)}
 
@@ -29,6 +31,22 @@ def settings_of(run: Path, kinds: dict[str, type]) -> dict[str, Any]:
     if wrong:
         raise ValueError(f"{run / CONFIG} is damaged at {', '.join(wrong)}: put a copy of it back")
     return {name: Path(value) if kinds[name] is Path else value for name, value in found.items()}
+
+
+def task_and_ppo(run: Path) -> tuple[TaskCfg, PpoCfg]:
+    """Settings of task and learner that a training of a base controller was begun with.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+        ValueError: If its config.json cannot be read, or is of a version with other settings.
+    """
+    config = read_json(run / CONFIG)
+    try:
+        return built(TaskCfg, config.get("task"), "task"), built(PpoCfg, config.get("ppo"), "ppo")
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{run / CONFIG} is damaged, or of another version: {error}; put a copy of it back, or begin a new run"
+        ) from None
 
 
 def saved_ppo(run: Path | None, saved: dict[str, Any]) -> PpoCfg:
