@@ -145,11 +145,11 @@ def _told(shown: Shown, crossed: Crossed, place: int) -> str:
         text += f" ({others}), and the middle one of those that did not ended at x = {crossed.failed_at:.1f} m"
     means = crossed.scaled.mean(axis=0)
     main = int(means.argmax())
-    kind = "fresh episode" if elites.fresh else "episode of the search"
+    kind = ("fresh episode", "fresh episodes") if elites.fresh else ("episode of the search", "episodes of the search")
     return (
         f"{text}. The largest penalty is {label_of(elites.penalties[main])}, "
         f"{percent(float(means[main] / max(means.sum(), 1e-12)))} of all. Its fitness is {elites.fitness[place]:.1f} "
-        f"by {counted(int(elites.counted[place]), kind)}, whose penalties have a standard deviation of "
+        f"by {counted(int(elites.counted[place]), *kind)}, whose penalties have a standard deviation of "
         f"{percent(float(elites.variation[place]))} of their mean."
     )
 

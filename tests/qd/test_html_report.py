@@ -171,6 +171,14 @@ def test_the_first_chapter_says_what_breaks_the_controller_and_in_how_many_ways(
     assert [first.index(part) for part in told] == sorted(first.index(part) for part in told)
 
 
+def test_without_fresh_episodes_those_of_the_search_are_named(reported, run):
+    archive, _ = grouped_archive()
+    write_archive(run / "archive.npz", dataclasses.replace(archive, iterations=4, fresh=None))
+    fitness, count = archive.fitness[0], archive.episodes[0]
+    told = f"Its fitness is {fitness:.1f} by {count} episodes of the search, whose penalties"
+    assert told in Page(reported()[0].read_bytes()).text
+
+
 def test_where_it_comes_from_names_who_made_the_fresh_episodes_too(reported, run):
     again = {"command": "python -m qd.search --resume <b>", "commit": "def", "seed": 7}
     (run / "archive.json").write_bytes(to_json({"reproduced_by": again}))
