@@ -17,21 +17,30 @@ def built(kind: type[Built], values: Any, name: str) -> Built:
         name: What to call it in an error.
 
     Raises:
-        TypeError: If a field is missing, or there is no such field.
-        ValueError: If a value is of another type, or out of range.
+        TypeError: If a field without a default is missing.
+        ValueError: If there is no such field, or a value is of another type or out of range.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{name} must be an object, got {_brief(values)}")
     hints = get_type_hints(kind)
-    return kind(**{key: _typed(hints[key], value, key) if key in hints else value for key, value in values.items()})
+    unknown = [str(key) for key in values if key not in hints]
+    if unknown:
+        raise ValueError(f"{name} has no setting {', '.join(unknown)}")
+    return kind(**{key: _typed(hints[key], value, key) for key, value in values.items()})
 
 
 def _typed(hint: Any, value: Any, name: str) -> Any:
     """A JSON value as a field wants it: a nested class, a tuple, or a value of just that type."""
     if is_dataclass(hint):
         return built(hint, value, name)  # pyright: ignore[reportArgumentType] - a hint is a class, no instance
-    if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(_typed(get_args(hint)[0], item, name) for item in value)
+    if get_origin(hint) is tuple:
+        parts = get_args(hint)
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{name} must be a list, got {_brief(value)}")
+        parts = parts[:1] * len(value) if parts[-1] is ... else parts
+        if len(value) != len(parts):
+            raise ValueError(f"{name} must have {len(parts)} values, got {_brief(value)}")
+        return tuple(_typed(part, item, name) for part, item in zip(parts, value, strict=True))
     kinds = get_args(hint) or (hint,)
     if type(value) in kinds or (type(value) is int and float in kinds and abs(value) < _MAX_WHOLE):
         return value

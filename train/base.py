@@ -13,6 +13,7 @@ from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -28,7 +29,7 @@ from train.learner import Learner
 from train.ppo import PpoCfg, check_ppo
 from train.progress import Progress
 from train.ranks import Ranks
-from train.resumed import settings_of, task_and_ppo
+from train.resumed import task_and_ppo, without_retired
 from train.run import (
     CHECKPOINT,
     CONFIG,
@@ -64,7 +65,7 @@ class BaseCfg:
 
     robot: str = _ROBOT
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults of
-    task and ppo."""
+    task and ppo, but of a resumed run, which has its own."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = None
@@ -112,9 +113,11 @@ def _resolve_size(cfg: BaseCfg, learning: LearningCfg) -> tuple[str, int, int]:
     return device, num_envs, iterations
 
 
-def _sizes_of(run: Path) -> dict[str, int]:
-    """Sizes that a run was begun with; none where there is no run, which its checkpoint is there to say."""
-    return settings_of(run, {"num_envs": int, "iterations": int}) if (run / CONFIG).exists() else {}
+def _saved_of(run: Path, robot: str) -> dict[str, Any]:
+    """The checkpoint of a training of a base controller."""
+    saved = read_saved(run / CHECKPOINT, robot)
+    check_kind(run, saved, finetuning=False)
+    return saved
 
 
 def _run_dir(cfg: BaseCfg, robot: str) -> Path:
@@ -139,14 +142,13 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     """What one process of a training does; only the first one's files are kept."""
     began = time.monotonic()
     robot = get_robot(cfg.robot)
-    before = _sizes_of(cfg.resume) if cfg.resume else {}
-    cfg = replace(cfg, **{name: value for name, value in before.items() if getattr(cfg, name) is None})
+    saved = _saved_of(cfg.resume, robot.name) if cfg.resume else None
+    begun = without_retired(saved["extra"]["settings"]) if saved else {}
+    sizes = {name: begun[name] for name in ("num_envs", "iterations") if type(begun.get(name)) is int}
+    cfg = replace(cfg, **{name: size for name, size in sizes.items() if getattr(cfg, name) is None})
     device, num_envs, iterations = _resolve_size(cfg, robot.learning)
-    saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
-    if saved is not None and cfg.resume is not None:
-        check_kind(cfg.resume, saved, finetuning=False)
     check_more(cfg.resume, saved, iterations)
-    seed: int = cfg.seed if cfg.seed is not None else saved["extra"]["settings"]["seed"] if saved else 0
+    seed: int = cfg.seed if cfg.seed is not None else begun.get("seed", 0)
     cfg = replace(cfg, seed=seed)
     check_ppo(cfg.ppo, num_envs)
     check_limits(rows=cfg.rows, save_every_s=cfg.save_every_s, max_seconds=cfg.max_seconds)
@@ -154,12 +156,13 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     settings = {
         "seed": seed,
         "num_envs": num_envs,
+        "iterations": iterations,
         "processes": ranks.size,
         "task": asdict(cfg.task),
         "ppo": asdict(cfg.ppo),
         **own_hash(robot),
     }
-    for change in changes(saved["extra"]["settings"], settings) if saved else []:
+    for change in changes(begun, settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     print(f"Training '{robot.name}': {num_envs} robots on {device}, {iterations} iterations, in {run_dir}", flush=True)
     with StopRequest() as stop, claimed(run_dir):
@@ -190,7 +193,7 @@ def read_arguments(arguments: Sequence[str]) -> BaseCfg:
     """The settings that a command line asks for; where it says nothing, those of the resumed run, or of the robot.
 
     Raises:
-        ValueError: If there is no such robot, or the run's settings cannot be read.
+        ValueError: If there is no such robot, no such run, or one whose settings cannot be read.
     """
     named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     named.add_argument("--robot", default=_ROBOT)
@@ -198,8 +201,8 @@ def read_arguments(arguments: Sequence[str]) -> BaseCfg:
     known = named.parse_known_args(arguments)[0]
     robot = get_robot(known.robot)
     task, ppo = TaskCfg.of(robot), PpoCfg.of(robot)
-    if known.resume is not None and (known.resume / CONFIG).exists():
-        task, ppo = task_and_ppo(known.resume)
+    if known.resume is not None:
+        task, ppo = task_and_ppo(known.resume, _saved_of(known.resume, robot.name), robot)
     default = BaseCfg(robot=known.robot, task=task, ppo=ppo)
     return tyro.cli(BaseCfg, args=arguments, default=default, description=__doc__)
 

@@ -243,7 +243,9 @@ def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:
         raise ValueError(f"{path} must be a '{CHECKPOINT_FORMAT}', got another kind of file: {remedy}")
     if content.get("robot") != robot:
-        raise ValueError(f"{path} is of robot '{content.get('robot')}', expected '{robot}': {remedy} of '{robot}'")
+        raise ValueError(
+            f"{path} is of robot '{content.get('robot')}', expected '{robot}': name its robot, or {remedy} of '{robot}'"
+        )
     check_entries(content, _ENTRIES, path)
     return content
 

@@ -1,11 +1,12 @@
 """What a training that is gone on with was begun with: its settings, out of its directory and its checkpoint."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from sim.files import read_json
 from sim.remembered import built
+from sim.robot import RobotCfg
 from train.learner import check_entries
 from train.ppo import PpoCfg
 from train.run import CHECKPOINT, CONFIG, changes
@@ -33,20 +34,42 @@ def settings_of(run: Path, kinds: dict[str, type]) -> dict[str, Any]:
     return {name: Path(value) if kinds[name] is Path else value for name, value in found.items()}
 
 
-def task_and_ppo(run: Path) -> tuple[TaskCfg, PpoCfg]:
+def task_and_ppo(run: Path, saved: dict[str, Any], robot: RobotCfg) -> tuple[TaskCfg, PpoCfg]:
     """Settings of task and learner that a training of a base controller was begun with.
 
+    Args:
+        run: Its directory.
+        saved: Its checkpoint.
+        robot: Gives what a run of an older version does not know of.
+
     Raises:
-        FileNotFoundError: If there is no run.
-        ValueError: If its config.json cannot be read, or is of a version with other settings.
+        ValueError: If they are damaged, or of a version that had others.
     """
-    config = read_json(run / CONFIG)
+    settings = saved["extra"]["settings"]
+    own = {"task": asdict(TaskCfg.of(robot)), "ppo": asdict(PpoCfg.of(robot))}
     try:
-        return built(TaskCfg, config.get("task"), "task"), built(PpoCfg, config.get("ppo"), "ppo")
-    except (TypeError, ValueError) as error:
+        known = {name: _over(own[name], without_retired(settings)[name]) for name in own}
+        return built(TaskCfg, known["task"], "task"), built(PpoCfg, known["ppo"], "ppo")
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{run / CONFIG} is damaged, or of another version: {error}; put a copy of it back, or begin a new run"
+            f"{run / CHECKPOINT} is damaged, or of another version: {error}; put a copy of it back, or begin a new run"
         ) from None
+
+
+def without_retired(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings without those that are no longer of a training: ``task.max_speed``, which is the robot's now."""
+    task = settings.get("task")
+    if not isinstance(task, dict):
+        return settings
+    return {**settings, "task": {name: value for name, value in task.items() if name != "max_speed"}}
+
+
+def _over(own: dict[str, Any], given: Any) -> Any:
+    """The given values, and those of one's own where there are none, in nested settings likewise."""
+    if not isinstance(given, dict):
+        return given
+    nested = {name: _over(own[name], value) for name, value in given.items() if isinstance(own.get(name), dict)}
+    return {**own, **given, **nested}
 
 
 def saved_ppo(run: Path | None, saved: dict[str, Any]) -> PpoCfg:
@@ -70,7 +93,7 @@ def check_resumed(run: Path, saved: dict[str, Any], settings: dict[str, Any]) ->
     """
     check_entries(saved["extra"], _STATE, run / CHECKPOINT)
     before = saved["extra"]["settings"]
-    different = changes(_wherever_elites_lie(before), _wherever_elites_lie(settings))
+    different = changes(_wherever_elites_lie(without_retired(before)), _wherever_elites_lie(settings))
     if different:
         raise ValueError(
             f"{run} was begun with other settings ({'; '.join(different)}): leave out what is given otherwise, "

@@ -68,38 +68,70 @@ def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
     assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
 
 
-def test_a_resumed_run_goes_on_as_it_was_begun(finished, tmp_path, capsys):
+def test_a_resumed_run_goes_on_as_it_was_begun(tmp_path, capsys):
     # The robot's own settings may have changed since; what the command line gives counts.
-    begun = config(tmp_path / "begun", task=TaskCfg(curriculum=CURRICULUM, push_speed=0.3, friction=(0.7, 0.8)))
+    run = tmp_path / "begun"
+    begun = config(run, task=TaskCfg(curriculum=CURRICULUM, push_speed=0.3, friction=(0.7, 0.8)))
     assert train(begun) == 0
-    resumed = read_arguments(["--resume", str(tmp_path / "begun"), "--task.friction", "0.6", "0.9"])
+    (run / "config.json").unlink()  # is for people to read
+    resumed = read_arguments(["--resume", str(run), "--task.friction", "0.6", "0.9", "--device", "cpu"])
     assert resumed.task == replace(begun.task, friction=(0.6, 0.9)) and resumed.ppo == PPO
-    assert (resumed.num_envs, resumed.iterations) == (None, None)  # until the run is looked at
     capsys.readouterr()
-    assert train(replace(resumed, device="cpu", iterations=3)) == 0
+    assert train(resumed) == 0
     said = capsys.readouterr().out
-    assert "6 robots on cpu, 3 iterations" in said
+    assert "6 robots on cpu, 2 iterations" in said
     assert [line for line in said.splitlines() if "Changed since" in line] == [
         "Changed since the checkpoint: task.friction (0.7, 0.8) -> (0.6, 0.9)"
     ]
 
 
+def damaged(finished, tmp_path, damage):
+    """A copy of a run whose checkpoint has other settings."""
+    shutil.copytree(finished, tmp_path / "run")
+    file = tmp_path / "run" / "checkpoint.pt"
+    content = torch.load(file, weights_only=True)
+    damage(content["extra"]["settings"])
+    torch.save(content, file)
+    return tmp_path / "run"
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda config: config["task"].update(gravity=3.0), "unexpected keyword argument 'gravity'"),
-        (lambda config: config["ppo"].update(gamma="a lot"), "gamma must be float, got 'a lot'"),
-        (lambda config: config.pop("ppo"), "ppo must be an object, got None"),
+        (lambda settings: settings["task"].update(gravity=3.0), "task has no setting gravity"),
+        (lambda settings: settings["ppo"].update(gamma="a lot"), "gamma must be float, got 'a lot'"),
+        (lambda settings: settings["task"].update(friction=0.5), "friction must be a list, got 0.5"),
+        (lambda settings: settings["task"].update(friction=[0.5]), r"friction must have 2 values, got \[0.5\]"),
+        (lambda settings: settings["task"].update(rewards=7), "rewards must be an object, got 7"),
+        (lambda settings: settings.pop("ppo"), "'ppo'"),
     ],
 )
 def test_a_run_whose_settings_cannot_be_read_is_refused(finished, tmp_path, damage, message):
-    shutil.copytree(finished, tmp_path / "run")
-    file = tmp_path / "run" / "config.json"
-    content = json.loads(file.read_text())
-    damage(content)
-    file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=f"config.json is damaged, or of another version: .*{message}"):
-        read_arguments(["--resume", str(tmp_path / "run")])
+    run = damaged(finished, tmp_path, damage)
+    with pytest.raises(ValueError, match=f"checkpoint.pt is damaged, or of another version: {message}; put a copy"):
+        read_arguments(["--resume", str(run)])
+
+
+def test_a_run_of_an_older_version_goes_on(finished, tmp_path, capsys):
+    # A setting that it does not know is the robot's; one that there is no more is left out.
+    def older(settings):
+        settings["task"].update(max_speed=100.0)
+        settings["task"]["rewards"].pop("stumble")
+
+    run = damaged(finished, tmp_path, older)
+    assert read_arguments(["--resume", str(run)]).task == TaskCfg(curriculum=CURRICULUM)
+    assert train(read_arguments(["--resume", str(run), "--iterations", "3", "--device", "cpu"])) == 0
+    assert [line.partition(": ")[2] for line in capsys.readouterr().out.splitlines() if "Changed" in line] == [
+        "iterations 2 -> 3", "task.rewards.stumble None -> -0.1"
+    ]  # fmt: skip
+
+
+def test_a_run_of_another_kind_is_named_before_its_settings_are_read(finished, tmp_path):
+    run = damaged(finished, tmp_path, lambda settings: settings.update(mix={}, task="crossing"))
+    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME="):
+        read_arguments(["--resume", str(run)])
+    with pytest.raises(ValueError, match="is of robot 'anymal', expected 'cassie': name its robot"):
+        read_arguments(["--robot", "cassie", "--resume", str(finished)])
 
 
 def test_fewer_iterations_than_are_done_are_refused(finished):

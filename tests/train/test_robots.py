@@ -81,7 +81,9 @@ def config(run_dir, **changes):
 def test_a_run_of_another_robot_is_saved_and_resumed(tmp_path, capsys):
     assert train(config(tmp_path / "run")) == 0
     assert train(config(None, resume=tmp_path / "run", iterations=3)) == 0
-    assert "Changed since the checkpoint" not in capsys.readouterr().out
+    assert [line for line in capsys.readouterr().out.splitlines() if "Changed since" in line] == [
+        "Changed since the checkpoint: iterations 2 -> 3"
+    ]
     record = json.loads((tmp_path / "run" / "policy.train.json").read_text())
     assert (record["robot"], record["iterations"]) == ("cassie", 3)
     assert record["settings"]["task"]["rewards"]["termination"] == -200.0
