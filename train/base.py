@@ -13,7 +13,6 @@ from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
@@ -37,7 +36,6 @@ from train.run import (
     RESERVE_S,
     StopRequest,
     changes,
-    check_kind,
     check_least,
     check_limits,
     check_more,
@@ -113,13 +111,6 @@ def _resolve_size(cfg: BaseCfg, learning: LearningCfg) -> tuple[str, int, int]:
     return device, num_envs, iterations
 
 
-def _saved_of(run: Path, robot: str) -> dict[str, Any]:
-    """The checkpoint of a training of a base controller."""
-    saved = read_saved(run / CHECKPOINT, robot)
-    check_kind(run, saved, finetuning=False)
-    return saved
-
-
 def _run_dir(cfg: BaseCfg, robot: str) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     return cfg.run_dir or cfg.resume or Path("runs") / f"{robot}-base-{stamp}"
@@ -142,7 +133,7 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     """What one process of a training does; only the first one's files are kept."""
     began = time.monotonic()
     robot = get_robot(cfg.robot)
-    saved = _saved_of(cfg.resume, robot.name) if cfg.resume else None
+    saved = read_saved(cfg.resume, robot.name, finetuning=False) if cfg.resume else None
     begun = without_retired(saved["extra"]["settings"]) if saved else {}
     sizes = {name: begun[name] for name in ("num_envs", "iterations") if type(begun.get(name)) is int}
     cfg = replace(cfg, **{name: size for name, size in sizes.items() if getattr(cfg, name) is None})
@@ -202,7 +193,7 @@ def read_arguments(arguments: Sequence[str]) -> BaseCfg:
     robot = get_robot(known.robot)
     task, ppo = TaskCfg.of(robot), PpoCfg.of(robot)
     if known.resume is not None:
-        task, ppo = task_and_ppo(known.resume, _saved_of(known.resume, robot.name), robot)
+        task, ppo = task_and_ppo(known.resume, read_saved(known.resume, robot.name, finetuning=False), robot)
     default = BaseCfg(robot=known.robot, task=task, ppo=ppo)
     return tyro.cli(BaseCfg, args=arguments, default=default, description=__doc__)
 

@@ -17,7 +17,7 @@ from train.held_out import marks_of, recorded_marks
 from train.mix import Mix, MixCfg
 from train.ppo import PpoCfg, check_ppo
 from train.resumed import check_resumed, saved_ppo, settings_of
-from train.run import CHECKPOINT, check_kind, check_least, check_limits, check_more, plain, prepare_run_dir, read_saved
+from train.run import check_least, check_limits, check_more, plain, prepare_run_dir, read_saved
 from train.sets import elites_sha256, split_elites
 from train.start import Start, read_start
 from train.task_cfg import TaskCfg
@@ -127,9 +127,7 @@ def job_of(cfg: FinetuneCfg) -> Job:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
-    saved = read_saved(cfg.resume / CHECKPOINT, robot.name) if cfg.resume else None
-    if saved is not None and cfg.resume is not None:
-        check_kind(cfg.resume, saved, finetuning=True)
+    saved = read_saved(cfg.resume, robot.name, finetuning=True) if cfg.resume else None
     cfg = _filled(cfg, robot.name, device)
     if saved is None:
         path = cfg.policy or robot.policy_file

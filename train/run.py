@@ -130,15 +130,22 @@ def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> 
     return found
 
 
-def read_saved(path: Path, robot: str) -> dict[str, Any]:
+def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
     """The checkpoint of a training run, with the progress it had made.
 
+    Args:
+        run: Its directory.
+        robot: Name of the robot it must be of.
+        finetuning: Whether it must be a fine-tuning, else the training of a base controller.
+
     Raises:
-        ValueError: As :func:`train.learner.read_checkpoint`.
+        ValueError: As :func:`train.learner.read_checkpoint`, or if it is of the other kind.
     """
+    path = run / CHECKPOINT
     saved = read_checkpoint(path, robot)
     check_entries(saved["extra"], STATE, path)
     check_entries(saved["extra"]["settings"], {"seed": (int,)}, path)
+    _check_kind(run, saved["extra"], finetuning=finetuning)
     return saved
 
 
@@ -152,18 +159,8 @@ def check_more(run: Path | None, saved: dict[str, Any] | None, iterations: int) 
         raise ValueError(f"{run} has done {saved['iter']} iterations already: give at least as many in all")
 
 
-def check_kind(run: Path, saved: dict[str, Any], *, finetuning: bool) -> None:
-    """Refuse to go on from a run of the other kind of training.
-
-    Args:
-        run: Its directory.
-        saved: Its checkpoint.
-        finetuning: Whether it must be a fine-tuning, else the training of a base controller.
-
-    Raises:
-        ValueError: If it is the other; with the command that goes on from it.
-    """
-    extra = saved["extra"]
+def _check_kind(run: Path, extra: dict[str, Any], *, finetuning: bool) -> None:
+    """Refuse to go on from a run of the other kind of training; with the command that does."""
     found = "mix" in extra or "mix" in extra["settings"]
     if found and not finetuning:
         raise ValueError(

@@ -19,7 +19,7 @@ from train.finetune import finetune
 from train.finetune_job import FinetuneCfg, job_of
 from train.learner import read_checkpoint
 from train.ppo import PpoCfg
-from train.run import check_kind, claimed
+from train.run import claimed, read_saved
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
@@ -221,7 +221,7 @@ def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
     with pytest.raises(ValueError, match=r"training of a base controller.*go on with make train RESUME=.*train.base"):
         finetune(FinetuneCfg(resume=run, device="cpu", iterations=4))
     with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME="):
-        check_kind(finished, read_checkpoint(finished / "checkpoint.pt", "anymal"), finetuning=False)
+        read_saved(finished, "anymal", finetuning=False)
 
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):
