@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from qd.cli import run_command
 from qd.own_terrain import OwnTerrain, own_seeds, read_own_terrain
 from qd.paths_figure import draw_paths
-from qd.places import controller_suffix
+from qd.places import who_crossed
 from qd.progress import share_bar
 from qd.replay import PENALTY_UNITS
 from qd.report import save_figure
@@ -79,7 +79,7 @@ def cross(cfg: CrossCfg) -> dict[str, Any]:
         raise ValueError(f"episodes must be at least 1 and seed at least 0, got {cfg.episodes} and {cfg.seed}")
     device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
     check_policy(policy, robot, device)
-    who = robot.name + controller_suffix(policy, str(robot.policy_file))
+    who = who_crossed(robot, policy)
     out, figure = _outputs(cfg, who)
     prepare_output(out)
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)

@@ -88,6 +88,11 @@ def controller_suffix(policy: str, usual: str) -> str:
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
+def who_crossed(robot: "RobotCfg", policy: str) -> str:
+    """What files about a map of one's own call the robot: by its name, and by its controller if not the shipped."""
+    return robot.name + controller_suffix(policy, str(robot.policy_file))
+
+
 def is_same(policy: str, other: str) -> bool:
     """Whether two names are of the same controller, by name or by its files."""
     digest = controller_hash(policy)

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from qd.cli import run_command
 from qd.own_terrain import read_own_terrain
-from qd.places import RUNS, controller_suffix, elite_name, folder_for
+from qd.places import RUNS, elite_name, folder_for, who_crossed
 from qd.progress import share_bar
 from qd.recordings import archive_of_robot, chosen_elites, policy_of, record_elites, record_heights
 from qd.replay import as_searched
@@ -155,8 +155,7 @@ def _own_order(cfg: VideoCfg, path: Path, robot: "RobotCfg") -> Order:
     print(f"{path}: {terrain.fitted}", flush=True)
     device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
     check_policy(policy, robot, device)
-    who = robot.name + controller_suffix(policy, str(robot.policy_file))
-    out = cfg.out or OWN_FOLDER / f"{path.stem}-{who}.mp4"
+    out = cfg.out or OWN_FOLDER / f"{path.stem}-{who_crossed(robot, policy)}.mp4"
     prepare_output(out)
     with share_bar("crossing") as progress:
         _, recording = record_heights(

@@ -28,7 +28,7 @@ from train.learner import Learner
 from train.ppo import PpoCfg, check_ppo
 from train.progress import Progress
 from train.ranks import Ranks
-from train.resumed import task_and_ppo, without_retired
+from train.resumed import task_and_ppo
 from train.run import (
     CHECKPOINT,
     CONFIG,
@@ -134,7 +134,7 @@ def _train(cfg: BaseCfg, ranks: Ranks) -> int:
     began = time.monotonic()
     robot = get_robot(cfg.robot)
     saved = read_saved(cfg.resume, robot.name, finetuning=False) if cfg.resume else None
-    begun = without_retired(saved["extra"]["settings"]) if saved else {}
+    begun = saved["extra"]["settings"] if saved else {}
     sizes = {name: begun[name] for name in ("num_envs", "iterations") if type(begun.get(name)) is int}
     cfg = replace(cfg, **{name: size for name, size in sizes.items() if getattr(cfg, name) is None})
     device, num_envs, iterations = _resolve_size(cfg, robot.learning)

@@ -1,6 +1,6 @@
 """What a training that is gone on with was begun with: its settings, out of its directory and its checkpoint."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -48,20 +48,12 @@ def task_and_ppo(run: Path, saved: dict[str, Any], robot: RobotCfg) -> tuple[Tas
     settings = saved["extra"]["settings"]
     own = {"task": asdict(TaskCfg.of(robot)), "ppo": asdict(PpoCfg.of(robot))}
     try:
-        known = {name: _over(own[name], without_retired(settings)[name]) for name in own}
+        known = {name: _over(own[name], settings[name]) for name in own}
         return built(TaskCfg, known["task"], "task"), built(PpoCfg, known["ppo"], "ppo")
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{run / CHECKPOINT} is damaged, or of another version: {error}; put a copy of it back, or begin a new run"
         ) from None
-
-
-def without_retired(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings without those that are no longer of a training: ``task.max_speed``, which is the robot's now."""
-    task = settings.get("task")
-    if not isinstance(task, dict):
-        return settings
-    return {**settings, "task": {name: value for name, value in task.items() if name != "max_speed"}}
 
 
 def _over(own: dict[str, Any], given: Any) -> Any:
@@ -79,9 +71,8 @@ def saved_ppo(run: Path | None, saved: dict[str, Any]) -> PpoCfg:
         ValueError: If they are damaged.
     """
     try:
-        ppo = PpoCfg(**saved["extra"]["settings"]["ppo"])
-        return replace(ppo, hidden_dims=tuple(ppo.hidden_dims))
-    except (KeyError, TypeError) as error:
+        return built(PpoCfg, saved["extra"]["settings"]["ppo"], "ppo")
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run} is damaged: {error} in its settings of ppo; put a copy of it back") from error
 
 
@@ -93,7 +84,7 @@ def check_resumed(run: Path, saved: dict[str, Any], settings: dict[str, Any]) ->
     """
     check_entries(saved["extra"], _STATE, run / CHECKPOINT)
     before = saved["extra"]["settings"]
-    different = changes(_wherever_elites_lie(without_retired(before)), _wherever_elites_lie(settings))
+    different = changes(_wherever_elites_lie(before), _wherever_elites_lie(settings))
     if different:
         raise ValueError(
             f"{run} was begun with other settings ({'; '.join(different)}): leave out what is given otherwise, "

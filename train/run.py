@@ -146,6 +146,8 @@ def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
     check_entries(saved["extra"], STATE, path)
     check_entries(saved["extra"]["settings"], {"seed": (int,)}, path)
     _check_kind(run, saved["extra"], finetuning=finetuning)
+    if isinstance(saved["extra"]["settings"].get("task"), dict):
+        saved["extra"]["settings"]["task"].pop("max_speed", None)  # of older versions; it is the robot's now
     return saved
 
 
