@@ -1,5 +1,6 @@
 """What a search leaves to look at: its curves, its archive, and its numbers."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,7 +9,6 @@ import numpy as np
 
 from qd.archive import Archive
 from qd.fresh import FRESH_EPISODES, numbers_of
-from sim.figure_png import figure_as_png
 from sim.files import write_atomically
 
 if TYPE_CHECKING:
@@ -72,7 +72,9 @@ def as_png(figure: "Figure") -> bytes:
         assert isinstance(text, Text)
         text.set_parse_math(False)  # a file may be called $x$.npz, or something that is no formula
         text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or hold bytes that are no text
-    return figure_as_png(figure)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150)
+    return buffer.getvalue()
 
 
 def new_figure(width: float, height: float) -> "Figure":

@@ -1,12 +1,12 @@
 """The tables as a figure, with the paper's own numbers beside ours."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim.figure_png import figure_as_png
 from sim.files import write_atomically
 from sim.named_controllers import kind_of
 from train.seeds import firsts
@@ -43,7 +43,9 @@ def write_figure(path: Path, report: dict[str, Any]) -> None:
         path: File to write.
         report: As ``tables.json`` has it.
     """
-    write_atomically(path, figure_as_png(draw_tables(report)))
+    buffer = io.BytesIO()
+    draw_tables(report).savefig(buffer, format="png", dpi=150)
+    write_atomically(path, buffer.getvalue())
 
 
 def draw_tables(report: dict[str, Any]) -> "Figure":
