@@ -100,16 +100,28 @@ def detail_section(shown: Shown) -> Section:
         return section
     stubborn = sum(shown.crossed[number].rates[_ARRIVED].hits == 0 for number in shown.worst)
     text = (
-        f"The {counted(len(shown.worst), 'elite')} with the highest fitness ({_list(shown.worst)}), on {stubborn} of "
-        f"which no robot reached the goal; the {len(shown.steady)} that break the controller the most alike each time "
-        f"({_list(shown.steady)}), whose penalties vary least between episodes for their size; and a typical one of "
-        f"each mode. Each was crossed {shown.material.cfg.episodes} times afresh for this page, by the episodes that "
-        "`make replay ELITE=N` shows. Scaled penalties: 1 is what a common one comes to on hard-random terrain."
+        f"{_worst(shown)}, and on {stubborn} of them no robot reached the goal; the {len(shown.steady)} that break the "
+        f"controller the most alike each time ({_list(shown.steady)}), whose penalties vary least between episodes for "
+        f"their size; and a typical one of each mode. Each was crossed {shown.material.cfg.episodes} times afresh for this "
+        "page, by the episodes that `make replay ELITE=N` shows. Scaled penalties: 1 is what a common one comes to on hard-random terrain."
     )
     section.blocks.append(Text(text))
     for number in shown.numbers:
         section.blocks += _elite(shown, number)
     return section
+
+
+def _worst(shown: Shown) -> str:
+    """Which elites are shown as the worst: those that fail, and others where too few do."""
+    failed = [number for number in shown.worst if shown.elites.failing[shown.elites.place_of(number)]]
+    others = shown.worst[len(failed) :]
+    fittest = f"{counted(len(others), 'elite')} with the highest fitness ({_list(others)})"
+    if not failed:
+        return f"The {fittest}, all crossed by half of the robots or more"
+    known = f"The {counted(len(failed), 'elite')} that under half of the robots cross"
+    if others:
+        return f"{known} ({_list(failed)}), the highest fitness first, and of the others the {fittest}"
+    return f"{known} and whose fitness is the highest ({_list(failed)})"
 
 
 def _list(numbers: list[int]) -> str:

@@ -89,8 +89,12 @@ def elites_of(archive: Archive) -> Elites:
 
 
 def worst(elites: Elites, count: int) -> list[int]:
-    """Numbers of the elites with the highest fitness, the highest first."""
-    return elites.numbers[np.argsort(-elites.fitness, kind="stable")[:count]].tolist()
+    """Numbers of the failed terrains with the highest fitness, the highest first; if fewer fail, of others after them.
+
+    An elite may have the highest fitness of all and be crossed by every robot, with trouble.
+    """
+    order = np.lexsort((-elites.fitness, ~elites.failing))
+    return elites.numbers[order[:count]].tolist()
 
 
 def most_reproducible(elites: Elites, count: int) -> list[int]:

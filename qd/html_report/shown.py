@@ -25,7 +25,7 @@ class Shown:
     elites: Elites
     modes: Modes
     worst: list[int]
-    """Numbers of the elites with the highest fitness."""
+    """Numbers of the failed terrains with the highest fitness; if there are fewer, of others after them."""
     steady: list[int]
     """Numbers of the most reproducible ones."""
     crossed: Mapping[int, Crossed] = field(default_factory=dict)

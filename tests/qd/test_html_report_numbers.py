@@ -68,7 +68,9 @@ def test_the_worst_and_the_steadiest_by_hand():
         penalty_std=np.array([[0.1, 0.1], [0.2, 0.3], [0.2, 0.2], [0.0, 0.0]]),
         goal_rate=np.array([0.0, 0.4, 0.0, 0.9]),
     )
-    assert worst(elites_of(archive), 3) == [1, 3, 2]
+    # the robots cross number 3, whose fitness is second
+    assert worst(elites_of(archive), 3) == [1, 2, 0]
+    assert worst(elites_of(archive), 4) == [1, 2, 0, 3]
     # the last is the steadiest of all, but the robots cross it
     assert most_reproducible(elites_of(archive), 4) == [0, 2, 1, 3]
     fresh = dataclasses.replace(fresh_values(archive), reproduced=np.array([False, True, True, True]))
