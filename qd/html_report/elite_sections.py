@@ -103,8 +103,8 @@ def detail_section(shown: Shown) -> Section:
         f"{_worst(shown)}, and on {stubborn} of them no robot reached the goal; the {len(shown.steady)} that break the "
         f"controller the most alike each time ({_list(shown.steady)}), whose penalties vary least between episodes for "
         f"their size; and a typical one of each mode. Each was crossed {shown.material.cfg.episodes} times afresh for "
-        "this page, by the episodes that `make replay ELITE=N` shows. Scaled penalties: 1 is what a common one comes to "
-        "on hard-random terrain."
+        "this page, by the episodes that `make replay ELITE=N` shows. Scaled penalties: 1 is what a common one comes "
+        "to on hard-random terrain."
     )
     section.blocks.append(Text(text))
     for number in shown.numbers:
