@@ -14,6 +14,7 @@ from qd.replay import PENALTY_UNITS
 from qd.report import save_figure
 from qd.video import OWN_FOLDER
 from qd.workers import check_policy, origin_of, resolve_device
+from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output, to_json, write_atomically
 from sim.intervals import rate_words, wilson_interval
 
@@ -113,7 +114,7 @@ def _about(cfg: CrossCfg, robot: str, terrain: OwnTerrain, policy: str) -> dict[
 
     return {
         "robot": robot,
-        "policy": policy,
+        "policy": ControllerSpec.parse(policy).label,
         "policy_sha256": controller_hash(policy),
         "terrain": str(cfg.terrain),
         "terrain_sha256": hashlib.sha256(cfg.terrain.read_bytes()).hexdigest(),

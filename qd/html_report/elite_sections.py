@@ -1,5 +1,6 @@
 """The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
 
+from qd.html_report.elites import Elites
 from qd.html_report.figures import draw_modes
 from qd.html_report.modes import MAX_MODES, TOLERANCE, Mode
 from qd.html_report.outcomes import ENDS, Crossed, Rate
@@ -100,11 +101,10 @@ def detail_section(shown: Shown) -> Section:
         return section
     stubborn = sum(shown.crossed[number].rates[_ARRIVED].hits == 0 for number in shown.worst)
     text = (
-        f"{_worst(shown)}, and on {stubborn} of them no robot reached the goal; the {len(shown.steady)} that break the "
-        f"controller the most alike each time ({_list(shown.steady)}), whose penalties vary least between episodes for "
-        f"their size; and a typical one of each mode. Each was crossed {shown.material.cfg.episodes} times afresh for "
-        "this page, by the episodes that `make replay ELITE=N` shows. Scaled penalties: 1 is what a common one comes "
-        "to on hard-random terrain."
+        f"{choice_told(shown.elites, shown.worst, shown.steady)} Each was crossed {shown.material.cfg.episodes} times "
+        "afresh for this page, by the episodes that `make replay ELITE=N` shows; on "
+        f"{stubborn} of the first {len(shown.worst)} no robot reached the goal. Scaled penalties: 1 is what a common "
+        "one comes to on hard-random terrain."
     )
     section.blocks.append(Text(text))
     for number in shown.numbers:
@@ -112,17 +112,25 @@ def detail_section(shown: Shown) -> Section:
     return section
 
 
-def _worst(shown: Shown) -> str:
-    """Which elites are shown as the worst: those that fail, and others where too few do."""
-    failed = [number for number in shown.worst if shown.elites.failing[shown.elites.place_of(number)]]
-    others = shown.worst[len(failed) :]
-    fittest = f"{counted(len(others), 'elite')} with the highest fitness ({_list(others)})"
-    if not failed:
-        return f"The {fittest}, all crossed by half of the robots or more"
-    known = f"The {counted(len(failed), 'elite')} that under half of the robots cross"
+def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
+    """Which elites are shown, in a sentence that holds for any number of them.
+
+    Args:
+        elites: All elites.
+        worst: Numbers of the failed ones of highest fitness, and of others after them if too few fail.
+        steady: Numbers of those that vary least.
+    """
+    fails = {number: bool(elites.failing[elites.place_of(number)]) for number in worst}
+    failed, others = ([number for number in worst if fails[number] is kind] for kind in (True, False))
+    parts = []
+    if failed:
+        parts.append(f"terrains on which the controller fails, the highest fitness first ({_list(failed)})")
     if others:
-        return f"{known} ({_list(failed)}), the highest fitness first, and of the others the {fittest}"
-    return f"{known} and whose fitness is the highest ({_list(failed)})"
+        parts.append(f"{'other ' * bool(failed)}terrains of high fitness on which it does not fail ({_list(others)})")
+    parts.append(
+        f"terrains whose penalties vary least between episodes for their size, failed ones first ({_list(steady)})"
+    )
+    return f"Shown are {'; '.join(parts)}; and a typical terrain of each mode."
 
 
 def _list(numbers: list[int]) -> str:
@@ -133,7 +141,8 @@ def _elite(shown: Shown, number: int) -> list[Block]:
     """One elite: why it is shown, what became of it, figure and numbers."""
     crossed, archive = shown.crossed[number], shown.material.archive
     place = shown.elites.place_of(number)
-    ranked = (("worst", shown.worst), ("most reproducible", shown.steady))
+    failed = shown.elites.failing[place]
+    ranked = (("worst failed" if failed else "high fitness", shown.worst), ("most reproducible", shown.steady))
     roles = [f"{what}, rank {numbers.index(number) + 1}" for what, numbers in ranked if number in numbers]
     roles += [f"typical of mode {mode.number}" for mode in shown.modes.modes if mode.typical == number]
     heading = Heading(f"Elite {number}: {'; '.join(roles)}", anchor_of(number))
@@ -229,6 +238,7 @@ def all_section(shown: Shown) -> Section:
     again = make_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
     table = Table(head, rows, sortable=True, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
     text = (
-        f"All {counted(len(rows), 'elite')}, the worst first; a click on a heading sorts. `{again}` crosses one again."
+        f"All {counted(len(rows), 'elite')}, the highest fitness first; a click on a heading sorts. `{again}` crosses "
+        "one again."
     )
     return Section("All elites", "all", [Text(text), table])

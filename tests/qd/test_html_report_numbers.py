@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
+from qd.html_report.elite_sections import choice_told
 from qd.html_report.elites import elites_of, most_reproducible, worst
 from qd.html_report.modes import MAX_MODES, find_modes, silhouette
 from qd.html_report.outcomes import crossed_of, penalties_by_place
@@ -75,6 +76,23 @@ def test_the_worst_and_the_steadiest_by_hand():
     assert most_reproducible(elites_of(archive), 4) == [0, 2, 1, 3]
     fresh = dataclasses.replace(fresh_values(archive), reproduced=np.array([False, True, True, True]))
     assert most_reproducible(elites_of(dataclasses.replace(archive, fresh=fresh)), 4) == [2, 1, 0, 3]
+
+
+@pytest.mark.parametrize(
+    ("goal_rates", "chosen", "told"),
+    [
+        ([0.0, 0.9, 0.2], ([0, 2], [0]), "terrains on which the controller fails, the highest fitness first (0, 2);"),
+        ([0.9, 0.0, 1.0], ([1, 0], [1]), "first (1); other terrains of high fitness on which it does not fail (0);"),
+        ([0.9], ([0], [0]), "Shown are terrains of high fitness on which it does not fail (0);"),
+    ],
+    ids=["enough fail", "too few fail", "one elite, crossed"],
+)
+def test_which_elites_are_shown_is_told_truly(goal_rates, chosen, told):
+    elites = elites_of(dataclasses.replace(small_archive(len(goal_rates)), goal_rate=np.array(goal_rates)))
+    assert (worst(elites, len(chosen[0])), most_reproducible(elites, 1)) == chosen
+    sentence = choice_told(elites, *chosen)
+    assert told in sentence
+    assert sentence.endswith(f"failed ones first ({chosen[1][0]}); and a typical terrain of each mode.")
 
 
 def test_modes_are_the_kinds_that_were_made():
