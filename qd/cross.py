@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from qd.cli import run_command
 from qd.own_terrain import OwnTerrain, own_seeds, read_own_terrain
 from qd.paths_figure import draw_paths
-from qd.places import who_crossed
 from qd.progress import share_bar
 from qd.replay import PENALTY_UNITS
 from qd.report import save_figure
@@ -17,6 +16,7 @@ from qd.workers import check_policy, origin_of, resolve_device
 from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output, to_json, write_atomically
 from sim.intervals import rate_words, wilson_interval
+from sim.named_controllers import who_crossed
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult

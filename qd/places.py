@@ -1,14 +1,12 @@
 """Where runs are, and where what is made from one goes."""
 
 import itertools
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qd.archive import ARCHIVE_FILE, read_archive
-from sim.controller_spec import ControllerSpec
-from sim.provenance import controller_hash
+from sim.named_controllers import controller_suffix
 
 if TYPE_CHECKING:
     from sim.robot import RobotCfg
@@ -78,25 +76,6 @@ def elite_name(elite: int, policy: str, searched: str) -> str:
         searched: That of the search.
     """
     return f"elite-{elite}{controller_suffix(policy, searched)}"
-
-
-def controller_suffix(policy: str, usual: str) -> str:
-    """What the name of a file about a controller ends with: nothing for the usual one, else such as -C-G."""
-    if is_same(policy, usual):
-        return ""
-    label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")
-    return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
-
-
-def who_crossed(robot: "RobotCfg", policy: str) -> str:
-    """What files about a map of one's own call the robot: by its name, and by its controller if not the shipped."""
-    return robot.name + controller_suffix(policy, str(robot.policy_file))
-
-
-def is_same(policy: str, other: str) -> bool:
-    """Whether two names are of the same controller, by name or by its files."""
-    digest = controller_hash(policy)
-    return policy == other or (digest is not None and digest == controller_hash(other))
 
 
 def numbered(root: Path, name: str) -> Iterator[Path]:

@@ -11,7 +11,7 @@ from qd.archive import Archive, read_archive
 from qd.cli import run_command
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.paths_figure import draw_paths
-from qd.places import directory_of, elite_name, folder_for, is_same, newest_or_published
+from qd.places import directory_of, elite_name, folder_for, newest_or_published
 from qd.report import save_figure
 from qd.resuming import refuse_unnamed_code
 from qd.run_directory import CONFIG_FILE, RunDirectory
@@ -19,6 +19,7 @@ from qd.workers import check_policy, episode_seeds, resolve_device
 from sim.controller_spec import SHIPPED, ControllerSpec, spec_of
 from sim.files import prepare_output
 from sim.intervals import rate_words
+from sim.named_controllers import is_same
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,13 +10,14 @@ from tqdm import tqdm
 
 from qd.cli import run_command
 from qd.own_terrain import read_own_terrain
-from qd.places import RUNS, elite_name, folder_for, who_crossed
+from qd.places import RUNS, elite_name, folder_for
 from qd.progress import share_bar
 from qd.recordings import archive_of_robot, chosen_elites, policy_of, record_elites, record_heights
 from qd.replay import as_searched
 from qd.workers import check_policy, resolve_device
 from sim.controller_spec import spec_of
 from sim.files import prepare_output
+from sim.named_controllers import who_crossed
 
 if TYPE_CHECKING:
     from sim.recording import Recording

@@ -1,9 +1,10 @@
-"""Several controllers on one command line, each by a name."""
+"""Controllers by name: several on one command line, and in the names of files about them."""
 
 import re
 from collections.abc import Sequence
 
-from sim.controller_spec import SHIPPED, spec_of
+from sim.controller_spec import SHIPPED, ControllerSpec, spec_of
+from sim.provenance import controller_hash
 from sim.robot import RobotCfg
 
 MARK = "@"
@@ -39,3 +40,22 @@ def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
             raise ValueError(f"policies must have different names, got '{name}' twice: rename one of them")
         found[name] = spec_of(policy, robot)
     return found
+
+
+def controller_suffix(policy: str, usual: str) -> str:
+    """What the name of a file about a controller ends with: nothing for the usual one, else such as -C-G."""
+    if is_same(policy, usual):
+        return ""
+    label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")
+    return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
+
+
+def who_crossed(robot: RobotCfg, policy: str) -> str:
+    """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
+    return robot.name + controller_suffix(policy, str(robot.policy_file))
+
+
+def is_same(policy: str, other: str) -> bool:
+    """Whether two names are of the same controller, by name or by its files."""
+    digest = controller_hash(policy)
+    return policy == other or (digest is not None and digest == controller_hash(other))

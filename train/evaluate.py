@@ -17,6 +17,7 @@ from qd.workers import EvaluatorCfg, EvaluatorError, check_policy, open_evaluato
 from sim.command import exit_code_of
 from sim.controller_spec import ControllerSpec
 from sim.files import prepare_output, to_json, write_atomically
+from sim.named_controllers import who_crossed
 from train.base_rates import VELOCITY_FROM_S, evaluate_sets, print_rates
 from train.evaluate_cfg import EvaluateCfg, size_of
 from train.evaluate_tables import evaluate_tables
@@ -31,7 +32,7 @@ def evaluate_base(cfg: EvaluateCfg) -> dict[str, Any]:
     size = size_of(cfg)
     robot = size.robot
     policy = str(cfg.policy or robot.policy_file)
-    out = cfg.out or Path("runs") / f"{robot.name}-rates.json"
+    out = cfg.out or Path("runs") / f"{who_crossed(robot, policy)}-rates.json"
     prepare_output(out)
     check_policy(policy, robot, size.device)
     evaluator = EvaluatorCfg(

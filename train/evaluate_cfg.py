@@ -47,7 +47,8 @@ class EvaluateCfg:
     workers: int | Literal["auto"] | None = None
     """Cross on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
     out: Path | None = None
-    """Where to write the numbers: runs/<robot>-rates.json; tables RUN_DIR/tables.json, their figure beside as .png."""
+    """Where to write the numbers: runs/<robot>-rates.json, of another controller than the shipped
+    runs/<robot>-<its name>-rates.json; tables RUN_DIR/tables.json, their figure beside as .png."""
     run_dir: Path | None = None
     """Where tables keep what is crossed, so that they can go on; runs/<robot>-tables."""
 

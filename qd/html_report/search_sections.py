@@ -46,7 +46,7 @@ def outcome_section(shown: Shown) -> Section:
         f"the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
     )
     if failing:
-        text += f"They fall into {counted(ways, 'cell')}: so many different ways of failing were found. "
+        text += f"{'It falls' if failing == 1 else 'They fall'} into {counted(ways, 'cell')}: so many different ways of failing were found. "
     text += (
         f"Over all elites {_rate(elites.goal_rate)} of the robots reach the goal, the base of "
         f"{_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
@@ -142,7 +142,8 @@ def curves_section(shown: Shown) -> Section:
     if len(rows) > 1:
         tail = rows[-max(1, len(rows) // 5) - 1 :]
         gained = tail[-1]["elites"] - tail[0]["elites"]
-        text += f" The last {counted(len(tail) - 1, 'iteration')} added {counted(gained, 'elite')}."
+        span = "iteration" if len(tail) == 2 else f"{len(tail) - 1:,} iterations"
+        text += f" The last {span} added {counted(gained, 'elite')}."
     if any(row.get("mean_std") is not None for row in rows):
         text += (
             " On the right the mean STD: the standard deviations of the scaled penalties over "
