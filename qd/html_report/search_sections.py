@@ -46,7 +46,8 @@ def outcome_section(shown: Shown) -> Section:
         f"the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
     )
     if failing:
-        text += f"{'It falls' if failing == 1 else 'They fall'} into {counted(ways, 'cell')}: so many different ways of failing were found. "
+        they = "It falls" if failing == 1 else "They fall"
+        text += f"{they} into {counted(ways, 'cell')}: so many different ways of failing were found. "
     text += (
         f"Over all elites {_rate(elites.goal_rate)} of the robots reach the goal, the base of "
         f"{_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
