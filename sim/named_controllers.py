@@ -2,10 +2,13 @@
 
 import re
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from sim.controller_spec import SHIPPED, ControllerSpec, spec_of
 from sim.provenance import controller_hash
-from sim.robot import RobotCfg
+
+if TYPE_CHECKING:
+    from sim.robot import RobotCfg
 
 MARK = "@"
 """Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""
@@ -16,7 +19,7 @@ def kind_of(name: str) -> str:
     return name.split(MARK)[0]
 
 
-def controllers_of(policies: Sequence[str], robot: RobotCfg) -> dict[str, str]:
+def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
 
     Args:
