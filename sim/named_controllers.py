@@ -53,7 +53,7 @@ def controller_suffix(policy: str, usual: str) -> str:
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
-def who_crossed(robot: RobotCfg, policy: str) -> str:
+def who_crossed(robot: "RobotCfg", policy: str) -> str:
     """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
     return robot.name + controller_suffix(policy, str(robot.policy_file))
 
