@@ -80,7 +80,7 @@ help: ## This list
 	@echo '  RUN=DIR          which archive; the newest one of ROBOT under runs/, else the published one, if left out'
 	@echo '                                                   replay report view reevaluate video export'
 	@echo '  ELITE=N          which elite of it, 0 the worst    replay view video export'
-	@echo '                   (video, export: or several, ELITE="0 3", or ELITE=all)'
+	@echo '                   (video, export, and of GENES crosscheck: or several, ELITE="0 3", or ELITE=all)'
 	@echo '  POLICIES="base=shipped C-G=FILE"   controllers of the tables or the page, each NAME=SPEC   evaluate view'
 	@echo '  ARCHIVE=DIR      run of a search: elites to train on, and those held out to evaluate on   finetune evaluate'
 	@echo '  SPLIT_SEED=N     which elites are held out         finetune evaluate'
@@ -170,7 +170,7 @@ tables: setup ## Write the published numbers, with the paper's beside them, into
 	$(BIN)/python -m train.publish
 
 crosscheck: setup ## Hold the crossings of ROBOT against the same in plain MuJoCo C
-	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES FINE OUT)
+	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES ELITE FINE OUT)
 
 bench: setup ## Time every kernel against torch and against what the device can do at best
 	$(BIN)/python -m sim.bench --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE SEED OUT)

@@ -13,8 +13,8 @@ from tqdm import tqdm
 from qd.archive import Archive
 from qd.cli import run_command
 from qd.places import folder_for
-from qd.recordings import archive_of_robot, chosen_elites
-from sim.command import split_words
+from qd.recordings import archive_of_robot
+from sim.command import chosen_elites, split_words
 from sim.files import prepare_output, to_json, write_atomically
 from sim.provenance import provenance
 
@@ -61,7 +61,7 @@ def export(cfg: ExportCfg) -> list[Path]:
     from sim.terrain_files import check_formats, write_terrain
 
     found = archive_of_robot(cfg.robot, cfg.run)
-    elites = chosen_elites(cfg.elite, found)
+    elites = chosen_elites(cfg.elite, len(found.archive), found.run)
     formats = list(dict.fromkeys(split_words(cfg.formats)))
     check_formats(formats)
     folder = cfg.out or folder_for(found.run, found.robot.name) / _FOLDER

@@ -14,16 +14,12 @@ from qd.places import directory_of, newest_or_published
 from qd.replay import REPLAY_STREAM, as_searched, check_penalties
 from qd.resuming import refuse_unnamed_code
 from qd.workers import episode_seeds
-from sim.command import split_words
 from sim.controller_spec import spec_of
 
 if TYPE_CHECKING:
     from sim.recording import Recording
     from sim.robot import RobotCfg
     from sim.rollout import RolloutResult
-
-ALL = "all"
-"""Every elite of an archive."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,27 +56,6 @@ def archive_of_robot(named: "RobotCfg | str", run: Path | None) -> Found:
     robot = robot_of(archive.robot, named, run)
     check_penalties(archive, robot, run)
     return Found(run=run, archive=archive, robot=robot)
-
-
-def chosen_elites(text: str, found: Found) -> list[int]:
-    """Numbers of elites, as a command line names them.
-
-    Args:
-        text: Numbers apart by spaces or commas, or ``all``.
-        found: Whose elites.
-
-    Raises:
-        ValueError: If it is something else, or there is no such elite.
-    """
-    count = len(found.archive)
-    words = split_words([text])
-    if words == [ALL]:
-        words = list(map(str, range(count)))
-    unknown = [word for word in words if not (word.isascii() and word.isdigit() and int(word) < count)]
-    if unknown or not words:
-        valid = f"expected {ALL}, or numbers of 0 to {count - 1}" if count else "the archive is empty"
-        raise ValueError(f"{found.run} has no elite {', '.join(unknown) or repr(text)}: {valid}")
-    return [int(word) for word in dict.fromkeys(words)]
 
 
 def policy_of(found: Found, robot: "RobotCfg", given: str | None) -> str:

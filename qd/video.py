@@ -12,9 +12,10 @@ from qd.cli import run_command
 from qd.own_terrain import read_own_terrain
 from qd.places import RUNS, elite_name, folder_for
 from qd.progress import share_bar
-from qd.recordings import archive_of_robot, chosen_elites, policy_of, record_elites, record_heights
+from qd.recordings import archive_of_robot, policy_of, record_elites, record_heights
 from qd.replay import as_searched
 from qd.workers import check_policy, resolve_device
+from sim.command import chosen_elites
 from sim.controller_spec import spec_of
 from sim.files import prepare_output
 from sim.named_controllers import who_crossed
@@ -129,7 +130,7 @@ def _orders(cfg: VideoCfg, robot: "RobotCfg") -> Iterator[Order]:
 def _elite_orders(cfg: VideoCfg, robot: "RobotCfg") -> Iterator[Order]:
     """Films of elites, whose recordings are written before the first is made."""
     found = archive_of_robot(cfg.robot, cfg.run)
-    elites = chosen_elites(cfg.elite, found)
+    elites = chosen_elites(cfg.elite, len(found.archive), found.run)
     policy, searched = policy_of(found, robot, cfg.policy), spec_of(as_searched(found.run, found.archive)[0], robot)
     single = cfg.out is not None and len(elites) == 1 and not cfg.out.is_dir()
     folder = cfg.out or folder_for(found.run, robot.name)

@@ -17,8 +17,8 @@ class Pair:
 
     index: int
     """Where the terrain stands in its pool."""
-    first: float
-    """Success rate of the set of episodes by which the terrain was chosen."""
+    first: float | None
+    """Success rate of the set of episodes by which the terrain was chosen; None if it was named."""
     ours: NDArray[np.uint8]
     """:class:`kernels.episode.Outcome` of the parallel simulation, shape (num_episodes,)."""
     plain: NDArray[np.uint8]

@@ -7,10 +7,33 @@ from typing import Any
 
 from sim.files import prepare_output, to_json, write_atomically
 
+_ALL = "all"
+
 
 def split_words(values: Sequence[str]) -> list[str]:
     """Words of arguments of which make hands over several in one, apart by spaces or commas."""
     return " ".join(values).replace(",", " ").split()
+
+
+def chosen_elites(text: str, count: int, whose: object) -> list[int]:
+    """Numbers of elites, as a command line names them.
+
+    Args:
+        text: Numbers apart by spaces or commas, or ``all``.
+        count: How many elites there are.
+        whose: What they are of, for the message.
+
+    Raises:
+        ValueError: If it is something else, or there is no such elite.
+    """
+    words = split_words([text])
+    if words == [_ALL]:
+        words = list(map(str, range(count)))
+    unknown = [word for word in words if not (word.isascii() and word.isdigit() and int(word) < count)]
+    if unknown or not words:
+        valid = f"expected {_ALL}, or numbers of 0 to {count - 1}" if count else "the archive is empty"
+        raise ValueError(f"{whose} has no elite {', '.join(unknown) or repr(text)}: {valid}")
+    return [int(word) for word in dict.fromkeys(words)]
 
 
 def exit_code_of(

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from kernels.penalties import PENALTIES
 from sim.agreement import Pair, summarise
 from sim.bank import TerrainBank
-from sim.command import exit_code_of, publish
+from sim.command import chosen_elites, exit_code_of, publish
 from sim.controller_spec import ControllerSpec
 from sim.mujoco_c import crossing_model
 from sim.plain_crossing import draw_starts
@@ -53,6 +53,9 @@ class CrosscheckCfg:
     """Of the parallel simulation: cpu, cuda or cuda:N; CUDA where there is one. Plain MuJoCo always runs on the CPU."""
     genes: Path | None = None
     """Pool of terrains: an archive.npz, or any .npz with genes (num_terrains, 64); drawn hard-random if left out."""
+    elite: str | None = None
+    """Exactly these of --genes instead of a choice by success rates: numbers apart by spaces, or all; --terrains and
+    --between then say nothing."""
     terrains: int = 20
     """Terrains to compare on."""
     between: tuple[float, float] = (0.3, 0.9)
@@ -115,8 +118,8 @@ class Choice:
     """Shape (num_terrains, 64)."""
     index: list[int]
     """Where they stand in the pool."""
-    first: list[float]
-    """Success rates of the first set of episodes, by which they were chosen."""
+    first: list[float | None]
+    """Success rates of the first set of episodes, by which they were chosen; None of those that were named."""
     looked_at: int
     """Terrains of the pool that were tried."""
 
@@ -145,19 +148,36 @@ class Crosscheck:
         self.policy = cfg.policy or self.robot.policy_file
         self.rng = np.random.default_rng([_KEY, cfg.seed])
         self._pool = None if cfg.genes is None else read_pool(cfg.genes)
+        self._named = self._choice_named()
+
+    def _choice_named(self) -> Choice | None:
+        """The terrains that the command line names, if it does.
+
+        Raises:
+            ValueError: If there are none of these numbers.
+        """
+        cfg = self.cfg
+        if cfg.elite is None:
+            return None
+        if self._pool is None:
+            raise ValueError(f"--elite {cfg.elite!r} names terrains of a pool: say of which (--genes archive.npz)")
+        index = chosen_elites(cfg.elite, len(self._pool), cfg.genes)
+        return Choice(genes=self._pool[index], index=index, first=[None] * len(index), looked_at=0)
 
     def choose(self) -> Choice:
-        """Terrains of middling difficulty.
+        """Terrains of middling difficulty, or those that are named.
 
         Raises:
             ValueError: If the pool has too few.
         """
+        if self._named is not None:
+            return self._named
         cfg, at_once = self.cfg, 200 if self.device.startswith("cuda") else 32
         pool = hard_random_genes(_MAX_POOL, self.rng).astype(np.float32) if self._pool is None else self._pool
         order = self.rng.permutation(len(pool))
         rollout = Rollout(self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device)
         chosen: list[int] = []
-        rates: list[float] = []
+        rates: list[float | None] = []
         looked_at = 0
         with tqdm(desc="choosing terrains", total=cfg.terrains, unit="terrain", disable=None) as bar:
             while len(chosen) < cfg.terrains and looked_at < len(pool):
@@ -191,18 +211,18 @@ class Crosscheck:
         """Choose, cross in both simulators, compare; everything of the results file."""
         cfg = self.cfg
         choice = self.choose()
-        genes, seeds = choice.genes, self._seeds(cfg.terrains)
+        genes, seeds = choice.genes, self._seeds(len(choice.index))
         robot, time_constant_s = self._resolved(cfg.fine == "both")
         rollout = Rollout(
             robot,
             self.policy,
-            num_terrains=cfg.terrains,
+            num_terrains=len(genes),
             num_replicas=cfg.episodes,
             device=self.device,
             solver=SolverCfg(time_constant_s=time_constant_s),
         )
         ours = rollout.evaluate(genes, seeds)
-        bank = TerrainBank(cfg.terrains, device=self.device)
+        bank = TerrainBank(len(genes), device=self.device)
         bank.set_genes(genes)
         heights: Any = bank.heights.numpy()
         starts = [

@@ -16,7 +16,7 @@ from qd.cross import CrossCfg, cross, describe, numbers_of
 from qd.cross import main as cross_main
 from qd.export import ExportCfg, export
 from qd.export import main as export_main
-from qd.recordings import archive_of_robot, chosen_elites, record_elites
+from qd.recordings import archive_of_robot, record_elites
 from qd.replay import ReplayCfg, replay
 from qd.video import VideoCfg, make_videos
 from qd.video import main as video_main
@@ -44,20 +44,6 @@ def run(in_a_folder_of_its_own):
     archive = small_archive(3)
     write_archive(folder / "archive.npz", archive.corrected_by(fresh_values(archive)))
     return folder
-
-
-def test_elites_are_named_by_numbers_or_all(run):
-    found = archive_of_robot("anymal", None)
-    assert found.folder == run
-    assert chosen_elites("1", found) == [1]
-    assert chosen_elites("2 0, 2", found) == [2, 0]
-    assert chosen_elites("all", found) == [0, 1, 2]
-    for text in ("3", "-1", "one", "", "0 3", "0 all", "1.0", "²"):
-        with pytest.raises(ValueError, match=r"has no elite .*: expected all, or numbers of 0 to 2"):
-            chosen_elites(text, found)
-    write_archive(run / "archive.npz", small_archive(0))
-    with pytest.raises(ValueError, match="the archive is empty"):
-        chosen_elites("all", archive_of_robot("anymal", run))
 
 
 def test_an_elite_is_recorded_in_the_episodes_of_its_replay(run):

@@ -7,7 +7,7 @@ import pytest
 
 from qd import speed as search_speed
 from qd.cli import run_command
-from sim.command import exit_code_of
+from sim.command import chosen_elites, exit_code_of
 from train import evaluate, speed
 
 
@@ -76,3 +76,14 @@ def test_a_run_of_another_device_is_not_timed_against_this_one(shipped_search):
         search_speed.read_iterations(shipped_search, 20, "NVIDIA H100")
     cfg, metrics, terrains = search_speed.read_iterations(shipped_search, 20, "NVIDIA H200")
     assert (cfg.robot, len(metrics), terrains.shape) == ("anymal", 20, (200, 64))
+
+
+def test_elites_are_named_by_numbers_or_all():
+    assert chosen_elites("1", 3, "a run") == [1]
+    assert chosen_elites("2 0, 2", 3, "a run") == [2, 0]
+    assert chosen_elites("all", 3, "a run") == [0, 1, 2]
+    for text in ("3", "-1", "one", "", "0 3", "0 all", "1.0", "²"):
+        with pytest.raises(ValueError, match=r"^a run has no elite .*: expected all, or numbers of 0 to 2$"):
+            chosen_elites(text, 3, "a run")
+    with pytest.raises(ValueError, match="the archive is empty"):
+        chosen_elites("all", 0, "a run")

@@ -113,6 +113,19 @@ def test_a_pool_without_middling_terrains_says_how_many_it_has(tmp_path):
         check.choose()
 
 
+def test_terrains_of_a_pool_can_be_named_whatever_their_rates(tmp_path):
+    pool = tmp_path / "pool.npz"
+    genes = np.arange(5, dtype=np.float32)[:, None].repeat(64, axis=1)
+    np.savez(pool, genes=genes)
+    choice = Crosscheck(CrosscheckCfg(device="cpu", genes=pool, elite="4 1")).choose()
+    assert choice.index == [4, 1] and choice.first == [None, None]
+    np.testing.assert_array_equal(choice.genes, genes[[4, 1]])
+    with pytest.raises(ValueError, match=r"pool\.npz has no elite 5: expected all, or numbers of 0 to 4"):
+        Crosscheck(CrosscheckCfg(device="cpu", genes=pool, elite="5"))
+    with pytest.raises(ValueError, match="say of which"):
+        Crosscheck(CrosscheckCfg(device="cpu", elite="all"))
+
+
 def test_command_line_helps_and_refuses(tmp_path):
     def call(*flags):
         command = [sys.executable, "-m", "sim.crosscheck", *flags]
