@@ -97,7 +97,7 @@ help: ## This list
 	@echo '  PORT=N HOST=ADDRESS   where the page is served: port 8080 for this machine alone      view'
 	@echo '  OUT=FILE         where to write the numbers        compare ablation calibrate report evaluate crosscheck bench'
 	@echo '                   or figure, film, folder           replay video export'
-	@echo '  GENES=FILE       an archive.npz to take terrains from; hard-random ones if left out    crosscheck'
+	@echo '  GENES=FILE       an archive.npz to take terrains from, ELITE= by number; hard-random ones if left out crosscheck'
 	@echo '  FINE=both        who resolves contacts: neither, mujoco, both; neither if left out      crosscheck'
 	@echo '  WORKERS=auto     Ray workers, one a GPU or CPU core: a number, or auto for all; a running cluster is'
 	@echo '                   joined by RAY_ADDRESS             archive compare ablation calibrate reevaluate evaluate'

@@ -27,9 +27,10 @@ def chosen_elites(text: str, count: int, whose: object) -> list[int]:
         ValueError: If it is something else, or there is no such elite.
     """
     words = split_words([text])
+    known = list(map(str, range(count)))
     if words == [_ALL]:
-        words = list(map(str, range(count)))
-    unknown = [word for word in words if not (word.isascii() and word.isdigit() and int(word) < count)]
+        words = known
+    unknown = [word for word in words if word not in known]
     if unknown or not words:
         valid = f"expected {_ALL}, or numbers of 0 to {count - 1}" if count else "the archive is empty"
         raise ValueError(f"{whose} has no elite {', '.join(unknown) or repr(text)}: {valid}")

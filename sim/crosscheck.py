@@ -1,8 +1,9 @@
 """Do terrains break the controller in another simulator too? ``python -m sim.crosscheck --robot anymal``.
 
-Of a pool of terrains, those are taken on which a first set of episodes succeeds in 30 to 90 %. On each of them fresh
-episodes are then held against more of plain MuJoCo C: the same robot file, height grid, controller and starts, but
-MuJoCo's own heightfield contact, a converged solver, and a second implementation of everything round it.
+Of a pool of terrains, those are taken on which a first set of episodes succeeds in 30 to 90 %, or those that
+``--elite`` names. On each of them fresh episodes are then held against more of plain MuJoCo C: the same robot file,
+height grid, controller and starts, but MuJoCo's own heightfield contact, a converged solver, and a second
+implementation of everything round it.
 """
 
 import json
@@ -54,8 +55,8 @@ class CrosscheckCfg:
     genes: Path | None = None
     """Pool of terrains: an archive.npz, or any .npz with genes (num_terrains, 64); drawn hard-random if left out."""
     elite: str | None = None
-    """Exactly these of --genes instead of a choice by success rates: numbers apart by spaces, or all; --terrains and
-    --between then say nothing."""
+    """Exactly these of --genes instead of a choice by success rates: one number, several as in --elite "97 124", or
+    all; --terrains and --between then count for nothing."""
     terrains: int = 20
     """Terrains to compare on."""
     between: tuple[float, float] = (0.3, 0.9)
@@ -160,7 +161,7 @@ class Crosscheck:
         if cfg.elite is None:
             return None
         if self._pool is None:
-            raise ValueError(f"--elite {cfg.elite!r} names terrains of a pool: say of which (--genes archive.npz)")
+            raise ValueError(f"--elite {cfg.elite!r} names terrains of a pool: say which (--genes, or GENES= of make)")
         index = chosen_elites(cfg.elite, len(self._pool), cfg.genes)
         return Choice(genes=self._pool[index], index=index, first=[None] * len(index), looked_at=0)
 
@@ -261,8 +262,8 @@ def _settings(robot: RobotCfg, time_constant_s: float | None) -> dict[str, Any]:
 
 def _print_table(report: dict[str, Any]) -> None:
     print(f"{'terrain':>7} {'success: ours':>22} {'MuJoCo C':>9} {'':>8} {'goal: ours':>19} {'MuJoCo C':>9}")
-    for k, row in enumerate(report["terrains"]):
-        cells = [f"{k:>7}"]
+    for row in report["terrains"]:
+        cells = [f"{row['index']:>7}"]
         for kind in ("success", "goal"):
             low, high = row[kind]["interval"]
             cells.append(f"{row[kind]['ours']:>8.2f} [{low:.2f} {high:.2f}] {row[kind]['mujoco_c']:>9.2f}")

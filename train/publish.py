@@ -29,8 +29,8 @@ _NONE = "-"
 class PublishCfg:
     """Write the published numbers of all robots, with the paper's beside them, into the README.
 
-    They come from results/<robot>/archive/archive.json, tables.json and ablation.json; what is not there yet is left
-    out.
+    They come from results/<robot>/archive/archive.json, tables.json, distances.json and ablation.json; what is not
+    there yet is left out.
     """
 
     results: Path = Path("results")
@@ -67,6 +67,7 @@ def _robot(folder: Path, robot: str) -> str:
     for file, section in (
         ("archive/archive.json", _archive),
         ("tables.json", _tables),
+        ("distances.json", _distances),
         ("ablation.json", _ablation),
     ):
         path = folder / file
@@ -152,6 +153,12 @@ def _rate(found: dict[str, Any], measure: str, name: str, who: str, digits: int 
     interval = "" if limits is None else f" ({limits[0]:.{digits}f} to {limits[1]:.{digits}f})"
     seeds = "" if several is None else f", {len(several['values'])} seeds"
     return f"{mean:.{digits}f}{interval}{seeds}"
+
+
+def _distances(found: dict[str, Any], robot: str) -> str:
+    """How near the elites trained on are."""
+    each = [f"{_SETS[name]} {100 * row['median']:.1f} cm" for name, row in found["nearest_m"].items()]
+    return f"RMS distance of the terrains' heights to the nearest elite trained on, medians: {'; '.join(each)}."
 
 
 def _ablation(found: dict[str, Any], robot: str) -> str:

@@ -11,6 +11,7 @@ from kernels.episode import Outcome
 from sim.agreement import Pair, summarise
 from sim.crosscheck import Crosscheck, CrosscheckCfg, read_pool
 from sim.intervals import bootstrap_interval, wilson_interval
+from sim.terrain import hard_random_genes
 
 
 def test_wilson_interval_by_hand():
@@ -122,8 +123,20 @@ def test_terrains_of_a_pool_can_be_named_whatever_their_rates(tmp_path):
     np.testing.assert_array_equal(choice.genes, genes[[4, 1]])
     with pytest.raises(ValueError, match=r"pool\.npz has no elite 5: expected all, or numbers of 0 to 4"):
         Crosscheck(CrosscheckCfg(device="cpu", genes=pool, elite="5"))
-    with pytest.raises(ValueError, match="say of which"):
+    with pytest.raises(ValueError, match="say which"):
         Crosscheck(CrosscheckCfg(device="cpu", elite="all"))
+
+
+def test_named_terrains_are_crossed_in_both_simulators(tmp_path):
+    genes = np.zeros((3, 64), np.float32)  # flat, but for the last
+    genes[2] = hard_random_genes(1, np.random.default_rng(3))[0]
+    np.savez(tmp_path / "pool.npz", genes=genes)
+    counts = {"episodes": 1, "plain_episodes": 1, "processes": 1}
+    report = Crosscheck(CrosscheckCfg(device="cpu", genes=tmp_path / "pool.npz", elite="2 0", **counts)).run()
+    assert [row["index"] for row in report["terrains"]] == [2, 0] and report["left_out"] == []
+    assert [row["episodes"] for row in report["terrains"]] == [[1, 1], [1, 1]]
+    flat = report["terrains"][1]
+    assert flat["first_success"] is None and flat["goal"]["ours"] == flat["goal"]["mujoco_c"] == 1.0
 
 
 def test_command_line_helps_and_refuses(tmp_path):
