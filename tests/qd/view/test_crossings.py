@@ -96,15 +96,12 @@ def test_a_cache_that_cannot_be_written_to_is_named(anymal, tmp_path):
         Crossings(anymal, cache=tmp_path / "file" / "cache")
 
 
-def test_the_published_recordings_are_those_of_the_published_archive(anymal, tmp_path):
+def test_the_published_recording_is_that_of_the_published_archive(anymal, tmp_path):
     from qd.archive import read_archive
     from qd.places import RESULTS
 
     archive = read_archive(RESULTS.resolve() / "anymal" / "archive")
     crossings = Crossings(anymal, cache=tmp_path, published=RESULTS.resolve() / "anymal" / "view")
     policy = str(anymal.policy_file)
-    found = [
-        crossings.read(Wanted(elite=k, controller="", policy=policy, replicas=20, genes=archive.genes[k : k + 1]))
-        for k in (0, 171)
-    ]
-    assert [recording.num_episodes for recording in found] == [20, 20]
+    found = crossings.read(Wanted(elite=0, controller="", policy=policy, replicas=20, genes=archive.genes[:1]))
+    assert found is not None and found.num_episodes == 20
