@@ -27,9 +27,9 @@ def chosen_elites(text: str, count: int, whose: object) -> list[int]:
         ValueError: If it is something else, or there is no such elite.
     """
     words = split_words([text])
-    known = list(map(str, range(count)))
+    known = dict.fromkeys(map(str, range(count)))
     if words == [_ALL]:
-        words = known
+        words = list(known)
     unknown = [word for word in words if word not in known]
     if unknown or not words:
         valid = f"expected {_ALL}, or numbers of 0 to {count - 1}" if count else "the archive is empty"

@@ -15,9 +15,7 @@ import tyro
 from qd.archive import read_archive
 from sim.command import exit_code_of, publish
 from sim.provenance import provenance
-from train.sets import make_sets, nearest_distance, paper_terrains, split_elites
-
-_SETS = ("hard_random", "generated", "generated_far")
+from train.sets import far_part, make_sets, nearest_distance, paper_terrains, split_elites
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,17 +48,23 @@ def distances(cfg: DistancesCfg) -> dict[str, Any]:
         raise ValueError(f"terrains must be at least 1 and seed at least 0, got {count} and {cfg.seed}")
     archive = read_archive(cfg.archive or Path("results") / cfg.robot / "archive")
     split = split_elites(archive, cfg.robot, cfg.split_seed)
-    sets = {}
-    for name, found in make_sets(_SETS, count, cfg.seed, archive=archive, split=split).items():
-        nearest = nearest_distance(found.terrains, archive.genes[split.train])
-        low, high = float(nearest.min()), float(nearest.max())
-        sets[name] = {"terrains": len(found), "median": float(np.median(nearest)), "least": low, "largest": high}
+    sets = make_sets(("hard_random", "generated"), count, cfg.seed, archive=archive, split=split)
+    nearest = {name: nearest_distance(found.terrains, archive.genes[split.train]) for name, found in sets.items()}
+    nearest["generated_far"] = nearest["generated"][far_part(nearest["generated"])]
     return {
         **provenance("cpu", cfg.seed),
         "robot": cfg.robot,
         "iterations": archive.iterations,
         "trained_on": len(split.train),
-        "nearest_m": sets,
+        "nearest_m": {
+            name: {
+                "terrains": len(row),
+                "median": float(np.median(row)),
+                "least": float(row.min()),
+                "largest": float(row.max()),
+            }
+            for name, row in nearest.items()
+        },
     }
 
 

@@ -157,10 +157,9 @@ def generated_set(archive: Archive, split: EliteSplit, count: int, seed: int) ->
     return TerrainSet(name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows)
 
 
-def far_part(generated: TerrainSet, training_genes: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Places in ``generated`` of the third that lies farthest from its nearest training terrain, ascending."""
-    distance = nearest_distance(generated.terrains, training_genes)
-    count = -(-len(generated) // 3)
+def far_part(distance: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Places of the third of terrains with the largest distance to its nearest training terrain, ascending."""
+    count = -(-len(distance) // 3)
     return np.sort(np.argsort(-distance, kind="stable")[:count])
 
 
@@ -217,7 +216,7 @@ def make_sets(
     if archive is not None and split is not None:
         sets["generated"] = whole = generated_set(archive, split, count, seed)
         if "generated_far" in names:
-            far = far_part(whole, archive.genes[split.train])
+            far = far_part(nearest_distance(whole.terrains, archive.genes[split.train]))
             sets["generated_far"] = part_of(whole, far, "generated_far")
     return {name: sets[name] for name in SETS if name in names}
 

@@ -131,7 +131,7 @@ def test_the_far_third_is_the_farthest():
     np.testing.assert_allclose(distance[[2, 5]], 0.0, atol=1e-6)
     assert (np.delete(distance, [2, 5]) > 0.02).all()
     whole = replace(plain_set("hard_random", 7, 0), name="generated", terrains=genes, numbers=np.arange(100, 107))
-    far = far_part(whole, training)  # a third of seven, rounded up
+    far = far_part(distance)  # a third of seven, rounded up
     assert far.tolist() == sorted(np.argsort(-distance)[:3])
     part = part_of(whole, far, "generated_far")
     assert part.numbers.tolist() == (100 + far).tolist()
