@@ -105,7 +105,7 @@ help: ## This list
 	@echo '  PROCESSES=N      processes on the CPU without Ray  archive compare reevaluate'
 	@echo '  PYTHON=python3   interpreter .venv is made from (3.11 or newer)'
 	@echo '  TORCH=SPEC       torch other than the pinned one, e.g. a build for your GPU driver: a requirement or a wheel'
-	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.replay, train.base, ...)'
+	@echo 'All flags of a command: .venv/bin/python -m qd.search --help (or qd.show.replay, train.base, ...)'
 
 setup: $(STAMP) ## Make .venv with the pinned packages, unless it is up to date
 
@@ -121,16 +121,16 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 stand: setup ## Look at ROBOT: its joints and geoms, whether it stands, what lying on rough ground takes
-	$(BIN)/python -m sim.stand --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE SEED)
+	$(BIN)/python -m sim.robots.stand --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE SEED)
 
 archive: setup ## Search the terrains on which the controller of ROBOT fails; writes a run under runs/
 	$(BIN)/python -m qd.search --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS PROCESSES WORKER_LIMIT_S METHOD INTERVALS WITHOUT REPRODUCE)
 
 compare: setup ## Let the search and its baselines loose on the same number of terrains
-	$(BIN)/python -m qd.compare --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS PROCESSES WORKER_LIMIT_S OUT)
+	$(BIN)/python -m qd.studies.compare --robot $(call quoted,$(ROBOT)) $(call flags,PRESET DEVICE ITERATIONS POLICY SEED RESUME WORKERS PROCESSES WORKER_LIMIT_S OUT)
 
 ablation: setup ## Search with and without the standard deviations in the fitness
-	$(BIN)/python -m qd.ablation --robot $(call quoted,$(ROBOT)) $(call flags,RUN PRESET DEVICE ITERATIONS POLICY SEED WORKERS OUT)
+	$(BIN)/python -m qd.studies.ablation --robot $(call quoted,$(ROBOT)) $(call flags,RUN PRESET DEVICE ITERATIONS POLICY SEED WORKERS OUT)
 
 train: setup ## Train the base controller of ROBOT from scratch
 	$(BIN)/python -m train.base --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE ITERATIONS SEED RESUME EXPORT)
@@ -139,16 +139,16 @@ finetune: setup ## Train the controller of ROBOT further, on the terrains of an 
 	$(BIN)/python -m train.finetune --robot $(call quoted,$(ROBOT)) $(call flags,MIX ARCHIVE SPLIT_SEED POLICY DRAW REWARDS TASK DEVICE ITERATIONS SEED RESUME EXPORT)
 
 calibrate: setup ## Measure the penalty scales of ROBOT
-	$(BIN)/python -m qd.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY TERRAINS SEED OUT WORKERS)
+	$(BIN)/python -m qd.studies.calibrate --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY TERRAINS SEED OUT WORKERS)
 
 replay: setup ## Print elite ELITE=N of an archive and draw its terrain with the robot's paths
-	$(BIN)/python -m qd.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY SEED OUT)
+	$(BIN)/python -m qd.show.replay --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE DEVICE POLICY SEED OUT)
 
 report: setup ## Write one HTML page about an archive: how the controller breaks, on which terrains, in figures
-	$(BIN)/python -m qd.html_report --robot $(call quoted,$(ROBOT)) $(call flags,RUN TABLES OUT DEVICE POLICY EPISODES)
+	$(BIN)/python -m qd.show.report --robot $(call quoted,$(ROBOT)) $(call flags,RUN TABLES OUT DEVICE POLICY EPISODES)
 
 view: setup ## Show an archive in the browser: its elites, their terrains, and the robot that crosses them
-	$(BIN)/python -m qd.view --robot $(call quoted,$(ROBOT)) $(call flags,RUN POLICIES ELITE PORT HOST)
+	$(BIN)/python -m qd.show.view --robot $(call quoted,$(ROBOT)) $(call flags,RUN POLICIES ELITE PORT HOST)
 
 reevaluate: setup ## Evaluate every elite of an archive again with 40 fresh episodes
 	$(BIN)/python -m qd.reevaluate --robot $(call quoted,$(ROBOT)) $(call flags,RUN DEVICE POLICY SEED WORKERS PROCESSES WORKER_LIMIT_S)
@@ -158,19 +158,19 @@ refused = $(if $(TERRAIN),$(strip $(foreach name,$(NO_MAP),$(if $($(name)),$(nam
 
 evaluate: setup ## Rates of the controller of ROBOT; with TERRAIN on a map of yours, with POLICIES or ARCHIVE the paper's tables
 	$(if $(refused),$(error make evaluate TERRAIN=FILE crosses one map with one controller, got $(refused) too: leave out one or the other, or name the controller with POLICY=FILE))
-	$(BIN)/python -m $(if $(TERRAIN),qd.cross,train.evaluate) --robot $(call quoted,$(ROBOT)) $(call flags,$(if $(TERRAIN),TERRAIN SIZE SCALE OFFSET DEVICE POLICY EPISODES SEED OUT,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS))
+	$(BIN)/python -m $(if $(TERRAIN),qd.show.cross,train.evaluate.evaluate) --robot $(call quoted,$(ROBOT)) $(call flags,$(if $(TERRAIN),TERRAIN SIZE SCALE OFFSET DEVICE POLICY EPISODES SEED OUT,DEVICE POLICY POLICIES ARCHIVE SPLIT_SEED SETS TERRAINS EPISODES SEED OUT WORKERS))
 
 video: setup ## Film the robot on elite ELITE=N of an archive, or on TERRAIN=FILE
-	$(BIN)/python -m qd.video --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE TERRAIN SIZE SCALE OFFSET RECORDING DEVICE POLICY SEED OUT)
+	$(BIN)/python -m qd.show.video --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE TERRAIN SIZE SCALE OFFSET RECORDING DEVICE POLICY SEED OUT)
 
 export: setup ## Write elites as npz, 16-bit PNG, MJCF and STL: ELITE=N or ELITE=all
-	$(BIN)/python -m qd.export --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE OUT FORMATS)
+	$(BIN)/python -m qd.show.export --robot $(call quoted,$(ROBOT)) $(call flags,RUN ELITE OUT FORMATS)
 
 tables: setup ## Write the published numbers, with the paper's beside them, into the README
-	$(BIN)/python -m train.publish
+	$(BIN)/python -m train.evaluate.publish
 
 crosscheck: setup ## Hold the crossings of ROBOT against the same in plain MuJoCo C
-	$(BIN)/python -m sim.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES ELITE FINE OUT)
+	$(BIN)/python -m sim.mujoco_c.crosscheck --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE POLICY SEED GENES ELITE FINE OUT)
 
 bench: setup ## Time every kernel against torch and against what the device can do at best
 	$(BIN)/python -m sim.bench --robot $(call quoted,$(ROBOT)) $(call flags,DEVICE SEED OUT)

@@ -5,11 +5,11 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_position, base_yaw, state_is_invalid
 from kernels.goal import Task, goal_command, is_at_goal, is_out
 from kernels.heightfield import Terrain
 from kernels.penalties import max_base_force
 from kernels.start import StartRanges, place_robot
+from kernels.state import base_position, base_yaw, state_is_invalid
 
 
 class Outcome(IntEnum):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from kernels.base_state import wrap_angle
+from kernels.state import wrap_angle
 
 
 @wp.struct

@@ -9,8 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_ang_vel_b, base_heading, base_lin_vel_b, projected_gravity
 from kernels.heightfield import Terrain, height_at
+from kernels.state import base_ang_vel_b, base_heading, base_lin_vel_b, projected_gravity
 
 NUM_BASE_COLUMNS = 12
 LIN_VEL_SCALE = wp.constant(2.0)

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_ang_vel_b, base_lin_vel_b
+from kernels.state import base_ang_vel_b, base_lin_vel_b
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 """Columns of the penalty sums."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_yaw, wrap_angle
 from kernels.goal import goal_command
 from kernels.heightfield import Terrain
 from kernels.rewards import Feet
 from kernels.start import StartRanges, place_robot
+from kernels.state import base_yaw, wrap_angle
 from kernels.training import End, Episodes, Rules
 
 _RUNNING = wp.constant(int(End.RUNNING))

@@ -5,8 +5,8 @@ Every term is the unweighted rate of reward in one control step; :mod:`kernels.r
 
 import warp as wp
 
-from kernels.base_state import projected_gravity
 from kernels.penalties import COLLISION_FORCE, FOOT, LIMB
+from kernels.state import projected_gravity
 
 TRACKING_VARIANCE = wp.constant(0.25)
 TOUCH_FORCE = wp.constant(1.0)
@@ -18,7 +18,7 @@ class Motion:
     """What a control step ended in; one row an environment."""
 
     joint_q: wp.array2d[float]
-    """Joint coordinates (:mod:`kernels.base_state`)."""
+    """Joint coordinates (:mod:`kernels.state`)."""
     joint_qd: wp.array2d[float]
     joint_torque: wp.array2d[float]
     """Actuator torques [N m] in columns 6 and up."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_ang_vel_b, base_lin_vel_b
 from kernels.penalties import excess_contact_force, is_stumbling
 from kernels.reward_terms import (
     Feet,
@@ -28,6 +27,7 @@ from kernels.reward_terms import (
     tracking_ang_vel,
     tracking_lin_vel,
 )
+from kernels.state import base_ang_vel_b, base_lin_vel_b
 
 REWARDS = (
     "tracking_lin_vel", "tracking_ang_vel", "lin_vel_z", "ang_vel_xy", "torques", "dof_acc",

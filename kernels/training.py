@@ -8,10 +8,10 @@ from typing import Any
 
 import warp as wp
 
-from kernels.base_state import base_ang_vel_b, base_lin_vel_b, base_position, projected_gravity, state_is_invalid
 from kernels.goal import Task, is_at_goal, is_out
 from kernels.penalties import max_base_force
 from kernels.rewards import REWARDS
+from kernels.state import base_ang_vel_b, base_lin_vel_b, base_position, projected_gravity, state_is_invalid
 
 
 class End(IntEnum):

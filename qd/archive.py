@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.space import NUM_GENES
-from sim.files import write_atomically
+from sim.files.atomic import write_atomically
 
 ARCHIVE_FILE = "archive.npz"
 """Name of the archive in a run directory."""

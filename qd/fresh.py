@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from qd.archive import Archive, FreshValues
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, FitnessCfg, evaluation_of
-from qd.progress import share_bar
-from qd.shards import taken
-from qd.workers import Evaluate, EvaluatorCfg
-from sim.intervals import bootstrap_interval, wilson_interval
+from qd.run.progress import share_bar
+from qd.workers.evaluator import Evaluate, EvaluatorCfg
+from qd.workers.shards import taken
+from sim.files.intervals import bootstrap_interval, wilson_interval
 
 if TYPE_CHECKING:
-    from qd.settings import SearchCfg
+    from qd.run.settings import SearchCfg
 
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""

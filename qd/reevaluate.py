@@ -5,20 +5,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qd.archive import Archive
-from qd.arguments import evaluator_of
-from qd.cli import naming_what_is_next, run_command
 from qd.fresh import Open, corrected
-from qd.next_commands import next_command
-from qd.places import newest_run
-from qd.resuming import origin_in, refuse_unnamed_code
-from qd.run_directory import CONFIG_FILE, RunDirectory, archive_of, claimed
+from qd.run.arguments import evaluator_of
+from qd.run.cli import naming_what_is_next, run_command
+from qd.run.directory import CONFIG_FILE, RunDirectory, archive_of, claimed
+from qd.run.next_commands import next_command
+from qd.run.places import newest_run
+from qd.run.resuming import origin_in, refuse_unnamed_code
+from qd.run.settings import SearchCfg, as_settings, file_hash, policy_spec
 from qd.search import write_results
-from qd.settings import SearchCfg, as_settings, file_hash, policy_spec
-from qd.workers import open_evaluator, origin_of, resolve_device
-from sim.controller_spec import SHIPPED
+from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
+from sim.policy.spec import SHIPPED
 
 if TYPE_CHECKING:
-    from sim.robot import RobotCfg
+    from sim.robots.robot import RobotCfg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ def reevaluate_run(args: ReevaluateCfg, *, open_evaluator: Open = open_evaluator
         Interrupted: On Ctrl-C; the run is as it was.
         EvaluatorError: If a worker is lost; likewise.
     """
-    from sim.robot import get_robot, robot_of
+    from sim.robots.robot import get_robot, robot_of
 
     path = args.run or newest_run(get_robot(args.robot or "anymal"))
     run = RunDirectory(path)

@@ -5,18 +5,18 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import Archive
-from qd.arguments import Arguments, Job, job_of
-from qd.cli import naming_what_is_next, run_command
 from qd.fitness import Evaluation, evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
-from qd.next_commands import make_command
-from qd.progress import ProgressBar, clock, plan
-from qd.report import summary, write_figures
-from qd.resuming import code_of
-from qd.run_directory import CONFIG_FILE, SUMMARY_FILE, Metrics, RunDirectory, archive_of, claimed
-from qd.settings import SearchCfg, as_settings
-from qd.workers import Evaluate, crew_status, episode_seeds, open_evaluator, origin_of
-from sim.files import to_json, write_atomically
+from qd.run.arguments import Arguments, Job, job_of
+from qd.run.cli import naming_what_is_next, run_command
+from qd.run.directory import CONFIG_FILE, SUMMARY_FILE, Metrics, RunDirectory, archive_of, claimed
+from qd.run.next_commands import make_command
+from qd.run.progress import ProgressBar, clock, plan
+from qd.run.resuming import code_of
+from qd.run.settings import SearchCfg, as_settings
+from qd.show.figures import summary, write_figures
+from qd.workers.evaluator import Evaluate, crew_status, episode_seeds, open_evaluator, origin_of
+from sim.files.atomic import to_json, write_atomically
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler

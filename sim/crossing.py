@@ -7,7 +7,7 @@ import warp as wp
 from kernels.episode import EpisodeState
 from kernels.goal import Task
 from kernels.start import StartRanges
-from sim.robot import RobotCfg
+from sim.robots.robot import RobotCfg
 
 
 @dataclass(frozen=True, kw_only=True)

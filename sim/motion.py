@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from kernels.reward_terms import Motion
+from sim.robots.training import TrainingCfg
 from sim.simulation import Simulation
-from sim.training import TrainingCfg
 
 
 def soft_joint_limits(sim: Simulation, share: float) -> tuple[np.ndarray, np.ndarray]:

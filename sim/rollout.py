@@ -12,10 +12,10 @@ from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_episode_state, make_start_ranges, make_task
-from sim.policy import PolicySpec, load_policy, prepare_torch
-from sim.policy_runner import PolicyRunner
+from sim.policy.loaders import PolicySpec, load_policy, prepare_torch
+from sim.policy.runner import PolicyRunner
 from sim.reward import RewardSum
-from sim.robot import RobotCfg
+from sim.robots.robot import RobotCfg
 from sim.rollout_result import RolloutResult, RolloutState
 from sim.simulation import Simulation, SolverCfg
 
@@ -151,7 +151,7 @@ class Rollout:
             terrains: Genes, shape (num_terrains, 64), or heights [m], shape (num_terrains, nrow, ncol).
             seeds: One seed a terrain, shape (num_terrains,), uint32.
             record_paths: Keep the base's position at every control step.
-            before_step: Called before every control step, to look at :attr:`state` (:mod:`sim.recording`).
+            before_step: Called before every control step, to look at :attr:`state` (:mod:`sim.recording.recorder`).
             progress: Called with (control steps done, most control steps) at every poll.
 
         Raises:

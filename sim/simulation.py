@@ -13,9 +13,9 @@ from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.reset import clear_rows
 from sim.bank import TerrainBank
-from sim.probes import make_probes
-from sim.robot import RobotCfg
-from sim.robot_model import build_robot, geom_names
+from sim.robots.model import build_robot, geom_names
+from sim.robots.probes import make_probes
+from sim.robots.robot import RobotCfg
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
@@ -25,12 +25,12 @@ CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 
 @dataclass(frozen=True, kw_only=True)
 class SolverCfg:
-    """Options of the physics solver, chosen by measurement (``python -m sim.options``).
+    """Options of the physics solver, chosen by measurement (``python -m sim.bench.options``).
 
     The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that a physics step
     of 0.005 s allows; at MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius. Friction
     cones are elliptic: a pyramid gives way at 0.7 of the friction across its axes, and robots fail on slopes that would
-    hold them (``sim.crosscheck``).
+    hold them (``sim.mujoco_c.crosscheck``).
     """
 
     iterations: int = 5
@@ -63,7 +63,7 @@ class Simulation:
     """``num_envs`` robots, each alone in a world of its own, in world-local coordinates on its terrain's grid.
 
     Attributes:
-        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints); layout in :mod:`kernels.base_state`.
+        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints); layout in :mod:`kernels.state`.
         joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
         targets: Joint position targets [rad] in columns 7 and up, shape (num_envs, 7 + num_joints).
         geom_force: Contact force on each geom with a role in the last step, world frame [N], vectors of shape

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sim.bank import TerrainBank
-from sim.robot import ROBOTS, get_robot
+from sim.robots.robot import ROBOTS, get_robot
 from sim.simulation import Simulation, resolve_device
 from tests.sim.scenes import Stepper
 

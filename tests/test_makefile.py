@@ -10,23 +10,23 @@ from pathlib import Path
 import pytest
 import tyro
 
-from qd.arguments import Arguments
-from qd.compare_arguments import Arguments as CompareArguments
-from qd.cross import CrossCfg
-from qd.next_commands import next_command
 from qd.reevaluate import ReevaluateCfg
+from qd.run.arguments import Arguments
+from qd.run.next_commands import next_command
+from qd.show.cross import CrossCfg
+from qd.studies.compare_arguments import Arguments as CompareArguments
 from tests.dry_run import ROOT, run_by
 
 ARGUMENTS = {
-    "archive": ("qd.arguments", "Arguments"),
-    "compare": ("qd.compare_arguments", "Arguments"),
-    "calibrate": ("qd.calibrate", "CalibrateCfg"),
-    "replay": ("qd.replay", "ReplayCfg"),
-    "report": ("qd.html_report.material", "HtmlReportCfg"),
+    "archive": ("qd.run.arguments", "Arguments"),
+    "compare": ("qd.studies.compare_arguments", "Arguments"),
+    "calibrate": ("qd.studies.calibrate", "CalibrateCfg"),
+    "replay": ("qd.show.replay", "ReplayCfg"),
+    "report": ("qd.show.report.material", "HtmlReportCfg"),
     "reevaluate": ("qd.reevaluate", "ReevaluateCfg"),
-    "evaluate": ("qd.cross", "CrossCfg"),  # with TERRAIN
-    "video": ("qd.video", "VideoCfg"),
-    "export": ("qd.export", "ExportCfg"),
+    "evaluate": ("qd.show.cross", "CrossCfg"),  # with TERRAIN
+    "video": ("qd.show.video", "VideoCfg"),
+    "export": ("qd.show.export", "ExportCfg"),
 }
 """Where the arguments of each target's command are."""
 VARIABLES = dict(re.findall(r"^FLAG_(\w+) := (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE))
@@ -86,9 +86,9 @@ def test_a_command_names_only_what_is_not_as_by_default():
 
 
 def test_a_map_of_ones_own_is_handed_to_the_command_that_crosses_it():
-    assert command_of("evaluate", POLICY="a.pt", SIZE="16 8")[2] == "train.evaluate"
+    assert command_of("evaluate", POLICY="a.pt", SIZE="16 8")[2] == "train.evaluate.evaluate"
     command = command_of("evaluate", TERRAIN="my hill.png", SIZE="16 8", SCALE="0.01", EPISODES="40", OUT="a.json")
-    assert command[:3] == [".venv/bin/python", "-m", "qd.cross"]
+    assert command[:3] == [".venv/bin/python", "-m", "qd.show.cross"]
     parsed = tyro.cli(CrossCfg, args=command[3:])
     given = {"terrain": Path("my hill.png"), "size": ("16 8",), "scale": 0.01, "episodes": 40, "out": Path("a.json")}
     assert parsed == CrossCfg(robot="anymal", **given)

@@ -5,11 +5,11 @@ import re
 import pytest
 import torch
 
-from sim.policy import load_policy
-from sim.robot import get_robot
+from sim.policy.loaders import load_policy
+from sim.robots.robot import get_robot
 from tests.dry_run import ROOT, run_by
 from tests.sim.dogs import mjcf
-from tests.sim.test_policy import rsl_rl_actor, save_checkpoint
+from tests.sim.policy.test_loaders import rsl_rl_actor, save_checkpoint
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 

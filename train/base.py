@@ -17,19 +17,19 @@ from pathlib import Path
 import torch
 import tyro
 
-from sim.command import exit_code_of
-from sim.files import to_json, write_atomically
-from sim.own_robot import own_hash
-from sim.provenance import provenance
-from sim.robot import get_robot
+from sim.files.atomic import to_json, write_atomically
+from sim.files.command import exit_code_of
+from sim.files.provenance import provenance
+from sim.robots.own import own_hash
+from sim.robots.robot import get_robot
+from sim.robots.training import LearningCfg
 from sim.simulation import resolve_device
-from sim.training import LearningCfg
-from train.learner import Learner
-from train.ppo import PpoCfg, check_ppo
-from train.progress import Progress
-from train.ranks import Ranks
-from train.resumed import task_and_ppo
-from train.run import (
+from train.ppo.learner import Learner
+from train.ppo.ppo import PpoCfg, check_ppo
+from train.ppo.progress import Progress
+from train.ppo.ranks import Ranks
+from train.ppo.resumed import task_and_ppo
+from train.ppo.run import (
     CHECKPOINT,
     CONFIG,
     POLICY,
@@ -47,9 +47,9 @@ from train.run import (
     read_saved,
     resumable,
 )
-from train.task import CommandTask
-from train.task_cfg import TaskCfg
-from train.vec_env import CommandVecEnv
+from train.task.cfg import TaskCfg
+from train.task.task import CommandTask
+from train.task.vec_env import CommandVecEnv
 
 _ROBOT = "anymal"
 

@@ -10,16 +10,16 @@ from dataclasses import asdict
 
 import tyro
 
-from sim.command import exit_code_of
-from sim.files import to_json, write_atomically
-from sim.policy import MlpPolicy, load_policy
-from sim.provenance import provenance
+from sim.files.atomic import to_json, write_atomically
+from sim.files.command import exit_code_of
+from sim.files.provenance import provenance
+from sim.policy.loaders import MlpPolicy, load_policy
+from train.evaluate.held_out import TRAINED_ON
 from train.finetune_job import FinetuneCfg, Job, job_of
-from train.held_out import TRAINED_ON
-from train.learner import Learner
-from train.ppo import CapturedPPO
-from train.progress import Progress
-from train.run import (
+from train.ppo.learner import Learner
+from train.ppo.ppo import CapturedPPO
+from train.ppo.progress import Progress
+from train.ppo.run import (
     CHECKPOINT,
     CONFIG,
     POLICY,
@@ -31,8 +31,8 @@ from train.run import (
     plain,
     resumable,
 )
-from train.task import CommandTask
-from train.vec_env import CommandVecEnv
+from train.task.task import CommandTask
+from train.task.vec_env import CommandVecEnv
 
 
 class Tuning:
@@ -78,9 +78,9 @@ class Tuning:
 def _write_onnx(job: Job) -> None:
     """The controller as ONNX beside the checkpoint, where the packages for it are."""
     path, policy = job.run_dir / POLICY, load_policy(job.run_dir / POLICY, job.robot, "cpu")
-    command = f"python -m train.export --robot {job.robot.name} --policy {shlex.quote(str(path))}"
+    command = f"python -m sim.policy.export --robot {job.robot.name} --policy {shlex.quote(str(path))}"
     try:
-        from train.export import export_onnx
+        from sim.policy.export import export_onnx
     except ImportError as error:
         print(f"No ONNX file was written ({error}); where onnx is installed:  {command}")
         return

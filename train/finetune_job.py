@@ -8,19 +8,19 @@ from typing import Any, Literal
 import numpy as np
 
 from qd.archive import read_archive
-from sim.command import split_words
-from sim.own_robot import own_hash
-from sim.robot import RobotCfg, get_robot
+from sim.files.command import split_words
+from sim.robots.own import own_hash
+from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.training import RewardCfg
 from sim.simulation import resolve_device
-from sim.training import RewardCfg
-from train.held_out import marks_of, recorded_marks
-from train.mix import Mix, MixCfg
-from train.ppo import PpoCfg, check_ppo
-from train.resumed import check_resumed, saved_ppo, settings_of
-from train.run import check_least, check_limits, check_more, plain, prepare_run_dir, read_saved
-from train.sets import elites_sha256, split_elites
-from train.start import Start, read_start
-from train.task_cfg import TaskCfg
+from train.evaluate.held_out import marks_of, recorded_marks
+from train.evaluate.sets import elites_sha256, split_elites
+from train.ppo.ppo import PpoCfg, check_ppo
+from train.ppo.resumed import check_resumed, saved_ppo, settings_of
+from train.ppo.run import check_least, check_limits, check_more, plain, prepare_run_dir, read_saved
+from train.ppo.start import Start, read_start
+from train.task.cfg import TaskCfg
+from train.task.mix import Mix, MixCfg
 
 _PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
 _PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}
@@ -116,7 +116,7 @@ class Job:
 
     @property
     def trained_on(self) -> list[str]:
-        """Marks of all elites that the controller has been trained on in the end (:mod:`train.held_out`)."""
+        """Marks of all elites that the controller has been trained on in the end (:mod:`train.evaluate.held_out`)."""
         return sorted({*marks_of(self.mix.genes), *self.settings.get("trained_before", [])})
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import tyro
 
 from sim.bench.report import file_of, measure, preset, table
-from sim.command import exit_code_of
-from sim.files import prepare_output, to_json, write_atomically
-from sim.provenance import provenance
-from sim.robot import get_robot
+from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.command import exit_code_of
+from sim.files.provenance import provenance
+from sim.robots.robot import get_robot
 from sim.simulation import resolve_device
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from kernels.ceiling import FLOPS_PER_STEP, SPECIALS_PER_STEP, do_nothing, exponentials, multiply_add
+from sim.bench.ceiling_kernels import FLOPS_PER_STEP, SPECIALS_PER_STEP, do_nothing, exponentials, multiply_add
 from sim.bench.timing import TimingCfg, fit_launches, repeat_torch, repeat_warp, time_in_turns
 from sim.bench.work import Work
 

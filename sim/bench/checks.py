@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels import oracle
 from kernels.penalties import BASE, FOOT, LIMB
+from sim.bench import oracle
 from sim.bench.scene import Scene
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 

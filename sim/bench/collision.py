@@ -10,7 +10,7 @@ import warp as wp
 
 from kernels.episode import PARKING_HEIGHT
 from sim.bank import TerrainBank
-from sim.bare import Segment, replay_segments
+from sim.bench.bare import Segment, replay_segments
 from sim.simulation import CAPACITY_OVERFLOWS, GROUND_FRICTION, Simulation
 from sim.terrain import SPACING
 

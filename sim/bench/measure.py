@@ -11,7 +11,7 @@ import warp as wp
 from sim.bench.cases import Case
 from sim.bench.ceiling import Ceiling
 from sim.bench.timing import TimingCfg, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns
-from sim.policy import reason_of
+from sim.policy.loaders import reason_of
 
 _FLUSH_BYTES = 256 << 20
 """More than any cache holds."""

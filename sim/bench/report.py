@@ -12,8 +12,8 @@ from sim.bench.measure import measure_case
 from sim.bench.scene import SceneCfg, build_scene
 from sim.bench.step import measure_step
 from sim.bench.timing import TimingCfg
-from sim.policy import prepare_torch
-from sim.robot import RobotCfg
+from sim.policy.loaders import prepare_torch
+from sim.robots.robot import RobotCfg
 
 _RUNS = Path("runs") / "bench"  # a measurement made in passing does not replace the published one
 

@@ -11,7 +11,7 @@ from kernels.episode import command_goal
 from kernels.penalties import PENALTIES
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_task
-from sim.robot import RobotCfg
+from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.terrain import hard_random_genes
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from sim.bare import record_segments
+from sim.bench.bare import record_segments
 from sim.bench.collision import HeightfieldSimulation, measure_collision
 from sim.bench.scene import Scene
 from sim.simulation import Simulation
@@ -36,7 +36,7 @@ def _build_heightfield(sim: Simulation) -> tuple[HeightfieldSimulation | None, s
 def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of the whole step, and the physics rates with either collision.
 
-    Bare physics is contact and solver alone in the motion of the same crossings (:mod:`sim.bare`).
+    Bare physics is contact and solver alone in the motion of the same crossings (:mod:`sim.bench.bare`).
 
     Args:
         scene: Robots and terrains; its state is that of another moment afterwards.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
+from sim.bench import oracle
 from sim.terrain import SPACING, crossing_terrain, hard_random_genes
 from tests.kernels.test_heightfield import make_terrain
 

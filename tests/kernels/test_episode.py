@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from kernels.episode import (
     PARKING_HEIGHT,
     EpisodeState,
@@ -15,6 +14,7 @@ from kernels.episode import (
     start_episodes,
 )
 from kernels.penalties import BASE, FOOT, LIMB
+from sim.bench import oracle
 from sim.crossing import CrossingCfg, make_start_ranges, make_task
 from tests.kernels.states import random_states, upright
 from tests.kernels.test_heightfield import make_terrain, rough

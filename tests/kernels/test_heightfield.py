@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from kernels.heightfield import (
     BLOCK,
     Terrain,
@@ -15,6 +14,7 @@ from kernels.heightfield import (
     nearest_surface_point,
     normal_at,
 )
+from sim.bench import oracle
 
 SPACING = 0.05
 RNG_SEED = 5

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from kernels.observation import Noise, Sensors, apply_action, write_observation, write_scan
+from sim.bench import oracle
 from tests.kernels.states import random_states, upright
 from tests.kernels.test_heightfield import SPACING, make_terrain, rough
 

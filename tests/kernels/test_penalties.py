@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, SolverContacts, add_penalties, sum_geom_forces
+from sim.bench import oracle
 from tests.kernels.states import random_states, upright
 
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]

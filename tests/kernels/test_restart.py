@@ -10,7 +10,7 @@ from kernels.rewards import make_feet
 from kernels.start import StartRanges
 from kernels.training import End, Rules, make_episodes
 from sim.crossing import CrossingCfg, make_task
-from sim.robot import get_robot
+from sim.robots.robot import get_robot
 
 NUM_JOINTS = 2
 DEFAULT_POSE = (0.5, -1.0)

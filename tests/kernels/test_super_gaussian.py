@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER, rasterise
+from sim.bench import oracle
 
 SPACING = 0.05
 

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-from qd.workers import EvaluatorCfg, open_evaluator, resolve_device
+from qd.workers.evaluator import EvaluatorCfg, open_evaluator, resolve_device
 from tests.qd import crossers
 
 GENES = np.random.default_rng(0).uniform(-1, 1, (12, 64)).astype(np.float32)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from kernels.episode import Outcome
-from sim.recording import Recording
+from sim.recording.recorder import Recording
 
 NAMES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 FRAMES = 21

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qd.workers import EvaluatorCfg
+from qd.workers.evaluator import EvaluatorCfg
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 SCALES = (1.0, 2.0, 1.0, 4.0, 1.0, 1.0)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive
-from qd.arguments import Arguments, job_of
 from qd.reevaluate import ReevaluateCfg, reevaluate_run
-from qd.replay import ReplayCfg, replay
+from qd.run.arguments import Arguments, job_of
+from qd.show.replay import ReplayCfg, replay
 from tests.sim.dogs import write_dog
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +57,7 @@ def project():
 @pytest.fixture(scope="module")
 def calibrated(project, home, robot, trot):
     """Scales, measured by a Ray worker, which has none of the dog's files but those it is sent."""
-    return run("qd.calibrate", *robot, *trot, "--terrains", "4", "--replicas", "2", "--workers", "1")
+    return run("qd.studies.calibrate", *robot, *trot, "--terrains", "4", "--replicas", "2", "--workers", "1")
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_its_archive_is_that_of_its_own_penalties(searched, home, robot, trot):
 
 def test_an_elite_is_replayed(searched, robot, trot):
     path, _ = searched
-    said = run("qd.replay", *robot, *trot, "--run", str(path), "--replicas", "4")
+    said = run("qd.show.replay", *robot, *trot, "--run", str(path), "--replicas", "4")
     assert "of dog, found in iteration" in said
     assert (path / "elite-0.png").exists()
 
@@ -144,11 +144,11 @@ def test_it_is_trained_and_evaluated(project, calibrated, home, robot):
     assert record["robot"] == "dog" and record["iterations"] == 2 and len(record["settings"]["robot_sha256"]) == 64
     # Its own controller from now on, which needs no naming.
     out = home / "rates.json"
-    run("train.evaluate", *robot, "--terrains", "2", "--episodes", "1", "--out", str(out))
+    run("train.evaluate.evaluate", *robot, "--terrains", "2", "--episodes", "1", "--out", str(out))
     report = json.loads(out.read_text())
     assert (report["robot"], report["policy"]) == ("dog", "dog.pt")
     assert report["hand_crafted"]["goal_rate"] == 0.0  # after two iterations
     tables = ["--policies", f"base=shipped trot={home}/dog_trot.py:Trot", "--sets", "hand_crafted"]
-    run("train.evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--run-dir", str(home / "tables"))
+    run("train.evaluate.evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--run-dir", str(home / "tables"))
     crossed = json.loads((home / "tables" / "tables.json").read_text())
     assert crossed["robot"] == "dog" and set(crossed["controllers"]) == {"base", "trot"}

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from qd.fitness import FitnessCfg
+from qd.run.settings import SchedulerCfg
 from qd.search import run_search
-from qd.settings import SchedulerCfg
-from qd.workers import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
-from sim.robot import get_robot
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
+from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
 from sim.terrain import uniform_random_genes
 from tests.qd import stand_in

@@ -10,12 +10,12 @@ import pytest
 
 from qd import search
 from qd.archive import read_archive
-from qd.cli import Interrupted
 from qd.reevaluate import ReevaluateCfg, reevaluate_run
+from qd.run.cli import Interrupted
+from qd.run.settings import file_hash
 from qd.search import run_search
-from qd.settings import file_hash
-from qd.workers import EvaluatorError
-from sim.robot import get_robot
+from qd.workers.evaluator import EvaluatorError
+from sim.robots.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 from tests.qd.test_search import make_job, rows_of, run

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
-from qd.checkpoint import load_checkpoint, save_checkpoint
 from qd.descriptors import Cells
 from qd.directions import DirectionEmitter
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
+from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.scheduler import Scheduler
 from qd.scheduler_cfg import ES_KINDS, METHODS, SchedulerCfg
 from tests.qd import stand_in

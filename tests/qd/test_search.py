@@ -15,16 +15,16 @@ import pytest
 
 from qd import search
 from qd.archive import read_archive
-from qd.arguments import Job
-from qd.checkpoint import load_checkpoint, save_checkpoint
-from qd.cli import Interrupted
 from qd.fitness import FitnessCfg
-from qd.run_directory import RunDirectory
+from qd.run.arguments import Job
+from qd.run.checkpoint import load_checkpoint, save_checkpoint
+from qd.run.cli import Interrupted
+from qd.run.directory import RunDirectory
+from qd.run.settings import SchedulerCfg, SearchCfg
 from qd.search import run_search
-from qd.settings import SchedulerCfg, SearchCfg
-from qd.workers import EvaluatorCfg, EvaluatorError
-from sim import files
-from sim.provenance import provenance
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError
+from sim.files.atomic import atomic as files
+from sim.files.provenance import provenance
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 
@@ -263,7 +263,7 @@ def test_a_directory_that_cannot_be_written_to(target):
 SLOW_SEARCH = """
 import signal, sys, time
 from pathlib import Path
-from qd.cli import run_command
+from qd.run.cli import run_command
 from qd.search import run_search
 from tests.qd import stand_in, test_search
 from contextlib import contextmanager

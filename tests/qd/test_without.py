@@ -8,10 +8,10 @@ import pytest
 
 from qd.archive import read_archive
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.replay import Replay, describe
-from qd.report import PENALTY_LABELS, draw_archive
+from qd.show.figures import PENALTY_LABELS, draw_archive
+from qd.show.replay import Replay, describe
 from tests.qd import stand_in
-from tests.qd.test_cli import TINY, fails, in_a_folder_of_its_own, run_main  # noqa: F401 - a fixture for all of these
+from tests.qd.run.test_cli import TINY, fails, in_a_folder_of_its_own, run_main  # noqa: F401 - a fixture for all of these
 from tests.qd.test_search import run
 
 KEPT = [0, 1, 3, 5]  # without vel_y and stumble

@@ -111,7 +111,7 @@ def urdf(*, trunk: str | None = None) -> str:
 
 SETTINGS = '''"""The dog's settings, as README describes them."""
 
-from sim.robot import RobotCfg
+from sim.robots.robot import RobotCfg
 
 LEGS = ("FL", "FR", "HL", "HR")
 
@@ -141,7 +141,7 @@ CONTROLLER = '''"""A trot by the clock: hips swing, and a leg that swings forwar
 
 import torch
 
-from sim.sensed import read_row
+from sim.policy.sensed import read_row
 
 
 class Trot:

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from sim.bank import TerrainBank
-from sim.robot import RobotCfg
+from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 

@@ -8,17 +8,17 @@ import pytest
 import torch
 import warp as wp
 
-from kernels import oracle
-from sim.controller_spec import ControllerSpec
+from sim.bench import oracle
 from sim.crossing import CrossingCfg
-from sim.mujoco_c import surface_heights
-from sim.policy import load_policy
+from sim.mujoco_c.model import surface_heights
+from sim.policy.loaders import load_policy
+from sim.policy.sensed import read_row
+from sim.policy.spec import ControllerSpec
 from sim.rollout import Rollout
-from sim.sensed import read_row
 from sim.terrain import hard_random_genes
 from tests.sim.policies import stretch
+from tests.sim.policy.test_loaders import rsl_rl_actor, save_checkpoint
 from tests.sim.scenes import positions, velocities
-from tests.sim.test_policy import rsl_rl_actor, save_checkpoint
 
 SHORT = CrossingCfg(max_duration_s=0.4, poll_every_s=0.1)
 JOINTS = 12
@@ -26,7 +26,7 @@ THEIR_ORDER = [9, 10, 11, 6, 7, 8, 3, 4, 5, 0, 1, 2]
 """Their k-th joint is our joint THEIR_ORDER[k]."""
 ADAPTER = """
 import torch
-from sim.sensed import read_row
+from sim.policy.sensed import read_row
 
 ORDER = [9, 10, 11, 6, 7, 8, 3, 4, 5, 0, 1, 2]
 BACK = [ORDER.index(joint) for joint in range(12)]

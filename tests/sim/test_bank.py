@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kernels import oracle
 from sim.bank import TerrainBank
+from sim.bench import oracle
 from sim.terrain import NUM_COLS, NUM_ROWS, uniform_random_genes
 from tests.sim.scenes import NODE_X, NODE_Y
 

@@ -16,7 +16,7 @@ from sim.bench.checks import OutputError, Truth, require_close
 from sim.bench.measure import measure_case
 from sim.bench.scene import SceneCfg, build_scene
 from sim.bench.timing import TimingCfg
-from sim.provenance import provenance
+from sim.files.provenance import provenance
 from tests.sim.test_bench_report import make_ceiling
 
 CASES = ("rasterise", "contact", "scan", "observation", "penalties", "contact_forces")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kernels import oracle
+from sim.bench import oracle
 from sim.terrain import SPACING
 from tests.sim.scenes import NODE_X, Stepper, free_body, lying, positions, put, simulate, slope, velocities
 

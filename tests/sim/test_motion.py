@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim.motion import make_motion, soft_joint_limits
-from sim.training import TrainingCfg
+from sim.robots.training import TrainingCfg
 from tests.sim.scenes import ONLY_ANYMAL, ONLY_CASSIE
 
 NOTHING = dict.fromkeys(("command", "action", "previous_action", "previous_joint_vel", "fallen"))

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from kernels.episode import Outcome
 from sim.bank import TerrainBank
-from sim.model_files import read_model_files
-from sim.mujoco_c import crossing_model
-from sim.probes import make_probes
-from sim.robot import get_robot
-from sim.robot_model import build_robot, geom_names, joint_names
+from sim.bench import oracle
+from sim.mujoco_c.model import crossing_model
+from sim.robots.model import build_robot, geom_names, joint_names
+from sim.robots.model_files import read_model_files
+from sim.robots.probes import make_probes
+from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from tests.sim.dogs import GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, urdf, with_mesh, write_dog

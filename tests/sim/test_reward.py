@@ -9,9 +9,9 @@ import torch
 
 from kernels.episode import Outcome
 from sim.crossing import CrossingCfg
-from sim.policy import load_policy
+from sim.policy.loaders import load_policy
+from sim.robots.training import RewardCfg, TrainingCfg
 from sim.rollout import Rollout
-from sim.training import RewardCfg, TrainingCfg
 from tests.sim.policies import stand
 from tests.sim.scenes import positions, put
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 import warp as wp
 
-from kernels import oracle
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
+from sim.bench import oracle
 from sim.crossing import CrossingCfg
-from sim.policy import load_policy
+from sim.policy.loaders import load_policy
 from sim.rollout import Rollout, evaluate
 from sim.terrain import crossing_terrain, uniform_random_genes
 from tests.sim.policies import stand, stretch

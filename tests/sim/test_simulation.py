@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
 from sim.bank import TerrainBank
+from sim.bench import oracle
 from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, resolve_device
 from sim.terrain import hard_random_genes
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, Stepper, lying, positions, put, velocities

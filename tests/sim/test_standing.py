@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels import oracle
-from sim.robot_model import build_robot
+from sim.bench import oracle
+from sim.robots.model import build_robot
 from sim.simulation import GROUND_FRICTION, SolverCfg
 from sim.terrain import SPACING, uniform_random_genes
 from tests.sim import mujoco_c

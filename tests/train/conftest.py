@@ -5,10 +5,10 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from sim.robot import get_robot
-from train.curriculum import CurriculumCfg
-from train.task import CommandTask
-from train.task_cfg import TaskCfg
+from sim.robots.robot import get_robot
+from train.task.cfg import TaskCfg
+from train.task.curriculum import CurriculumCfg
+from train.task.task import CommandTask
 
 NUM_ENVS = 6
 CURRICULUM = CurriculumCfg(num_columns=2, noise_columns=1)

@@ -5,7 +5,7 @@ import sys
 import torch
 from torch import distributed
 
-from train.ranks import Ranks
+from train.ppo.ranks import Ranks
 
 
 def main() -> None:

@@ -9,13 +9,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sim.policy import load_policy
-from sim.robot import get_robot
+from sim.policy.loaders import load_policy
+from sim.robots.robot import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import BaseCfg, main, read_arguments, train
-from train.ppo import PpoCfg
-from train.run import StopRequest, claimed
-from train.task_cfg import TaskCfg
+from train.ppo.ppo import PpoCfg
+from train.ppo.run import StopRequest, claimed
+from train.task.cfg import TaskCfg
 
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
 
@@ -172,7 +172,7 @@ def test_out_of_time_saves_and_says_how_to_go_on(finished, tmp_path, capsys):
 
 
 def test_an_interrupt_saves_and_says_how_to_go_on(finished, tmp_path, capsys, monkeypatch):
-    from train.learner import Learner
+    from train.ppo.learner import Learner
 
     iterate = Learner.iterate
 

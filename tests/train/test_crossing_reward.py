@@ -6,11 +6,11 @@ import numpy as np
 import torch
 
 from sim.crossing import CrossingCfg
-from sim.policy import load_policy
+from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from tests.train.conftest import CURRICULUM
-from train.task import CommandTask
-from train.task_cfg import TaskCfg
+from train.task.cfg import TaskCfg
+from train.task.task import CommandTask
 
 FLAT = np.zeros((161, 321), np.float32)
 NUM_ENVS = 4

@@ -10,16 +10,16 @@ import pytest
 import torch
 
 from qd.archive import write_archive
-from sim.policy import load_policy
-from sim.robot import get_robot
+from sim.policy.loaders import load_policy
+from sim.robots.robot import get_robot
 from tests.train.archives import make_archive
 from tests.train.starts import make_places, write_actor
 from train import finetune as command
 from train.finetune import finetune
 from train.finetune_job import FinetuneCfg, job_of
-from train.learner import read_checkpoint
-from train.ppo import PpoCfg
-from train.run import claimed, read_saved
+from train.ppo.learner import read_checkpoint
+from train.ppo.ppo import PpoCfg
+from train.ppo.run import claimed, read_saved
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
@@ -62,10 +62,10 @@ def test_a_run_leaves_a_controller_and_its_record(places, finished):
 
 
 def test_without_the_packages_for_onnx_it_says_how_to_make_the_file(places, finished, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "train.export", None)
+    monkeypatch.setitem(sys.modules, "sim.policy.export", None)
     run = places / "without"
     assert finetune(config(places, run_dir=run, iterations=1)) == 0
-    assert f"python -m train.export --robot anymal --policy {run / 'policy.pt'}" in capsys.readouterr().out
+    assert f"python -m sim.policy.export --robot anymal --policy {run / 'policy.pt'}" in capsys.readouterr().out
     assert not (run / "policy.onnx").exists()
 
 

@@ -49,7 +49,7 @@ def places(tmp_path_factory):
         (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
         (["--iterations", "-1"], "iterations must be at least 1, got -1"),
         (["--ppo.mini-batches", "0"], "ppo.mini_batches must be at least 1"),
-        (["--export", "tuned.onnx"], "export must be a file named *.pt, got tuned.onnx: python -m train.export"),
+        (["--export", "tuned.onnx"], "export must be a file named *.pt, got tuned.onnx: python -m sim.policy.export"),
         (["--rows", "0"], "rows must be at least 1, got 0"),
         (["--max-seconds", "0"], "max_seconds must be above 0 s, got 0.0"),
         (["--save-every-s", "-1"], "save_every_s must be at least 0 s, got -1.0"),

@@ -28,14 +28,14 @@ def test_from_a_file_of_the_user_to_the_tables(tmp_path):
     state = torch.load(tuned / "policy.pt", weights_only=True)["actor_state_dict"]
     assert [state[f"mlp.{k}.weight"].shape[0] for k in (0, 2, 4, 6)] == [24, 20, 16, 12]
 
-    run("train.export", "--policy", str(tuned / "policy.pt"), "--out", str(tmp_path / "again.onnx"))
+    run("sim.policy.export", "--policy", str(tuned / "policy.pt"), "--out", str(tmp_path / "again.onnx"))
     assert (tmp_path / "again.onnx").read_bytes() == (tuned / "policy.onnx").read_bytes()
 
     controllers = (f"mine={mine}", f"C-G={tuned / 'policy.pt'}", f"C-G@onnx={tuned / 'policy.onnx'}")
     out = tmp_path / "tables.json"
     where = ("--archive", "results/anymal/archive", "--out", str(out), "--run-dir", str(tmp_path / "kept"))
     said = run(
-        "train.evaluate",
+        "train.evaluate.evaluate",
         "--policies",
         *controllers,
         *where,

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from sim.policy import load_policy
-from sim.robot import get_robot
+from sim.policy.loaders import load_policy
+from sim.robots.robot import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import BaseCfg, read_arguments, train
-from train.ppo import PpoCfg
-from train.task_cfg import TaskCfg
+from train.ppo.ppo import PpoCfg
+from train.task.cfg import TaskCfg
 
 CONTROL_DT = 0.02
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)

@@ -1,0 +1,87 @@
+"""The command ``faultline``: one word after it says what to do, and only what that needs is loaded."""
+
+import difflib
+import importlib
+import sys
+from typing import NamedTuple
+
+
+class Command(NamedTuple):
+    """A word that may stand after ``faultline``."""
+
+    where: str
+    """Module and class; the class is a dataclass of the flags whose ``execute`` does the work (:mod:`sim.files.command`)."""
+    summary: str
+
+
+COMMANDS: dict[str, dict[str, Command]] = {
+    "Find what breaks a controller": {
+        "archive": Command("qd.run.arguments:Archive", "search the terrains on which a controller fails"),
+        "reevaluate": Command("qd.fresh:Reevaluate", "cross every elite of an archive again in fresh episodes"),
+        "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers: by terrain, or the paper's tables"),
+        "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
+    },
+    "Look at it": {
+        "replay": Command("qd.show.replay:ReplayElite", "one elite again: numbers, and paths over its terrain"),
+        "view": Command("qd.show.view.arguments:View", "an archive in the browser"),
+        "report": Command("qd.show.report.material:Report", "one page about a run"),
+        "film": Command("qd.show.video:Film", "film the robot on an elite or on a map of your own"),
+        "export": Command("qd.show.export:Export", "elites as npz, 16-bit PNG, MJCF and STL"),
+    },
+    "Train": {
+        "train": Command("train.base:Train", "train a base controller from scratch"),
+        "finetune": Command("train.finetune:Finetune", "train a controller further on terrains that broke it"),
+        "export-policy": Command("sim.policy.export:ExportPolicy", "a controller as one ONNX file"),
+    },
+    "Bring a robot": {
+        "stand": Command("sim.robots.stand:Stand", "look at a robot: its joints and geoms, whether it stands"),
+        "calibrate": Command("qd.studies.calibrate:Calibrate", "measure the penalty scales of a robot"),
+    },
+    "Study the search": {
+        "compare": Command("qd.studies.compare:Compare", "the search and its baselines on the same number of terrains"),
+        "ablation": Command("qd.studies.ablation:Ablation", "with and without standard deviations in the fitness"),
+        "beside": Command("qd.studies.beside:Beside", "searches against different controllers side by side"),
+        "crosscheck": Command("sim.mujoco_c.crosscheck:Crosscheck", "the same crossings in plain MuJoCo C"),
+        "distances": Command("train.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
+        "tables": Command("train.evaluate.publish:Tables", "the published numbers beside the paper's"),
+    },
+    "Measure speed": {
+        "bench": Command("sim.bench.report:Bench", "every kernel against torch and the device's ceiling"),
+        "speed": Command("qd.studies.speed:Speed", "the search beside the bare physics it is made of"),
+        "train-speed": Command("train.ppo.speed:TrainSpeed", "environment steps a second of training"),
+        "scale": Command("qd.studies.scale:Scale", "what more devices bring"),
+        "solver-options": Command("sim.bench.options:SolverOptions", "what solver options cost and change"),
+    },
+}
+"""What can be done, by what it is for."""
+
+_BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}
+
+
+def _usage() -> str:
+    lines = ["usage: faultline COMMAND [OPTIONS]", "", "Find the terrains that break a legged robot's controller.", ""]
+    for title, group in COMMANDS.items():
+        lines += [f"{title}:", *(f"  {name:<16}{command.summary}" for name, command in group.items()), ""]
+    lines.append("faultline COMMAND --help tells all of a command. FAULTLINE_DEBUG=1 shows tracebacks of errors.")
+    return "\n".join(lines)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command that a command line names; returns its exit status, 2 if there is none of that name."""
+    name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help", "help"):
+        print(_usage())
+        return 0
+    if name not in _BY_NAME:
+        near = difflib.get_close_matches(name, _BY_NAME, n=1)
+        meant = f"did you mean {near[0]}?" if near else "faultline --help lists them"
+        print(f"error: there is no command '{name}': {meant}", file=sys.stderr)
+        return 2
+    module, _, cls = _BY_NAME[name].where.partition(":")
+    from sim.files.command import run_command
+
+    return run_command(getattr(importlib.import_module(module), cls), rest, name=name)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

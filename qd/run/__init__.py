@@ -1,0 +1,1 @@
+"""A run of the search: its settings, directory and checkpoint, and how it is resumed."""

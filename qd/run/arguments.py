@@ -1,0 +1,230 @@
+"""What a command line of the search means: a new run, or an old one that goes on."""
+
+import itertools
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from qd.run.directory import CONFIG_FILE, RunDirectory, differences
+from qd.run.next_commands import Placed, next_command
+from qd.run.places import RUNS, numbered
+from qd.run.resuming import code_of, moved_policy, origin_in, own_file, refuse_changes, refuse_unnamed_code, resumed
+from qd.run.settings import SearchCfg, as_settings, changed, kept_penalties, measured_now, policy_spec, preset
+from qd.workers.evaluator import EvaluatorCfg, check_policy, origin_of, resolve_device
+from sim.files.atomic import is_leftover
+
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """Search the terrains on which a controller fails, each in its own way.
+
+    Every iteration asks CMA-MAE for terrains, lets robots cross them, and files each terrain by the proportions of what
+    went wrong. State is saved after every iteration: stop with Ctrl-C whenever you like and go on with --resume.
+    """
+
+    robot: str | None = None
+    """Which robot: anymal, unless resuming; anymal, cassie, or the settings file of another (my_robot.py)."""
+    preset: str | None = None
+    """Size of the search: paper (a GPU's work) or small (minutes on a CPU); by default what the device can do."""
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    iterations: int | None = None
+    """Iterations to reach; with --resume, more than before extend a finished run."""
+    policy: str | None = None
+    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
+    module:callable, or file.py:adapter@FILE for a file that expects another observation."""
+    seed: int | None = None
+    """Seed of everything drawn; 0."""
+    resume: Path | None = None
+    """Go on with the run in this directory."""
+    run_dir: Path | None = None
+    """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
+    replicas: int | None = None
+    """Episodes a terrain."""
+    method: str | None = None
+    """Where terrains come from: cma_mae, cma_me, map_elites, directions, hard_random, uniform_random, joined by +."""
+    emitters: int | None = None
+    """Emitters."""
+    batch_size: int | None = None
+    """Terrains an emitter asks for in an iteration."""
+    learning_rate: float | None = None
+    """Step of a cell's acceptance threshold."""
+    sigma0: float | None = None
+    """First step size of an emitter."""
+    restart_rule: str | None = None
+    """When emitters restart: a number of iterations, basic or no_improvement."""
+    es: str | None = None
+    """Evolution strategy: cma_es or sep_cma_es."""
+    intervals: int | None = None
+    """Intervals of each ratio."""
+    without: tuple[str, ...] | None = None
+    """Penalties to leave out of fitness, ratios and cells, such as stumble collision."""
+    alpha: float | None = None
+    """Weight of the standard deviations in the fitness."""
+    lam: float | None = None
+    """Weight of the share of episodes without collision in the fitness."""
+    reevaluate_every: int | None = None
+    """Every so many iterations, look at up to 200 elites again in 40 fresh episodes; 0: never."""
+    processes: int | None = None
+    """Processes on the CPU, without Ray; one a core."""
+    workers: int | Literal["auto"] | None = None
+    """Search on so many Ray workers, a GPU or a CPU core each; auto: as many as there are. RAY_ADDRESS names a running
+    cluster; without it they are this machine's."""
+    worker_limit_s: float = 300.0
+    """A Ray worker that gets no further for so many seconds is given up, and its terrains go to another; building its
+    simulation has a limit of its own."""
+    reproduce: Literal["auto", "yes", "no"] = "auto"
+    """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
+
+
+_PLACED = ("device", "processes", "workers", "worker_limit_s")
+_NOT_SETTINGS = (*_PLACED, "robot", "resume", "run_dir", "without", "reproduce")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A search that can begin: everything a user may have got wrong has been looked at."""
+
+    cfg: SearchCfg
+    path: Path
+    """The run directory."""
+    resumes: bool
+    """Whether the directory holds the run already."""
+    evaluator: EvaluatorCfg
+    reproduce: bool
+    """Whether the elites are evaluated again at the end."""
+    origin: dict[str, Any]
+    """Provenance of the run's beginning."""
+    resume_command: str
+    """How to go on with it."""
+    reevaluate_command: str
+    """How to evaluate its elites again once it has found them."""
+
+    @property
+    def device(self) -> str:
+        """Warp device name."""
+        return self.evaluator.device
+
+    @property
+    def robot(self) -> str:
+        """What the command line calls the robot."""
+        robot = self.evaluator.robot
+        return robot if isinstance(robot, str) else robot.spec
+
+
+def job_of(args: Arguments) -> Job:
+    """The job that a command line asks for.
+
+    Raises:
+        FileNotFoundError: If there is no run to resume.
+        ValueError: If robot, preset, device, controller, a setting or the run directory is not as it must be.
+    """
+    if args.resume and args.run_dir:
+        raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
+    there = RunDirectory(args.resume).read_cfg() if args.resume else None
+    robot = _robot_of(args, there)
+    device = resolve_device(args.device, args.workers)
+    changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
+    if args.without is not None:
+        changes["penalties"] = kept_penalties(robot, args.without)
+    moved = None
+    if args.resume and there:
+        refuse_unnamed_code(there.policy, args.policy, args.resume)
+        moved = moved_policy(there, args.policy)
+        path, cfg = args.resume, resumed(args.resume, there, robot, changes, moved)
+        refuse_changes(path, "run", as_settings(there), as_settings(cfg))
+        origin = origin_in(RunDirectory(path).read_config())
+    else:
+        name = args.preset or ("paper" if device.startswith("cuda") else "small")
+        cfg = measured_now(changed(preset(name, robot), changes), robot)
+        path, origin = _free_path(args, cfg, robot), origin_of(device, cfg.seed, args.workers) | own_file(robot)
+    policy = moved or policy_spec(cfg, robot)
+    named = moved or code_of(cfg)
+    return Job(
+        cfg=cfg,
+        path=path,
+        resumes=there is not None,
+        evaluator=evaluator_of(cfg, robot, policy, device, args),
+        reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
+        origin=origin,
+        resume_command=_resume_command(robot.spec, path, args, named),
+        reevaluate_command=next_command("reevaluate", args, robot=robot.spec, run=path, policy=named),
+    )
+
+
+def _robot_of(args: Arguments, there: SearchCfg | None) -> "RobotCfg":
+    from sim.robots.robot import get_robot, robot_of
+
+    if args.resume and there:
+        return robot_of(there.robot, args.robot, args.resume)
+    return get_robot(args.robot or "anymal")
+
+
+def _resume_command(robot: str, path: Path, args: Arguments, policy: str | None) -> str:
+    reproduce = None if args.reproduce == "auto" else args.reproduce
+    return next_command("archive", args, robot=robot, resume=path, policy=policy, reproduce=reproduce)
+
+
+def evaluator_of(
+    cfg: SearchCfg, robot: "RobotCfg", policy: str, device: str, args: Placed, *, runs_on_gpu: int = 1
+) -> EvaluatorCfg:
+    """What evaluates an iteration's terrains all at once, with a controller that was tried.
+
+    Args:
+        cfg: The search.
+        robot: Its robot.
+        policy: Controller.
+        device: Warp device name.
+        args: Where to work.
+        runs_on_gpu: Searches a GPU crosses the terrains of at once; a CPU is full with one's.
+
+    Raises:
+        ValueError: If the controller cannot be loaded or does not fit the robot.
+    """
+    check_policy(policy, robot, device)
+    return EvaluatorCfg(
+        robot=robot,
+        policy=policy,
+        num_terrains=cfg.scheduler.num_terrains * (runs_on_gpu if device.startswith("cuda") else 1),
+        num_replicas=cfg.replicas,
+        device=device,
+        num_processes=args.processes,
+        workers=args.workers,
+        worker_limit_s=args.worker_limit_s,
+    )
+
+
+def _free_path(args: Arguments, cfg: SearchCfg, robot: "RobotCfg") -> Path:
+    """Directory of a new run; never one that holds something."""
+    if args.run_dir is None:
+        name = f"{cfg.robot}-{cfg.preset}-{cfg.seed}"
+        path = next(path for path in numbered(RUNS, name) if not path.exists())
+        _mention_unfinished(name, cfg, args, robot)
+        return path
+    if (args.run_dir / CONFIG_FILE).exists():
+        different = differences(as_settings(RunDirectory(args.run_dir).read_cfg()), as_settings(cfg))
+        if different:
+            found = f"{args.run_dir} holds a run of other settings"
+            raise ValueError(f"{found}: {', '.join(different)}: give another --run-dir")
+        command = _resume_command(robot.spec, args.run_dir, args, code_of(cfg))
+        raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
+    if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
+        raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
+    return args.run_dir
+
+
+def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments, robot: "RobotCfg") -> None:
+    """Says so where the new run repeats one that was stopped; starting over is still the user's to choose."""
+    for path in itertools.takewhile(Path.exists, numbered(RUNS, name)):
+        run = RunDirectory(path)
+        try:
+            there, done = run.read_cfg(), run.iterations_done()
+        except (OSError, ValueError):
+            continue
+        if done < there.iterations and as_settings(there) == as_settings(cfg):
+            state = f"stopped after {done} of {there.iterations} iterations"
+            print(f"{path} holds the same search, {state}. Go on with:")
+            print(f"  {_resume_command(robot.spec, path, args, code_of(cfg))}")

@@ -1,0 +1,258 @@
+"""The directory of a search's run: what it was asked to do, how far it is, and what it found.
+
+The checkpoint is the one truth and is written first; metrics and archive are made from it and made again on resume, so
+that a kill between any two writes leaves a run that goes on as if nothing had been.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qd.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
+from qd.run.checkpoint import load_checkpoint, save_checkpoint
+from qd.run.settings import SearchCfg, Settings, as_settings, from_settings
+from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
+
+if TYPE_CHECKING:
+    from qd.scheduler import Scheduler
+
+CONFIG_FILE = "config.json"
+CHECKPOINT_FILE = "checkpoint.bin"
+METRICS_FILE = "metrics.jsonl"
+SUMMARY_FILE = "archive.json"
+_REMEDY = "put a copy of it back, or start a new run"
+
+Metrics = list[dict[str, Any]]
+"""One row an iteration."""
+
+
+def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:
+    """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
+    found = []
+    for key in sorted(there.keys() | wanted.keys()):
+        a, b = there.get(key), wanted.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += differences(a, b, f"{prefix}{key}.")
+        elif a != b:
+            found.append(f"{prefix}{key} ({_short(a)} there, {_short(b)} wanted)")
+    return found
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[None]:
+    """Makes a run directory if need be and keeps other searches out of it.
+
+    Args:
+        path: The directory; if it was made here and is still empty at the end, it is removed again.
+
+    Raises:
+        ValueError: If it cannot be made or written to, its name cannot be typed into a command to go on, or another
+            search works in it.
+    """
+    if not str(path).isprintable():
+        raise ValueError(f"run directory {str(path)!a} must have a name of printable characters: rename it")
+    try:
+        made = not path.exists()
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"run directory {path} cannot be made: {error.strerror}: give another --run-dir") from None
+    check_writable(path)
+    with locked(path, f"another search works in {path}: let it end, or give another --run-dir"):
+        try:
+            yield
+        finally:
+            if made and not any(path.iterdir()):
+                path.rmdir()
+
+
+class RunDirectory:
+    """Files of one run.
+
+    Args:
+        path: The directory, claimed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def read_config(self) -> dict[str, Any]:
+        """What the run was asked to do: ``settings``, ``iterations`` and where it comes from.
+
+        Raises:
+            FileNotFoundError: If there is no run here.
+            ValueError: If the file is damaged.
+        """
+        file = self.path / CONFIG_FILE
+        if not os.path.lexists(file):
+            raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
+        config = read_json(file)
+        kinds = {"settings": dict, "iterations": int, "device": str}
+        if any(type(config.get(name)) is not kind for name, kind in kinds.items()):
+            raise ValueError(
+                f"{file} must hold settings, iterations and device of a search, got {', '.join(config)}; {_REMEDY}"
+            )
+        return config
+
+    def read_cfg(self) -> SearchCfg:
+        """The search as its config has it.
+
+        Raises:
+            FileNotFoundError: If there is no run here.
+            ValueError: If the file is damaged, or of another version.
+        """
+        config = self.read_config()
+        try:
+            return from_settings(config["settings"], config["iterations"])
+        except ValueError as error:
+            raise ValueError(f"{self.path / CONFIG_FILE}: {error}; {_REMEDY}") from None
+
+    def write_config(self, settings: Settings, iterations: int, origin: dict[str, Any]) -> None:
+        """Writes what the run is asked to do.
+
+        Args:
+            settings: Everything that must not change on resume.
+            iterations: Iterations to reach; may grow.
+            origin: Provenance.
+        """
+        content = {"settings": settings, "iterations": iterations, **origin}
+        write_atomically(self.path / CONFIG_FILE, to_json(content))
+
+    def save(self, settings: Settings, search: "Scheduler", metrics: Metrics, archive: Archive) -> None:
+        """Saves an iteration; killed anywhere in here, the run is either before or after it.
+
+        Args:
+            settings: The run's settings, so that a checkpoint that strayed here is noticed.
+            search: The search after ``tell``.
+            metrics: All rows up to this iteration.
+            archive: What the search has found.
+        """
+        save_checkpoint(self.path / CHECKPOINT_FILE, {"settings": settings, "metrics": metrics, **search.state()})
+        self.write_derived(metrics, archive)
+
+    def write_derived(self, metrics: Metrics, archive: Archive) -> None:
+        """Writes the files that follow from a checkpoint: metrics and archive."""
+        rows = "".join(json.dumps(row, allow_nan=False) + "\n" for row in metrics)
+        write_atomically(self.path / METRICS_FILE, rows.encode())
+        write_archive(self.path / ARCHIVE_FILE, archive)
+
+    def has_fresh_values(self) -> bool:
+        """Whether the archive's file says what fresh episodes made of its elites."""
+        return self._fresh_archive() is not None
+
+    def with_fresh_values(self, found: Archive) -> Archive:
+        """An archive with the fresh values of its file, where those are of just these elites; else as it is.
+
+        Args:
+            found: What the search has found.
+        """
+        there = self._fresh_archive()
+        return replace(there, iterations=found.iterations) if there and there.has_elites_of(found) else found
+
+    def _fresh_archive(self) -> Archive | None:
+        """The archive of the file if it has fresh values; a damaged one, which is made again, has none."""
+        try:
+            archive = read_archive(self.path)
+        except (OSError, ValueError):
+            return None
+        return None if archive.fresh is None else archive
+
+    def read_summary(self) -> dict[str, Any]:
+        """The run in numbers; nothing where they were not written or are damaged, as they are made again."""
+        try:
+            return read_json(self.path / SUMMARY_FILE)
+        except (OSError, ValueError):
+            return {}
+
+    def read_metrics(self) -> Metrics:
+        """Rows of the metrics file, without reading the checkpoint.
+
+        Raises:
+            FileNotFoundError: If there is none.
+            ValueError: If it is damaged.
+        """
+        file = self.path / METRICS_FILE
+        try:
+            rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        except ValueError as error:
+            raise ValueError(f"{file} is damaged: {error}; {_REMEDY}") from None
+        if not rows or not all(isinstance(row, dict) for row in rows):
+            raise ValueError(f"{file} must have a row an iteration, got {len(rows)}; {_REMEDY}")
+        return rows
+
+    def iterations_done(self) -> int:
+        """Rows of the metrics file, without reading the checkpoint."""
+        file = self.path / METRICS_FILE
+        return len(file.read_text(encoding="utf-8").splitlines()) if file.exists() else 0
+
+    def load(self, settings: Settings) -> tuple["Scheduler", Metrics] | None:
+        """The search as its checkpoint has it.
+
+        Args:
+            settings: The settings that the run's config has.
+
+        Returns:
+            The search and its metrics, or None if the run was killed before its first checkpoint.
+
+        Raises:
+            ValueError: If the checkpoint is damaged, lost, or belongs to a run of other settings.
+        """
+        file = self.path / CHECKPOINT_FILE
+        derived = [self.path / name for name in (METRICS_FILE, ARCHIVE_FILE)]
+        for made in (*derived, self.path / SUMMARY_FILE):
+            if made.is_dir():
+                raise ValueError(f"{made} is a directory, expected a file or nothing: move it away")
+        if not file.exists():
+            lost = [made.name for made in derived if made.exists()]
+            if lost:
+                raise ValueError(f"{file} is lost: expected it beside {' and '.join(lost)}; {_REMEDY}")
+            return None
+        from qd.scheduler import Scheduler  # pyribs takes two seconds to import: not for `--help`
+
+        state = load_checkpoint(file)
+        there, metrics = state.get("settings"), state.get("metrics")
+        if not isinstance(there, dict) or not isinstance(metrics, list):
+            raise ValueError(f"{file} is no checkpoint of a search: it lacks settings or metrics; {_REMEDY}")
+        different = differences(_of_now(there), settings)
+        if different:
+            raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}; {_REMEDY}")
+        try:
+            return Scheduler.from_state(state), metrics
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{file} is no checkpoint of a search: {error}; {_REMEDY}") from None
+
+
+def _of_now(settings: Settings) -> Settings:
+    """Settings with those that later versions added, which stand for what was done before; damaged ones as they are."""
+    try:
+        return as_settings(from_settings(settings, iterations=1))
+    except ValueError:
+        return settings
+
+
+def archive_of(settings: Settings, search: "Scheduler", iterations: int) -> Archive:
+    """What a search has found so far.
+
+    Args:
+        settings: Settings of the run.
+        search: The search.
+        iterations: Iterations done.
+    """
+    elites: dict[str, Any] = search.elites()
+    return Archive(
+        robot=settings["robot"],
+        penalties=tuple(settings["fitness"]["penalties"]),
+        scales=tuple(settings["fitness"]["scales"]),
+        intervals=settings["intervals"],
+        collision_bit=settings["collision_bit"],
+        iterations=iterations,
+        **elites,
+    )

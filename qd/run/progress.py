@@ -1,0 +1,143 @@
+"""What a search tells its user: what it will do, how long that should take, and how far it is."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from qd.run.settings import SearchCfg
+from sim.policy.spec import SHIPPED
+
+_EPISODE_STEPS = 4000  # 20 s at 200 Hz
+_STEPS_PER_S = {"cpu": 15_000.0, "cuda": 3_500_000.0}  # of one process on one core, and of a large GPU
+_FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
+
+
+def clock(seconds: float) -> str:
+    """A duration as people say it: ``45 s``, ``7 min``, ``3.2 h``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def expected_s(cfg: SearchCfg, iterations: int, device: str, processes: int) -> float:
+    """A first guess at how long iterations take [s], before any was timed.
+
+    Args:
+        cfg: The search.
+        iterations: How many.
+        device: Warp device name.
+        processes: Processes that evaluate.
+    """
+    rate = _STEPS_PER_S["cuda" if device.startswith("cuda") else "cpu"] * processes
+    return iterations * cfg.episodes_per_iteration * _EPISODE_STEPS / rate
+
+
+def plan(cfg: SearchCfg, path: Path, done: int, device: str, processes: int) -> str:
+    """What a search is about to do, in words.
+
+    Args:
+        cfg: The search.
+        path: Its run directory.
+        done: Iterations already done.
+        device: Warp device name.
+        processes: Processes that evaluate.
+    """
+    left = cfg.iterations - done
+    where = f"{processes} process{'es' * (processes > 1)} on the CPU"
+    if device.startswith("cuda"):
+        where = device if processes == 1 else f"{processes} GPUs"
+    controller = "its shipped controller" if cfg.policy == SHIPPED else f"controller {cfg.policy}"
+    if not left:
+        return f"All {done} iterations of {path} are done; writing its figures and results again."
+    iterations = f"{left:,} iterations" + (f" after {done:,} done" if done else "")
+    duration = clock(expected_s(cfg, left, device, processes))
+    return "\n".join(
+        [
+            f"Searching for terrains that break {cfg.robot} with {controller}, each in its own way.",
+            f"  preset {cfg.preset}, seed {cfg.seed}: {iterations} of {cfg.scheduler.num_terrains} terrains x "
+            f"{cfg.replicas} episodes of up to 20 s",
+            f"  {left * cfg.episodes_per_iteration:,} episodes on {where}: about {duration}, and a minute or two more "
+            "where kernels must be compiled",
+            f"  {cfg.cells.num_cells:,} reachable cells of {len(cfg.fitness.penalties)} penalties; results in {path}",
+        ]
+    )
+
+
+@contextmanager
+def share_bar(what: str) -> Iterator[Callable[[float], None]]:
+    """A bar over one piece of work.
+
+    Args:
+        what: Name of the work.
+
+    Yields:
+        A function that moves the bar to the share that is done.
+    """
+    with tqdm(total=1.0, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=0.5, bar_format=_FORMAT) as bar:
+
+        def move_to(share: float) -> None:
+            bar.update(share - bar.n)
+
+        yield move_to
+
+
+class ProgressBar:
+    """A bar over iterations that moves within them; closes on leaving its context.
+
+    Args:
+        iterations: Iterations to reach.
+        done: Iterations done before.
+    """
+
+    def __init__(self, iterations: int, done: int) -> None:
+        self._iterations, self._first, self._at = iterations, done, float(done)
+        self._bar = tqdm(
+            total=iterations,
+            initial=done,
+            file=sys.stderr,
+            dynamic_ncols=True,
+            mininterval=0.5,
+            bar_format=_FORMAT,
+        )
+        self._describe(done, "compiling and evaluating")
+
+    def __enter__(self) -> "ProgressBar":
+        """Nothing to do: the bar is there from the start."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Leaves the bar as it stands."""
+        self._bar.close()
+
+    def within(self, iteration: int) -> Callable[[float], None]:
+        """A function that moves the bar to a share of an iteration, counted from 1."""
+        return lambda share: self._move_to(iteration - 1 + share)
+
+    def show(self, row: dict[str, Any], staff: str | None = None) -> None:
+        """Shows where the search stands after an iteration.
+
+        Args:
+            row: The iteration's metrics.
+            staff: How the workers fare, where there are any.
+        """
+        self._move_to(row["iteration"])
+        if row["iteration"] == self._first + 1:
+            left = (self._iterations - row["iteration"]) * row["wall_s"]
+            self._bar.write(f"First iteration: {row['wall_s']:.1f} s; about {clock(left)} to go.", file=sys.stderr)
+        self._describe(
+            row["iteration"],
+            f"{row['elites']} elites ({row['reachable_coverage']:.1%} of reachable), QD {row['qd_score']:.0f}, "
+            f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s"
+            + (f" by {staff}" if staff else ""),
+        )
+
+    def _describe(self, done: int, state: str) -> None:
+        self._bar.set_description_str(f"iteration {min(done + 1, self._iterations)}/{self._iterations}: {state}")
+
+    def _move_to(self, position: float) -> None:
+        self._bar.update(position - self._at)
+        self._at = position

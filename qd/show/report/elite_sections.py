@@ -1,0 +1,244 @@
+"""The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
+
+from qd.run.next_commands import make_command
+from qd.show.figures import label_of
+from qd.show.replay import PENALTY_UNITS
+from qd.show.report.elites import Elites
+from qd.show.report.figures import draw_modes
+from qd.show.report.modes import MAX_MODES, TOLERANCE, Mode
+from qd.show.report.outcomes import ENDS, Crossed, Rate
+from qd.show.report.page import Absent, Block, Heading, Section, Table, Text
+from qd.show.report.shown import Shown, counted, percent, picture
+from qd.show.report.terrain_figures import draw_crossing, draw_maps
+
+_ARRIVED = next(iter(ENDS.values()))
+
+
+def anchor_of(number: int) -> str:
+    """Where an elite is shown in detail."""
+    return f"elite-{number}"
+
+
+def modes_section(shown: Shown) -> Section:
+    """The groups of elites, each with a typical terrain."""
+    modes, elites = shown.modes, shown.elites
+    largest = max(modes.modes, key=lambda mode: len(mode.members))
+    text = (
+        f"The {counted(len(elites), 'elite')} fall into {counted(len(modes.modes), 'mode')} by how the robot "
+        f"struggles and how its crossings end. The largest, mode {largest.number}, has {len(largest.members):,} "
+        f"({percent(len(largest.members) / len(elites))}): {_described(largest)}."
+    )
+    section = Section("Failure modes", "modes", [Text(text), Text(_how(shown))])
+    shows = "Mean shares of the penalties and of the ends of crossings by group; silhouette by number of groups"
+    section.blocks += [picture("modes", draw_modes(elites, modes), shows), _modes_table(shown)]
+    typical = {
+        f"mode {mode.number}: elite {mode.typical}, {mode.ending}": shown.crossed[mode.typical]
+        for mode in modes.modes
+        if mode.typical in shown.crossed
+    }
+    if not typical:
+        return section
+    arrived = [shown.crossed[mode.typical].rates[_ARRIVED] for mode in modes.modes]
+    reached = "; ".join(f"mode {mode.number}: {rate}" for mode, rate in zip(modes.modes, arrived, strict=True))
+    section.blocks += [
+        Text(f"A typical terrain of each, the elite nearest to all others of its mode, crossed again. Robots that "
+             f"reached the goal, with 95 % intervals: {reached}."),
+        picture("modes-terrains", draw_maps(typical, f"{shown.material.archive.robot}: a typical terrain of each mode"),
+                "Height map of a typical terrain of each mode with the robots' paths"),
+    ]  # fmt: skip
+    return section
+
+
+def _described(mode: Mode) -> str:
+    return (
+        f"the robot {mode.deed} (goal {percent(mode.goal_rate)}, base collision "
+        f"{percent(mode.collision_rate)}, neither {percent(mode.other_rate)}), and the share that stands out is that "
+        f"of {label_of(mode.marked_by)}"
+    )
+
+
+def _how(shown: Shown) -> str:
+    """How the groups were made."""
+    how = (
+        "Ward's clustering on the shares and on the rates of goal, base collision and fall, all fractions and "
+        f"unweighted; of 2 to {MAX_MODES} groups the most whose mean silhouette is within {TOLERANCE} of the best"
+    )
+    found = shown.modes.silhouettes
+    if not found:
+        return f"{how}. These elites are too few or too equal to be divided."
+    best = max(found, key=lambda count: found[count])
+    taken = len(shown.modes.modes)
+    return (
+        f"{how}: {taken} have {found[taken]:.2f}, the best, {best}, {found[best]:.2f} (1: apart, 0: touching; under "
+        "one half the borders between them are soft)."
+    )
+
+
+def _modes_table(shown: Shown) -> Table:
+    head = ["mode", "elites", "of all", "goal", "base collision", "neither", "fallen", "fitness",
+            "share that stands out", "typical elite"]  # fmt: skip
+    rows = [
+        [
+            f"{mode.number}: {mode.ending}",
+            f"{len(mode.members):,}",
+            percent(len(mode.members) / len(shown.elites)),
+            *(percent(rate) for rate in (mode.goal_rate, mode.collision_rate, mode.other_rate, mode.fallen_rate)),
+            f"{mode.fitness:.1f}",
+            label_of(mode.marked_by),
+            f"{mode.typical}",
+        ]
+        for mode in shown.modes.modes
+    ]
+    links = [anchor_of(mode.typical) if mode.typical in shown.crossed else "" for mode in shown.modes.modes]
+    return Table(head, rows, links=links)
+
+
+def detail_section(shown: Shown) -> Section:
+    """The worst, the most reproducible and the typical elites, each with figure and numbers."""
+    section = Section("Terrains worth a look", "terrains")
+    if shown.not_crossed:
+        section.blocks.append(Absent(shown.not_crossed))
+        return section
+    stubborn = sum(shown.crossed[number].rates[_ARRIVED].hits == 0 for number in shown.worst)
+    text = (
+        f"{choice_told(shown.elites, shown.worst, shown.steady)} Each was crossed {shown.material.cfg.episodes} times "
+        "afresh for this page, by the episodes that `make replay ELITE=N` shows; on "
+        f"{stubborn} of the first {len(shown.worst)} no robot reached the goal. Scaled penalties: 1 is what a common "
+        "one comes to on hard-random terrain."
+    )
+    section.blocks.append(Text(text))
+    for number in shown.numbers:
+        section.blocks += _elite(shown, number)
+    return section
+
+
+def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
+    """Which elites are shown, in a sentence that holds for any number of them.
+
+    Args:
+        elites: All elites.
+        worst: Numbers of the failed ones of highest fitness, and of others after them if too few fail.
+        steady: Numbers of those that vary least.
+    """
+    fails = {number: bool(elites.failing[elites.place_of(number)]) for number in worst}
+    failed, others = ([number for number in worst if fails[number] is kind] for kind in (True, False))
+    parts = []
+    if failed:
+        parts.append(f"terrains on which the controller fails, the highest fitness first ({_list(failed)})")
+    if others:
+        parts.append(f"{'other ' * bool(failed)}terrains of high fitness on which it does not fail ({_list(others)})")
+    parts.append(
+        f"terrains whose penalties vary least between episodes for their size, failed ones first ({_list(steady)})"
+    )
+    return f"Shown are {'; '.join(parts)}; and a typical terrain of each mode."
+
+
+def _list(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers))
+
+
+def _elite(shown: Shown, number: int) -> list[Block]:
+    """One elite: why it is shown, what became of it, figure and numbers."""
+    crossed, archive = shown.crossed[number], shown.material.archive
+    place = shown.elites.place_of(number)
+    failed = shown.elites.failing[place]
+    ranked = (("worst failed" if failed else "high fitness", shown.worst), ("most reproducible", shown.steady))
+    roles = [f"{what}, rank {numbers.index(number) + 1}" for what, numbers in ranked if number in numbers]
+    roles += [f"typical of mode {mode.number}" for mode in shown.modes.modes if mode.typical == number]
+    heading = Heading(f"Elite {number}: {'; '.join(roles)}", anchor_of(number))
+    if not len(crossed.chosen):
+        return [heading, Absent("All its episodes were invalid this time: there is nothing to draw.")]
+    title = f"{archive.robot}, elite {number} of {len(archive):,}: {len(crossed.chosen)} crossings"
+    drawn = picture(
+        f"elite-{number}", draw_crossing(crossed, archive.penalties, title),
+        f"Height map of elite {number} with the paths of {len(crossed.chosen)} robots, profile, and penalties",
+    )  # fmt: skip
+    return [heading, Text(_told(shown, crossed, place)), drawn, _penalty_table(shown, crossed), _rate_table(crossed)]
+
+
+def _told(shown: Shown, crossed: Crossed, place: int) -> str:
+    """What became of the robots, in a sentence or two."""
+    elites = shown.elites
+    arrived = crossed.rates[_ARRIVED]
+    failures = {label: crossed.rates[label].hits for label in list(ENDS.values())[1:]}
+    others = "; ".join(f"{label} {hits}" for label, hits in failures.items() if hits)
+    text = f"{arrived.hits} of {arrived.count} robots reached the goal"
+    if others:
+        text += f" ({others}), and the middle one of those that did not ended at x = {crossed.failed_at:.1f} m"
+    means = crossed.scaled.mean(axis=0)
+    main = int(means.argmax())
+    kind = ("fresh episode", "fresh episodes") if elites.fresh else ("episode of the search", "episodes of the search")
+    return (
+        f"{text}. The largest penalty is {label_of(elites.penalties[main])}, "
+        f"{percent(float(means[main] / max(means.sum(), 1e-12)))} of all. Its fitness is {elites.fitness[place]:.1f} "
+        f"by {counted(int(elites.counted[place]), *kind)}, whose penalties have a standard deviation of "
+        f"{percent(float(elites.variation[place]))} of their mean."
+    )
+
+
+def _penalty_table(shown: Shown, crossed: Crossed) -> Table:
+    names, scaled = shown.material.archive.penalties, crossed.scaled
+    total = max(float(scaled.mean(axis=0).sum()), 1e-12)
+    rows = [
+        [
+            label_of(name) + (f" [{PENALTY_UNITS[name]}]" if name in PENALTY_UNITS else ""),
+            f"{raw.mean():.2f}",
+            f"{raw.std():.2f}",
+            f"{own.mean():.2f}",
+            f"{own.std():.2f}",
+            percent(float(own.mean()) / total),
+        ]
+        for name, raw, own in zip(names, crossed.penalties.T, scaled.T, strict=True)
+    ]
+    return Table(["penalty an episode", "mean", "std", "mean, scaled", "std, scaled", "share"], rows)
+
+
+def _rate_table(crossed: Crossed) -> Table:
+    rows = [
+        [
+            label,
+            f"{rate.hits} of {rate.count}",
+            f"{100 * rate.hits / rate.count:.0f} %",
+            rate.limits,
+        ]
+        for label, rate in crossed.rates.items()
+    ]
+    return Table(["crossings", "", "rate", "95 % interval (Wilson)"], rows)
+
+
+def all_section(shown: Shown) -> Section:
+    """Every elite in a table that can be sorted."""
+    elites, archive = shown.elites, shown.material.archive
+    head = ["elite", "fitness", "mode", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]", "std / mean",
+            "iteration", *(f"{label_of(name)} [%]" for name in elites.penalties)]  # fmt: skip
+    rows, keys = [], []
+    for k, number in enumerate(elites.numbers.tolist()):
+        rate = Rate(hits=round(elites.goal_rate[k] * elites.counted[k]), count=int(elites.counted[k]))
+        rates = [float(values[k]) for values in (elites.goal_rate, elites.collision_rate, elites.fallen_rate)]
+        mode, found = int(shown.modes.labels[k]), int(archive.iteration[number])
+        shares, low_high = elites.ratios[k].tolist(), rate.interval
+        values = [
+            number,
+            elites.fitness[k],
+            mode,
+            rates[0],
+            low_high[0],
+            *rates[1:],
+            elites.variation[k],
+            found,
+            *shares,
+        ]
+        rows.append(
+            [f"{number}", f"{values[1]:.2f}", f"{mode}", f"{100 * rates[0]:.0f}", rate.limits,
+             f"{100 * rates[1]:.0f}", f"{100 * rates[2]:.0f}", f"{values[7]:.2f}", f"{found}",
+             *(f"{100 * share:.0f}" for share in shares)]
+        )  # fmt: skip
+        keys.append([f"{value:.5g}" for value in values])
+    links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers.tolist()]
+    again = make_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
+    table = Table(head, rows, sortable=True, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
+    text = (
+        f"All {counted(len(rows), 'elite')}, the highest fitness first; a click on a heading sorts. `{again}` crosses "
+        "one again."
+    )
+    return Section("All elites", "all", [Text(text), table])

@@ -1,0 +1,152 @@
+"""Figures of all elites: their shares against each other, and the failure modes they fall into.
+
+Okabe and Ito's colours, apart for every kind of colour blindness; markers and hatches tell the same apart in grey.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qd.show.figures import PENALTY_LABELS, label_of, new_figure
+from qd.show.report.elites import Elites
+from qd.show.report.modes import TOLERANCE, Modes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MODE_LOOKS = {
+    "collision_rate": (("#d55e00", "X"), ("#e69f00", "D"), ("#cc79a7", "^")),
+    "other_rate": (("#0072b2", "s"), ("#56b4e9", "v")),
+    "goal_rate": (("#009e73", "o"), ("#000000", "P")),
+}
+"""Colours and markers of failure modes by how most of their crossings end, as of the ends themselves."""
+PENALTY_LOOKS = {
+    "yaw_rate": ("#cc79a7", "//"),
+    "vel_x": ("#0072b2", ""),
+    "vel_y": ("#56b4e9", "\\\\"),
+    "contact_force": ("#000000", ""),
+    "stumble": ("#e69f00", ".."),
+    "collision": ("#d55e00", ""),
+}
+"""Colour and hatch of each penalty."""
+_PLAIN = ("#999999", "")  # of a penalty that this page does not know
+_ENDS = (("goal_rate", "goal", "#009e73", "o"), ("collision_rate", "base collision", "#d55e00", "X"),
+         ("other_rate", "stuck, late or off", "#0072b2", "s"))  # fmt: skip
+
+
+def mode_looks(modes: Modes) -> list[tuple[str, str]]:
+    """Colour and marker of each mode, no two alike."""
+    free = {end: list(looks) for end, looks in _MODE_LOOKS.items()}
+    chosen = []
+    for mode in modes.modes:
+        own = max(free, key=lambda end: getattr(mode, end))
+        chosen.append((free[own] or max(free.values(), key=len)).pop(0))
+    return chosen
+
+
+def look_of(penalty: str) -> tuple[str, str]:
+    """Colour and hatch of a penalty."""
+    return PENALTY_LOOKS.get(penalty, _PLAIN)
+
+
+def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
+    """Every two shares of the penalties against each other, a point an elite, by failure mode.
+
+    Args:
+        elites: What to draw.
+        modes: The modes they are in.
+    """
+    count = len(elites.penalties)
+    figure = new_figure(1.75 * (count - 1) + 1.2, 1.7 * (count - 1) + 0.9)
+    grid: Any = figure.subplots(count - 1, count - 1, sharex="col", sharey="row", squeeze=False)
+    top = min(1.0, 0.1 * np.ceil(10.0 * float(elites.ratios.max()) + 0.2))
+    ticks = np.arange(0.0, top + 1e-9, 0.2 if top > 0.3 else 0.1)
+    for row, column in np.ndindex(count - 1, count - 1):
+        axes = grid[row, column]
+        if column > row:
+            axes.set_axis_off()
+            continue
+        _scatter(axes, elites, modes, column, row + 1)
+        axes.set(xlim=(-0.02, top), ylim=(-0.02, top))
+        axes.set(xticks=ticks, yticks=ticks)
+        axes.set_aspect("equal")
+        axes.grid(alpha=0.3)
+        if row == count - 2:
+            axes.set_xlabel(PENALTY_LABELS.get(elites.penalties[column], elites.penalties[column]), fontsize=9)
+        if column == 0:
+            axes.set_ylabel(PENALTY_LABELS.get(elites.penalties[row + 1], elites.penalties[row + 1]), fontsize=9)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    place: dict[str, Any] = (
+        {"loc": "upper right"} if count > 3 else {"loc": "outside lower center", "ncols": len(labels)}
+    )
+    figure.legend(handles, labels, title="failure mode (elites)", markerscale=1.8, frameon=False, **place)
+    return figure
+
+
+def _scatter(axes: "Axes", elites: Elites, modes: Modes, x: int, y: int) -> None:
+    for mode, (colour, marker) in zip(modes.modes, mode_looks(modes), strict=True):
+        style = {"s": 12, "color": colour, "marker": marker, "alpha": 0.65, "linewidths": 0}
+        label = f"{mode.number}: {mode.ending} ({len(mode.members)})"
+        axes.scatter(elites.ratios[mode.members, x], elites.ratios[mode.members, y], label=label, **style)
+
+
+def draw_modes(elites: Elites, modes: Modes) -> "Figure":
+    """The failure modes: their mean shares, how their crossings end, and how well divisions separate.
+
+    Args:
+        elites: What was grouped.
+        modes: The groups.
+    """
+    figure = new_figure(12.0, max(3.4, 0.5 * len(modes.modes) + 2.2))
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1.5, 1.2, 0.9))
+    places = np.arange(len(modes.modes))
+    start = np.zeros(len(places))
+    for column, penalty in enumerate(elites.penalties):
+        shares = 100.0 * np.array([mode.ratios[column] for mode in modes.modes])
+        colour, hatch = look_of(penalty)
+        style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5, "label": label_of(penalty)}
+        left.barh(places, shares, left=start, **style)
+        start += shares
+    for shift, (name, label, colour, marker) in zip((-0.22, 0.0, 0.22), _ENDS, strict=True):
+        rates = [100.0 * getattr(mode, name) for mode in modes.modes]
+        middle.plot(
+            rates, places + shift, linestyle="", marker=marker, markersize=8, color=colour, label=label, alpha=0.9
+        )
+    names = [f"mode {mode.number}: {mode.ending}\n{len(mode.members):,} elites" for mode in modes.modes]
+    left.set_yticks(places, names)
+    middle.set_yticks(places, [])
+    for axes, label in ((left, "mean share of the penalties [%]"), (middle, "mean share of the crossings [%]")):
+        axes.set_ylim(len(places) - 0.5, -0.5)
+        axes.set_xlabel(label)
+        axes.grid(axis="x", alpha=0.3)
+        axes.set_axisbelow(True)
+        for place in places[1:]:
+            axes.axhline(place - 0.5, color="0.85", linewidth=0.8, zorder=0)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2 if axes is left else 1, frameon=False,
+                    fontsize=9)  # fmt: skip
+    left.set_xlim(0, 100)
+    middle.set_xlim(-3, 103)
+    _draw_silhouettes(right, modes)
+    return figure
+
+
+def _draw_silhouettes(axes: "Axes", modes: Modes) -> None:
+    axes.set_xlabel("number of modes")
+    axes.set_ylabel("mean silhouette")
+    if not modes.silhouettes:
+        axes.text(
+            0.5, 0.5, "too few or too equal\nelites to divide", ha="center", va="center", transform=axes.transAxes
+        )
+        axes.set(xticks=[], yticks=[])
+        return
+    counts, values = list(modes.silhouettes), list(modes.silhouettes.values())
+    axes.plot(counts, values, color="#0072b2", marker="o", label="of each number")
+    chosen = len(modes.modes)
+    style = {"markersize": 15, "markerfacecolor": "none", "color": "#d55e00", "markeredgewidth": 2}
+    axes.plot(chosen, modes.silhouettes[chosen], "o", label="taken", **style)
+    axes.axhline(max(values) - TOLERANCE, color="0.4", linestyle="--", label=f"best less {TOLERANCE}")
+    axes.set_xticks(counts)
+    axes.set_ylim(bottom=min(0.0, *values))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False, fontsize=9)

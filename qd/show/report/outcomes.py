@@ -1,0 +1,124 @@
+"""Recorded crossings in numbers: how they ended, what they cost, and where."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kernels.episode import Outcome
+from qd.show.endings import ENDINGS
+from sim.files.intervals import wilson_interval
+from sim.recording.recorder import Recording
+
+ENDS = {outcome: ending.words for outcome, ending in ENDINGS.items()}
+"""How a valid episode may end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """Hits among episodes."""
+
+    hits: int
+    count: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % Wilson interval; anything possible without an episode."""
+        return wilson_interval(self.hits, self.count) if self.count else (0.0, 1.0)
+
+    def __str__(self) -> str:
+        if not self.count:
+            return "no valid episode"
+        return f"{self.hits} of {self.count} ({100 * self.hits / self.count:.0f} %; {self.limits})"
+
+    @property
+    def limits(self) -> str:
+        """The interval in words: ``0 to 16 %``."""
+        return "{:.0f} to {:.0f} %".format(*(100.0 * limit for limit in self.interval))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crossed:
+    """One terrain's recording; E valid episodes."""
+
+    recording: Recording
+    """Of one terrain."""
+    chosen: NDArray[np.int64]
+    """Valid episodes, shape (E,)."""
+    penalties: NDArray[np.float64]
+    """Raw penalty sums of each, in the archive's order, shape (E, P)."""
+    scales: NDArray[np.float64]
+    """Shape (P,)."""
+    rates: dict[str, Rate]
+    """By :data:`ENDS`, and ``fallen``."""
+
+    @property
+    def ends(self) -> NDArray[np.float64]:
+        """Where each episode ended, shape (E, 3) [m]."""
+        last = self.recording.num_frames[0, self.chosen] - 1
+        return self.recording.base_position[0, self.chosen, last].astype(np.float64)
+
+    @property
+    def outcome(self) -> NDArray[np.uint8]:
+        """How each ended, shape (E,)."""
+        return self.recording.outcome[0, self.chosen]
+
+    @property
+    def scaled(self) -> NDArray[np.float64]:
+        """Scaled penalties, shape (E, P)."""
+        return self.penalties / self.scales
+
+    @property
+    def failed_at(self) -> float | None:
+        """Median of x where the episodes that did not reach the goal ended [m]; None if all did."""
+        x = self.ends[self.outcome != Outcome.GOAL, 0]
+        return float(np.median(x)) if len(x) else None
+
+    def path(self, k: int) -> NDArray[np.float64]:
+        """Base positions of the k-th valid episode [m], shape (frames, 3)."""
+        episode = self.chosen[k]
+        frames = slice(self.recording.num_frames[0, episode])
+        return self.recording.base_position[0, episode, frames].astype(np.float64)
+
+
+def crossed_of(recording: Recording, penalties: tuple[str, ...], scales: tuple[float, ...]) -> Crossed:
+    """A recording of one terrain in numbers.
+
+    Args:
+        recording: Of one terrain.
+        penalties: Those of the archive.
+        scales: One each.
+    """
+    outcome = recording.outcome[0]
+    chosen = np.flatnonzero(outcome != Outcome.INVALID)
+    columns = [recording.penalty_names.index(name) for name in penalties]
+    last = recording.num_frames[0, chosen] - 1
+    hits = {label: outcome[chosen] == end for end, label in ENDS.items()} | {"fallen": recording.fallen[0, chosen]}
+    return Crossed(
+        recording=recording,
+        chosen=chosen,
+        penalties=recording.penalties[0, chosen, last][:, columns].astype(np.float64),
+        scales=np.asarray(scales, dtype=np.float64),
+        rates={label: Rate(hits=int(hit.sum()), count=len(chosen)) for label, hit in hits.items()},
+    )
+
+
+def penalties_by_place(crossed: Crossed, penalties: tuple[str, ...], edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scaled penalties per episode by where along x they were incurred.
+
+    Args:
+        crossed: The crossings.
+        penalties: Those of the archive.
+        edges: Of the places [m], shape (places + 1,); what lies outside counts in the first or last.
+
+    Returns:
+        Mean over the episodes, shape (places, P); the sum over places is the mean penalty.
+    """
+    recording = crossed.recording
+    columns = [recording.penalty_names.index(name) for name in penalties]
+    found = np.zeros((len(edges) - 1, len(columns)))
+    for k, episode in enumerate(crossed.chosen):
+        sums = recording.penalties[0, episode, : recording.num_frames[0, episode]][:, columns].astype(np.float64)
+        places = np.clip(np.digitize(crossed.path(k)[1:, 0], edges) - 1, 0, len(found) - 1)
+        np.add.at(found, places, np.diff(sums, axis=0))
+    return found / (crossed.scales * max(1, len(crossed.chosen)))

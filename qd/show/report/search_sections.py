@@ -1,0 +1,240 @@
+"""The page's chapters about the search: what was done, what came out, its curves and its archive."""
+
+from typing import Any
+
+import numpy as np
+
+from qd.fresh import FRESH_EPISODES
+from qd.run.next_commands import make_command
+from qd.run.progress import clock
+from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
+from qd.show.report.elites import FAILING_BELOW, Elites
+from qd.show.report.figures import draw_pairs
+from qd.show.report.page import Absent, Block, Facts, Section, Table, Text
+from qd.show.report.shown import Shown, counted, hours, percent, picture
+from qd.show.report.table_sections import fates, most_mended
+from sim.files.intervals import bootstrap_interval
+from sim.policy.spec import SHIPPED, ControllerSpec
+
+_AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes
+_MIN_TERRAINS = 10  # that an interval of a mean is resampled from
+
+
+def outcome_section(shown: Shown) -> Section:
+    """What was searched, at what cost, and in how many ways the controller breaks how often."""
+    elites, archive = shown.elites, shown.material.archive
+    failing, ways = int(elites.failing.sum()), elites.failing_cells
+    basis = (
+        f"by {int(elites.counted.max(initial=0))} fresh episodes each, free of the luck that made them elites"
+        if elites.fresh
+        else "by the episodes that found them, which flatter themselves"
+    )
+    tables = _tables_of_these(shown)
+    mended = most_mended(tables) if tables else None
+    facts = Facts(
+        [
+            ("terrains, the hardest of each cell, that under half of the robots cross", f"{failing:,}"),
+            ("different ways of failing: cells that these fall into", f"{ways:,}"),
+            ("failure modes: kinds of these ways", f"{sum(mode.failing for mode in shown.modes.modes)}"),
+            ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
+            ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
+            *([mended] if mended else []),
+        ]
+    )
+    text = (
+        f"The controller fails on {failing:,} of {counted(len(elites), 'elite')} judged ({basis}): there under half of "
+        f"the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
+    )
+    if failing:
+        they = "It falls" if failing == 1 else "They fall"
+        text += f"{they} into {counted(ways, 'cell')}: so many different ways of failing were found. "
+    text += (
+        f"Over all elites {_rate(elites.goal_rate)} of the robots reach the goal, the base of "
+        f"{_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
+    )
+    explained = (
+        f"A cell is a combination of shares of the penalties, each in {archive.intervals} intervals; terrains in "
+        "different cells make the robot struggle differently. A terrain counts as failed if under "
+        f"{percent(FAILING_BELOW)} of the robots reach the goal. The rates are means over terrains"
+        f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
+    )
+    told = (_common(shown), text, _others(tables) if tables else "", explained)
+    blocks = [_searched(shown), facts, *(Text(words) for words in told if words)]
+    return Section("What breaks the controller", "outcome", blocks)
+
+
+def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
+    """The evaluation's tables, if their elites are those of this archive."""
+    tables, archive = shown.material.tables, shown.material.archive
+    about = (tables or {}).get("archive") or {}
+    return tables if (about.get("elites"), about.get("iterations")) == (len(archive), archive.iterations) else None
+
+
+def _others(tables: dict[str, Any]) -> str:
+    """What other controllers make of elites of this archive, and where that is shown; may be empty."""
+    told = fates(tables)
+    if not told:
+        return ""
+    return (
+        f"Other controllers crossed some of these terrains too. {told} The chapter Controllers compared says who they "
+        "are, The same terrain before and after shows how they fare."
+    )
+
+
+def _common(shown: Shown) -> str:
+    """What happens to the robot on how many elites: what fails before what does not, the most common first."""
+    modes = sorted(shown.modes.modes, key=lambda mode: (not mode.failing, -len(mode.members)))
+    told = [
+        f"{mode.deed} on {counted(len(mode.members), 'elite')} (mode {mode.number}; goal {percent(mode.goal_rate)})"
+        for mode in modes
+    ]
+    return f"The robot {'; '.join(told)}. The chapters Failure modes and Terrains worth a look show where and how."
+
+
+def _rate(rates: np.ndarray) -> str:
+    """Mean over terrains with its interval; of few terrains without, since resampling them says too little."""
+    mean = percent(float(rates.mean()))
+    limits = bootstrap_interval(rates, np.random.default_rng(0)) if len(rates) >= _MIN_TERRAINS else None
+    return mean if limits is None else f"{mean} ({percent(limits[0])} to {percent(limits[1])})"
+
+
+def _searched(shown: Shown) -> Block:
+    """Robot, controller, method and cost in a sentence."""
+    material, numbers = shown.material, shown.material.summary
+    archive, search = material.archive, material.search
+    policy = SHIPPED if search is None else search.policy
+    who = "its shipped controller" if policy == SHIPPED else f"controller {ControllerSpec.parse(policy).label}"
+    if search is None:
+        who = "a controller that is not on record (the archive lies without its config.json)"
+    text = f"{archive.robot} with {who}, after {counted(archive.iterations, 'iteration')}"
+    if search is not None:
+        text += f" of {search.scheduler.method.replace('+', ' and ')} (seed {search.seed})"
+    text += f": {counted(len(archive), 'elite')} in {percent(archive.reachable_coverage)} of the "
+    text += f"{archive.cells.num_cells:,} reachable cells"
+    if numbers is None or material.metrics is None:
+        return Text(f"{text}. What that cost is not on record: there is no metrics.jsonl beside the archive.")
+    text += f", from {counted(numbers['terrains_evaluated'], 'terrain')} and {numbers['episodes']:,} episodes"
+    walked = [row["episodes"] * row["mean_duration_s"] for row in material.metrics if "mean_duration_s" in row]
+    if len(walked) == len(material.metrics):
+        text += f" ({hours(sum(walked))} of walking, simulated)"
+    where = f" on {'up to ' if material.gpus > 1 else ''}{counted(material.gpus, 'GPU')}" if material.gpus else ""
+    invalid = counted(numbers["invalid_episodes"], "episode was", "episodes were")
+    return Text(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
+
+
+def curves_section(shown: Shown) -> Section:
+    """How the search went."""
+    section = Section("The search", "search")
+    rows, archive = shown.material.metrics, shown.material.archive
+    if not rows:
+        section.blocks.append(
+            Absent("The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:",
+                   make_command("archive", robot=shown.material.robot.spec))
+        )  # fmt: skip
+        return section
+    first, last = rows[0], rows[-1]
+    half = next(row["iteration"] for row in rows if row["elites"] >= last["elites"] / 2)
+    text = (
+        f"From iteration {first['iteration']} to {last['iteration']} the archive grew from {first['elites']:,} to "
+        f"{counted(last['elites'], 'elite')}, half of them found by iteration {half}; the QD score, the sum of fitness "
+        f"above -20, rose from {first['qd_score']:,.0f} to {last['qd_score']:,.0f}, the mean fitness went from "
+        f"{first['mean_fitness']:.1f} to {last['mean_fitness']:.1f}."
+    )
+    if len(rows) > 1:
+        tail = rows[-max(1, len(rows) // 5) - 1 :]
+        gained = tail[-1]["elites"] - tail[0]["elites"]
+        span = "iteration" if len(tail) == 2 else f"{len(tail) - 1:,} iterations"
+        text += f" The last {span} added {counted(gained, 'elite')}."
+    if any(row.get("mean_std") is not None for row in rows):
+        text += (
+            " On the right the mean STD: the standard deviations of the scaled penalties over "
+            f"{FRESH_EPISODES} fresh episodes, summed, and averaged over elites looked at during the search, with its "
+            "95 % interval."
+        )
+    shows = "QD score, number of elites with reachable coverage, and mean fitness over the iterations"
+    section.blocks += [Text(text), picture("curves", draw_curves(archive, rows), shows)]
+    return section
+
+
+def archive_section(shown: Shown) -> Section:
+    """The archive on parallel axes, and its spread over each share."""
+    elites, archive = shown.elites, shown.material.archive
+    largest = elites.ratios.max(axis=0)
+    ranges = ", ".join(
+        f"{label_of(name)} {percent(top)}" for name, top in zip(elites.penalties, largest.tolist(), strict=True)
+    )
+    lines = (
+        f"Each line is one of {counted(len(elites), 'elite')}; each axis a penalty, the height its share of all that "
+        f"went wrong. The largest shares reached are: {ranges}."
+    )
+    counts = spread(archive).sum(axis=2)
+    filled = (counts > 0).sum(axis=1).tolist()
+    widest = int(np.argmax(filled))
+    spread_text = (
+        f"Of the {archive.intervals} intervals of each share the search filled {min(filled)} to {max(filled)}, most of "
+        f"{label_of(archive.penalties[widest])}; in {int(archive.collided.sum()):,} of "
+        f"{counted(len(archive), 'elite')} the base collides in at least one episode."
+    )
+    return Section(
+        "The archive",
+        "archive",
+        [
+            Text(lines),
+            picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
+            Text(spread_text),
+            picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
+        ],
+    )
+
+
+def pairs_section(shown: Shown) -> Section:
+    """Every two shares against each other."""
+    elites, section = shown.elites, Section("Shares against each other", "pairs")
+    if len(elites) < 3 or len(elites.penalties) < 2:
+        section.blocks.append(
+            Absent(f"The projections are left out: they need 3 elites, and there are {len(elites)}. A longer search "
+                   "finds more:", make_command("archive", resume=shown.material.run, iterations="N"))
+        )  # fmt: skip
+        return section
+    text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode (next chapter)."
+    text += _related(elites)
+    shows = "Scatter plots of every two shares of the penalties, by failure mode"
+    section.blocks += [Text(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]
+    return section
+
+
+def _related(elites: Elites) -> str:
+    """Which shares go together, and in how few directions they vary; nothing of shares that do not."""
+    changing = np.flatnonzero(elites.ratios.std(axis=0) > 0.0)
+    if len(changing) < 3:  # of two shares, one is what the other leaves
+        return ""
+    related = np.corrcoef(elites.ratios[:, changing].T) - np.eye(len(changing))
+    names = [label_of(elites.penalties[column]) for column in changing]
+    low, high = (np.unravel_index(pick(related), related.shape) for pick in (np.argmin, np.argmax))
+    text = f" The shares of {names[low[0]]} and {names[low[1]]} are the most opposed (correlation {related[low]:.2f})"
+    if related[high] > 0.0:
+        text += f", those of {names[high[0]]} and {names[high[1]]} go together the most ({related[high]:.2f})"
+    variances = np.linalg.eigvalsh(np.cov(elites.ratios.T))[::-1]
+    share = float(variances[:2].sum() / variances.sum())
+    return f"{text}. Two principal directions hold {percent(share)} of their variance."
+
+
+def origin_section(shown: Shown) -> Section:
+    """Where the numbers come from."""
+    origin = shown.material.origin
+    section = Section("Where this comes from", "origin")
+    if not origin:
+        section.blocks.append(
+            Absent("The search is not on record: there is no config.json beside the archive. A search writes one:",
+                   make_command("archive", robot=shown.material.robot.spec))
+        )  # fmt: skip
+        return section
+    rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]
+    versions = origin.get("versions")
+    if isinstance(versions, dict):
+        rows.append(["versions", ", ".join(f"{name} {version}" for name, version in versions.items())])
+    again = shown.material.reproduced_by
+    rows += [[f"fresh episodes: {name}", str(again[name])] for name in _AGAIN if name in again]
+    text = f"The archive read is {shown.material.run}. Its search began with:"
+    section.blocks += [Text(text), Table(["", ""], rows, words=True)]
+    return section

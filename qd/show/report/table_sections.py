@@ -1,0 +1,210 @@
+"""The page's chapters about an evaluation: the tables, and the same terrain before and after fine-tuning."""
+
+from typing import Any
+
+from qd.run.next_commands import make_command
+from qd.show.report.changes import Change, Changes
+from qd.show.report.outcomes import ENDS, Crossed
+from qd.show.report.page import Absent, Block, Heading, Section, Table, Text
+from qd.show.report.shown import Shown, counted, percent, picture
+from qd.show.report.table_figures import draw_tables
+from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, by_kind
+from qd.show.report.terrain_figures import draw_maps
+
+_ARRIVED = next(iter(ENDS.values()))
+_TRAINED_ON = {
+    "C-HC": "hand-crafted terrains alone",
+    "C-HR": "hand-crafted and hard-random ones",
+    "C-G": "hand-crafted ones and elites",
+    "C-F": "hand-crafted ones and elites, drawn by how often it fails them",
+}
+"""What controllers are trained further on that are named as the paper and the README name them."""
+
+
+def tables_section(shown: Shown) -> Section:
+    """Controllers on the evaluation's sets."""
+    section, tables = Section("Controllers compared", "tables"), shown.material.tables
+    if tables is None:
+        about = f"Left out: there are no evaluation tables at {shown.material.tables_file}. They are made by"
+        section.blocks.append(Absent(about, _command(shown)))
+        return section
+    kinds = by_kind(tables)
+    section.blocks += [
+        Text(_told(tables, kinds)),
+        *([Text(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
+        picture("tables", draw_tables(kinds), "Success, goal rate and reward of every controller on every set"),
+        *(_measure_table(kinds, measure) for measure in MEASURES),
+        *_changes_tables(tables),
+    ]
+    return section
+
+
+def _from_first(tables: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What became of held-out elites from the first controller to each other one."""
+    first = next(iter(tables["controllers"]))
+    pairs = {pair.partition(" -> "): found for pair, found in (tables["differences"].get(GENERATED) or {}).items()}
+    return {after: found for (before, _, after), found in pairs.items() if before == first}
+
+
+def most_mended(tables: dict[str, Any]) -> tuple[str, str] | None:
+    """How many of the held-out elites that the first controller fails the best one mends, and what that counts.
+
+    Args:
+        tables: The evaluation's.
+    """
+    pairs, first = _from_first(tables), next(iter(tables["controllers"]))
+    if not pairs:
+        return None
+    best = max(pairs, key=lambda who: pairs[who]["mended"]["count"])
+    mended, failing = (pairs[best][kind]["count"] for kind in CHANGES[:2])
+    return f"elites held out of training that {first} fails and {best} mends", f"{mended} of {mended + failing}"
+
+
+def fates(tables: dict[str, Any]) -> str:
+    """What the other controllers make of the held-out elites that the first one fails, in a sentence; may be empty.
+
+    Args:
+        tables: The evaluation's.
+    """
+    pairs, first = _from_first(tables), next(iter(tables["controllers"]))
+    if not pairs:
+        return ""
+    compared = max(found["compared"] for found in pairs.values())
+    counts = {who: [found[kind]["count"] for kind in CHANGES[:3]] for who, found in pairs.items()}
+    told = [f"{who} mends {mended} of {mended + failing}" for who, (mended, failing, _) in counts.items()]
+    told[0] += f" that {first} fails"
+    broken = [f"{number} by {who}" for who, (_, _, number) in counts.items() if number]
+    return (
+        f"Of {counted(compared, 'elite')} held out of training {', '.join(told)}; newly broken are "
+        f"{', '.join(broken) or 'none'}."
+    )
+
+
+def _command(shown: Shown) -> str:
+    """What makes the tables."""
+    material = shown.material
+    return make_command(
+        "evaluate",
+        robot=material.robot.spec,
+        policies="base=shipped C-G=FILE",
+        archive=material.run,
+        out=material.tables_file,
+    )
+
+
+def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
+    """Who was compared on what, in a sentence or two."""
+    first = next(iter(kinds["controllers"]))
+    sets = ", ".join(f"{_label(name)}: {count}" for name, count in tables["terrains"].items())
+    text = (
+        f"{counted(len(tables['controllers']), 'controller')} on {counted(len(tables['terrains']), 'set')} of "
+        f"terrains ({sets}), {tables['episodes']} episodes on each terrain; intervals are 95 %, over terrains"
+    )
+    several = len(kinds["controllers"]) < len(tables["controllers"])
+    text += ", of several trainings that differ in their seed over these." if several else "."
+    trained = [f"{who} on {what}" for who, what in _TRAINED_ON.items() if who in tables["controllers"]]
+    return text + (f" By their names these are {first} trained further: {'; '.join(trained)}." if trained else "")
+
+
+def _worst(kinds: dict[str, Any]) -> str:
+    """How all fare on the first one's hardest set, in a sentence; empty if nothing is known of that one."""
+    first, *others = kinds["controllers"]
+    known = {name: row for name, row in kinds["goal"].items() if row[first] is not None}
+    if not known:
+        return ""
+    hardest = min(known, key=lambda name: known[name][first])
+    rate = _value(kinds, "goal", hardest, first)
+    better = "".join(f"; {who} {_value(kinds, 'goal', hardest, who)}" for who in others)
+    return f"{first} fares worst on {_label(hardest)}: {rate} of its episodes reach the goal{better}."
+
+
+def _label(name: str) -> str:
+    return LABELS.get(name, name)
+
+
+def _value(tables: dict[str, Any], measure: str, name: str, who: str) -> str:
+    value, limits = tables[measure][name][who], tables["intervals"][measure][name][who]
+    if value is None:
+        return "-"
+    if measure == "reward":
+        return f"{value:.1f}" + (f" ({limits[0]:.1f} to {limits[1]:.1f})" if limits else "")
+    return percent(value) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
+
+
+def _measure_table(tables: dict[str, Any], measure: str) -> Table:
+    controllers = list(tables["controllers"])
+    rows = [[_label(name), *(_value(tables, measure, name, who) for who in controllers)] for name in tables[measure]]
+    return Table([MEASURES[measure], *controllers], rows)
+
+
+def _changes_tables(tables: dict[str, Any]) -> list[Block]:
+    """What became of the terrains from the first controller to every other, and folded between the others."""
+    first = next(iter(tables["controllers"]))
+    from_first, others = [], []
+    for name, pairs in tables["differences"].items():
+        for pair, found in pairs.items():
+            counts = [f"{found[kind]['count']}" for kind in CHANGES]
+            row = [f"{_label(name)}: {pair}", *counts, f"{found['compared']}"]
+            (from_first if pair.startswith(f"{first} -> ") else others).append(row)
+    if not from_first and not others:
+        return []
+    head = ["terrains", *(kind.replace("_", " ") for kind in CHANGES), "compared"]
+    text = (
+        "Terrains that a controller fails, under half of its episodes reaching the goal, from the first controller to "
+        "the second; of several trainings the first one:"
+    )
+    blocks: list[Block] = [Text(text), Table(head, from_first)]
+    return [*blocks, Table(head, others, folded=f"Show {counted(len(others), 'other pair')}")] if others else blocks
+
+
+def before_after_section(shown: Shown) -> Section | None:
+    """Two controllers' paths on the same terrains; None without tables."""
+    if shown.changes is None:
+        return None
+    section = Section("The same terrain before and after", "before-after")
+    if not shown.pairs:
+        reason = shown.changes.reason or shown.not_crossed
+        section.blocks.append(Absent(f"Left out. {reason} New tables are made by", _command(shown)))
+        return section
+    section.blocks.append(Text(_introduced(shown, shown.changes)))
+    for change, crossed in shown.pairs.items():
+        section.blocks += _change(shown, change, crossed)
+    return section
+
+
+def _introduced(shown: Shown, changes: Changes) -> str:
+    """Who crosses what, and how to see it move."""
+    change, policies = changes.chosen[0], changes.policies or {}
+    files = " and ".join(f"{who} ({policy})" for who, policy in policies.items())
+    view = make_command("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
+                        policies=" ".join(f"{who}={policy}" for who, policy in policies.items()))  # fmt: skip
+    return (
+        f"{files} on elites held out of training, numbered as in {changes.run}: the worst of those mended, of those "
+        f"newly broken and of those still failing, as far as there are such. `{view}` shows them walk."
+    )
+
+
+def _change(shown: Shown, change: Change, crossed: tuple[Crossed, Crossed]) -> list[Block]:
+    """One terrain under both controllers."""
+    names = (change.before, change.after)
+    far = ", among the third farthest from all that was trained on" if change.far else ""
+    told = "; with ".join(f"{who} {_ended(one)}" for who, one in zip(names, crossed, strict=True))
+    text = f"{change.kind.capitalize()} by the tables{far}. Crossed again from the same starts: with {told}."
+    rates = [one.rates[_ARRIVED] for one in crossed]
+    maps = {f"{who}: {rate.hits} of {rate.count} reach the goal": one
+            for who, rate, one in zip(names, rates, crossed, strict=True)}  # fmt: skip
+    title = f"{shown.material.archive.robot}, elite {change.number}: {change.before} and {change.after}"
+    shows = f"Paths of {change.before} and of {change.after} on elite {change.number}"
+    drawn = picture(f"change-{change.number}", draw_maps(maps, title), shows)
+    by = "with" if change.kind == "still failing" else "by"
+    return [Heading(f"Elite {change.number}: {change.kind} {by} {change.after}"), Text(text), drawn]
+
+
+def _ended(crossed: Crossed) -> str:
+    """How many reached the goal, and what the others ended in."""
+    arrived, at = crossed.rates[_ARRIVED], crossed.failed_at
+    if at is None:
+        return f"{arrived} reach the goal"
+    others = [f"{label} {crossed.rates[label].hits}" for label in list(ENDS.values())[1:] if crossed.rates[label].hits]
+    who = "the other one" if arrived.count - arrived.hits == 1 else "the middle one of the others"
+    return f"{arrived} reach the goal ({', '.join(others)}; {who} ends at x = {at:.1f} m)"

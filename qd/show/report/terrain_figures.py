@@ -1,0 +1,179 @@
+"""Figures of recorded crossings: height map, paths, where they ended, and where the penalties were incurred."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qd.show.endings import ENDINGS
+from qd.show.figures import PENALTY_LABELS, new_figure
+from qd.show.report.figures import look_of
+from qd.show.report.outcomes import ENDS, Crossed, penalties_by_place
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
+_START, _GOAL = (2.0, 4.0), (14.0, 4.0)
+_PLACE = 0.5  # length of the places that penalties are summed over [m]
+
+
+def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> "Figure":
+    """One terrain: its height map with the paths, its profile, and the penalties by place and by kind.
+
+    Args:
+        crossed: Its crossings.
+        penalties: Those of the archive.
+        title: Of the figure.
+    """
+    figure = new_figure(12.0, 7.2)
+    figure.suptitle(title)
+    grid = figure.add_gridspec(3, 2, width_ratios=(2.6, 1.0), height_ratios=(3.2, 0.9, 1.1))
+    top = figure.add_subplot(grid[0, 0])
+    profile, places = (figure.add_subplot(grid[row, 0], sharex=top) for row in (1, 2))
+    image = draw_map(top, crossed)
+    figure.colorbar(image, ax=top, label="height [m]", shrink=0.85, pad=0.01)
+    _draw_profile(profile, crossed)
+    _draw_places(places, crossed, penalties)
+    _draw_penalties(figure.add_subplot(grid[1:, 1]), crossed, penalties)
+    legend = figure.add_subplot(grid[0, 1])
+    legend.set_axis_off()
+    legend.legend(*_legend(top), loc="center left", frameon=False, title="crossings", alignment="left", handlelength=3)
+    for axes in (top, profile):
+        axes.tick_params(labelbottom=False)
+    top.set_xlim(*_x_limits([crossed]))
+    return figure
+
+
+def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None = None) -> Any:
+    """The height map with every path, its end marked by how it ended; returns the image.
+
+    Args:
+        axes: Where.
+        crossed: The crossings.
+        limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    heights = crossed.recording.heights[0]
+    low, high = limits or (float(heights.min()), float(heights.max()))
+    greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
+    image = axes.imshow(
+        heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
+    )
+    for outcome, end in ENDINGS.items():
+        chosen = np.flatnonzero(crossed.outcome == outcome)
+        for k in chosen:
+            axes.plot(*crossed.path(int(k))[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
+        if len(chosen):
+            places = crossed.ends[chosen]
+            looks = {"color": end.color, "marker": end.marker, "s": 55, "edgecolors": "white", "zorder": 3}
+            axes.scatter(*places[:, :2].T, label=f"{end.words} ({len(chosen)})", **looks)
+    white = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
+    axes.plot(*_START, marker=">", markersize=11, label="start", **white)
+    axes.plot(*_GOAL, marker="*", markersize=16, label="goal", **white)
+    axes.set_ylabel("y [m]")
+    axes.set_aspect("equal")
+    return image
+
+
+def _legend(axes: "Axes") -> tuple[list[Any], list[str]]:
+    """Markers with the lines of the paths that lead to them."""
+    from matplotlib.lines import Line2D
+
+    lines = {end.words: (end.color, end.marker, end.line) for end in ENDINGS.values()}
+    handles, labels = axes.get_legend_handles_labels()
+    shown = []
+    for handle, label in zip(handles, labels, strict=True):
+        colour, marker, line = lines.get(label.rpartition(" (")[0], ("", "", ""))
+        style = {"color": colour, "marker": marker, "linestyle": line, "markeredgecolor": "white", "markersize": 9}
+        shown.append(Line2D([], [], **style) if colour else handle)
+    return shown, labels
+
+
+def _x_limits(drawn: Sequence[Crossed]) -> tuple[float, float]:
+    """The terrain, and what robots left it for."""
+    xs = np.concatenate([[0.0, _LENGTH], *(crossed.ends[:, 0] for crossed in drawn)])
+    return float(xs.min()), float(xs.max())
+
+
+def _draw_profile(axes: "Axes", crossed: Crossed) -> None:
+    """Heights along the straight line from start to goal."""
+    heights = crossed.recording.heights[0]
+    row = heights[heights.shape[0] // 2]
+    x = np.linspace(0.0, _LENGTH, len(row))
+    axes.fill_between(x, row, min(float(row.min()), 0.0) - 0.1, color="0.75")
+    axes.plot(x, row, color="0.2", linewidth=1.0)
+    axes.set_ylabel("height at\ny = 4 m [m]", fontsize=9)
+    axes.grid(alpha=0.3)
+
+
+def _draw_places(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) -> None:
+    """Scaled penalties of an episode by where they were incurred."""
+    edges = np.arange(0.0, _LENGTH + _PLACE / 2, _PLACE)
+    amounts = penalties_by_place(crossed, penalties, edges)
+    bottom = np.zeros(len(amounts))
+    for penalty, amount in zip(penalties, amounts.T, strict=True):
+        colour, hatch = look_of(penalty)
+        style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.0}
+        axes.bar(edges[:-1], amount, width=_PLACE, align="edge", bottom=bottom, **style)
+        bottom += amount
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel(f"penalties per\n{_PLACE} m (scaled)", fontsize=9)
+    axes.grid(alpha=0.3)
+    axes.set_axisbelow(True)
+
+
+def _draw_penalties(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) -> None:
+    """Mean of each scaled penalty with its standard deviation over the episodes."""
+    places = np.arange(len(penalties))
+    means, stds = crossed.scaled.mean(axis=0), crossed.scaled.std(axis=0)
+    for place, penalty in zip(places, penalties, strict=True):
+        colour, hatch = look_of(penalty)
+        axes.barh(place, means[place], color=colour, hatch=hatch, edgecolor="white", linewidth=0.0)
+    axes.errorbar(means, places, xerr=stds, linestyle="", color="0.3", capsize=3)
+    axes.set_yticks(places, [PENALTY_LABELS.get(name, name) for name in penalties], fontsize=9)
+    axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("penalty an episode (scaled),\nmean and standard deviation", fontsize=9)
+    axes.grid(axis="x", alpha=0.3)
+    axes.set_axisbelow(True)
+
+
+def draw_maps(crossings: Mapping[str, Crossed], title: str) -> "Figure":
+    """Several terrains or controllers side by side, each a map with paths, all in the same shades.
+
+    Args:
+        crossings: By what stands over each map.
+        title: Of the figure.
+    """
+    columns = 2
+    rows = -(-len(crossings) // columns)
+    figure = new_figure(12.0, 3.0 * rows + 0.9)
+    figure.suptitle(title)
+    panels = [*np.ravel(figure.subplots(rows, columns, squeeze=False))]
+    heights = np.concatenate([crossed.recording.heights.ravel() for crossed in crossings.values()])
+    limits = (float(heights.min()), float(heights.max()))
+    for axes, (label, crossed) in zip(panels, crossings.items(), strict=False):
+        draw_map(axes, crossed, limits)
+        axes.set_title(label, fontsize=10)
+        axes.set_xlabel("x [m]")
+        axes.set_xlim(*_x_limits([crossed]))
+    for axes in panels[len(crossings) :]:
+        axes.set_axis_off()
+    figure.colorbar(panels[0].images[0], ax=list(panels), label="height [m]", shrink=0.6)
+    figure.legend(
+        *_common_legend(panels[: len(crossings)]), loc="outside lower center", ncols=6, frameon=False, handlelength=3
+    )
+    return figure
+
+
+def _common_legend(panels: Sequence["Axes"]) -> tuple[list[Any], list[str]]:
+    """One entry for each mark in any of the panels, without counts."""
+    entries: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*_legend(axes), strict=True):
+            entries.setdefault(label.rpartition(" (")[0] or label, handle)
+    order = [label for label in (*ENDS.values(), "start", "goal") if label in entries]
+    return [entries[label] for label in order], order

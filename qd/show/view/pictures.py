@@ -1,0 +1,126 @@
+"""Plots of the page as SVG: the archive on parallel axes, and the penalties of a crossing over its time."""
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.show.view.elites import Axis, Elites
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#666666")
+"""Of curves, one a penalty; readable by most colour-blind people."""
+_SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites by fitness, the worst darkest
+_GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
+_WIDTH, _HEIGHT = 460, 350
+_TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 16
+_CURVES_HEIGHT, _MARGIN = 170, 24
+
+
+def axes_svg(
+    elites: Elites, kept: NDArray[np.int64], ranges: dict[str, tuple[float, float]], picked: int | None
+) -> str:
+    """The archive on parallel axes: a line an elite, grey outside the ranges, the picked one on top.
+
+    Args:
+        elites: All of them.
+        kept: Numbers of those in the ranges.
+        ranges: Range of each brushed axis.
+        picked: Number of the picked elite, if any.
+    """
+    x = np.linspace(_LEFT, _WIDTH - _RIGHT, len(elites.axes))
+    y = np.stack([_height_of(axis, axis.values) for axis in elites.axes], axis=1)
+    dropped = np.setdiff1d(np.arange(len(elites)), kept)
+    parts = [_lines(x, y[dropped], _GREY, 0.6, 0.6)]
+    # Equally many a shade, so that the worst stand out whatever the range of fitness.
+    for shade, numbers in zip(_SHADES, reversed(np.array_split(kept, len(_SHADES))), strict=True):
+        parts.append(_lines(x, y[numbers], shade, 0.8, 0.75))
+    if picked is not None:
+        parts.append(_lines(x, y[[picked]], _PICKED, 2.5, 1.0))
+    parts += [_axis(axis, float(place), ranges.get(axis.name)) for axis, place in zip(elites.axes, x, strict=True)]
+    return _svg(_HEIGHT, parts)
+
+
+def _height_of(axis: Axis, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where values stand on their axis [pixels from the top]."""
+    share = (values - axis.low) / (axis.high - axis.low)
+    return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
+
+
+def _lines(x: NDArray[np.float64], rows: NDArray[np.float64], color: str, width: float, opacity: float) -> str:
+    """Lines over the same x as one path."""
+    path = "".join("M" + "L".join(f"{a:.0f} {b:.1f}" for a, b in zip(x, row, strict=True)) for row in rows)
+    style = f'fill="none" stroke="{color}" stroke-width="{width}" stroke-opacity="{opacity}"'
+    return f'<path d="{path}" {style}/>' if path else ""
+
+
+def _axis(axis: Axis, x: float, brushed: tuple[float, float] | None) -> str:
+    """An axis with its ends, its name, and its range if it has one."""
+    bottom = _HEIGHT - _BOTTOM
+    parts = [f'<line x1="{x:.0f}" y1="{_TOP}" x2="{x:.0f}" y2="{bottom}" stroke="#444" stroke-width="1"/>']
+    if brushed is not None:
+        high, low = _height_of(axis, np.array([brushed[1], brushed[0]]))
+        size = f'width="9" height="{max(low - high, 2.0):.1f}"'
+        parts.append(f'<rect x="{x - 4.5:.1f}" y="{high:.1f}" {size} fill="{_BRUSH}" fill-opacity="0.75"/>')
+    decimals = 0 if axis.name == "fitness" else 2
+    parts.append(_text(x, _TOP - 5, f"{axis.high:.{decimals}f}", "middle"))
+    parts.append(_text(x, bottom + 12, f"{axis.low:.{decimals}f}", "middle"))
+    turned = f'transform="rotate(-52 {x:.0f} {bottom + 24})"'
+    parts.append(_text(x + 4, bottom + 24, _shortened(axis.label), "end", turned))
+    return "".join(parts)
+
+
+def _shortened(label: str) -> str:
+    """A label that has room under the axes."""
+    return label if len(label) <= 22 else f"{label[:21]}…"
+
+
+def _text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:
+    return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}" {more}>{escape(text)}</text>'
+
+
+def _svg(height: int, parts: Iterable[str]) -> str:
+    style = "width:100%;font-family:sans-serif;font-size:10px;fill:currentColor"
+    inner = "".join(parts)
+    return f'<svg viewBox="0 0 {_WIDTH} {height}" style="{style}" xmlns="http://www.w3.org/2000/svg">{inner}</svg>'
+
+
+class Curves:
+    """Running penalties of one crossing, drawn once; only the mark of the shown time moves."""
+
+    def __init__(self, times_s: NDArray[np.floating], sums: NDArray[np.floating], labels: Sequence[str]) -> None:
+        """Draw the curves.
+
+        Args:
+            times_s: Time of each frame [s], shape (num_frames,).
+            sums: Scaled penalty sums so far, shape (num_frames, num_penalties).
+            labels: Each penalty in words.
+        """
+        self._end = max(float(times_s[-1]), 1e-9)
+        most = max(float(np.max(sums)), 1e-9)
+        step = max(1, len(times_s) // 200)
+        chosen = np.unique([*range(0, len(times_s), step), len(times_s) - 1])
+        x = self._x(times_s[chosen])
+        bottom, top = _CURVES_HEIGHT - 18, 12
+        parts = [
+            f'<line x1="{_MARGIN + 8}" y1="{bottom}" x2="{_WIDTH - 8}" y2="{bottom}" stroke="#444"/>',
+            _text(_MARGIN + 4, top + 4, f"{most:.3g}", "end"),
+            _text(_MARGIN + 4, bottom, "0", "end"),
+            _text(_MARGIN + 8, bottom + 13, "penalties so far, in multiples of their scales", "start"),
+            _text(_WIDTH - 8, bottom + 13, f"{self._end:.1f} s", "end"),
+        ]
+        for column, label in enumerate(labels):
+            color = COLORS[column % len(COLORS)]
+            y = bottom - np.asarray(sums[chosen, column], dtype=np.float64) / most * (bottom - top)
+            parts.append(_lines(x, y[None], color, 1.6, 1.0))
+            parts.append(_text(_MARGIN + 16, top + 12 * column + 4, label, "start", f'style="fill:{color}"'))
+        self._drawn = "".join(parts)
+
+    def _x(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
+        return _MARGIN + 8 + np.asarray(times_s, dtype=np.float64) / self._end * (_WIDTH - _MARGIN - 16)
+
+    def at(self, time_s: float) -> str:
+        """The curves with a mark at a time [s]."""
+        x = float(self._x(np.array([time_s]))[0])
+        mark = f'<line x1="{x:.1f}" y1="6" x2="{x:.1f}" y2="{_CURVES_HEIGHT - 18}" stroke="#d00" stroke-width="1.5"/>'
+        return _svg(_CURVES_HEIGHT, [self._drawn, mark])

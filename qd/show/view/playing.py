@@ -1,0 +1,177 @@
+"""One crossing as it is shown: bodies, forces, command and penalties at every frame, and how it ends."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ImageColor
+
+from kernels.episode import Outcome
+from qd.show.endings import ENDINGS
+from sim.recording.recorder import Recording
+from sim.robots.skeleton import Skeleton
+
+OUTCOMES = {
+    **{outcome: (ending.words, ImageColor.getrgb(ending.color)) for outcome, ending in ENDINGS.items()},
+    Outcome.INVALID: ("invalid: the simulation broke", (90, 90, 90)),
+}
+"""How an episode may end, in words, and the colour of its path."""
+_FORCE_LENGTH = 1e-3  # of an arrow [m/N]
+_LEAST_FORCE = 5.0  # shown [N]
+_COMMAND_LENGTH = 1.0  # of an arrow [m/(m/s)]
+_COMMAND_HEIGHT = 0.45  # over the base [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crossing:
+    """F frames of one episode."""
+
+    dt: float
+    """Time between frames [s]."""
+    duration_s: float
+    """Simulated time up to the end [s]."""
+    ending: str
+    """Outcome in words, and whether the robot had fallen."""
+    positions: NDArray[np.float64]
+    """Origins of the bodies, world [m], shape (F, num_bodies, 3)."""
+    quaternions: NDArray[np.float64]
+    """Bodies to world, w x y z, shape (F, num_bodies, 4)."""
+    forces: NDArray[np.float64]
+    """Arrows of the feet's contact forces, begin and end [m], of no length where there is none, (F, num_feet, 2, 3)."""
+    force_newtons: NDArray[np.float64]
+    """Their size [N], shape (F, num_feet)."""
+    command: NDArray[np.float64]
+    """Arrow of the velocity command, begin and end [m], shape (F, 2, 3)."""
+    command_values: NDArray[np.float64]
+    """v_x, v_y [m/s], yaw rate [rad/s], yaw frame, shape (F, 3)."""
+    penalties: NDArray[np.float64]
+    """Scaled sums so far, in the archive's order, shape (F, P)."""
+
+    @property
+    def num_frames(self) -> int:
+        """F."""
+        return len(self.positions)
+
+    @property
+    def times_s(self) -> NDArray[np.float64]:
+        """Time of each frame [s], shape (F,)."""
+        return self.dt * np.arange(self.num_frames, dtype=np.float64)
+
+
+def crossing_of(
+    recording: Recording, replica: int, skeleton: Skeleton, penalties: Sequence[str], scales: Sequence[float]
+) -> Crossing | None:
+    """One episode of a recording of one terrain; None of an episode that broke before its first frame.
+
+    Args:
+        recording: The recording.
+        replica: Number of the episode.
+        skeleton: The robot's.
+        penalties: Names of the penalties to show, all of them recorded.
+        scales: What to divide each by.
+    """
+    frames = int(recording.num_frames[0, replica])
+    if frames == 0:
+        return None
+    qpos = recording.qpos(0, replica)
+    positions, quaternions = skeleton.body_poses(qpos)
+    newtons = recording.foot_force[0, replica, :frames].astype(np.float64)
+    size = np.linalg.norm(newtons, axis=-1)
+    arrows = np.where(size[..., None] >= _LEAST_FORCE, _FORCE_LENGTH * newtons, 0.0)
+    feet = _foot_positions(recording, skeleton, positions, quaternions)
+    command = recording.command[0, replica, :frames].astype(np.float64)
+    columns = [recording.penalty_names.index(name) for name in penalties]
+    outcome = Outcome(int(recording.outcome[0, replica]))
+    fallen = " · fallen" if recording.fallen[0, replica] else ""
+    return Crossing(
+        dt=recording.dt,
+        duration_s=float(recording.duration_s[0, replica]),
+        ending=OUTCOMES[outcome][0] + fallen,
+        positions=positions,
+        quaternions=quaternions,
+        forces=np.stack([feet, feet + arrows], axis=2),
+        force_newtons=size,
+        command=_command_arrows(qpos, command),
+        command_values=command,
+        penalties=recording.penalties[0, replica, :frames][:, columns].astype(np.float64) / np.asarray(scales),
+    )
+
+
+def rotated(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Vectors turned by unit quaternions w x y z; leading axes broadcast."""
+    w, axis = quaternions[..., :1], quaternions[..., 1:]
+    twice = 2.0 * np.cross(axis, vectors)
+    return vectors + w * twice + np.cross(axis, twice)
+
+
+def _foot_positions(
+    recording: Recording, skeleton: Skeleton, positions: NDArray[np.float64], quaternions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Centres of the feet's shapes [m], shape (F, num_feet, 3)."""
+    feet = [skeleton.geom(name) for name in recording.foot_names]
+    bodies = [foot.body for foot in feet]
+    centres = np.stack([foot.position for foot in feet])
+    return positions[:, bodies] + rotated(quaternions[:, bodies], centres)
+
+
+def _command_arrows(qpos: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The commanded velocity, from above the base; the command is given in the frame of the base's yaw."""
+    forward = rotated(qpos[:, 3:7], np.array([1.0, 0.0, 0.0]))
+    yaw = np.arctan2(forward[:, 1], forward[:, 0])
+    x = np.cos(yaw) * command[:, 0] - np.sin(yaw) * command[:, 1]
+    y = np.sin(yaw) * command[:, 0] + np.cos(yaw) * command[:, 1]
+    begin = qpos[:, :3] + np.array([0.0, 0.0, _COMMAND_HEIGHT])
+    return np.stack([begin, begin + _COMMAND_LENGTH * np.stack([x, y, np.zeros_like(x)], axis=1)], axis=1)
+
+
+def paths_of(recording: Recording, every: int = 5) -> list[tuple[NDArray[np.float32], tuple[int, int, int]]]:
+    """Way of the base in every episode: points [m], shape (num_points, 3), and the colour of its outcome.
+
+    Args:
+        recording: Of one terrain.
+        every: Frames from one point to the next.
+    """
+    found = []
+    for replica in range(recording.num_episodes):
+        frames = int(recording.num_frames[0, replica])
+        points = recording.base_position[0, replica, :frames]
+        chosen = np.unique([*range(0, frames, every), frames - 1]) if frames else []
+        outcome = Outcome(int(recording.outcome[0, replica]))
+        found.append((points[chosen], OUTCOMES[outcome][1]))
+    return found
+
+
+def endings(recording: Recording) -> str:
+    """How many episodes of one terrain ended how, such as ``12 out of time, 8 base collision``, in colours, as HTML."""
+    counts = [(int((recording.outcome[0] == outcome).sum()), *looks) for outcome, looks in OUTCOMES.items()]
+    return ", ".join(
+        f'<span style="color:rgb{color}">{count} {words}</span>'
+        for count, words, color in sorted(counts, key=lambda entry: -entry[0])
+        if count
+    )
+
+
+def moment_text(crossing: Crossing, frame: int, penalties: Sequence[str]) -> str:
+    """The numbers of a frame, as Markdown: penalties so far, forces of the feet, command, height.
+
+    Args:
+        crossing: The crossing.
+        frame: Which frame.
+        penalties: Each penalty in words.
+    """
+    v_x, v_y, yaw_rate = crossing.command_values[frame]
+    forces = " · ".join(f"{newtons:,.0f}" for newtons in crossing.force_newtons[frame])
+    x, y, z = crossing.positions[frame, 0]
+    rows = [f"| {name} | {value:.2f} |" for name, value in zip(penalties, crossing.penalties[frame], strict=True)]
+    return "\n".join(
+        [
+            "| penalty so far | multiples of its scale |",
+            "|---|---|",
+            *rows,
+            "",
+            f"Feet: {forces} N",
+            "",
+            f"Command: {v_x:.2f}, {v_y:.2f} m/s, {yaw_rate:.2f} rad/s · base at {x:.2f}, {y:.2f}, {z:.2f} m",
+        ]
+    )

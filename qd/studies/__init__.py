@@ -1,0 +1,1 @@
+"""Studies: several searches beside each other, and what they say of a setting."""

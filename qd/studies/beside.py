@@ -1,0 +1,197 @@
+"""Searches against different controllers side by side: what breaks one of them, and what is still left of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.archive import Archive, read_archive
+from qd.run.cli import run_command
+from qd.run.directory import Metrics, RunDirectory, differences
+from qd.run.settings import as_settings
+from qd.show.figures import PENALTY_LABELS, new_figure, save_figure
+from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.intervals import bootstrap_interval
+from sim.files.provenance import provenance
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LOOKS = (("#0072b2", "-"), ("#d55e00", "--"), ("#009e73", "-."), ("#cc79a7", ":"))
+"""Colour and line of each run."""
+_CURVES = ("qd_score", "elites", "batch_goal_rate")
+_MAY_DIFFER = ("policy", "policy_sha256", "seed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BesideCfg:
+    """Lay searches against different controllers side by side: curves, and how their elites end.
+
+    The searches must be of one robot, with the same settings and equally many iterations; only controller and seed may
+    differ.
+    """
+
+    runs: tuple[str, ...]
+    """The run directories, each NAME=DIR, the name that of its controller; 2 to 4."""
+    out: Path
+    """Where to write the numbers; the figure goes beside it as .png."""
+
+
+def prepare_numbers(out: Path) -> None:
+    """Find out whether a file of numbers and its figure, ``.png`` in place of ``.json``, can be written.
+
+    Raises:
+        ValueError: If they cannot, or it has another name: the figure would take its place.
+    """
+    if out.suffix != ".json":
+        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
+    for file in (out, out.with_suffix(".png")):
+        prepare_output(file)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """One of the searches."""
+
+    name: str
+    archive: Archive
+    metrics: Metrics
+    settings: dict[str, Any]
+
+
+def sides_of(runs: Sequence[str]) -> list[Side]:
+    """The searches that a command line names.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+        ValueError: If one is damaged, or they cannot be compared.
+    """
+    named = [run.partition("=") for run in runs]
+    if any(not name or not folder for name, _, folder in named) or len({name for name, _, _ in named}) < len(named):
+        raise ValueError(f"runs must be NAME=DIR each, with different names, got {' '.join(runs)}")
+    if not 2 <= len(named) <= len(LOOKS):
+        raise ValueError(f"runs must be 2 to {len(LOOKS)}, got {len(named)}")
+    sides = []
+    for name, _, folder in named:
+        run = RunDirectory(Path(folder))
+        settings = as_settings(run.read_cfg())
+        sides.append(Side(name=name, archive=read_archive(folder), metrics=run.read_metrics(), settings=settings))
+    first = sides[0]
+    for side in sides:
+        if len(side.archive) == 0:
+            raise ValueError(f"the search against {side.name} has no elites: let it go on")
+        other = {key: value for key, value in side.settings.items() if key not in _MAY_DIFFER}
+        own = {key: value for key, value in first.settings.items() if key not in _MAY_DIFFER}
+        if different := differences(own, other):
+            raise ValueError(f"searches laid side by side must have the same settings, but: {', '.join(different)}")
+        if len(side.metrics) != len(first.metrics) or side.archive.iterations != len(side.metrics):
+            raise ValueError(
+                f"searches laid side by side must have equally many iterations, got {len(first.metrics)} against "
+                f"{first.name} and {side.archive.iterations} against {side.name}: extend the shorter one"
+            )
+    return sides
+
+
+def numbers_of(side: Side) -> dict[str, Any]:
+    """A search in numbers, its elites as they were found.
+
+    Returns:
+        ``elites``, ``qd_score``, the ``curves``; over the elites the mean ``goal_rate`` and ``collision_rate``, and the
+        shares ``under_half_cross`` and ``half_collide``, each with its 95 % bootstrap interval; and ``mean_ratios``.
+    """
+    archive, rng = side.archive, np.random.default_rng(0)
+    measured = {
+        "goal_rate": archive.goal_rate,
+        "collision_rate": archive.collision_rate,
+        "under_half_cross": (archive.goal_rate < 0.5).astype(float),
+        "half_collide": (archive.collision_rate >= 0.5).astype(float),
+    }
+    return {
+        "controller": {key: side.settings[key] for key in ("policy", "policy_sha256")},
+        "seed": side.settings["seed"],
+        "elites": len(archive),
+        "qd_score": archive.qd_score,
+        **{name: float(values.mean()) for name, values in measured.items()},
+        "intervals": {name: bootstrap_interval(values, rng) for name, values in measured.items()},
+        "mean_ratios": dict(zip(archive.penalties, archive.ratios.mean(axis=0).tolist(), strict=True)),
+        "curves": {key: [row[key] for row in side.metrics] for key in _CURVES},
+    }
+
+
+def draw_beside(sides: Sequence[Side]) -> "Figure":
+    """Curves of the searches, how often their elites are crossed, and where their penalties lie."""
+    figure = new_figure(13.0, 4.4)
+    archive = sides[0].archive
+    names = " and ".join(side.name for side in sides)
+    figure.suptitle(f"{archive.robot}: searches of {archive.iterations} iterations against {names}")
+    axes = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1))
+    for side, (color, style) in zip(sides, LOOKS, strict=False):
+        label = f"{side.name}: {len(side.archive)} elites"
+        iterations = [row["iteration"] for row in side.metrics]
+        for panel, key, factor in ((axes[0], "elites", 1.0), (axes[1], "batch_goal_rate", 100.0)):
+            values = [factor * row[key] for row in side.metrics]
+            panel.plot(iterations, values, color=color, linestyle=style, label=label)
+        rates = np.sort(100.0 * side.archive.goal_rate)
+        shares = 100.0 * np.arange(1, len(rates) + 1) / len(rates)
+        axes[2].step(rates, shares, color=color, linestyle=style, where="post")
+        ratios = 100.0 * side.archive.ratios.mean(axis=0)
+        axes[3].plot(ratios, range(len(ratios)), color=color, linestyle=style, marker="o")
+    _label(axes, archive)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(sides), frameon=False)
+    return figure
+
+
+def _label(axes: "NDArray[Any] | Sequence[Axes]", archive: Archive) -> None:
+    labels = (
+        ("iteration", "elites"),
+        ("iteration", "robots that reach the goal,\nof all that are evaluated [%]"),
+        ("episodes of an elite that reach the goal [%]", "elites of which no more do [%]"),
+        ("mean share of the penalties [%]", ""),
+    )
+    for panel, (x, y) in zip(axes, labels, strict=True):
+        panel.set_xlabel(x)
+        panel.set_ylabel(y)
+        panel.grid(alpha=0.3)
+    axes[0].set_ylim(bottom=0)
+    axes[1].set_ylim(0, 102)
+    axes[2].set_ylim(0, 102)
+    names = [PENALTY_LABELS.get(name, name) for name in archive.penalties]
+    axes[3].set_xlim(left=0)
+    axes[3].set_yticks(range(len(names)), names)
+
+
+def beside(cfg: BesideCfg) -> dict[str, Any]:
+    """The command; returns what it writes.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+        ValueError: If runs cannot be compared, or the file cannot be written.
+    """
+    sides = sides_of(cfg.runs)
+    prepare_numbers(cfg.out)
+    report = {
+        **provenance("cpu", 0),
+        "robot": sides[0].archive.robot,
+        "iterations": sides[0].archive.iterations,
+        "runs": {side.name: numbers_of(side) for side in sides},
+    }
+    for name, numbers in report["runs"].items():
+        low, high = numbers["intervals"]["under_half_cross"]
+        print(
+            f"{name}: {numbers['elites']} elites, QD score {numbers['qd_score']:.0f}; under half of the robots cross "
+            f"{numbers['under_half_cross']:.0%} of them ({low:.0%}-{high:.0%}); mean goal rate "
+            f"{numbers['goal_rate']:.3f}, base collisions {numbers['collision_rate']:.3f}"
+        )
+    figure = cfg.out.with_suffix(".png")
+    write_atomically(cfg.out, to_json(report))
+    save_figure(figure, draw_beside(sides))
+    print(f"written to {cfg.out} and {figure}")
+    return report
+
+
+if __name__ == "__main__":
+    run_command(BesideCfg, beside)

@@ -1,0 +1,144 @@
+"""What more devices bring: ``python -m qd.studies.scale --workers 1 2 4 --out results/anymal/scale.json``.
+
+The same evaluation by 1 to N Ray workers on one host: with as many environments a worker as keep a GPU busy, and at the
+size of the paper's iteration, which they share.
+"""
+
+import statistics
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qd.run.cli import run_command
+from qd.run.settings import preset
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, crew_status, open_evaluator, resolve_device
+from sim.files.command import publish, show_json
+from sim.files.provenance import provenance
+
+_PAPER_ITERATIONS = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """Time evaluations on hard-random terrains by different numbers of workers, against one process without Ray."""
+
+    robot: str = "anymal"
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
+    device: str | None = None
+    """cpu or cuda; CUDA where there is one."""
+    workers: tuple[int, ...] = (1, 2, 4)
+    """Numbers of workers to try, rising."""
+    terrains: int | None = None
+    """Terrains a worker; 256 on CUDA, 4 on the CPU."""
+    replicas: int | None = None
+    """Episodes a terrain; 16 on CUDA, 4 on the CPU."""
+    preset: str | None = None
+    """Whose iteration is shared among the workers; paper on CUDA, small on the CPU."""
+    rounds: int = 3
+    """Evaluations timed of each, after one that is not; the median counts."""
+    seed: int = 0
+    """Draws terrains and starts."""
+    out: Path | None = None
+    """Where to write; printed alone if left out."""
+
+
+def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
+    """Seconds of one evaluation of ``cfg.num_terrains`` hard-random terrains, by whoever ``cfg`` says; the median.
+
+    Raises:
+        EvaluatorError: If fewer workers than wanted took part, or one had to be replaced.
+    """
+    from sim.terrain import hard_random_genes
+
+    genes = hard_random_genes(cfg.num_terrains, seed)
+    seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
+    with open_evaluator(cfg) as evaluate:
+        seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]
+        crew = crew_status(evaluate)
+    if crew is not None and (crew.workers != cfg.workers or crew.retries):
+        raise EvaluatorError(f"expected {cfg.workers} workers throughout, got {crew}: nothing was measured")
+    return statistics.median(seconds[1:])
+
+
+def measure(args: Arguments) -> dict[str, Any]:
+    """Everything of ``scale.json``.
+
+    Raises:
+        ValueError: If something asked for cannot be had.
+    """
+    from sim.robots.robot import get_robot
+
+    numbers = (*args.workers, args.rounds, *(n for n in (args.terrains, args.replicas) if n is not None))
+    if not args.workers or min(numbers) < 1 or list(args.workers) != sorted(set(args.workers)):
+        raise ValueError(f"all numbers must be positive and those of --workers rise, got {args}")
+    robot = get_robot(args.robot)
+    resolve_device(args.device, args.workers[-1])  # so many must be there
+    device = resolve_device(args.device)
+    on_gpu = device.startswith("cuda")
+    search = preset(args.preset or ("paper" if on_gpu else "small"), robot)
+    policy = str(robot.policy_file)
+    terrains, replicas = args.terrains or (256 if on_gpu else 4), args.replicas or (16 if on_gpu else 4)
+    alone = EvaluatorCfg(
+        robot=robot,
+        policy=policy,
+        num_terrains=terrains,
+        num_replicas=replicas,
+        device=device,
+        num_processes=1,
+    )
+    shared = replace(alone, num_terrains=search.scheduler.num_terrains, num_replicas=search.replicas)
+    alone_s, shared_alone_s = (time_evaluation(cfg, args.rounds, args.seed) for cfg in (alone, shared))
+    one = terrains * replicas / alone_s
+    print(f"without Ray: {one:,.1f} episodes/s; {shared_alone_s:.2f} s an iteration of {search.preset}", flush=True)
+    rows = []
+    dealt = "cuda" if on_gpu else "cpu"  # which GPU is Ray's to say
+    for count in args.workers:
+        crew = replace(alone, num_terrains=terrains * count, workers=count, device=dealt)
+        rate = terrains * count * replicas / time_evaluation(crew, args.rounds, args.seed)
+        iteration_s = time_evaluation(replace(shared, workers=count, device=dealt), args.rounds, args.seed)
+        rows.append(
+            {
+                "workers": count,
+                "num_envs": terrains * count * replicas,
+                "episodes_per_s": rate,
+                "efficiency": rate / one / count,
+                "paper_size_iteration_s": iteration_s,
+                "speedup_paper_size": shared_alone_s / iteration_s,
+            }
+        )
+        print(
+            f"{count} workers: {rate:,.1f} episodes/s, {rows[-1]['efficiency']:.3f} of linear; {iteration_s:.2f} s an "
+            f"iteration of {search.preset}, {rows[-1]['speedup_paper_size']:.2f} times as fast",
+            flush=True,
+        )
+    last = rows[-1]
+    return {
+        **provenance(device, args.seed),
+        "robot": robot.name,
+        "gpus": last["workers"] if on_gpu else 0,
+        "workers": last["workers"],
+        "envs_per_worker": terrains * replicas,
+        "paper_size": search.preset,
+        "episodes_per_s_without_ray": one,
+        "iteration_s_without_ray": shared_alone_s,
+        "efficiency": last["efficiency"],
+        "speedup_paper_size": last["speedup_paper_size"],
+        "projected_s": {
+            f"{_PAPER_ITERATIONS} iterations of {search.preset}": _PAPER_ITERATIONS * last["paper_size_iteration_s"],
+            "as many episodes at full width": _PAPER_ITERATIONS
+            * search.episodes_per_iteration
+            / last["episodes_per_s"],
+        },
+        "rows": rows,
+    }
+
+
+def main(args: Arguments) -> None:
+    """The command."""
+    publish(args.out, lambda: measure(args), show_json)
+
+
+if __name__ == "__main__":
+    run_command(Arguments, main)

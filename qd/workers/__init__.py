@@ -1,0 +1,1 @@
+"""Who crosses terrains: this process, several processes, or Ray."""

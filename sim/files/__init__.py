@@ -1,0 +1,1 @@
+"""What every room shares: atomic files, provenance, intervals, and how commands begin and end."""

@@ -1,0 +1,202 @@
+"""What all commands share: option groups, how a command starts and fails, how a result is published.
+
+A command is a frozen dataclass: its docstring is its help, its fields are its flags, ``execute`` does the work. Its
+module loads quickly; what takes seconds to import (torch, warp, newton, pyribs) is imported inside ``execute``.
+"""
+
+import os
+import shlex
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn, Protocol
+
+from sim.files.atomic import prepare_output, to_json, write_atomically
+
+_ALL = "all"
+_DEBUG = "FAULTLINE_DEBUG"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Who:
+    """Options that say which robot, under which controller."""
+
+    robot: str | None = None
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); anymal if left out."""
+    policy: str | None = None
+    """Controller other than the robot's own: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
+    module:callable, or file.py:adapter@FILE for a file that expects another observation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Where:
+    """Options that say where a command works."""
+
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    workers: str | None = None
+    """Who works: a number of processes on the CPU (one a core if left out), ray for every device of a Ray cluster, or
+    ray:N for N of them. RAY_ADDRESS names a running cluster."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Which:
+    """Options that say which elite of which run."""
+
+    run: Path | None = None
+    """Run directory; the newest of this robot under runs/, else its published archive."""
+    elite: str = "0"
+    """Number of the elite, 0 the worst; where a command takes several, numbers apart by spaces, or all."""
+
+
+class UserError(Exception):
+    """What a user can mend, where no built-in error says it; its text is all that is shown."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """The program was asked to stop; its text says what comes next, for example how to resume."""
+
+
+class _Command(Protocol):
+    def execute(self) -> object: ...
+
+
+@contextmanager
+def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None]:
+    """Ends work that stops or fails half way with what there is and how to go on.
+
+    Args:
+        state: What is saved, after ``Stopped;``.
+        command: Says what to do next, once it is known.
+
+    Raises:
+        Interrupted: On Ctrl-C.
+        UserError: If a worker is lost.
+        OSError: If a file cannot be written.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(f"Stopped; {state}. {command()}") from None
+    except (UserError, OSError) as error:
+        raise type(error)(f"{error}. {command()}") from None
+
+
+def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
+    """Parses the flags of a command and runs it.
+
+    Args:
+        cls: The command.
+        argv: Its flags.
+        name: The word that calls it.
+
+    Returns:
+        Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user can mend
+        (ValueError, OSError, FloatingPointError, UserError); 130 for Ctrl-C and SIGTERM. FAULTLINE_DEBUG=1 shows the
+        traceback instead of the line.
+    """
+    import tyro
+
+    signal.signal(signal.SIGTERM, _interrupt)
+    command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv))
+    try:
+        status = command.execute()
+        return status if isinstance(status, int) else 0
+    except (ValueError, OSError, FloatingPointError, UserError) as error:
+        if os.environ.get(_DEBUG):
+            raise
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as stop:
+        print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
+        return 130
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def command_line(name: str, **flags: object) -> str:
+    """A command as one types it here: ``faultline replay --run runs/x --elite 0``.
+
+    Args:
+        name: The word that calls it.
+        flags: Values by field name; None and False are left out, True is a bare flag.
+    """
+    words = [_program(), name]
+    for flag, value in flags.items():
+        if value is None or value is False:
+            continue
+        words.append(f"--{flag.replace('_', '-')}")
+        if value is not True:
+            words += map(str, value) if isinstance(value, list | tuple) else [str(value)]
+    return shlex.join(words)
+
+
+def _program() -> str:
+    """How ``faultline`` is called on this machine: as it was called, or beside the interpreter that runs."""
+    called = Path(sys.argv[0])
+    if called.name == "faultline":
+        return "faultline" if shutil.which("faultline") == str(called) else str(called)
+    beside = Path(sys.executable).with_name("faultline")
+    return os.path.relpath(beside) if beside.exists() and not shutil.which("faultline") else "faultline"
+
+
+def split_words(values: Sequence[str]) -> list[str]:
+    """Words of arguments that may hold several each, apart by spaces or commas."""
+    return " ".join(values).replace(",", " ").split()
+
+
+def chosen_elites(text: str, count: int, whose: object) -> list[int]:
+    """Numbers of elites, as a command line names them.
+
+    Args:
+        text: Numbers apart by spaces or commas, or ``all``.
+        count: How many elites there are.
+        whose: What they are of, for the message.
+
+    Raises:
+        ValueError: If it is something else, or there is no such elite.
+    """
+    words = split_words([text])
+    known = dict.fromkeys(map(str, range(count)))
+    if words == [_ALL]:
+        words = list(known)
+    unknown = [word for word in words if word not in known]
+    if unknown or not words:
+        valid = f"expected {_ALL}, or numbers of 0 to {count - 1}" if count else "the archive is empty"
+        raise ValueError(f"{whose} has no elite {', '.join(unknown) or repr(text)}: {valid}")
+    return [int(word) for word in dict.fromkeys(words)]
+
+
+def publish(
+    out: Path | None, measure: Callable[[], dict[str, Any]], show: Callable[[dict[str, Any]], None]
+) -> dict[str, Any]:
+    """Measures, shows and writes a report, which is returned; where to write is tried before the work.
+
+    Args:
+        out: File to write; None for none.
+        measure: Makes the report.
+        show: Prints it.
+
+    Raises:
+        ValueError: If the file cannot be written to.
+    """
+    if out is not None:
+        prepare_output(out)
+    report = measure()
+    show(report)
+    if out is not None:
+        write_atomically(out, to_json(report))
+        print(f"written to {out}")
+    return report
+
+
+def show_json(report: dict[str, Any]) -> None:
+    """Prints a report as its file has it."""
+    print(to_json(report).decode())

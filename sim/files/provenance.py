@@ -1,0 +1,105 @@
+"""Where a result comes from: the keys that every results file carries."""
+
+import hashlib
+import importlib.util
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from sim.policy.spec import ControllerSpec
+
+_ROOT = Path(__file__).resolve().parents[2]
+_PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
+
+
+def provenance(device: str, seed: int) -> dict[str, Any]:
+    """Command, commit, device, versions, seed and date of the running program.
+
+    Args:
+        device: Warp device name.
+        seed: Seed of the run.
+    """
+    return {
+        "command": shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
+        "commit": os.environ.get("FAULTLINE_COMMIT") or _output(["git", "rev-parse", "HEAD"]),
+        "device": device_name(device),
+        "versions": versions(),
+        "seed": seed,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python and of the packages that results depend on; None of one that is not installed."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
+
+
+def code_fingerprint(rooms: Sequence[str]) -> str:
+    """SHA-256 of the sources and robot files of rooms and of all package versions: two that agree compute the same.
+
+    Args:
+        rooms: Top-level folders.
+    """
+    digest = hashlib.sha256(repr(sorted(versions().items())).encode())
+    for room in rooms:
+        for path in sorted((_ROOT / room).rglob("*")):
+            if path.suffix in (".py", ".xml"):
+                digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def controller_hash(policy: str) -> str | None:
+    """SHA-256 of a controller's files, among them the module that a ``module:callable`` stands in; None without any.
+
+    What code reads beside its own file is not in it.
+    """
+    spec = ControllerSpec.parse(policy)
+    if spec.place is None or spec.place.endswith(".py"):
+        return spec.digest()
+    try:
+        module = importlib.util.find_spec(spec.place)
+    except (ImportError, ValueError):  # no package of that name
+        module = None
+    if module is None or module.origin is None or not os.path.isfile(module.origin):
+        return None
+    digest = hashlib.sha256(Path(module.origin).read_bytes()).hexdigest()
+    return digest if spec.file is None else f"{digest} {spec.digest()}"
+
+
+def _module() -> str:
+    """Name of the module that runs, as after ``python -m``."""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    return spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except ModuleNotFoundError:  # a checkout on the path without being installed
+        return None
+
+
+def device_name(device: str) -> str:
+    """What a Warp device is, in words; its own name where this machine cannot tell."""
+    if not device.startswith("cuda"):
+        return f"CPU ({platform.machine()}, {os.cpu_count()} cores)"
+    index = device.partition(":")[2] or "0"
+    return _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader", f"--id={index}"]) or device
+
+
+def _output(command: list[str]) -> str | None:
+    """What a program prints, run in the checkout; None where it is missing or fails."""
+    try:
+        done = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=20, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None

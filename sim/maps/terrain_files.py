@@ -1,0 +1,172 @@
+"""Terrains as files that other programs read: npz, 16-bit PNG, MJCF and STL, each with what it means in a JSON beside.
+
+All lengths are metres; x runs along the course (0 to 16 m), y across it (0 to 8 m), z up.
+"""
+
+import io
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sim.files.atomic import to_json, write_atomically
+from sim.maps.hfield import as_hfield
+from sim.simulation import GROUND_FRICTION
+from sim.terrain import SPACING
+
+Heights = NDArray[np.floating]
+
+_MAX_GRAY = 65_535
+_LEAST_EXTENT = 1e-3  # of the range of a PNG [m], or flat ground would have no scale
+_STL_HEADER = 80
+_BASE_BELOW = 0.5  # depth of the block under the lowest point of an STL [m]
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def size_of(heights: Heights) -> tuple[float, float]:
+    """Length along x and width along y of a height grid [m]."""
+    return SPACING * (heights.shape[1] - 1), SPACING * (heights.shape[0] - 1)
+
+
+def gray_scale(heights: Heights) -> tuple[float, float]:
+    """Metres a gray level of a PNG and height of level 0, so that all 16 bits are used."""
+    return max(float(np.ptp(heights)), _LEAST_EXTENT) / _MAX_GRAY, float(heights.min())
+
+
+def png_of(heights: Heights) -> bytes:
+    """A 16-bit grayscale PNG seen from above: x to the right, y up, so that the topmost row is the highest y.
+
+    Height = offset + scale * gray level, with those of :func:`gray_scale`; exact to half a gray level.
+    """
+    scale, offset = gray_scale(heights)
+    gray = np.rint((np.asarray(heights, dtype=np.float64) - offset) / scale).astype(np.uint16)
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(gray[::-1])).save(buffer, format="PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None) -> bytes:
+    """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``."""
+    content: dict[str, Any] = {} if genes is None else {"genes": np.asarray(genes, dtype=np.float32)}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, heights=np.float32(heights), size_m=np.array(size_of(heights)), **content)
+    return buffer.getvalue()
+
+
+def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:
+    """A scene of the terrain alone, in one file: its surface is the simulation's, between the nodes too.
+
+    The geom stands turned by a quarter, for the reason that :mod:`sim.maps.hfield` gives; x, y and z of the world are the
+    terrain's. Its friction is below every robot's own: of two MuJoCo takes the larger.
+    """
+    field = as_hfield(heights)
+    root = ET.Element("mujoco", model=name)
+    rows, columns = map(str, field.data.shape)
+    # The first row of an elevation has the highest y of the asset; MuJoCo scales what it reads to 0..1.
+    lines = [" ".join(f"{value:.7g}" for value in row) for row in field.data[::-1]]
+    size = " ".join(map(repr, field.size))
+    asset = {"name": "terrain", "nrow": rows, "ncol": columns, "size": size, "elevation": " ".join(lines)}
+    ET.SubElement(ET.SubElement(root, "asset"), "hfield", asset)
+    world = ET.SubElement(root, "worldbody")
+    ET.SubElement(world, "light", directional="true", pos="0 0 10", dir="0.3 0.4 -1")
+    geom = {"name": "terrain", "type": "hfield", "hfield": "terrain", "friction": str(GROUND_FRICTION)}
+    geom |= {"pos": " ".join(map(repr, field.position)), "quat": " ".join(map(repr, field.quaternion))}
+    ET.SubElement(world, "geom", geom)
+    ET.indent(root)
+    return ET.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def triangles_of(heights: Heights) -> NDArray[np.float64]:
+    """A solid block with the terrain as its top, closed; corners counter-clockwise seen from outside.
+
+    Returns:
+        Corners [m], shape (num_triangles, 3, 3); the top's first, 2 a cell, cut as :mod:`kernels.heightfield` is.
+    """
+    rows, columns = heights.shape
+    y, x = np.meshgrid(SPACING * np.arange(rows), SPACING * np.arange(columns), indexing="ij")
+    top = np.stack([x, y, np.asarray(heights, dtype=np.float64)], axis=-1)
+    low, along_x, along_y, high = top[:-1, :-1], top[:-1, 1:], top[1:, :-1], top[1:, 1:]
+    surface = np.stack([low, along_x, along_y, high, along_y, along_x], axis=2).reshape(-1, 3, 3)
+    # Once round the rim, the terrain on the left; below it the bottom's rim, and fans to the middle of the bottom.
+    rim = np.concatenate([top[0, :-1], top[:-1, -1], top[-1, :0:-1], top[:0:-1, 0]])
+    under = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, top[..., 2].min() - _BASE_BELOW]
+    next_rim, next_under = np.roll(rim, -1, axis=0), np.roll(under, -1, axis=0)
+    middle = np.broadcast_to(under.mean(axis=0), under.shape)
+    walls = np.stack([under, next_under, rim, next_under, next_rim, rim], axis=1).reshape(-1, 3, 3)
+    bottom = np.stack([middle, next_under, under], axis=1)
+    return np.concatenate([surface, walls, bottom])
+
+
+def stl_of(heights: Heights) -> bytes:
+    """The block of :func:`triangles_of` as binary STL [m]."""
+    corners = triangles_of(heights)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    records = np.zeros(len(corners), _TRIANGLE)
+    records["corners"] = corners
+    records["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    header = b"faultline terrain, metres".ljust(_STL_HEADER)
+    return header + np.uint32(len(records)).tobytes() + records.tobytes()
+
+
+FORMATS: dict[str, Callable[[Heights], bytes]] = {"npz": npz_of, "png": png_of, "xml": mjcf_of, "stl": stl_of}
+"""Formats by the ending of their files; ``xml`` is MJCF."""
+TYPICAL_BYTES = {"npz": 150_000, "png": 40_000, "xml": 530_000, "stl": 5_300_000}
+"""About what a terrain takes in each."""
+
+
+def write_terrain(
+    stem: Path,
+    heights: Heights,
+    *,
+    formats: Sequence[str],
+    about: dict[str, Any],
+    genes: NDArray[np.floating] | None = None,
+) -> list[Path]:
+    """Writes a terrain as ``<stem>.<format>``, and as ``<stem>.json`` what the files mean; each atomically.
+
+    Args:
+        stem: Path of the files without their endings; the folder exists.
+        heights: Height grid [m], shape (nrow, ncol).
+        formats: Some of :data:`FORMATS`.
+        about: Further keys of the JSON.
+        genes: The terrain's genes, shape (64,), for the npz.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: If a format is unknown.
+        OSError: If a file cannot be written.
+    """
+    check_formats(formats)
+    scale, offset = gray_scale(heights)
+    meaning = {
+        "size_m": list(size_of(heights)),
+        "nodes": list(heights.shape),
+        "axes": "rows along y, columns along x; the top row of a PNG is the highest y",
+        "scale_m": scale,
+        "offset_m": offset,
+        "png_height": "offset_m + scale_m * gray level",
+        **about,
+    }
+    files = {stem.with_name(f"{stem.name}.{ending}"): ending for ending in formats}
+    for path, ending in files.items():
+        write_atomically(path, npz_of(heights, genes) if ending == "npz" else FORMATS[ending](heights))
+    description = stem.with_name(f"{stem.name}.json")
+    write_atomically(description, to_json(meaning))
+    return [*files, description]
+
+
+def check_formats(formats: Sequence[str]) -> None:
+    """That all formats are known and there is one.
+
+    Raises:
+        ValueError: If not.
+    """
+    unknown = [ending for ending in formats if ending not in FORMATS]
+    if unknown or not formats:
+        raise ValueError(f"formats must be some of {', '.join(FORMATS)}, got {', '.join(unknown) or 'none'}")

@@ -1,0 +1,1 @@
+"""The second simulator: the same crossings in plain MuJoCo C."""

@@ -1,0 +1,219 @@
+"""Crossings run in plain MuJoCo C, one after another: what the parallel simulation is held against."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+
+from kernels.episode import EpisodeState, Outcome, start_episodes
+from kernels.observation import ACTION_LIMIT
+from kernels.penalties import BASE, PENALTIES
+from sim.bank import TerrainBank
+from sim.crossing import CrossingCfg, make_start_ranges
+from sim.mujoco_c.model import Array, crossing_model, goal_commands, observations, step_penalties
+from sim.policy.loaders import Policy
+from sim.policy.runner import forget
+from sim.robots.model import build_robot
+from sim.robots.robot import RobotCfg
+
+_mj: Any = mujoco  # its types are not written down
+_WARNINGS = [
+    _mj.mjtWarning.mjWARN_CONTACTFULL,
+    _mj.mjtWarning.mjWARN_CNSTRFULL,
+    _mj.mjtWarning.mjWARN_BADQPOS,
+    _mj.mjtWarning.mjWARN_BADQVEL,
+    _mj.mjtWarning.mjWARN_BADQACC,
+    _mj.mjtWarning.mjWARN_BADCTRL,
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Starts:
+    """Initial states in MuJoCo's convention, one row an episode."""
+
+    qpos: Array
+    """Base position [m], quaternion wxyz, joint angles [rad]; shape (num_episodes, 7 + num_joints)."""
+    qvel: Array
+    """Velocity of the base's origin, world frame [m/s]; its angular velocity, base frame [rad/s]; joint velocities
+    [rad/s]; shape (num_episodes, 6 + num_joints)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlainCrossings:
+    """What came of crossings of one terrain, one row an episode."""
+
+    outcome: NDArray[np.uint8]
+    """:class:`kernels.episode.Outcome`, shape (num_episodes,)."""
+    penalties: Array
+    """Raw penalty sums times the physics step, NaN where invalid; shape (num_episodes, num_penalties)."""
+    duration_s: Array
+    """Simulated time up to the end [s], shape (num_episodes,)."""
+
+
+def join(parts: Sequence[PlainCrossings]) -> PlainCrossings:
+    """Crossings of one terrain that were run in parts, in their order."""
+    return PlainCrossings(
+        outcome=np.concatenate([part.outcome for part in parts]),
+        penalties=np.concatenate([part.penalties for part in parts]),
+        duration_s=np.concatenate([part.duration_s for part in parts]),
+    )
+
+
+def draw_starts(
+    robot: RobotCfg,
+    heights: NDArray[np.float32],
+    seed: int,
+    count: int,
+    device: str,
+    cfg: CrossingCfg | None = None,
+) -> Starts:
+    """The starts of replicas 0 to ``count - 1`` of a terrain, those that :class:`sim.rollout.Rollout` gives them.
+
+    Args:
+        robot: Robot settings.
+        heights: Height grid [m], shape (nrow, ncol).
+        seed: The terrain's seed, uint32.
+        count: Episodes.
+        device: Warp device name.
+        cfg: The crossing.
+    """
+    builder = build_robot(robot)
+    bank = TerrainBank(1, device=device)
+    bank.set_heights(heights[None])
+    with wp.ScopedDevice(device):
+        joint_q = wp.zeros((count, 7 + robot.num_joints), dtype=float)
+        joint_qd = wp.zeros((count, 6 + robot.num_joints), dtype=float)
+        episode = EpisodeState()
+        for field in ("outcome", "steps", "counted"):
+            setattr(episode, field, wp.zeros(count, dtype=int))
+        episode.final_pose = wp.zeros(count, dtype=wp.transform)
+        episode.num_running = wp.zeros(1, dtype=int)
+        base_com = wp.vec3(*builder.body_com[0])
+        start_episodes(
+            wp.array([seed], dtype=wp.uint32), wp.zeros(count, dtype=int), count, bank.terrain,
+            make_start_ranges(cfg or CrossingCfg(), robot), base_com,
+            wp.array(robot.default_joint_pos, dtype=float), joint_q, joint_qd, episode,
+        )  # fmt: skip
+    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), np.array(base_com))
+
+
+def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:
+    """Newton's joint state as MuJoCo's: quaternion wxyz, velocity of the origin, angular velocity in the base frame.
+
+    Args:
+        joint_q: Shape (num, 7 + num_joints), quaternion xyzw.
+        joint_qd: Shape (num, 6 + num_joints), velocity of the base's mass centre and angular velocity, world frame.
+        base_com: Mass centre of the base in its frame [m].
+    """
+    qpos, qvel = joint_q.astype(np.float64), joint_qd.astype(np.float64)
+    qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
+    for k, quaternion in enumerate(qpos[:, 3:7]):
+        matrix = np.zeros(9)
+        _mj.mju_quat2Mat(matrix, quaternion)
+        to_world = matrix.reshape(3, 3)
+        qvel[k, :3] -= np.cross(qvel[k, 3:6], to_world @ base_com)
+        qvel[k, 3:6] = to_world.T @ qvel[k, 3:6]
+    return Starts(qpos=qpos, qvel=qvel)
+
+
+class _Episodes:
+    """States of the running episodes of one terrain, stepped one by one, looked at together."""
+
+    def __init__(self, robot: RobotCfg, model: Any, starts: Starts) -> None:
+        self._model, self._robot = model, robot
+        self.data = [_mj.MjData(model) for _ in starts.qpos]
+        for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
+            data.qpos[:], data.qvel[:] = qpos, qvel
+        self.qpos, self.qvel = starts.qpos.copy(), starts.qvel.copy()
+        self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
+        self.warned = np.zeros(len(self.data), bool)
+
+    def step(self, running: NDArray[np.intp]) -> None:
+        for k in running:
+            data = self.data[k]
+            _mj.mj_step(self._model, data)
+            self.qpos[k], self.qvel[k] = data.qpos, data.qvel
+            self.forces[k] = data.sensordata.reshape(-1, 3)
+            self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
+
+    def hold(self, running: NDArray[np.intp], targets: Array) -> None:
+        for k, target in zip(running, targets, strict=True):
+            self.data[k].ctrl[:] = target
+
+
+def _judge(
+    robot: RobotCfg, episodes: _Episodes, running: NDArray[np.intp], base: NDArray[np.bool_], cfg: CrossingCfg
+) -> Array:
+    """Outcome of each running episode after a physics step, the gravest of several."""
+    qpos, qvel = episodes.qpos[running], episodes.qvel[running]
+    x, y = qpos[:, 0], qpos[:, 1]
+    outcome = np.full(len(running), Outcome.RUNNING)
+    outside = (x < cfg.lower[0]) | (x > cfg.upper[0]) | (y < cfg.lower[1]) | (y > cfg.upper[1])
+    outcome[outside] = Outcome.OUT
+    outcome[np.hypot(cfg.goal[0] - x, cfg.goal[1] - y) < cfg.goal_radius] = Outcome.GOAL
+    force = np.linalg.norm(episodes.forces[running][:, base], axis=2).max(axis=1)
+    outcome[force > cfg.base_force] = Outcome.BASE_COLLISION
+    finite = np.isfinite(qpos).all(axis=1) & (np.abs(qvel) <= robot.max_speed).all(axis=1)
+    outcome[~finite | episodes.warned[running]] = Outcome.INVALID
+    return outcome
+
+
+@torch.inference_mode()
+def cross(
+    robot: RobotCfg,
+    policy: Policy,
+    heights: NDArray[np.float32],
+    starts: Starts,
+    cfg: CrossingCfg | None = None,
+    *,
+    time_constant_s: float | None = None,
+) -> PlainCrossings:
+    """Run one crossing from each start in plain MuJoCo C.
+
+    Args:
+        robot: Robot settings.
+        policy: The controller, on the CPU.
+        heights: Height grid [m], shape (nrow, ncol).
+        starts: Initial states.
+        cfg: The crossing.
+        time_constant_s: Contact time constant [s]; that of the robot's file if None.
+    """
+    cfg = cfg or CrossingCfg()
+    episodes = _Episodes(robot, crossing_model(robot, heights, time_constant_s=time_constant_s), starts)
+    count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
+    outcome = np.full(count, Outcome.RUNNING)
+    steps, sums = np.zeros(count, int), np.zeros((count, len(PENALTIES)))
+    last_action = np.zeros((count, robot.num_joints))
+    rows = np.zeros((count, robot.observation_size))
+    remembers = forget(policy)  # it must be asked for the same robots every time
+    most = round(cfg.max_duration_s / robot.physics_dt)
+    for step in range(most):
+        running = np.flatnonzero(outcome == Outcome.RUNNING)
+        if len(running) == 0:
+            break
+        if step % robot.decimation == 0:
+            qpos, qvel = episodes.qpos[running], episodes.qvel[running]
+            command = np.zeros((count, 3))
+            command[running] = goal_commands(qpos, cfg)
+            rows[running] = observations(robot, heights, qpos, qvel, command[running], last_action[running])
+            asked = rows if remembers else rows[running]
+            action = policy(torch.as_tensor(asked, dtype=torch.float32)).numpy().astype(np.float64)
+            action = action[running] if remembers else action
+            action = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
+            last_action[running] = action
+            episodes.hold(running, np.array(robot.default_joint_pos) + robot.action_scale * action)
+        episodes.step(running)
+        judged = _judge(robot, episodes, running, base, cfg)
+        judged[(judged == Outcome.RUNNING) & (step + 1 >= most)] = Outcome.TIME_OUT
+        outcome[running] = judged
+        steps[running] += 1
+        sums[running] += robot.physics_dt * step_penalties(
+            robot, episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running]
+        )
+    sums[outcome == Outcome.INVALID] = np.nan
+    return PlainCrossings(outcome=outcome.astype(np.uint8), penalties=sums, duration_s=steps * robot.physics_dt)

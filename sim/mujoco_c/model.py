@@ -1,0 +1,192 @@
+"""The crossing written a second time, from the definitions, for plain MuJoCo C with its own heightfield contact.
+
+Nothing of the parallel simulation is used, neither its kernels nor its contact: model, observation, command and
+penalties in float64 NumPy. States are MuJoCo's: the quaternion is wxyz, the base's linear velocity that of its origin
+in the world frame, its angular velocity in the base frame.
+"""
+
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from kernels.penalties import PENALTIES
+from sim.crossing import CrossingCfg
+from sim.maps.hfield import as_hfield
+from sim.robots.robot import RobotCfg
+from sim.simulation import GROUND_FRICTION
+from sim.terrain import SPACING
+
+_MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
+_MEMORY = "4M"
+_OF_THE_FILE = ("stiffness", "damping", "effort_limit", "armature", "friction", "contact_time_constant_s")
+_mj: Any = mujoco  # its types are not written down
+
+Array = NDArray[np.float64]
+
+
+def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_constant_s: float | None = None) -> Any:
+    """The robot's own file on MuJoCo's heightfield, with a sensor of the net contact force on each geom with a role.
+
+    The solver may take as many iterations as it needs: the caps of the parallel simulation are themselves in question.
+
+    Args:
+        robot: Robot settings.
+        heights: Height grid [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`.
+        time_constant_s: Contact time constant of all geoms [s], critically damped; the file's if None.
+
+    Raises:
+        ValueError: If the robot is more than its MJCF says, or MuJoCo does not read it.
+    """
+    root = _root_of(robot)
+    field = as_hfield(heights, margin=_MARGIN_NODES)
+    ET.SubElement(root, "size", memory=_MEMORY)
+    option = root.find("option")
+    option = ET.SubElement(root, "option") if option is None else option
+    option.set("timestep", str(robot.physics_dt))
+    option.set("iterations", "100")
+    option.set("ls_iterations", "50")
+    ET.SubElement(option, "flag", autoreset="disable")  # or a state that blows up would begin anew unseen
+    rows, columns = map(str, field.data.shape)
+    size = " ".join(map(repr, field.size))
+    ET.SubElement(ET.SubElement(root, "asset"), "hfield", name="grid", nrow=rows, ncol=columns, size=size)
+    world = root.find("worldbody")
+    if world is None:
+        raise ValueError(f"robot '{robot.name}': {robot.model_file} has no <worldbody>")
+    # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
+    # solmix 0: the stiffness of a contact is the robot's.
+    ground = {"name": "ground", "type": "hfield", "hfield": "grid", "friction": str(GROUND_FRICTION)}
+    ground |= {"pos": " ".join(map(repr, field.position)), "quat": " ".join(map(repr, field.quaternion))}
+    ET.SubElement(world, "geom", ground | {"conaffinity": "1", "solmix": "0"})
+    sensors = ET.SubElement(root, "sensor")
+    for name in robot.geom_names:
+        ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")
+    model = _mj.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+    model.hfield_data[:] = field.data.ravel()
+    model.geom_conaffinity[:] = 0  # a robot does not touch itself
+    model.geom("ground").conaffinity[:] = 1
+    if time_constant_s is not None:
+        model.geom_solref[:] = time_constant_s, 1.0
+    return model
+
+
+def _root_of(robot: RobotCfg) -> ET.Element:
+    """The XML of a robot's MJCF, its meshes found from anywhere."""
+    root = ET.parse(robot.model_file).getroot()
+    given = [name for name in _OF_THE_FILE if getattr(robot, name) is not None]
+    included = root.find(".//include")
+    if root.tag != "mujoco" or given or included is not None:
+        got = "a URDF" if root.tag != "mujoco" else "an include" if not given else f"{', '.join(given)} in the settings"
+        raise ValueError(
+            f"robot '{robot.name}': plain MuJoCo reads {robot.model_file} alone, expected an MJCF of one file with "
+            f"position actuators, got {got}: write such a file for it"
+        )
+    compiler = root.find("compiler")
+    compiler = ET.SubElement(root, "compiler") if compiler is None else compiler
+    folder = compiler.get("meshdir", compiler.get("assetdir", ""))
+    compiler.set("meshdir", str(robot.model_file.absolute().parent / folder))
+    return root
+
+
+def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:
+    """Height [m] of the triangulated grid at world-local points.
+
+    Each cell is cut from its (low x, high y) to its (high x, low y) corner.
+
+    Args:
+        heights: Height grid [m], shape (nrow, ncol); beyond its edge the edge height continues.
+        x: Points [m], any shape.
+        y: Likewise.
+    """
+    limit_row, limit_col = heights.shape[0] - 1, heights.shape[1] - 1
+    column = np.clip(x / SPACING, 0.0, limit_col)
+    row = np.clip(y / SPACING, 0.0, limit_row)
+    j = np.minimum(column.astype(int), limit_col - 1)
+    i = np.minimum(row.astype(int), limit_row - 1)
+    u, v = column - j, row - i
+    near, far = heights[i, j], heights[i + 1, j + 1]
+    along_x, along_y = heights[i, j + 1], heights[i + 1, j]
+    lower = near + u * (along_x - near) + v * (along_y - near)
+    upper = far + (1 - u) * (along_y - far) + (1 - v) * (along_x - far)
+    return np.where(u + v <= 1, lower, upper)
+
+
+def _rotations(qpos: Array) -> Array:
+    """Matrices (num, 3, 3) that turn base-frame vectors into the world frame."""
+    w, x, y, z = (qpos[:, 3:7] / np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _base_velocity(qpos: Array, qvel: Array) -> Array:
+    """Velocity of the base's origin in the base frame [m/s], shape (num, 3)."""
+    return np.einsum("nij,ni->nj", _rotations(qpos), qvel[:, :3])
+
+
+def _heading(qpos: Array) -> Array:
+    forward = _rotations(qpos)[:, :, 0]
+    return np.arctan2(forward[:, 1], forward[:, 0])
+
+
+def goal_commands(qpos: Array, cfg: CrossingCfg) -> Array:
+    """Commanded v_x, v_y [m/s] and yaw rate [rad/s] toward the goal, yaw frame, shape (num, 3)."""
+    to_goal = np.array(cfg.goal) - qpos[:, :2]
+    error = np.arctan2(to_goal[:, 1], to_goal[:, 0]) - _heading(qpos)
+    error = np.arctan2(np.sin(error), np.cos(error))
+    yaw_rate = np.clip(cfg.yaw_gain * error, -cfg.max_yaw_rate, cfg.max_yaw_rate)
+    return np.stack([cfg.speed * np.cos(error), cfg.speed * np.sin(error), yaw_rate], axis=1)
+
+
+def observations(
+    robot: RobotCfg, heights: NDArray[np.floating], qpos: Array, qvel: Array, command: Array, last_action: Array
+) -> Array:
+    """Observation rows, shape (num, observation_size); order and scales as the controllers of the field expect them."""
+    rotations = _rotations(qpos)
+    heading = _heading(qpos)[:, None]
+    scan_x, scan_y = (points.astype(np.float64) for points in robot.scan_points())
+    x = qpos[:, 0:1] + np.cos(heading) * scan_x - np.sin(heading) * scan_y
+    y = qpos[:, 1:2] + np.sin(heading) * scan_x + np.cos(heading) * scan_y
+    return np.concatenate(
+        [
+            2.0 * _base_velocity(qpos, qvel),
+            0.25 * qvel[:, 3:6],
+            -rotations[:, 2, :],  # gravity's direction in the base frame
+            command * [2.0, 2.0, 0.25],
+            qpos[:, 7:] - np.array(robot.default_joint_pos),
+            0.05 * qvel[:, 6:],
+            last_action,
+            5.0 * np.clip(qpos[:, 2:3] - 0.5 - surface_heights(heights, x, y), -1.0, 1.0),
+        ],
+        axis=1,
+    )
+
+
+def step_penalties(robot: RobotCfg, qpos: Array, qvel: Array, command: Array, forces: Array) -> Array:
+    """Raw penalties of one physics step, before times dt, in the order of :data:`PENALTIES`; shape (num, 6).
+
+    Args:
+        robot: Robot settings.
+        qpos: Shape (num, 7 + num_joints).
+        qvel: Shape (num, 6 + num_joints).
+        command: Shape (num, 3).
+        forces: Contact force on each of ``robot.geom_names``, world frame [N], shape (num, num_geoms, 3).
+    """
+    velocity = _base_velocity(qpos, qvel)
+    size = np.linalg.norm(forces, axis=2)
+    sideways = np.linalg.norm(forces[:, :, :2], axis=2)
+    foot = np.array([name in robot.foot_geoms for name in robot.geom_names])
+    by_name = {
+        "yaw_rate": np.abs(qvel[:, 5] - command[:, 2]),
+        "vel_x": np.abs(velocity[:, 0] - command[:, 0]),
+        "vel_y": np.abs(velocity[:, 1] - command[:, 1]),
+        "contact_force": np.maximum(0.0, size[:, foot] - robot.contact_force_limit).sum(axis=1),
+        "stumble": (sideways[:, foot] > 5.0 * np.abs(forces[:, foot, 2])).any(axis=1).astype(float),
+        "collision": (size[:, ~foot] > 0.1).sum(axis=1).astype(float),
+    }
+    return np.stack([by_name[name] for name in PENALTIES], axis=1)

@@ -1,0 +1,236 @@
+"""Controllers as black boxes: a batch of observation rows to a batch of actions."""
+
+import os
+import re
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+import warp as wp
+
+from sim.files.atomic import check_zip
+from sim.policy.named_code import find_named
+from sim.policy.onnx_file import load_onnx
+from sim.policy.runner import action_problem
+from sim.policy.spec import ControllerSpec
+from sim.robots.robot import RobotCfg
+
+_FORMATS = (
+    "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), module:callable or "
+    "file.py:callable (a function on device tensors, or a class or factory marked by `faultline_factory = True` that "
+    "is called with (robot, device)), or module:adapter@file (a function that is called with (controller, robot))"
+)
+
+
+class Policy(Protocol):
+    """Anything that maps observations to actions.
+
+    One that remembers has a method ``reset()``, called before every evaluation: all robots begin anew, perhaps others
+    and another number of them.
+    """
+
+    def __call__(self, observation: torch.Tensor, /) -> torch.Tensor:
+        """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size)."""
+        ...
+
+
+class MlpPolicy(torch.nn.Module):
+    """Multilayer perceptron with ELU between its layers: rsl_rl's ``MLPModel`` without its distribution."""
+
+    def __init__(self, state: dict[str, torch.Tensor]) -> None:
+        """Build from rsl_rl's keys ``mlp.<k>.weight`` / ``.bias`` and, if any, ``obs_normalizer._mean`` / ``._std``."""
+        super().__init__()
+        indices = sorted(int(m.group(1)) for key in state if (m := re.fullmatch(r"mlp\.(\d+)\.weight", key)))
+        layers: list[torch.nn.Module] = []
+        for index in indices:
+            weight = state[f"mlp.{index}.weight"]
+            layer = torch.nn.Linear(weight.shape[1], weight.shape[0])
+            layer.weight.data.copy_(weight)
+            layer.bias.data.copy_(state[f"mlp.{index}.bias"])
+            layers += [layer, torch.nn.ELU()]
+        self.layers = torch.nn.Sequential(*layers[:-1])
+        self.mean = torch.nn.Buffer(state.get("obs_normalizer._mean", torch.zeros(1)).float())
+        self.std = torch.nn.Buffer(state.get("obs_normalizer._std", torch.ones(1)).float())
+        self.normalised = "obs_normalizer._mean" in state
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Observation and action size."""
+        linear = [layer for layer in self.layers if isinstance(layer, torch.nn.Linear)]
+        return linear[0].in_features, linear[-1].out_features
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions, shape (num_envs, num_joints)."""
+        if self.normalised:
+            observation = (observation - self.mean) / (self.std + 1e-2)
+        return self.layers(observation)
+
+
+def prepare_torch(device: str) -> None:
+    """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting.
+
+    On the CPU, torch gets one thread, as Warp has: batches are small, and a second thread only waits on a busy core.
+    """
+    if device.startswith("cuda"):
+        torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
+    else:
+        torch.set_num_threads(1)
+
+
+def reason_of(error: BaseException) -> str:
+    """What went wrong, in one line; of a refused file torch's finding, without its advice to load it as code."""
+    _, _, finding = str(error).partition("WeightsUnpickler error: ")
+    lines = [line.strip() for line in (finding or str(error)).splitlines() if line.strip()]
+    lines = [line for line in lines if not line.startswith("Weights only load failed")]
+    if not lines:
+        return type(error).__name__
+    line = lines[-1] if lines[0].startswith("The following operation failed") else lines[0].partition(". Please")[0]
+    return line if isinstance(error, RuntimeError | ValueError | OSError) else f"{type(error).__name__}: {line}"
+
+
+def read_weights(path: Path) -> Any:
+    """What ``torch.save`` wrote: plain tensors and values, as data only, and compared with its checksums.
+
+    Raises:
+        Exception: Anything, if the file is damaged, foreign, or holds code.
+    """
+    if zipfile.is_zipfile(path):
+        check_zip(path)
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
+    """Load a controller and try it on one batch of zeros.
+
+    Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
+    checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
+    file made to harm can crash.
+
+    Args:
+        spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or ``module:adapter@file``;
+            a Python file may stand for the module. An adapter is called with the file's controller, of whatever sizes,
+            and the robot, and returns a policy.
+        robot: The robot it is to walk: fixes observation and action size.
+        device: Warp device name.
+
+    Raises:
+        ValueError: If the controller cannot be loaded, or its actions have the wrong shape or are not finite.
+    """
+    where = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
+    if where != "cpu" and not torch.cuda.is_available():
+        raise ValueError(
+            f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build or "
+            "use --device cpu"
+        )
+    named = ControllerSpec.parse(spec)
+    policy = _load_file(Path(spec), robot, where) if named.place is None else _load_code(named, robot, where)
+    _try_policy(policy, robot, where, str(spec))
+    return policy
+
+
+def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
+    assert spec.place is not None and spec.name is not None
+    try:
+        target: Any = find_named(spec.place, spec.name)
+    except Exception as error:  # a module can fail with anything
+        raise ValueError(f"policy '{spec}' cannot be imported: {reason_of(error)}; expected {_FORMATS}") from error
+    if not callable(target):
+        raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
+    kind, arguments = "factory", (robot, device)
+    if spec.file is not None:
+        kind, arguments = "adapter", (_load_file(Path(spec.file), robot, device, fits=False), robot)
+    elif not getattr(target, "faultline_factory", False):
+        return target
+    try:
+        policy = target(*arguments)
+    except Exception as error:
+        raise ValueError(f"policy '{spec}' is {_a(kind)} that failed: {reason_of(error)}; mend it first") from error
+    if not callable(policy):
+        raise ValueError(f"policy '{spec}' is {_a(kind)} that must return a callable, got {type(policy).__name__}")
+    return policy
+
+
+def _a(kind: str) -> str:
+    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
+
+
+def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -> Policy:
+    """The controller in a file; with ``fits`` it must have the robot's sizes."""
+    if path == robot.policy_file and not path.exists():
+        raise ValueError(
+            f"robot '{robot.name}' has no shipped controller yet, expected at {path}: train one with "
+            f"`make train ROBOT={robot.name}` and give its policy.pt as the policy"
+        )
+    if not os.path.isfile(path):  # False too for a name that no file can have
+        raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
+    if path.suffix == ".py":
+        raise ValueError(f"policy '{path}' is a Python file: name what to call in it, {path}:CALLABLE")
+    expected = (robot.observation_size, robot.num_joints)
+    if path.suffix.lower() == ".onnx":
+        return load_onnx(path, expected if fits else None, device)
+    try:
+        if zipfile.is_zipfile(path):
+            check_zip(path)
+    except ValueError as error:
+        raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back; expected {_FORMATS}") from error
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of TorchScript files, which are none of the matter here
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a stream of pickle opcodes can fail with anything
+        return _load_script(path, device, error)
+    state = content.get("actor_state_dict") if isinstance(content, dict) else None
+    if not isinstance(state, dict) or "mlp.0.weight" not in state:
+        found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(
+            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', found {found}"
+        )
+    try:
+        policy = MlpPolicy(state)
+    except (KeyError, RuntimeError, AttributeError, TypeError, IndexError) as error:
+        raise ValueError(f"policy '{path}' holds a damaged layer: {error}; save the checkpoint anew") from error
+    if fits and policy.sizes != expected:
+        raise ValueError(
+            f"policy '{path}' maps {policy.sizes[0]} observations to {policy.sizes[1]} actions, but robot "
+            f"'{robot.name}' has {expected[0]} observations and {expected[1]} joints: use a controller of this robot, "
+            "or an adapter"
+        )
+    return policy.to(device).eval()
+
+
+def _load_script(path: Path, device: str, reason: Exception) -> Policy:
+    try:
+        return torch.jit.load(str(path), map_location=device).eval()
+    except Exception as error:
+        raise ValueError(
+            f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
+            f"or holding code): {reason_of(reason)}; expected {_FORMATS}"
+        ) from error
+
+
+def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None:
+    observation = torch.zeros((4, robot.observation_size), device=device)
+    expected = (4, robot.num_joints)
+    try:
+        with torch.inference_mode():
+            action = policy(observation)
+    except (Exception, SystemExit) as error:  # a controller can fail with anything
+        raise ValueError(
+            f"policy '{spec}' failed on observations of shape {tuple(observation.shape)}, which robot '{robot.name}' "
+            f"gives: {reason_of(error)}"
+        ) from error
+    problem = action_problem(action, expected)
+    if problem is not None:
+        raise ValueError(
+            f"policy '{spec}' must return actions of shape (num_envs, {robot.num_joints}) for robot '{robot.name}', "
+            f"{problem} for 4 environments"
+        )
+    if not torch.isfinite(action).all():
+        raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
+
+
+PolicySpec = str | Path | Callable[[torch.Tensor], torch.Tensor]
+"""A controller as :func:`load_policy` takes it, or as a callable."""

@@ -1,0 +1,232 @@
+"""Recorded crossings: what every robot did at every control step, for films, figures and the browser.
+
+A recording is made while a rollout runs its ordinary episodes; nothing is simulated for it. Frame k of an episode is
+the state at ``k * dt``: frame 0 the start, the last one the end of the control step in which the episode ended, up to
+``dt`` after its end. The frames of an invalid episode end before the step that broke it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kernels.episode import Outcome
+from kernels.penalties import PENALTIES
+from sim.files.provenance import controller_hash, provenance
+from sim.robots.robot import RobotCfg
+
+if TYPE_CHECKING:  # who reads a recording has no simulation to wait for
+    from sim.rollout import Rollout, RolloutResult
+
+FRAME_ARRAYS: dict[str, type[np.floating]] = {
+    "base_position": np.float32,
+    "base_quaternion": np.float32,
+    "joint_position": np.float16,
+    "foot_force": np.float16,
+    "penalties": np.float32,
+    "command": np.float16,
+}
+"""Arrays with a row a frame, and how exact they are kept: half a milliradian of a joint moves a foot by 0.3 mm. In
+memory all are float32, in which a force can be squared."""
+_MAX_FORCE = 60_000.0  # [N]; what a float16 can hold
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """T terrains, K episodes of each, up to F frames of each; NaN from ``num_frames`` on."""
+
+    robot: str
+    joint_names: tuple[str, ...]
+    """Of the J joints."""
+    foot_names: tuple[str, ...]
+    """Of the geoms of the feet."""
+    penalty_names: tuple[str, ...]
+    """Of the P penalties."""
+    dt: float
+    """Control step [s]."""
+    labels: tuple[str, ...]
+    """What each terrain is, in words, shape (T,)."""
+    heights: NDArray[np.float32]
+    """Height grids [m], shape (T, nrow, ncol), row along y, column along x, 0.05 m apart."""
+    genes: NDArray[np.float32] | None
+    """Genes, shape (T, 64), of terrains that were given by them."""
+    seeds: NDArray[np.uint32]
+    """Seed of each terrain's episodes, shape (T,)."""
+    replicas: NDArray[np.int32]
+    """Number of each recorded episode among the terrain's, shape (K,)."""
+    outcome: NDArray[np.uint8]
+    """:class:`kernels.episode.Outcome` of each episode, shape (T, K)."""
+    fallen: NDArray[np.bool_]
+    """Tilt above 60 degrees at the end, shape (T, K)."""
+    duration_s: NDArray[np.float32]
+    """Simulated time up to the end [s], shape (T, K)."""
+    num_frames: NDArray[np.int32]
+    """Frames of each episode, shape (T, K)."""
+    base_position: NDArray[np.float32]
+    """World-local [m], shape (T, K, F, 3)."""
+    base_quaternion: NDArray[np.float32]
+    """Base to world frame, w x y z as MuJoCo has it, shape (T, K, F, 4)."""
+    joint_position: NDArray[np.float32]
+    """[rad], shape (T, K, F, J)."""
+    foot_force: NDArray[np.float32]
+    """Contact force on each foot in the last physics step, world frame [N], shape (T, K, F, num_feet, 3)."""
+    penalties: NDArray[np.float32]
+    """Raw penalty sums so far, times the physics step, shape (T, K, F, P)."""
+    command: NDArray[np.float32]
+    """Command of the coming control step: v_x, v_y [m/s], yaw rate [rad/s], yaw frame; 0 once ended; (T, K, F, 3)."""
+    origin: dict[str, Any]
+    """Where it comes from: policy, policy_sha256, command, commit, device, versions, seed, date."""
+
+    @property
+    def num_terrains(self) -> int:
+        """T."""
+        return len(self.seeds)
+
+    @property
+    def num_episodes(self) -> int:
+        """K."""
+        return len(self.replicas)
+
+    @property
+    def times_s(self) -> NDArray[np.float64]:
+        """Time of each frame since the start [s], shape (F,)."""
+        return self.dt * np.arange(self.base_position.shape[2])
+
+    def of_terrain(self, terrain: int) -> "Recording":
+        """The recording of one of the terrains alone.
+
+        Args:
+            terrain: Its index.
+        """
+        num_frames = self.num_frames[terrain : terrain + 1]
+        cut = {name: getattr(self, name)[terrain : terrain + 1, :, : num_frames.max()] for name in FRAME_ARRAYS}
+        each = ("labels", "heights", "seeds", "outcome", "fallen", "duration_s")
+        cut |= {name: getattr(self, name)[terrain : terrain + 1] for name in each}
+        genes = None if self.genes is None else self.genes[terrain : terrain + 1]
+        return replace(self, num_frames=num_frames, genes=genes, **cut)
+
+    def qpos(self, terrain: int, episode: int) -> NDArray[np.float64]:
+        """MuJoCo's joint coordinates of an episode: position, quaternion w x y z, joints.
+
+        Args:
+            terrain: Index of the terrain.
+            episode: Index of the episode among those recorded.
+
+        Returns:
+            Shape (frames of the episode, 7 + J).
+        """
+        frames = slice(self.num_frames[terrain, episode])
+        parts = (self.base_position, self.base_quaternion, self.joint_position)
+        return np.concatenate([part[terrain, episode, frames].astype(np.float64) for part in parts], axis=1)
+
+
+class _Frames:
+    """Collects the frames of the chosen episodes of every terrain of a rollout."""
+
+    def __init__(self, rollout: "Rollout", chosen: NDArray[np.int64]) -> None:
+        self._rollout = rollout
+        robot = rollout.robot
+        self._shape = (rollout.num_terrains, len(chosen))
+        self._rows = (np.arange(rollout.num_terrains)[:, None] * rollout.num_replicas + chosen).ravel()
+        self._feet = [robot.geom_names.index(name) for name in robot.foot_geoms]
+        self._columns = [PENALTIES.index(name) for name in robot.penalties]
+        self._taken: dict[str, list[NDArray[Any]]] = {name: [] for name in FRAME_ARRAYS}
+
+    def take(self) -> None:
+        """Add the present state as a frame."""
+        state, rows = self._rollout.state, self._rows
+        joint_q = state.joint_q.numpy()[rows]
+        force = state.geom_force.numpy()[rows][:, self._feet]
+        if not self._taken["foot_force"]:
+            force = np.zeros_like(force)  # at the start there was no step yet, and what is there is of another episode
+        values = {
+            "base_position": joint_q[:, :3],
+            "base_quaternion": joint_q[:, [6, 3, 4, 5]],
+            "joint_position": joint_q[:, 7:],
+            "foot_force": np.clip(force, -_MAX_FORCE, _MAX_FORCE),
+            "penalties": state.penalty_sums.numpy()[rows][:, self._columns],
+            "command": state.command.numpy()[rows],
+        }
+        for name, taken in self._taken.items():
+            with np.errstate(over="ignore", invalid="ignore"):  # of an episode that broke
+                taken.append(values[name].astype(FRAME_ARRAYS[name]))
+
+    def stacked(self) -> dict[str, Any]:
+        """All frames by name once the episodes are over, and how many each episode has."""
+        state, decimation = self._rollout.state, self._rollout.robot.decimation
+        control_steps = -(-state.steps.numpy()[self._rows] // decimation)
+        valid = state.outcome.numpy()[self._rows] != Outcome.INVALID
+        num_frames = (control_steps + valid).reshape(self._shape).astype(np.int32)
+        most = int(num_frames.max())
+        absent = np.arange(most) >= num_frames[..., None]
+        stacks: dict[str, Any] = {"num_frames": num_frames}
+        for name, taken in self._taken.items():
+            stack = np.stack(taken[:most], axis=1).reshape(*self._shape, most, *taken[0].shape[1:])
+            stacks[name] = stack.astype(np.float32)
+            stacks[name][absent] = np.nan
+        return stacks
+
+
+def record(
+    rollout: "Rollout",
+    terrains: NDArray[Any],
+    seeds: NDArray[Any],
+    *,
+    policy: str | Path,
+    replicas: Sequence[int] | None = None,
+    labels: Sequence[str] | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> "tuple[RolloutResult, Recording]":
+    """Runs a rollout's episodes and records some of them; the episodes are those that ``rollout.evaluate`` would run.
+
+    On the host a frame of an episode takes some 110 bytes: 4,000 whole episodes are half a gigabyte.
+
+    Args:
+        rollout: The crossing, on any device.
+        terrains: Genes, shape (T, 64), or heights [m], shape (T, nrow, ncol).
+        seeds: One a terrain, shape (T,), uint32.
+        policy: What the rollout's controller was loaded from, to name and hash it.
+        replicas: Which of each terrain's episodes to record; all.
+        labels: What each terrain is, in words.
+        seed: What the seeds were drawn with, for the record.
+        progress: As of ``rollout.evaluate``.
+
+    Returns:
+        The result of all episodes, and the recording of those chosen.
+
+    Raises:
+        ValueError: If a shape does not fit, or there is no such episode.
+    """
+    chosen = np.arange(rollout.num_replicas) if replicas is None else np.asarray(replicas, dtype=np.int64)
+    if chosen.ndim != 1 or not len(chosen) or chosen.min() < 0 or chosen.max() >= rollout.num_replicas:
+        raise ValueError(f"replicas must be some of 0..{rollout.num_replicas - 1}, got {list(replicas or ())}")
+    frames = _Frames(rollout, chosen)
+    result = rollout.evaluate(terrains, seeds, before_step=frames.take, progress=progress)
+    frames.take()
+    heights: Any = rollout.sim.bank.heights.numpy()
+    device = rollout.sim.device
+    return result, Recording(
+        **_names_of(rollout.robot),
+        labels=tuple(labels or (f"terrain {k}" for k in range(rollout.num_terrains))),
+        heights=heights.copy(),  # on the CPU numpy() is a view
+        genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
+        seeds=seeds.astype(np.uint32),
+        replicas=chosen.astype(np.int32),
+        origin={"policy": str(policy), "policy_sha256": controller_hash(str(policy)), **provenance(device, seed)},
+        **{name: getattr(result, name)[:, chosen] for name in ("outcome", "fallen", "duration_s")},
+        **frames.stacked(),
+    )
+
+
+def _names_of(robot: RobotCfg) -> dict[str, Any]:
+    return {
+        "robot": robot.name,
+        "joint_names": robot.joint_names,
+        "foot_names": robot.foot_geoms,
+        "penalty_names": robot.penalties,
+        "dt": robot.control_dt,
+    }

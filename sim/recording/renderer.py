@@ -1,0 +1,189 @@
+"""Pictures of recorded poses by MuJoCo's renderer, without a screen: through EGL on Linux, on a GPU or in software."""
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.crossing import CrossingCfg
+from sim.recording.scene import scene_model
+from sim.robots.robot import RobotCfg
+
+_mj: Any = mujoco  # its types are not written down
+
+_MAX_GEOMS = 4000
+_GHOST_OPACITY, _GHOST_PALENESS = 0.25, 0.6
+_ARROW = 0.8  # length of the arrow of a force at the robot's limit [m]
+_ARROW_WIDTH = 0.012
+_LEAST_FORCE = 5.0  # shown [N]
+_SUN_AWAY = 8.0  # from what one looks at [m]
+_CALM, _ALARMED = np.array([0.95, 0.80, 0.20, 0.9], np.float32), np.array([0.85, 0.10, 0.10, 0.9], np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """Where a picture is taken from."""
+
+    target: tuple[float, float, float]
+    """What is in the middle [m]."""
+    distance: float
+    """From it [m]."""
+    azimuth: float = 55.0
+    """Direction of view in the horizontal plane, from x toward y [deg]."""
+    elevation: float = -22.0
+    """Of the view over the horizon [deg]; negative looks down."""
+
+
+def open_context(width: int, height: int) -> Any:
+    """A current OpenGL context without a screen: EGL on Linux, or what MUJOCO_GL names; free it with ``free()``.
+
+    Args:
+        width: Of the images [pixels].
+        height: Likewise.
+
+    Raises:
+        ValueError: If there is none to be had.
+    """
+    usual = {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
+    name = os.environ.get("MUJOCO_GL", "").strip().lower() or usual
+    try:
+        context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        context.make_current()
+    except Exception as error:  # a library that is not there fails with anything
+        raise ValueError(
+            f"pictures need OpenGL without a screen, but '{name}' cannot be had here: {type(error).__name__}: {error}: "
+            "install it (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or name another way in MUJOCO_GL "
+            "(egl, osmesa, glfw)"
+        ) from None
+    return context
+
+
+class Renderer:
+    """Renders poses of one robot on one terrain; a context manager that frees what it took of the graphics driver."""
+
+    def __init__(
+        self,
+        robot: RobotCfg,
+        heights: NDArray[np.floating],
+        *,
+        width: int = 1280,
+        height: int = 480,
+        shadows: bool = True,
+        cfg: CrossingCfg | None = None,
+    ) -> None:
+        """Build the scene and open OpenGL.
+
+        Args:
+            robot: Robot settings.
+            heights: Height grid [m], shape (nrow, ncol).
+            width: Of the images [pixels].
+            height: Likewise.
+            shadows: Whether the sun casts them; in software they take as long as all the rest.
+            cfg: The crossing, for its goal.
+
+        Raises:
+            ValueError: If there is no OpenGL, or the robot's file cannot be shown.
+        """
+        self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg)
+        self._context = open_context(width, height)
+        self._robot = robot
+        geom = _mj.mjtObj.mjOBJ_GEOM.value
+        self._feet = [_mj.mj_name2id(self.model, geom, name) for name in robot.foot_geoms]
+        self._data = [_mj.MjData(self.model)]
+        self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
+        self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._scene.flags[_mj.mjtRndFlag.mjRND_REFLECTION] = False
+        self._options, self._nudge, self._camera = _mj.MjvOption(), _mj.MjvPerturb(), _mj.MjvCamera()
+        self._camera.type = _mj.mjtCamera.mjCAMERA_FREE
+        self._gpu = _mj.MjrContext(self.model, _mj.mjtFontScale.mjFONTSCALE_100.value)
+        _mj.mjr_setBuffer(_mj.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
+        self._rectangle = _mj.MjrRect(0, 0, width, height)
+        self._image = np.empty((height, width, 3), np.uint8)
+
+    def __enter__(self) -> "Renderer":
+        """Nothing to do: all is there."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Frees what it took."""
+        self._gpu.free()
+        self._context.free()
+
+    def render(
+        self,
+        qpos: NDArray[np.floating],
+        camera: Camera,
+        *,
+        ghosts: Sequence[NDArray[np.floating]] = (),
+        foot_force: NDArray[np.floating] | None = None,
+    ) -> NDArray[np.uint8]:
+        """A picture of one pose.
+
+        Args:
+            qpos: MuJoCo's joint coordinates, shape (7 + num_joints,).
+            camera: Where from.
+            ghosts: Poses of others, shown translucent.
+            foot_force: Contact force on each foot, world frame [N], shape (num_feet, 3), shown as arrows.
+
+        Returns:
+            RGB, shape (height, width, 3).
+        """
+        data = self._posed(0, qpos)
+        self._camera.lookat[:] = camera.target
+        self._camera.distance = camera.distance
+        # The sun goes with the camera, so that its shadows are sharp where one looks.
+        data.light_xpos[-1] = np.array(camera.target) - _SUN_AWAY * data.light_xdir[-1]
+        self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
+        everything = _mj.mjtCatBit.mjCAT_ALL.value
+        _mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
+        for number, pose in enumerate(ghosts, 1):
+            self._add_ghost(self._posed(number, pose))
+        if foot_force is not None:
+            for index, force in zip(self._feet, foot_force, strict=True):
+                if index >= 0:
+                    self._add_arrow(data.geom_xpos[index], np.asarray(force, dtype=np.float64))
+        _mj.mjr_render(self._rectangle, self._scene, self._gpu)
+        _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
+        return self._image[::-1].copy()  # OpenGL's lowest row is first
+
+    def foot_positions(self, qpos: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Centres of the foot geoms in a pose, world-local [m], shape (num_feet, 3); NaN of what no file names."""
+        centres = self._posed(0, qpos).geom_xpos
+        return np.array([centres[index] if index >= 0 else np.full(3, np.nan) for index in self._feet])
+
+    def _posed(self, number: int, qpos: NDArray[np.floating]) -> Any:
+        while len(self._data) <= number:
+            self._data.append(_mj.MjData(self.model))
+        data = self._data[number]
+        data.qpos[:] = qpos
+        _mj.mj_kinematics(self.model, data)
+        _mj.mj_comPos(self.model, data)
+        _mj.mj_camlight(self.model, data)
+        return data
+
+    def _add_ghost(self, data: Any) -> None:
+        first = self._scene.ngeom
+        moving = _mj.mjtCatBit.mjCAT_DYNAMIC.value
+        _mj.mjv_addGeoms(self.model, data, self._options, self._nudge, moving, self._scene)
+        for geom in self._scene.geoms[first : self._scene.ngeom]:
+            geom.rgba[:3] += _GHOST_PALENESS * (1.0 - geom.rgba[:3])
+            geom.rgba[3] = _GHOST_OPACITY
+            geom.transparent = 1
+
+    def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:
+        size, limit = float(np.linalg.norm(force)), self._robot.contact_force_limit
+        if size < _LEAST_FORCE or self._scene.ngeom >= self._scene.maxgeom:
+            return
+        geom = self._scene.geoms[self._scene.ngeom]
+        arrow = _mj.mjtGeom.mjGEOM_ARROW.value
+        color = _ALARMED if size > limit else _CALM
+        _mj.mjv_initGeom(geom, arrow, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
+        tip = foot + force * (_ARROW / limit * min(1.0, 2.5 * limit / size))
+        _mj.mjv_connector(geom, arrow, _ARROW_WIDTH, foot, tip)
+        self._scene.ngeom += 1

@@ -1,0 +1,166 @@
+"""A robot on its terrain as a MuJoCo model to look at: ground painted by height, light, goal, and bones between joints.
+
+Nothing in it is simulated: poses come from a recording.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.crossing import CrossingCfg
+from sim.maps.hfield import as_hfield
+from sim.robots.mujoco_spec import robot_model, robot_spec
+from sim.robots.robot import RobotCfg
+from sim.terrain import SPACING
+
+_mj: Any = mujoco  # its types are not written down
+
+MARGIN_NODES = 40
+"""Edge height shown on each side: a crossing may leave the terrain by 2 m."""
+_GROUND = "faultline_ground"
+_PIXELS = 4  # of the paint a cell, along each side
+_LOW, _LEVEL, _HIGH = (np.array(color) for color in ((0.36, 0.50, 0.66), (0.80, 0.79, 0.74), (0.70, 0.44, 0.27)))
+_LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
+_COLORS = {"base": (0.20, 0.22, 0.25, 1.0), "limb": (0.42, 0.45, 0.50, 1.0), "foot": (0.90, 0.35, 0.13, 1.0)}
+_SHADOWED = 3.0  # half side of the square about the robot that shadows fall in [m]
+_HIDDEN_GROUP = 5  # MuJoCo shows groups 0 to 2
+_BONE, _LEAST_BONE = 0.35, 0.02  # radius of a bone in that of limbs and feet, and at least [m]
+
+
+def ground_paint(heights: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Colours of a height grid: blue below 0, brown above, a line every metre, steep ground darker.
+
+    Args:
+        heights: [m], shape (nrow, ncol), margins included; node (0, 0) stands on a whole metre.
+
+    Returns:
+        RGB, shape (4 (nrow - 1), 4 (ncol - 1), 3), row along y.
+    """
+    cells = 0.25 * (heights[:-1, :-1] + heights[1:, :-1] + heights[:-1, 1:] + heights[1:, 1:])
+    reach = max(float(np.abs(cells).max()), _LEAST_RANGE)
+    share = np.clip(cells / reach, -1.0, 1.0)[..., None]
+    color = np.where(share < 0, _LEVEL + (_LEVEL - _LOW) * share, _LEVEL + (_HIGH - _LEVEL) * share)
+    rise_y, rise_x = np.gradient(cells, SPACING)
+    color *= (0.75 + 0.25 / np.sqrt(1.0 + rise_x**2 + rise_y**2))[..., None]
+    paint = color.repeat(_PIXELS, axis=0).repeat(_PIXELS, axis=1)
+    metre = round(1.0 / SPACING) * _PIXELS
+    for axis in (0, 1):
+        on_line = np.arange(paint.shape[axis]) % metre < _PIXELS // 2
+        paint[(slice(None),) * axis + (on_line,)] *= 0.82
+    return np.rint(255.0 * paint).astype(np.uint8)
+
+
+def scene_model(
+    robot: RobotCfg, heights: NDArray[np.floating], *, width: int, height: int, cfg: CrossingCfg | None = None
+) -> Any:
+    """The model of a scene: the robot's own file and its terrain, in world-local coordinates.
+
+    Args:
+        robot: Robot settings.
+        heights: Height grid [m], shape (nrow, ncol).
+        width: Largest image to be rendered [pixels].
+        height: Likewise.
+        cfg: The crossing, for its goal.
+
+    Raises:
+        ValueError: If MuJoCo cannot read the robot's file, or finds other joints in it.
+    """
+    spec = robot_spec(robot)
+    for geom in spec.worldbody.geoms:
+        geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
+    if not len(spec.meshes):
+        _dress(spec, robot)
+    paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"))
+    _add_ground(spec, heights, paint.shape)
+    _add_goal(spec, heights, cfg or CrossingCfg())
+    _add_light(spec)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    model = robot_model(spec, robot)
+    model.vis.map.shadowclip = _SHADOWED / model.stat.extent
+    texture = model.texture(_GROUND)
+    first = int(texture.adr[0])
+    # The asset lies on its side (sim.maps.hfield): the rows of its texture run along x, its columns along y.
+    model.tex_data[first : first + paint.size] = paint.swapaxes(0, 1).ravel()
+    return model
+
+
+def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]) -> None:
+    field = as_hfield(heights, margin=MARGIN_NODES)
+    rows, columns = field.data.shape
+    data = field.data.ravel().tolist()
+    spec.add_hfield(name=_GROUND, nrow=rows, ncol=columns, size=list(field.size), userdata=data)
+    flat = {"type": _mj.mjtTexture.mjTEXTURE_2D, "builtin": _mj.mjtBuiltin.mjBUILTIN_FLAT, "nchannel": 3}
+    spec.add_texture(name=_GROUND, width=paint[0], height=paint[1], **flat)
+    material = spec.add_material(name=_GROUND, specular=0.0, shininess=0.0, reflectance=0.0)
+    material.textures[_mj.mjtTextureRole.mjTEXROLE_RGB] = _GROUND
+    spec.worldbody.add_geom(
+        name=_GROUND,
+        type=_mj.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=_GROUND,
+        pos=list(field.position),
+        quat=list(field.quaternion),
+        material=_GROUND,
+        group=0,
+    )
+
+
+def _add_goal(spec: Any, heights: NDArray[np.floating], cfg: CrossingCfg) -> None:
+    """A post at the goal, and the rim of the circle that counts as reaching it."""
+    x, y = cfg.goal
+    ground = float(heights[round(y / SPACING), round(x / SPACING)])
+    green = [0.0, 0.62, 0.45, 1.0]
+    post = {"type": _mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
+    spec.worldbody.add_geom(pos=[x, y, ground + 0.5], size=[0.02, 0.5, 0.0], rgba=green, **post)
+    disc = [*green[:3], 0.25]
+    spec.worldbody.add_geom(pos=[x, y, ground + 0.01], size=[cfg.goal_radius, 0.02, 0.0], rgba=disc, **post)
+
+
+def _add_light(spec: Any) -> None:
+    sky = {"type": _mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": _mj.mjtBuiltin.mjBUILTIN_GRADIENT}
+    spec.add_texture(
+        name="faultline_sky", rgb1=[0.72, 0.81, 0.91], rgb2=[0.96, 0.97, 0.98], width=64, height=384, **sky
+    )
+    for light in spec.lights:
+        light.active = False
+    spec.worldbody.add_light(
+        name="faultline_sun",
+        type=_mj.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=[8.0, 4.0, 20.0],
+        dir=[-0.25, 0.45, -1.0],
+        diffuse=[0.55, 0.55, 0.53],
+        ambient=[0.0, 0.0, 0.0],
+        specular=[0.1, 0.1, 0.1],
+        castshadow=True,
+    )
+    headlight = spec.visual.headlight
+    headlight.ambient, headlight.diffuse, headlight.specular = [0.42] * 3, [0.22] * 3, [0.0] * 3
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 2048, 0
+
+
+def _dress(spec: Any, robot: RobotCfg) -> None:
+    """Colours by role and bones from joint to joint, for a robot whose file has only shapes to collide with."""
+    roles = {"base": robot.base_geoms, "limb": robot.limb_geoms, "foot": robot.foot_geoms}
+    sizes = []
+    for role, names in roles.items():
+        for name in names:
+            if (geom := spec.geom(name)) is None:
+                continue  # a shape that its file does not name
+            geom.rgba = list(_COLORS[role])
+            sizes += [float(geom.size[0])] if role != "base" else []
+    radius = max(_LEAST_BONE, _BONE * float(np.median(sizes))) if sizes else _LEAST_BONE
+    for body in spec.bodies:
+        if body.parent is None or body.parent.name == "world":
+            continue
+        _add_bone(body.parent, body.pos, radius)
+        for geom in body.geoms:
+            if geom.name in robot.foot_geoms:
+                _add_bone(body, geom.pos, radius)
+
+
+def _add_bone(body: Any, end: Any, radius: float) -> None:
+    if np.linalg.norm(end) > radius:
+        limits = [0.0, 0.0, 0.0, *map(float, end)]
+        kind = {"type": _mj.mjtGeom.mjGEOM_CAPSULE, "group": 0, "mass": 0.0, "contype": 0, "conaffinity": 0}
+        body.add_geom(fromto=limits, size=[radius, 0.0, 0.0], rgba=list(_COLORS["limb"]), **kind)

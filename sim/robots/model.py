@@ -1,0 +1,231 @@
+"""A robot's file, MJCF or URDF, as a Newton model, held against the robot's settings."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from sim.robots.model_files import ModelFiles, read_model_files
+from sim.robots.model_numbers import drive_problems, number_problems
+from sim.robots.robot import RobotCfg
+
+_URDF_FRICTION = 1.0
+_URDF_TIME_CONSTANT_S = 0.01
+_vec3: Any = wp.vec3
+_RAW_SOLREF = 1  # Newton: MuJoCo's solref is taken as it stands
+
+
+def leaf_name(label: str) -> str:
+    """Name of a Newton label's last part: ``anymal/worldbody/base/LF_HIP`` -> ``LF_HIP``."""
+    return label.rsplit("/", 1)[-1]
+
+
+def joint_names(builder: newton.ModelBuilder) -> list[str]:
+    """Names of a robot's joints but for that of its base."""
+    return [leaf_name(label) for label in builder.joint_label][1:]
+
+
+def geom_names(builder: newton.ModelBuilder) -> list[str]:
+    """Names of a robot's collision shapes."""
+    return [leaf_name(label) for label in builder.shape_label]
+
+
+def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
+    """One robot as a Newton builder, ready to be replicated into worlds.
+
+    Visual shapes are left out, bodies that are fixed to each other become one. Collision shapes of a URDF are called as
+    their link, with a number from 0 behind where it has several (``LF_SHANK_0``).
+
+    Raises:
+        ValueError: If a file is missing or cannot be read, or file and settings do not agree; all that is wrong is
+            named at once.
+    """
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    builder.rigid_gap = 0.0  # the default of 0.1 m triples the contacts
+    try:
+        files = read_model_files(robot.model_file)
+        _add_model(builder, robot, files)
+    except Exception as error:  # an importer can fail with anything
+        raise ValueError(f"robot '{robot.name}': {' '.join(str(error).split()) or type(error).__name__}") from error
+    # The rest is only told of a tree of single joints, where joints and their columns are one.
+    problems = _structure_problems(builder)
+    if not problems:
+        bodies = [leaf_name(label) for label in builder.body_label]
+        problems = number_problems(builder, bodies, joint_names(builder)) + _name_problems(builder, robot)
+    if not problems:
+        problems = _set_drives(builder, robot) or drive_problems(builder, files.root, robot.joint_names)
+    if problems:
+        raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
+    _set_contact(builder, robot, is_urdf=files.is_urdf)
+    return builder
+
+
+def _add_model(builder: newton.ModelBuilder, robot: RobotCfg, files: ModelFiles) -> None:
+    if files.is_urdf:
+        for capsule in files.root.iter("capsule"):
+            capsule.set("height", capsule.get("length", capsule.get("height", "1")))  # Newton knows it by this name
+        text = ET.tostring(files.root, encoding="unicode")
+        builder.add_urdf(text, floating=True, enable_self_collisions=False)
+        _name_by_link(builder)
+    else:
+        builder.add_mjcf(
+            str(robot.model_file), enable_self_collisions=False, parse_mujoco_options=False, parse_visuals=False
+        )
+    if newton.JointType.FIXED in builder.joint_type:
+        merge_fixed_bodies(builder)
+
+
+def _name_by_link(builder: newton.ModelBuilder) -> None:
+    """Calls the shapes of a URDF, which has no names for them that are unique, by their links."""
+    bodies = list(builder.shape_body)
+    for k, body in enumerate(bodies):
+        name = builder.body_label[body]
+        builder.shape_label[k] = f"{name}_{bodies[:k].count(body)}" if bodies.count(body) > 1 else name
+
+
+def merge_fixed_bodies(builder: newton.ModelBuilder) -> None:
+    """Makes one body of those that are fixed to each other, with the mass, mass centre and inertia of all of them.
+
+    Newton's own merging adds inertias about different points.
+    """
+    model: Any = builder  # its lists hold Warp's types
+    root, pose = list(range(model.body_count)), [wp.transform_identity()] * model.body_count
+    for joint, kind in enumerate(model.joint_type):  # parents come before their children
+        parent, child = model.joint_parent[joint], model.joint_child[joint]
+        if kind == newton.JointType.FIXED and parent >= 0:
+            in_parent = model.joint_X_p[joint] * wp.transform_inverse(model.joint_X_c[joint])
+            root[child], pose[child] = root[parent], pose[parent] * in_parent
+    merged = {}
+    for body in set(root):
+        parts = [k for k in range(model.body_count) if root[k] == body]
+        merged[model.body_label[body]] = _mass_of(model, parts, [pose[k] for k in parts])
+    model.collapse_fixed_joints()
+    for body, label in enumerate(model.body_label):
+        mass, centre, inertia = merged[label]
+        model.body_mass[body], model.body_com[body] = mass, wp.vec3(*centre)
+        model.body_inertia[body] = wp.mat33(*inertia.ravel())
+        model.body_inv_mass[body] = 1.0 / mass if mass > 0.0 else 0.0
+        model.body_inv_inertia[body] = wp.inverse(model.body_inertia[body]) if mass > 0.0 else wp.mat33()
+
+
+def _mass_of(builder: Any, bodies: list[int], poses: list[Any]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass [kg], mass centre [m] and inertia about it [kg m^2] of bodies at the given poses."""
+    mass = [float(builder.body_mass[k]) for k in bodies]
+    centres = [
+        np.array(wp.transform_point(pose, _vec3(*builder.body_com[k])), dtype=np.float64)
+        for k, pose in zip(bodies, poses, strict=True)
+    ]
+    total = sum(mass)
+    centre = np.average(centres, axis=0, weights=mass) if total > 0.0 else centres[0]
+    inertia = np.zeros((3, 3))
+    for k, pose, m, own in zip(bodies, poses, mass, centres, strict=True):
+        turn = np.array(wp.quat_to_matrix(pose.q), dtype=np.float64).reshape(3, 3)
+        off = own - centre
+        inertia += turn @ np.array(builder.body_inertia[k], dtype=np.float64).reshape(3, 3) @ turn.T
+        inertia += m * (off @ off * np.eye(3) - np.outer(off, off))
+    return total, centre, inertia
+
+
+def _structure_problems(builder: newton.ModelBuilder) -> list[str]:
+    if builder.joint_count == 0 or builder.joint_type[0] != newton.JointType.FREE:
+        return ["the first body must move freely: give it a <freejoint/>"]
+    problems = []
+    joints = joint_names(builder)
+    crowded = [name for name, size in zip(joints, builder.joint_dof_dim[1:], strict=True) if sum(size) != 1]
+    if crowded:
+        problems.append(
+            f"every joint must be a hinge or slide on a body of its own, unlike {', '.join(crowded)}: one robot, one "
+            "free body, one joint a body"
+        )
+    fixed = [name for name, body in zip(geom_names(builder), builder.shape_body, strict=True) if body < 0]
+    if fixed:
+        problems.append(f"geoms that belong to the world, not to the robot: {', '.join(fixed)}: take them out")
+    return problems
+
+
+def _name_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
+    joints = joint_names(builder)
+    problems = _unknown("joint", robot.joint_names, joints, robot)
+    if not problems and tuple(joints) != robot.joint_names:
+        problems.append(f"joint_names must follow the file's order {tuple(joints)}, got {robot.joint_names}")
+    for name in ("default_joint_pos", "stiffness", "damping", "effort_limit", "armature"):
+        values = getattr(robot, name)
+        if values is not None and len(values) != len(joints):
+            problems.append(f"{name} needs {len(joints)} {_UNITS[name]}, got {len(values)}")
+    if not problems:
+        problems = _range_problems(builder, robot)
+    return [*problems, *_unknown("geom", robot.geom_names, geom_names(builder), robot)]
+
+
+def _range_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
+    """Default angles that the joints cannot take."""
+    ranges = zip(
+        robot.joint_names,
+        robot.default_joint_pos,
+        builder.joint_limit_lower[6:],
+        builder.joint_limit_upper[6:],
+        strict=True,
+    )
+    beyond = [f"{name} ({low:g} to {high:g}, got {angle:g})" for name, angle, low, high in ranges
+              if not low - _SLACK <= angle <= high + _SLACK]  # fmt: skip
+    return [f"default_joint_pos is outside of the file's range for {', '.join(beyond)}"] if beyond else []
+
+
+_SLACK = 1e-3  # files round [rad]
+_UNITS = {
+    "default_joint_pos": "angles",
+    "stiffness": "gains [N m/rad]",
+    "damping": "gains [N m s/rad]",
+    "effort_limit": "limits [N m]",
+    "armature": "inertias [kg m^2]",
+}
+
+
+def _unknown(kind: str, wanted: Sequence[str], present: list[str], robot: RobotCfg) -> list[str]:
+    missing = [name for name in wanted if name not in present]
+    if not missing:
+        return []
+    return [f"no {kind} named {', '.join(missing)} in {robot.model_file}: the file has {', '.join(present)}"]
+
+
+def _set_drives(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
+    """Takes gains, limits and armature from the settings where they are given; returns what is wrong with the gains."""
+    joints = robot.joint_names
+    driven = [name for name, gain in zip(joints, builder.joint_target_ke[6:], strict=True) if gain > 0.0]
+    if robot.stiffness is not None and driven:
+        return [
+            f"{robot.model_file} has position actuators for {', '.join(driven)}, and the settings have stiffness: take "
+            "one of them out"
+        ]
+    limp = [name for name in joints if name not in driven]
+    if robot.stiffness is None and limp:
+        return [
+            f"no gains for {', '.join(limp)}: give stiffness and damping in the settings, or <position> actuators in "
+            f"{robot.model_file}"
+        ]
+    for name, gains in (("joint_target_ke", robot.stiffness), ("joint_target_kd", robot.damping),
+                        ("joint_effort_limit", robot.effort_limit), ("joint_armature", robot.armature)):  # fmt: skip
+        if gains is not None:
+            getattr(builder, name)[6:] = list(gains)
+    if robot.stiffness is not None:
+        builder.joint_target_mode[6:] = [int(newton.JointTargetMode.POSITION)] * len(joints)
+    return []
+
+
+def _set_contact(builder: newton.ModelBuilder, robot: RobotCfg, *, is_urdf: bool) -> None:
+    """Friction and contact time constant of the settings; a URDF has none of its own."""
+    friction = _URDF_FRICTION if is_urdf and robot.friction is None else robot.friction
+    time_constant_s = robot.contact_time_constant_s
+    if is_urdf and time_constant_s is None:
+        time_constant_s = _URDF_TIME_CONSTANT_S
+    if friction is not None:
+        builder.shape_material_mu[:] = [friction] * builder.shape_count
+    if time_constant_s is not None:
+        solref: Any = builder.custom_attributes["mujoco:solref"].values
+        modes: Any = builder.custom_attributes["mujoco:solref_mode"].values
+        for shape in range(builder.shape_count):
+            solref[shape], modes[shape] = wp.vec2(time_constant_s, 1.0), _RAW_SOLREF

@@ -1,0 +1,132 @@
+"""Bodies and shapes of a robot as its file has them, and where recorded joint coordinates put them.
+
+For showing a robot, not for simulating one: forward kinematics and the geometry are those of MuJoCo C.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robots.mujoco_spec import robot_model, robot_spec
+from sim.robots.robot import RobotCfg
+
+_mj: Any = mujoco  # its types are not written down
+_KINDS = {
+    int(getattr(_mj.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
+    for kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+}
+_FIRST_HIDDEN_GROUP = 3
+_FREE_COORDINATES = 7  # position and quaternion of the base
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geom:
+    """One shape, fixed to a body."""
+
+    name: str
+    """As the simulation calls it; may be empty of one that touches nothing."""
+    body: int
+    """Index into the skeleton's bodies."""
+    kind: str
+    """One of sphere, capsule, ellipsoid, cylinder, box and mesh."""
+    size: NDArray[np.float64]
+    """MuJoCo's: radius; radius and half length; half sides; unused of a mesh; shape (3,) [m]."""
+    position: NDArray[np.float64]
+    """Centre in the body's frame [m], shape (3,)."""
+    quaternion: NDArray[np.float64]
+    """Geom to body frame, w x y z; capsules and cylinders lie along z."""
+    vertices: NDArray[np.float64] | None = None
+    """Of a mesh, in the geom's frame [m], shape (num_vertices, 3)."""
+    faces: NDArray[np.int64] | None = None
+    """Of a mesh, indices into ``vertices``, shape (num_faces, 3)."""
+
+
+class Skeleton:
+    """A robot's bodies; the world is none of them."""
+
+    def __init__(self, robot: RobotCfg) -> None:
+        """Read the robot's file.
+
+        Args:
+            robot: Robot settings.
+
+        Raises:
+            ValueError: If MuJoCo cannot read the file, or its joints are not a free one and the robot's.
+        """
+        self._model = model = robot_model(robot_spec(robot), robot)
+        self.num_coordinates = _FREE_COORDINATES + robot.num_joints
+        """Columns of ``qpos``."""
+        self.body_names: tuple[str, ...] = tuple(model.body(k).name for k in range(1, model.nbody))
+        self.parents: tuple[int, ...] = tuple(int(parent) - 1 for parent in model.body_parentid[1:])
+        """Index of each body's parent; -1 of one that hangs on the world."""
+        self.offsets: NDArray[np.float64] = np.array(model.body_pos[1:])
+        """Origin of each body in its parent's frame [m], shape (num_bodies, 3)."""
+        self.geoms: tuple[Geom, ...] = tuple(map(self._geom, self._shown()))
+        """What is to be seen of it, in the file's order."""
+
+    def geom(self, name: str) -> Geom:
+        """A shape by the name that the simulation has for it, to be seen or not.
+
+        Raises:
+            ValueError: If there is none of that name.
+        """
+        model = self._model
+        names = [model.geom(k).name for k in range(model.ngeom)]
+        if name not in names:
+            raise ValueError(f"no geom named {name}: the robot's file has {', '.join(filter(None, names))}")
+        return self._geom(names.index(name))
+
+    def _shown(self) -> list[int]:
+        """Geoms on a body, without those of the groups that MuJoCo hides, unless there are no others."""
+        model = self._model
+        known = [k for k in range(model.ngeom) if model.geom_bodyid[k] > 0 and int(model.geom_type[k]) in _KINDS]
+        return [k for k in known if model.geom_group[k] < _FIRST_HIDDEN_GROUP] or known
+
+    def _geom(self, index: int) -> Geom:
+        model = self._model
+        kind = _KINDS[int(model.geom_type[index])]
+        vertices = faces = None
+        if kind == "mesh":
+            mesh = model.mesh(model.geom_dataid[index])
+            first, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
+            vertices = np.array(model.mesh_vert[first : first + count], dtype=np.float64)
+            first, count = int(mesh.faceadr[0]), int(mesh.facenum[0])
+            faces = np.array(model.mesh_face[first : first + count], dtype=np.int64)
+        return Geom(
+            name=model.geom(index).name,
+            body=int(model.geom_bodyid[index]) - 1,
+            kind=kind,
+            size=np.array(model.geom_size[index]),
+            position=np.array(model.geom_pos[index]),
+            quaternion=np.array(model.geom_quat[index]),
+            vertices=vertices,
+            faces=faces,
+        )
+
+    def body_poses(self, qpos: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where the bodies are.
+
+        Args:
+            qpos: MuJoCo's joint coordinates, as :meth:`sim.recording.recorder.Recording.qpos` gives them, shape (num_frames,
+                num_coordinates).
+
+        Returns:
+            Origins in the world [m], shape (num_frames, num_bodies, 3), and body-to-world quaternions w x y z, shape
+            (num_frames, num_bodies, 4).
+
+        Raises:
+            ValueError: If the shape is another one.
+        """
+        if qpos.ndim != 2 or qpos.shape[1] != self.num_coordinates:
+            raise ValueError(f"qpos must have shape (num_frames, {self.num_coordinates}), got {qpos.shape}")
+        data = _mj.MjData(self._model)
+        positions = np.empty((len(qpos), len(self.body_names), 3))
+        quaternions = np.empty((len(qpos), len(self.body_names), 4))
+        for frame, row in enumerate(qpos):
+            data.qpos[:] = row
+            _mj.mj_kinematics(self._model, data)
+            positions[frame], quaternions[frame] = data.xpos[1:], data.xquat[1:]
+        return positions, quaternions

@@ -1,0 +1,94 @@
+"""Every command that reads a file which may be damaged, on stand-ins for what takes long, to be run in a child."""
+
+import dataclasses
+import os
+import resource
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from kernels.episode import Outcome
+from qd import reevaluate
+from qd.run.cli import run_command
+from qd.show import replay
+from qd.studies import calibrate
+from sim import rollout
+from sim.files.command import exit_code_of
+from tests.kills import searches, trainings
+from tests.qd import stand_in
+from train.evaluate.evaluate import evaluate
+
+SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
+
+
+def resume_search(path: Path) -> None:
+    """One iteration more than the search had."""
+    searches.run(["--resume", str(path), "--device", "cpu", "--iterations", "3", "--policy", searches.POLICY])
+
+
+def reevaluate_search(path: Path) -> None:
+    """All elites again."""
+    searches.without_figures()
+    main = partial(reevaluate.reevaluate_run, open_evaluator=stand_in.open_stand_in)
+    run_command(reevaluate.ReevaluateCfg, main, ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY])
+
+
+def replay_elite(path: Path) -> None:
+    """The worst elite again."""
+    rollout.Rollout = _StandInRollout
+    argv = ["--run", str(path), "--device", "cpu", "--replicas", "4", "--policy", searches.POLICY]
+    run_command(replay.ReplayCfg, replay.main, argv)
+
+
+def resume_training(run_dir: Path) -> int:
+    """One iteration more than the training had."""
+    trainings.base.CommandTask = lambda *_, **__: trainings.TASK
+    cfg = dataclasses.replace(trainings.config(Path("none"), 3), run_dir=None, resume=run_dir)
+    return exit_code_of(lambda: trainings.base.train(cfg))
+
+
+def calibrate_with(policy: Path) -> None:
+    """Penalty scales with a controller."""
+    calibrate.open_evaluator = stand_in.open_stand_in
+    out = str(policy.parent / "scales.json")
+    argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
+    run_command(calibrate.CalibrateCfg, calibrate.calibrate, argv)
+
+
+def evaluate_with(policy: Path) -> int:
+    """Crossings with a controller, up to where the simulation would be built."""
+    evaluate.open_evaluator = stand_in.open_stand_in
+    evaluate.evaluate_sets = lambda crossings, count, seed: (_ for _ in ()).throw(SystemExit(0))
+    out = policy.parent / "rates.json"
+    cfg = evaluate.EvaluateCfg(policy=str(policy), device="cpu", terrains=2, episodes=1, out=out)
+    return exit_code_of(lambda: int(evaluate.evaluate(cfg) is None))
+
+
+def as_nobody(command: Callable[[Path], Any], path: Path) -> Any:
+    """A command by a user who owns nothing, where this process may become one."""
+    if os.geteuid() == 0:
+        os.setgid(65534)
+        os.setuid(65534)
+    return command(path)
+
+
+class _StandInRollout:
+    def __init__(self, robot: Any, policy: Any, *, num_terrains: int, num_replicas: int, device: str) -> None:
+        self.num_replicas = num_replicas
+        self.sim = SimpleNamespace(bank=SimpleNamespace(heights=SimpleNamespace(numpy=lambda: np.zeros((1, 161, 321)))))
+
+    def evaluate(self, genes: np.ndarray, seeds: np.ndarray, *, record_paths: bool) -> Any:
+        result = stand_in.evaluate(genes, seeds, self.num_replicas)
+        shape = result.invalid.shape
+        extra = {"outcome": np.full(shape, int(Outcome.GOAL)), "final_position": np.zeros((*shape, 3)), "paths": None}
+        return SimpleNamespace(**vars(result), **extra)
+
+
+def search_below(limit: int, path: Path, iterations: int) -> None:
+    """The search where no file may grow beyond a number of bytes; the log of this process lies open already."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    searches.search(path, iterations=iterations)

@@ -1,0 +1,153 @@
+import hashlib
+import os
+import pickle
+import zlib
+
+import numpy as np
+import pytest
+
+from qd.descriptors import Cells
+from qd.run import checkpoint
+from qd.run.checkpoint import load_checkpoint, save_checkpoint
+from qd.run.settings import SchedulerCfg
+from qd.scheduler import Scheduler
+from tests.qd.test_scheduler import advance, make_search
+
+
+def wrap(payload: bytes) -> bytes:
+    """A file with a right magic and hash around any payload, as an attacker would make it."""
+    return checkpoint._MAGIC + hashlib.sha256(payload).digest() + payload
+
+
+@pytest.fixture
+def saved(tmp_path):
+    cells = Cells(6, 3)  # few cells: a small file
+    search = make_search(cells=cells)
+    advance(search, 1, 3, cells)
+    path = tmp_path / "checkpoint.bin"
+    save_checkpoint(path, {**search.state(), "metrics": [{"iteration": 3}]})
+    return path
+
+
+@pytest.mark.parametrize("es", ["cma_es", "sep_cma_es"])
+def test_round_trip(tmp_path, es):
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, es=es))
+    advance(search, 1, 8)
+    path = tmp_path / "checkpoint.bin"
+    save_checkpoint(path, search.state())
+    back = Scheduler.from_state(load_checkpoint(path))
+    assert np.array_equal(back.ask(), search.ask())
+    assert path.stat().st_size < 16 << 20
+
+
+def test_what_a_full_search_needs_fits(tmp_path):
+    cfg = SchedulerCfg()
+    search = make_search(cfg)
+    rng = np.random.default_rng(0)
+    archive_rows = {"solution": rng.normal(size=(4795, 64)), "objective": rng.normal(size=4795)}
+    extra = {name: rng.random((4795, *shape)) for name, (shape, _) in _extra_fields(search).items()}
+    for archive in (search.archive, search.result):
+        archive.add(**archive_rows, measures=np.arange(4795)[:, None] + 0.5, **extra)
+    save_checkpoint(tmp_path / "full.bin", search.state())
+    assert (tmp_path / "full.bin").stat().st_size < 16 << 20
+
+
+def _extra_fields(search):
+    taken = {"solution", "objective", "measures", "threshold", "index"}
+    data = search.result.data()
+    return {name: (rows.shape[1:], rows.dtype) for name, rows in data.items() if name not in taken}
+
+
+def test_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*: give the directory of a search's run"):
+        load_checkpoint(tmp_path / "checkpoint.bin")
+
+
+def test_truncation_anywhere_is_noticed(saved):
+    whole = saved.read_bytes()
+    for size in [0, 5, 30, 61, 62, 63, *np.random.default_rng(0).integers(0, len(whole), 40)]:
+        saved.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=r"another file|truncated or damaged"):
+            load_checkpoint(saved)
+
+
+def test_a_flipped_bit_anywhere_is_noticed(saved):
+    whole = saved.read_bytes()
+    for position in np.random.default_rng(1).integers(0, len(whole), 100):
+        saved.write_bytes(whole[:position] + bytes([whole[position] ^ 4]) + whole[position + 1 :])
+        with pytest.raises(ValueError, match=r"another file|truncated or damaged"):
+            load_checkpoint(saved)
+
+
+def test_damage_behind_a_right_hash_is_one_clear_error(saved):
+    state = zlib.decompress(saved.read_bytes()[len(checkpoint._MAGIC) + 32 :])
+    rng = np.random.default_rng(2)
+    for position in rng.integers(0, 3000, 150):  # where the opcodes are; later come long arrays
+        bad = state[:position] + bytes([rng.integers(256)]) + state[position + 1 :]
+        saved.write_bytes(wrap(zlib.compress(bad, 1)))
+        try:
+            Scheduler.from_state(load_checkpoint(saved))
+        except ValueError as error:
+            assert "\n" not in str(error)
+
+
+class Bomb:
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        Bomb(os.system, "touch {}"),
+        {"archive": Bomb(eval, "open('{}', 'w')")},
+        [Bomb(exec, "open('{}', 'w')")],
+        Bomb(np.load, "{}"),
+        Bomb(np.testing.measure, "open('{}', 'w')"),
+        Bomb(__import__, "os"),
+        Bomb(pickle.loads, b"cos\nsystem\n"),
+    ],
+)
+def test_a_pickle_that_would_run_code_is_refused(tmp_path, content):
+    target = tmp_path / "ran"
+    data = pickle.dumps(content, protocol=4).replace(b"{}", str(target).encode())
+    path = tmp_path / "checkpoint.bin"
+    path.write_bytes(wrap(zlib.compress(data)))
+    with pytest.raises(ValueError, match="is no checkpoint of a search"):
+        load_checkpoint(path)
+    assert not target.exists()
+
+
+def test_admitted_modules_are_no_way_to_their_neighbours(tmp_path):
+    # Protocol 4 names may have dots: numpy.dtype is admitted, what hangs on it is not.
+    path = tmp_path / "checkpoint.bin"
+    for name in (b"dtype.__init__", b"dtype.mro", b"ndarray.tofile", b"os"):
+        path.write_bytes(wrap(zlib.compress(b"\x80\x04\x8c\x05numpy\x8c" + bytes([len(name)]) + name + b"\x93.")))
+        with pytest.raises(ValueError, match="is no part of a search"):
+            load_checkpoint(path)
+
+
+def test_a_bomb_of_zeros_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "_MAX_STATE_BYTES", 1 << 20)
+    path = tmp_path / "checkpoint.bin"
+    path.write_bytes(wrap(zlib.compress(bytes(8 << 20))))
+    with pytest.raises(ValueError, match="larger than 1 MB"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"{}", pickle.dumps({"archive": 1}), wrap(b""), wrap(b"junk")])
+def test_foreign_files(tmp_path, content):
+    path = tmp_path / "checkpoint.bin"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"another file|is no checkpoint of a search"):
+        load_checkpoint(path)
+
+
+def test_the_state_must_be_a_dictionary(tmp_path):
+    path = tmp_path / "checkpoint.bin"
+    path.write_bytes(wrap(zlib.compress(pickle.dumps([1, 2]))))
+    with pytest.raises(ValueError, match="expected a dictionary, got list"):
+        load_checkpoint(path)

@@ -1,0 +1,321 @@
+"""Every mistake that a user can mend: one line on stderr, exit code 2, and existing runs as they were."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+from qd import search
+from qd.run import arguments
+from qd.run.arguments import Arguments
+from qd.run.cli import Interrupted, run_command
+from qd.show import replay
+from qd.workers.process import EvaluatorError
+from sim.robots.robot import RobotCfg, get_robot
+from tests.qd import stand_in
+from tests.qd.test_archive import small_archive
+
+TINY = ["--device", "cpu", "--emitters", "1", "--batch-size", "4", "--replicas", "1", "--iterations", "1"]
+
+
+def fine_policy(observation: torch.Tensor) -> torch.Tensor:
+    return observation[:, :12]
+
+
+def narrow_policy(observation: torch.Tensor) -> torch.Tensor:
+    return observation[:, :3]
+
+
+def nan_policy(observation: torch.Tensor) -> torch.Tensor:
+    return observation[:, :12] * float("nan")
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self: stand_in.SCALES)
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def run_main(*argv: str) -> None:
+    """The search's command on the stand-in evaluator."""
+
+    def main(args: Arguments) -> None:
+        search.run_search(arguments.job_of(args), open_evaluator=stand_in.open_stand_in)
+
+    run_command(Arguments, main, list(argv))
+
+
+def fails(capsys, *argv: str, run=run_main) -> str:
+    """The error line of a command that must fail as a user's mistake."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit:
+        run(*argv)
+    errors = capsys.readouterr().err
+    assert exit.value.code == 2
+    lines = [line for line in errors.splitlines() if "Warp CUDA warning" not in line]
+    assert len(lines) == 1, errors
+    return lines[0].removeprefix("error: ")
+
+
+def test_unknown_robot_and_preset(capsys):
+    assert fails(capsys, "--robot", "dog") == (
+        "unknown robot 'dog': expected one of anymal, cassie, or a Python file that sets ROBOT (README, Bring your own "
+        "robot)"
+    )
+    assert fails(capsys, "--robot", "dog.py") == "dog.py: no such file"
+    assert fails(capsys, "--preset", "huge", *TINY) == "unknown preset 'huge': expected one of paper, small"
+    assert not Path("runs").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA here")
+def test_cuda_that_is_not_there(capsys):
+    assert "no CUDA device was found here" in fails(capsys, "--device", "cuda")
+    assert "unknown device 'tpu'" in fails(capsys, "--device", "tpu")
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ("missing.pt", "no such file"),
+        (f"{__name__}:narrow_policy", "must return actions of shape (num_envs, 12)"),
+        (f"{__name__}:nan_policy", "not finite"),
+        (f"{__name__}:no_policy", "cannot be imported"),
+        ("truncated.pt", "neither a checkpoint of plain tensors nor a TorchScript module"),
+    ],
+)
+def test_controllers_that_cannot_be_used(capsys, policy, message):
+    Path("truncated.pt").write_bytes(b"PK\x03\x04 and no more")
+    assert message in fails(capsys, *TINY, "--policy", policy)
+    assert not Path("runs").exists()
+
+
+def test_a_setting_out_of_range(capsys):
+    assert fails(capsys, *TINY, "--sigma0", "0") == "sigma0 must lie in [1e-06, 1000], got 0.0"
+
+
+def test_directories(capsys):
+    Path("full").mkdir()
+    Path("full/thesis.tex").write_text("years of work")
+    assert "is not empty and holds no run" in fails(capsys, *TINY, "--run-dir", "full")
+    assert "cannot be made: Not a directory" in fails(capsys, *TINY, "--run-dir", "full/thesis.tex/run")
+    assert "no run at nowhere" in fails(capsys, "--resume", "nowhere")
+    assert not Path("nowhere").exists()
+    assert "not both" in fails(capsys, "--resume", "full", "--run-dir", "other")
+    assert Path("full/thesis.tex").read_text() == "years of work"
+
+
+def everything_in(folder: str) -> dict[str, bytes]:
+    return {name: (Path(folder) / name).read_bytes() for name in sorted(os.listdir(folder))}
+
+
+def test_a_run_is_never_overwritten(capsys):
+    run_main(*TINY, "--run-dir", "a")
+    before = everything_in("a")
+    assert "a holds this run already: go on with `make archive ROBOT=anymal RESUME=a DEVICE=cpu`" in fails(
+        capsys, *TINY, "--run-dir", "a"
+    )
+    assert "a holds a run of other settings: seed (0 there, 1 wanted)" in fails(
+        capsys, *TINY, "--run-dir", "a", "--seed", "1"
+    )
+    other = fails(capsys, "--resume", "a", "--learning-rate", "0.5")
+    assert "scheduler.learning_rate (0.09 there, 0.5 wanted)" in other
+    assert 'preset ("small" there, "paper" wanted)' in fails(capsys, "--resume", "a", "--preset", "paper")
+    assert everything_in("a") == before
+
+
+def test_a_damaged_checkpoint_is_reported_and_left_alone(capsys):
+    run_main(*TINY, "--run-dir", "a")
+    checkpoint = Path("a/checkpoint.bin")
+    whole = checkpoint.read_bytes()
+    for content, message in ((whole[:-100], "truncated or damaged"), (b"hello", "it is another file")):
+        checkpoint.write_bytes(content)
+        before = everything_in("a")
+        assert message in fails(capsys, "--resume", "a", "--iterations", "3")
+        assert everything_in("a") == before
+    checkpoint.write_bytes(whole)
+    run_main("--resume", "a", "--iterations", "3")
+
+
+def test_a_controller_that_moved_is_asked_for_and_taken_where_it_is_now(capsys):
+    shutil.copy(get_robot("anymal").policy_file, "mine.pt")
+    run_main(*TINY, "--policy", "mine.pt", "--run-dir", "a")
+    Path("mine.pt").rename("moved.pt")
+    Path("other.pt").write_bytes(Path("moved.pt").read_bytes() + b"\0")
+    before = everything_in("a")
+    assert fails(capsys, "--resume", "a") == (
+        "a was searched with the controller in mine.pt, got no such file now: put it back, or say where it is now "
+        "with --policy"
+    )
+    assert 'policy ("mine.pt" there, "other.pt" wanted)' in fails(capsys, "--resume", "a", "--policy", "other.pt")
+    assert everything_in("a") == before
+    run_main("--resume", "a", "--iterations", "2", "--policy", "moved.pt")
+    assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
+    Path("moved.pt").rename("mine.pt")
+    run_main("--resume", "a", "--iterations", "3")
+
+
+def test_code_runs_only_if_it_is_named_again(capsys):
+    fine = f"{__name__}:fine_policy"
+    run_main(*TINY, "--policy", fine, "--run-dir", "a")
+    told = capsys.readouterr().out
+    assert f"make replay ROBOT=anymal RUN=a ELITE=0 POLICY={fine}" in told
+    before = everything_in("a")
+    refused = f"a was searched with the controller {fine}, which is code: name it again (--policy)"
+    assert refused in fails(capsys, "--resume", "a", "--iterations", "2")
+    assert f"make archive ROBOT=anymal RESUME=a POLICY={fine} DEVICE=cpu" in fails(
+        capsys, *TINY, "--policy", fine, "--run-dir", "a"
+    )
+    config = json.loads(Path("a/config.json").read_text())
+    Path("evil.py").write_text("open('it_ran', 'w').close()\ndef act(row): pass\n")
+    for policy in ("evil:act", f"{Path.cwd()}/evil.py:act", f"{Path.cwd()}/evil.py:act@a/checkpoint.bin"):
+        settings = {**config["settings"], "policy": policy}
+        Path("a/config.json").write_text(json.dumps({**config, "settings": settings}))
+        assert "which is code" in fails(capsys, "--resume", "a", "--iterations", "2")
+    settings = {**config["settings"], "robot": f"{Path.cwd()}/evil.py"}
+    Path("a/config.json").write_text(json.dumps({**config, "settings": settings}))
+    assert "which is not shipped: name its settings file too" in fails(capsys, "--resume", "a", "--policy", fine)
+    assert not Path("it_ran").exists()
+    Path("a/config.json").write_bytes(before["config.json"])
+    run_main("--resume", "a", "--iterations", "2", "--policy", fine)
+    assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
+
+
+def test_what_a_killed_beginning_leaves_is_begun_in_again():
+    Path("a").mkdir()
+    for name in (".config.json.tmp", ".write-test"):
+        Path("a", name).write_text("{")
+    run_main(*TINY, "--run-dir", "a")
+    assert Path("a/archive.npz").exists()
+
+
+def test_a_lost_checkpoint_is_not_begun_over(capsys):
+    run_main(*TINY, "--run-dir", "a")
+    Path("a/checkpoint.bin").unlink()
+    assert "a/checkpoint.bin is lost: expected it beside metrics.jsonl and archive.npz" in fails(
+        capsys, "--resume", "a"
+    )
+
+
+def test_new_runs_get_directories_of_their_own_and_stopped_ones_are_mentioned(capsys):
+    run_main(*TINY)
+    run_main(*TINY)
+    assert sorted(os.listdir("runs")) == ["anymal-small-0", "anymal-small-0-2"]
+    assert "holds the same search" not in capsys.readouterr().out
+    config = json.loads(Path("runs/anymal-small-0/config.json").read_text())
+    Path("runs/anymal-small-0/config.json").write_text(json.dumps({**config, "iterations": 9}))
+    run_main(*TINY)
+    output = capsys.readouterr().out
+    assert "runs/anymal-small-0 holds the same search, stopped after 1 of 9 iterations" in output
+    assert "make archive ROBOT=anymal RESUME=runs/anymal-small-0 DEVICE=cpu" in output
+
+
+def test_the_command_to_go_on_says_all_that_was_given_of_where_to_work(capsys):
+    run_main(*TINY, "--run-dir", "a  b$c")
+    given = ["--processes", "1", "--worker-limit-s", "20.5", "--reproduce", "yes"]
+    message = fails(capsys, *TINY, "--run-dir", "a  b$c", *given)
+    assert message.endswith(
+        "go on with `make archive ROBOT=anymal RESUME='a  b$$c' REPRODUCE=yes DEVICE=cpu PROCESSES=1 "
+        "WORKER_LIMIT_S=20.5`"
+    )
+
+
+def test_a_resumed_run_keeps_where_it_came_from():
+    run_main(*TINY, "--run-dir", "a")
+    first = json.loads(Path("a/config.json").read_text())
+    run_main("--resume", "a", "--iterations", "2")
+    second = json.loads(Path("a/config.json").read_text())
+    assert second.pop("iterations") == 2
+    assert {**second, "iterations": 1} == first
+    assert set(first) >= {"settings", "command", "commit", "device", "versions", "seed", "date"}
+
+
+def test_replay_of_an_elite_that_is_not_there(capsys):
+    from qd.archive import write_archive
+
+    write_archive(Path("archive.npz"), small_archive())
+
+    def run_replay(*argv):
+        run_command(replay.ReplayCfg, replay.main, list(argv))
+
+    def replayed(*argv):
+        return fails(capsys, *argv, run=run_replay)
+
+    assert replayed("--run", "archive.npz", "--elite", "3") == "archive.npz has no elite 3: expected 0 to 2"
+    assert replayed("--run", "archive.npz", "--elite", "-1") == "archive.npz has no elite -1: expected 0 to 2"
+    assert "no archive of anymal under runs/" in replayed()
+    assert "no archive at elsewhere" in replayed("--run", "elsewhere")
+
+
+@dataclass
+class Nothing:
+    """No arguments."""
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (ValueError("two\nlines"), 2, "error: two lines\n"),
+        (PermissionError(13, "Permission denied", "x"), 2, "error: [Errno 13] Permission denied: 'x'\n"),
+        (EvaluatorError("a worker died"), 2, "error: a worker died\n"),
+        (Interrupted("Go on with: x"), 130, "\nGo on with: x\n"),
+        (KeyboardInterrupt(), 130, "\nStopped.\n"),
+    ],
+)
+def test_errors_become_one_line_and_an_exit_code(capsys, error, code, message):
+    def main(args: Nothing) -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as exit:
+        run_command(Nothing, main, [])
+    assert exit.value.code == code
+    assert capsys.readouterr().err == message
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch):
+    def main(args: Nothing) -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run_command(Nothing, main, [])
+
+    def mistake(args: Nothing) -> None:
+        raise ValueError("mistake")
+
+    monkeypatch.setenv("FAULTLINE_DEBUG", "1")
+    with pytest.raises(ValueError, match="mistake"):
+        run_command(Nothing, mistake, [])
+
+
+def test_sigterm_is_an_interrupt(capsys):
+    def main(args: Nothing) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(SystemExit) as exit:
+        run_command(Nothing, main, [])
+    assert exit.value.code == 130
+
+
+@pytest.mark.parametrize("module", ["qd.search", "qd.studies.compare", "qd.studies.calibrate", "qd.show.replay"])
+def test_help_teaches_and_is_fast(module):
+    code = f"""
+import runpy, sys
+sys.argv = ["{module}", "--help"]
+try:
+    runpy.run_module("{module}", run_name="__main__")
+finally:
+    print("slow imports:", [name for name in ("torch", "warp", "newton", "ribs") if name in sys.modules])
+"""
+    root = Path(__file__).parents[3]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True)
+    assert "--device" in done.stdout
+    assert "slow imports: []" in done.stdout

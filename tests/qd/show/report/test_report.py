@@ -1,0 +1,333 @@
+"""The report's page from end to end, on small archives with made-up crossings: whole, true to its files, shut off."""
+
+import dataclasses
+import json
+import re
+from html.parser import HTMLParser
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from qd.archive import write_archive
+from qd.run.cli import Interrupted
+from qd.run.settings import as_settings, preset
+from qd.show.figures import as_png, new_figure, summary
+from qd.show.report import __main__ as command
+from qd.show.report.elites import elites_of
+from qd.show.report.material import HtmlReportCfg, gather
+from qd.show.report.page import Absent, Facts, Heading, Section, Table, Text, render
+from sim.files.atomic import to_json
+from sim.robots.robot import get_robot
+from tests.qd.recordings import stand_in_recorder
+from tests.qd.show.test_figures import rows
+from tests.qd.test_archive import fresh_values
+from tests.qd.test_html_report_numbers import grouped_archive
+
+DOT = bytes.fromhex("89504e470d0a1a0a")
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Text, resources, anchors and balance of a page."""
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__()
+        self.open, self.words, self.resources, self.links, self.ids = [], [], [], [], []
+        self.feed(content.decode())
+        self.close()
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+        self.resources += [given[name] for name in ("src", "srcset", "data", "action") if name in given]
+        self.links += [given["href"]] if "href" in given else []
+        self.ids += [given["id"]] if "id" in given else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.words.append(data)
+
+
+def make_run(root):
+    """A whole run of 20 elites with fresh values."""
+    archive, _ = grouped_archive()
+    archive = dataclasses.replace(archive, iterations=4)
+    archive = archive.corrected_by(fresh_values(archive))
+    folder = root / "run"
+    folder.mkdir()
+    write_archive(folder / "archive.npz", archive)
+    metrics = [{**row, "mean_duration_s": 15.0} for row in rows(4)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in metrics))
+    small = preset("small", get_robot("anymal"))
+    fitness = dataclasses.replace(small.fitness, penalties=archive.penalties, scales=archive.scales)
+    settings = as_settings(dataclasses.replace(small, fitness=fitness))
+    origin = {"command": "python <script>alert(1)</script>", "commit": "abc", "device": "CPU", "seed": 0,
+              "versions": {"numpy": "2"}, "date": "today"}  # fmt: skip
+    (folder / "config.json").write_bytes(to_json({"settings": settings, "iterations": 4, **origin}))
+    return folder
+
+
+def reporter(run, patch):
+    """Makes a report in a folder without published tables; returns the page and what was crossed."""
+    patch.chdir(run.parent)
+    patch.setattr(command, "check_policy", lambda policy, robot, device: None)
+
+    def make(**changes):
+        cfg = HtmlReportCfg(**{"run": run, "device": "cpu", "episodes": 4, "elites": 1, **changes})
+        crossed = []
+        return command.html_report(cfg, make_recorder=stand_in_recorder(crossed)), crossed
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A report with its figures, as anyone would get it; not to be changed."""
+    run = make_run(tmp_path_factory.mktemp("whole"))
+    with pytest.MonkeyPatch.context() as patch:
+        return reporter(run, patch)(elites=2)
+
+
+@pytest.fixture
+def run(tmp_path):
+    return make_run(tmp_path)
+
+
+@pytest.fixture
+def reported(run, monkeypatch):
+    """Makes reports whose figures are a dot: drawing takes most of the time."""
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(DOT))
+    return reporter(run, monkeypatch)
+
+
+def test_the_page_is_whole_and_fetches_nothing(whole):
+    out, crossed = whole
+    run = out.parent
+    assert out.name == "report.html" and run.name == "run"
+    content = out.read_bytes()
+    page = Page(content)
+    assert page.open == [] and len(content) < command.MAX_BYTES
+    assert page.resources and all(resource.startswith("data:image/png;base64,") for resource in page.resources)
+    assert all(link.startswith("#") and link[1:] in page.ids for link in page.links)
+    assert len(page.ids) == len(set(page.ids))
+    outside = re.sub(rb"data:image/png;base64,[A-Za-z0-9+/=]+", b"", content)
+    assert not re.search(rb"https?://|url\(|@import|<link|<iframe|fetch\(", outside)
+    assert b"default-src 'none'" in content
+    figures = sorted(path.name for path in (run / "report-figures").iterdir())
+    assert len(figures) == len(page.resources)
+    assert {"curves.png", "archive.png", "spread.png", "pairs.png", "modes.png", "elite-0.png"} <= set(figures)
+    for name in figures:
+        assert matplotlib.image.imread(run / "report-figures" / name).std() > 0.01  # something is drawn
+    assert len(crossed) == len(set(crossed)) == sum(name.startswith("elite-") for name in figures)
+
+
+def test_the_sentences_have_the_numbers_of_the_files(whole):
+    text = Page(whole[0].read_bytes()).text
+    archive = gather(HtmlReportCfg(run=whole[0].parent)).archive
+    elites, numbers = elites_of(archive), summary(archive, rows(4), gpus=0, origin={})
+    failing = int((archive.fresh.goal_rate < 0.5).sum())
+    assert f"The controller fails on {failing} of {len(archive)} elites judged (by 40 fresh episodes each" in text
+    assert f"from {numbers['terrains_evaluated']} terrains and {numbers['episodes']} episodes" in text
+    assert f"{numbers['invalid_episodes']} episodes were invalid" in text
+    assert "(40 min of walking, simulated)" in text  # 160 episodes of 15 s
+    assert "the archive grew from 5 to 20 elites, half of them found by iteration 2" in text
+    assert "QD score, the sum of fitness above -20, rose from 20 to 80" in text
+    assert "The 20 elites fall into 3 modes" in text
+    assert f"in {int(archive.collided.sum())} of 20 elites the base collides" in text
+    # of elite 0 four made-up crossings end each in its own way, at x = 6, 8.7, 11.3 and 14, the first at the goal
+    at = np.median(np.linspace(6.0, 14.0, 4)[1:])
+    assert (
+        "1 of 4 robots reached the goal (base collision 1; out of time 1; left the terrain 1), and the middle one of "
+        f"those that did not ended at x = {at:.1f} m" in text
+    )
+    assert f"Its fitness is {elites.fitness[0]:.1f} by 40 fresh episodes" in text
+    assert "1 of 4 25 % 5 to 70 %" in text  # Wilson
+    assert "Show 20 elites" in text
+
+
+def test_the_first_chapter_says_what_breaks_the_controller_and_in_how_many_ways(reported, run):
+    archive, _ = grouped_archive()  # 6 stuck, 9 collided, 5 across
+    fresh = dataclasses.replace(
+        fresh_values(archive),
+        **{
+            name: getattr(archive, name) for name in ("ratios", "goal_rate", "collision_rate", "fallen_rate", "fitness")
+        },
+    )
+    # afresh, the six land in two cells and the nine in one, which is that of the five too
+    fresh.cell[:] = [0, 0, 0, 1, 1, 1, *[2] * 14]
+    write_archive(run / "archive.npz", dataclasses.replace(archive, iterations=4, fresh=fresh))
+    text = Page(reported()[0].read_bytes()).text
+    first = text[: text.index("From iteration 1")]
+    assert "The controller fails on 15 of 20 elites" in first and "They fall into 3 cells" in first
+    assert "different ways of failing: cells that these fall into 3 failure modes: kinds of these ways 2" in first
+    told = ("strikes the terrain with its base on 9 elites", "gets stuck on 6 elites", "reaches the goal on 5 elites")
+    assert [first.index(part) for part in told] == sorted(first.index(part) for part in told)
+
+
+def test_without_fresh_episodes_those_of_the_search_are_named(reported, run):
+    archive, _ = grouped_archive()
+    write_archive(run / "archive.npz", dataclasses.replace(archive, iterations=4, fresh=None))
+    fitness, count = archive.fitness[0], archive.episodes[0]
+    told = f"Its fitness is {fitness:.1f} by {count} episodes of the search, whose penalties"
+    assert told in Page(reported()[0].read_bytes()).text
+
+
+def test_where_it_comes_from_names_who_made_the_fresh_episodes_too(reported, run):
+    again = {"command": "python -m qd.search --resume <b>", "commit": "def", "seed": 7}
+    (run / "archive.json").write_bytes(to_json({"reproduced_by": again}))
+    content = reported()[0].read_bytes()
+    assert "Its search began with: command python <script>" in Page(content).text
+    assert "fresh episodes: command python -m qd.search --resume <b> fresh episodes: commit def" in Page(content).text
+    assert b'<table class="words">' in content  # a command of any length leaves the other cells in sight
+
+
+@pytest.mark.parametrize("name", ["$\\foo$", "a\udcff"])
+def test_names_that_are_no_formula_or_no_text_are_drawn_as_they_are(name):
+    figure = new_figure(2.0, 1.0)
+    figure.suptitle(name)
+    assert as_png(figure).startswith(DOT)
+
+
+def test_what_comes_from_files_is_escaped(whole):
+    content = whole[0].read_text()
+    assert "<script>alert" not in content and "&lt;script&gt;alert(1)" in content
+    blocks = [Text("a < b & `x<y`"), Heading("<h>", "a\"b"), Absent("<i>", "make <x>"), Facts([("<f>", "&")]),
+              Table(["<t>"], [["<r>"]], keys=[['"']], links=["'x"], folded="<s>")]  # fmt: skip
+    page = Page(render("<title>", "<lead>", [Section("<s>", "<a>", blocks)]))
+    assert page.open == []
+    for text in ("a < b & x<y", "<h>", "<i>", "make <x>", "<f>", "<t>", "<r>", "<title>", "<lead>"):
+        assert text in page.text.replace("x<y", "x<y")
+    assert 'a"b' in page.ids and "<a>" in page.ids and "#'x" in page.links
+
+
+def test_crossings_are_kept_and_a_stopped_report_goes_on(reported, run, monkeypatch):
+    first, crossed = reported()
+    before = first.read_bytes()
+    assert crossed and reported()[1] == [] and first.read_bytes() == before
+    kept = sorted((run / "report-recordings").iterdir())
+    assert len(kept) == len(crossed)
+    kept[0].write_bytes(kept[0].read_bytes()[:100])  # damaged: crossed again
+    kept[1].unlink()
+    assert len(reported()[1]) == 2
+    assert len(reported(episodes=3)[1]) == len(crossed)  # other crossings
+
+    def dying(place):
+        cross, done = stand_in_recorder([])(place), []
+
+        def cross_two(wanted, progress):
+            if len(done) == 2:
+                raise KeyboardInterrupt
+            done.append(wanted)
+            return cross(wanted, progress)
+
+        return cross_two
+
+    cfg = HtmlReportCfg(run=run, device="cpu", episodes=5, elites=2)
+    with pytest.raises(Interrupted, match=r"what was crossed is kept\. The same command goes on"):
+        command.html_report(cfg, make_recorder=dying)
+    assert len(reported(episodes=5)[1]) == len(crossed) - 2
+
+
+def test_sections_without_data_name_the_command_that_makes_it(reported, run):
+    (run / "metrics.jsonl").unlink()
+    (run / "config.json").unlink()
+    text = Page(reported()[0].read_bytes()).text
+    assert "there is no metrics.jsonl beside the archive. A search writes one: make archive ROBOT=anymal" in text
+    assert "no config.json beside the archive" in text
+    assert "They are made by make evaluate ROBOT=anymal POLICIES='base=shipped C-G=FILE'" in text
+
+
+@pytest.mark.parametrize("count", [1, 2, 11])
+def test_archives_of_any_size_and_without_fresh_values(reported, run, count):
+    archive, _ = grouped_archive((count, 0, 0))
+    write_archive(run / "archive.npz", dataclasses.replace(archive, iterations=4))
+    page = Page(reported()[0].read_bytes())
+    assert f"of {count} elite{'s' * (count > 1)} judged (by the episodes that found them" in page.text
+    assert ("95 % intervals (bootstrap over terrains)" in page.text) == (count == 11)
+    assert "Over all elites 0 % of the robots" in page.text or count == 11
+    assert page.open == []
+
+
+def test_code_that_only_the_run_names_is_not_run(reported, run):
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["policy"] = "tests.sim.policies:stand"
+    (run / "config.json").write_bytes(to_json(config))
+    out, crossed = reported()
+    assert crossed == []
+    assert "name it with POLICY=tests.sim.policies:stand" in Page(out.read_bytes()).text
+    assert reported(policy="tests.sim.policies:stand")[1]
+
+
+def test_a_controller_that_cannot_be_loaded_leaves_its_crossings_out(reported, monkeypatch):
+    def refuse(policy, robot, device):
+        raise ValueError("no such controller <x>")
+
+    monkeypatch.setattr(command, "check_policy", refuse)
+    out, crossed = reported()
+    assert crossed == []
+    assert "cannot be loaded: no such controller <x>" in Page(out.read_bytes()).text
+    with pytest.raises(ValueError, match="no such controller"):
+        reported(policy="lost.pt")
+
+
+def test_bad_input_is_refused_before_any_work(reported, run, tmp_path, monkeypatch):
+    def refused(error, message, **changes):
+        with pytest.raises(error, match=message):
+            reported(**changes)
+        assert not list(tmp_path.rglob("*.html")) and not list(tmp_path.rglob("report-*"))
+
+    refused(ValueError, "unknown robot 'spot': expected one of anymal", robot="spot")
+    refused(ValueError, "is of robot anymal, got --robot cassie", robot="cassie")
+    refused(FileNotFoundError, "no archive at", run=tmp_path / "nothing")
+    refused(FileNotFoundError, "no tables at .*make evaluate", tables=tmp_path / "nothing.json")
+    refused(ValueError, r"out must be a file named \*\.html, got", out=tmp_path / "folder")
+    (tmp_path / "blocked").write_text("a file")
+    refused(ValueError, "cannot write to .*blocked", out=tmp_path / "blocked" / "report.html")
+    (tmp_path / "damaged.json").write_text("{")
+    refused(ValueError, "must be a JSON file", tables=tmp_path / "damaged.json")
+    refused(ValueError, "must be 1 to 10 of each kind, got 0", elites=0)
+    whole = (run / "archive.npz").read_bytes()
+    (run / "archive.npz").write_bytes(whole[: len(whole) // 2])
+    refused(ValueError, "must be the archive of a search, but it is damaged")
+    (run / "archive.npz").unlink()
+    refused(ValueError, r"got one without archive\.npz: let it go on with `make archive ROBOT=anymal RESUME=")
+    (run / "archive.npz").write_bytes(whole)
+    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[:2]))
+    refused(ValueError, "a row for each of the archive's 4 iterations, got 2: the run is half-written")
+    (run / "metrics.jsonl").write_text("".join(lines))
+    write_archive(run / "archive.npz", dataclasses.replace(grouped_archive((0, 0, 0))[0], iterations=4))
+    refused(ValueError, "must have elites to report on, got an archive of none after 4 iterations")
+    other = dataclasses.replace(grouped_archive()[0], iterations=4, penalties=("yaw_rate", "<b>"))
+    write_archive(run / "archive.npz", other)
+    refused(ValueError, "by penalties that robot anymal does not have: <b>; expected some of yaw_rate, vel_x")
+
+
+def test_a_page_is_whole_or_as_it_was(reported, run, monkeypatch):
+    out, _ = reported()
+    before = out.read_bytes()
+
+    def full(path, data):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(command, "write_atomically", full)
+    with pytest.raises(OSError, match="no space left"):
+        reported(elites=1)
+    assert out.read_bytes() == before
+
+
+def test_published_results_are_not_written_to(monkeypatch, tmp_path, run):
+    monkeypatch.chdir(tmp_path)
+    published = tmp_path / "results" / "anymal" / "archive"
+    published.parent.mkdir(parents=True)
+    run.rename(published)
+    material = gather(HtmlReportCfg())
+    assert str(material.run) == "results/anymal/archive"
+    assert str(material.out) == "runs/anymal-published/report.html"

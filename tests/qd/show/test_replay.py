@@ -1,0 +1,175 @@
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from kernels.episode import Outcome
+from qd.archive import write_archive
+from qd.descriptors import Cells
+from qd.fitness import FitnessCfg, evaluation_of
+from qd.run.directory import RunDirectory
+from qd.run.places import elite_name, folder_for, newest_or_published, newest_run
+from qd.run.settings import as_settings
+from qd.show.recordings import archive_of_robot
+from qd.show.replay import Replay, ReplayCfg, describe, draw, replay
+from sim.robots.robot import get_robot
+from tests.qd import stand_in
+from tests.qd.stand_in import make_result
+from tests.qd.test_archive import fresh_values, small_archive
+from tests.qd.test_search import CFG, run
+
+
+@pytest.fixture
+def done(tmp_path):
+    cells = Cells(2)
+    ratios = np.array([[0.35, 0.65]])
+    archive = dataclasses.replace(
+        small_archive(1),
+        ratios=ratios,
+        cell=cells.cell_of(ratios),
+        penalty_mean=np.array([[2.0, 3.0]]),
+        penalty_std=np.array([[1.0, 0.5]]),
+        fitness=np.array([3.25]),
+        collision_rate=np.array([0.25]),
+        goal_rate=np.array([0.75]),
+        fallen_rate=np.array([0.0]),
+    )
+    # raw sums of four episodes; scales .5 and 2 make them (4, 8), a ratio of 1/3
+    result = make_result([[[2.0, 16.0]] * 4], base_collision=[[True, False, False, False]])
+    fresh = evaluation_of(result, cells, FitnessCfg(penalties=archive.penalties, scales=archive.scales))
+    paths = np.full((1, 4, 30, 3), np.nan)
+    paths[0, :, :20, 0] = np.linspace(2, 10, 20)
+    paths[0, :, :20, 1] = 4 + np.arange(4)[:, None] / 10
+    outcome = np.array([[Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]])
+    shown = SimpleNamespace(**vars(result), outcome=outcome, paths=paths, final_position=paths[:, :, 19])
+    heights = np.random.default_rng(0).normal(size=(161, 321)).astype(np.float32)
+    out = tmp_path / "elite-0.png"
+    return Replay(run=tmp_path, out=out, archive=archive, elite=0, heights=heights, result=shown, fresh=fresh)  # pyright: ignore
+
+
+def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
+    text = describe(done)
+    row = next(line for line in text.splitlines() if "yaw_rate [rad]" in line)
+    assert " ".join(row.split()) == "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)"
+    row = next(line for line in text.splitlines() if "vel_x [m]" in line)
+    assert " ".join(row.split()) == "vel_x [m] 6.00 +- 1.00 (65% of all) 16.00 +- 0.00 (67% of all)"
+    row = next(line for line in text.splitlines() if "base collision" in line)
+    assert " ".join(row.split()) == "base collision 1 of 4 (25%, 5 to 70%) 1 of 4 (25%, 5 to 70%)"
+    # Wilson, z^2 = 3.8415, of 1 of 4: (.25 + .4802 +- 1.96 sqrt(.0469 + .0600)) / 1.9604 = .3725 +- .3269
+    row = next(line for line in text.splitlines() if "goal reached" in line)
+    assert " ".join(row.split()) == "goal reached 3 of 4 (75%, 30 to 95%) 3 of 4 (75%, 30 to 95%)"
+    # fresh: 4 + 8 - 0 - 2 * 3/4
+    assert next(line for line in text.splitlines() if "fitness" in line).split() == ["fitness", "3.25", "10.50"]
+    assert "lands in its cell or a neighbour of it again" in text
+
+
+def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
+    fresh = dataclasses.replace(fresh_values(done.archive), invalid_episodes=np.array([8]))
+    corrected = dataclasses.replace(done, archive=dataclasses.replace(done.archive, fresh=fresh))
+    lines = [" ".join(line.split()) for line in describe(corrected).splitlines()]
+    assert lines[1:3] == ["found (4 episodes) corrected (40 episodes) now (4 episodes)", "fitness 3.25 1.62 10.50"]
+    assert "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
+    # 8 of the 40 are invalid
+    assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) 1 of 4 (25%, 5 to 70%)" in lines
+    title = draw(corrected).axes[0].get_title()
+    assert title.endswith("fitness 3.25 as found, 1.62 corrected, 10.50 in 4 fresh episodes")
+
+
+def test_another_controller_than_was_searched_is_named(done):
+    other = dataclasses.replace(done, controller="runs/tuned/C-G.pt")
+    text = describe(other)
+    assert "Now it was crossed with runs/tuned/C-G.pt; all else is of the controller that was searched." in text
+    assert "in its cell" not in text
+    assert draw(other).axes[0].get_title().endswith("\nwith another controller than was searched: C-G.pt")
+
+
+def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
+    for name, content in (("a.pt", b"1"), ("b.pt", b"1"), ("C-G.pt", b"2")):
+        (tmp_path / name).write_bytes(content)
+    a, b, tuned = (str(tmp_path / name) for name in ("a.pt", "b.pt", "C-G.pt"))
+    assert elite_name(3, a, b) == elite_name(3, "no.such:code", "no.such:code") == "elite-3"
+    assert elite_name(3, tuned, a) == "elite-3-C-G"
+    assert elite_name(3, "no.such:code", "no.other:code") == "elite-3-no.such-code"
+    assert elite_name(3, "mine/row.py:adapt@my model.onnx", a) == "elite-3-row.py-adapt-my-model"
+
+
+def test_of_an_invalid_terrain_no_rate_is_known(done):
+    fresh = dataclasses.replace(done.fresh, invalid_episodes=np.array([3]), collision_rate=np.array([0.0]))
+    lines = [" ".join(line.split()) for line in describe(dataclasses.replace(done, fresh=fresh)).splitlines()]
+    assert "base collision 1 of 4 (25%, 5 to 70%) no valid episode" in lines
+
+
+def test_the_drawing_has_all_paths_and_how_they_ended(done):
+    axes = draw(done).axes[0]
+    paths = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == 30]
+    assert len(paths) == 4
+    image = axes.images[0]
+    assert image.get_array().shape == (161, 321)
+    assert tuple(image.get_extent()) == (0.0, 16.0, 0.0, 8.0)
+    labels = [text for text in axes.get_legend_handles_labels()[1] if "(" in text]
+    assert labels == ["reached the goal (2)", "base collision (1)", "out of time (1)"]
+
+
+def test_without_paths_the_ends_are_drawn(done):
+    result = SimpleNamespace(**{**vars(done.result), "paths": None})
+    axes = draw(dataclasses.replace(done, result=result)).axes[0]
+    assert len(axes.collections) == 3
+
+
+@pytest.mark.parametrize("change", [{"scales": (9.0,) * 6}, {"penalties": stand_in.PENALTIES[::-1]}])
+def test_a_config_of_another_search_is_refused(tmp_path, change):
+    fitness = dataclasses.replace(CFG.fitness, **change)
+    run(tmp_path / "run")
+    settings = as_settings(dataclasses.replace(CFG, fitness=fitness))
+    RunDirectory(tmp_path / "run").write_config(settings, 2, {"device": "cpu"})
+    with pytest.raises(ValueError, match=r"config\.json must have the penalties and scales of its archive, yaw_rate"):
+        replay(ReplayCfg(run=tmp_path / "run", device="cpu"))
+
+
+def test_no_run_yet(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`make archive ROBOT=anymal`"):
+        newest_run(get_robot("anymal"))
+    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/"):
+        newest_or_published(get_robot("anymal"))
+
+
+def test_the_published_run_is_taken_where_there_is_none_and_nothing_is_written_into_it(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    published = tmp_path / "results" / "anymal" / "archive"
+    published.mkdir(parents=True)
+    write_archive(published / "archive.npz", small_archive())
+    with pytest.raises(FileNotFoundError, match=r"or give --run, such as the published results/anymal/archive$"):
+        newest_run(get_robot("anymal"))
+    found = newest_or_published(get_robot("anymal"))
+    assert found == Path("results/anymal/archive")
+    for named in (found, published, published / "archive.npz", published / ".." / "archive"):
+        assert folder_for(named, "anymal") == Path("runs/anymal-published")
+    own = Path("runs/anymal-small-0")
+    own.mkdir(parents=True)
+    write_archive(own / "archive.npz", small_archive())
+    assert newest_or_published(get_robot("anymal")) == own
+    assert folder_for(own, "anymal") == folder_for(own / "archive.npz", "anymal") == own
+
+
+@pytest.mark.parametrize("changes", [{"replicas": 0}, {"seed": -1}])
+def test_numbers_of_no_episodes_are_refused(changes):
+    with pytest.raises(ValueError, match="replicas must be at least 1 and seed at least 0, got"):
+        replay(ReplayCfg(**changes))
+
+
+def test_an_archive_of_penalties_that_the_robot_lacks_is_refused(tmp_path):
+    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), penalties=("yaw_rate", "<b>")))
+    for refused in (lambda: replay(ReplayCfg(run=tmp_path)), lambda: archive_of_robot("anymal", tmp_path)):
+        with pytest.raises(ValueError, match="penalties that robot anymal does not have: <b>; expected some of yaw_"):
+            refused()
+
+
+@pytest.mark.parametrize("out", ["a.jpg", "/proc/nowhere/a.png"])
+def test_a_place_for_the_figure_is_looked_for_before_the_crossing(tmp_path, monkeypatch, out):
+    run(tmp_path / "run")
+    monkeypatch.setattr("sim.rollout.Rollout", None)  # crossing anything would fail with another error
+    with pytest.raises(ValueError, match=r"out must be a file named \*\.png|cannot write to /proc/nowhere"):
+        replay(ReplayCfg(run=tmp_path / "run", device="cpu", out=Path(out)))

@@ -1,0 +1,115 @@
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from qd.show.view.meshes import arrow_mesh, arrow_pose, body_meshes, geom_mesh, terrain_mesh
+from qd.show.view.playing import rotated
+from sim.mujoco_c.model import surface_heights
+from sim.robots.skeleton import Geom, Skeleton
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+SIZES = {
+    "sphere": (0.2, 0.0, 0.0),
+    "capsule": (0.1, 0.3, 0.0),
+    "ellipsoid": (0.1, 0.2, 0.3),
+    "cylinder": (0.1, 0.3, 0.0),
+    "box": (0.1, 0.2, 0.3),
+}
+
+
+def make_geom(kind, size, position=(0.3, -0.2, 0.1), quaternion=(0.5, 0.5, -0.5, 0.5)):
+    """A shape turned and moved about."""
+    arrays = [np.array(values, dtype=float) for values in (size, position, quaternion)]
+    return Geom(name="it", body=0, kind=kind, size=arrays[0], position=arrays[1], quaternion=arrays[2])
+
+
+def outside(geom, points):
+    """Distance of points from a shape's surface along the line to its centre [m], by MuJoCo's ray casting."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, geom.quaternion)
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{geom.kind.upper()}")
+    inward = geom.position - points
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    far = points - inward  # a metre off
+    cast = [mujoco.mju_rayGeom(geom.position, matrix, geom.size, a, b, kind) for a, b in zip(far, inward, strict=True)]
+    return np.array(cast) - 1.0
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_the_vertices_of_a_shape_lie_on_it(kind):
+    geom = make_geom(kind, SIZES[kind])
+    mesh = geom_mesh(geom, (1, 2, 3))
+    vertices = mesh.vertices.astype(np.float64)
+    vertices = vertices[np.linalg.norm(vertices - geom.position, axis=1) > 1e-6]  # not the middle of a lid
+    assert np.abs(outside(geom, vertices)).max() < 1e-5
+    assert mesh.as_trimesh().is_watertight and mesh.as_trimesh().volume > 0.0  # faces look outward
+    assert mesh.colors.tolist() == [[1, 2, 3, 255]] * len(mesh.vertices)
+
+
+def test_every_shape_of_a_robot_is_part_of_its_body(robot):
+    skeleton = Skeleton(robot)
+    meshes = body_meshes(skeleton, robot)
+    assert len(meshes) == len(skeleton.body_names)
+    for geom in skeleton.geoms:
+        mesh = meshes[geom.body]
+        own = {tuple(vertex) for vertex in geom_mesh(geom, (0, 0, 0)).vertices.tolist()}
+        assert own <= {tuple(vertex) for vertex in mesh.vertices.tolist()}
+        assert mesh.faces.max() == len(mesh.vertices) - 1
+
+
+def test_bones_hold_the_robot_together(robot):
+    skeleton = Skeleton(robot)
+    qpos = np.concatenate([[0.0, 0.0, 1.0], IDENTITY, robot.default_joint_pos])[None]
+    positions, quaternions = skeleton.body_poses(qpos)
+    world = []
+    for k, mesh in enumerate(body_meshes(skeleton, robot)):
+        if mesh is not None:
+            world.append(positions[0, k] + rotated(quaternions[0, k], mesh.vertices.astype(float)))
+    clouds = [trimesh.bounds.corners(np.stack([points.min(axis=0), points.max(axis=0)])) for points in world]
+    for k, corners in enumerate(clouds):  # the box round each part overlaps that of another one
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        others = [c for j, c in enumerate(clouds) if j != k]
+        assert any((low <= c.max(axis=0)).all() and (high >= c.min(axis=0)).all() for c in others)
+
+
+def test_the_terrain_is_the_surface_of_the_physics():
+    rng = np.random.default_rng(5)
+    heights = rng.normal(size=(5, 7)).astype(np.float32)
+    mesh = terrain_mesh(heights)
+    triangles = mesh.vertices.astype(float)[mesh.faces.astype(int)]
+    assert len(triangles) == 2 * 4 * 6
+    weights = rng.dirichlet(np.ones(3), size=(len(triangles), 5))
+    points = np.einsum("tkc,tcd->tkd", weights, triangles).reshape(-1, 3)
+    np.testing.assert_allclose(
+        points[:, 2], surface_heights(heights.astype(float), points[:, 0], points[:, 1]), atol=1e-6
+    )
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert (normals[:, 2] > 0.0).all()
+
+
+def test_low_ground_is_blue_and_high_ground_red():
+    heights = np.zeros((21, 21), np.float32)
+    heights[5, 5], heights[15, 15] = -1.0, 1.0
+    colors = terrain_mesh(heights).colors.reshape(21, 21, 4).astype(int)
+    low, level, high = colors[5, 5], colors[10, 10], colors[15, 15]
+    assert low[2] > low[0] and high[0] > high[2] and abs(level[0] - level[2]) < 30
+    flat = terrain_mesh(np.full((21, 21), 0.01, np.float32)).colors[25].astype(int)
+    assert np.abs(flat - level).max() < 10  # a centimetre is no mountain
+
+
+def test_colours_are_exported_in_linear_light():
+    mesh = geom_mesh(make_geom("box", SIZES["box"]), (0, 188, 255))
+    # sRGB 188 is ((188/255 + .055) / 1.055)^2.4 = .5029 of the light, 128 of 255
+    assert mesh.as_trimesh().visual.vertex_colors[0].tolist() == [0, 128, 255, 255]
+
+
+@pytest.mark.parametrize("way", [(0.3, -0.4, 1.2), (0.0, 0.0, 2.0), (0.0, 0.0, -0.5), (1.0, 0.0, 0.0)])
+def test_an_arrow_points_from_its_beginning_to_its_end(way):
+    begin = np.array([1.0, 2.0, 3.0])
+    quaternion, length = arrow_pose(begin, begin + way)
+    vertices = arrow_mesh((9, 9, 9)).vertices.astype(float)
+    tip = vertices[np.argmax(vertices[:, 2])]
+    np.testing.assert_allclose(tip, [0.0, 0.0, 1.0], atol=1e-6)
+    assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(begin + rotated(quaternion, tip * [1.0, 1.0, length]), begin + way, atol=1e-5)

@@ -1,0 +1,95 @@
+import dataclasses
+import queue
+import time
+
+import numpy as np
+import pytest
+
+from qd.show.view.crossings import Wanted
+from qd.show.view.recorder import Recorder
+from tests.qd.show.view.instant import build
+
+
+def wish(number, policy="fast"):
+    genes = np.full((1, 64), number, np.float32)
+    return Wanted(elite=number, controller=policy, policy=policy, replicas=1, genes=genes)
+
+
+@pytest.fixture
+def reports():
+    return queue.SimpleQueue()
+
+
+@pytest.fixture
+def recorder(anymal, reports):
+    recorder = Recorder(anymal, reports.put, build=build)
+    yield recorder
+    recorder.stop()
+
+
+def last_of(reports):
+    """Reports up to the one that ends a recording."""
+    found = []
+    while not found or not (found[-1].recording or found[-1].failed):
+        found.append(reports.get(timeout=60))
+    return found
+
+
+def test_progress_comes_before_the_recording(recorder, reports):
+    recorder.record(wish(2))
+    found = last_of(reports)
+    assert [report.share for report in found] == [0.0, 0.5, 1.0]
+    assert "building" in found[0].text and found[-1].recording == "fast on 2"
+    recorder.record(wish(3))
+    assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
+
+
+def test_of_several_wishes_the_last_one_counts(recorder, reports):
+    recorder.record(wish(1, "slow"))
+    while reports.get(timeout=60).share == 0.0:  # until it is at it
+        pass
+    for number in (2, 3, 4):
+        recorder.record(wish(number, "slow"))
+    assert last_of(reports)[-1].recording == "slow on 1"
+    assert last_of(reports)[-1].recording == "slow on 4"
+    recorder.record(wish(5))
+    recorder.record(None)
+    time.sleep(0.5)
+    assert all(report.wanted.elite == 5 for report in iter_now(reports))
+
+
+def iter_now(reports):
+    while not reports.empty():
+        yield reports.get()
+
+
+def test_a_failure_is_told_and_the_next_recording_works(recorder, reports):
+    recorder.record(wish(13))
+    failed = last_of(reports)[-1]
+    assert failed.failed and "RuntimeError: broken" in failed.text
+    recorder.record(wish(14))
+    assert last_of(reports)[-1].recording == "fast on 14"
+    recorder.record(wish(1, "refused"))
+    assert last_of(reports)[-1].text == "no such controller"
+
+
+def test_few_processes_are_kept(recorder, reports):
+    for policy in "abcde":
+        recorder.record(wish(1, policy))
+        assert last_of(reports)[-1].recording == f"{policy} on 1"
+    assert [cfg.policy for cfg in recorder._workers] == ["c", "d", "e"]
+
+
+def test_stopping_does_not_wait_for_a_recording(anymal, reports):
+    recorder = Recorder(anymal, reports.put, build=build)
+    recorder.record(wish(1, "slow"))
+    while reports.get(timeout=60).share == 0.0:
+        pass
+    began = time.perf_counter()
+    recorder.stop()
+    assert time.perf_counter() - began < 0.9
+    assert not recorder._thread.is_alive()
+
+
+def test_wishes_are_told_apart_without_their_genes():
+    assert wish(1) == dataclasses.replace(wish(1)) and wish(1) != wish(2) and wish(1) != wish(1, "other")

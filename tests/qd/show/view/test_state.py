@@ -1,0 +1,121 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from qd.show.view.elites import elites_of
+from qd.show.view.state import PAGE, Clock, Selection
+from tests.qd.test_archive import fresh_values, small_archive
+
+
+@pytest.fixture
+def elites():
+    """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
+    numbers = np.arange(20)
+    archive = dataclasses.replace(
+        small_archive(20),
+        goal_rate=numbers / 20,
+        collision_rate=(numbers % 2).astype(float),
+        fitness=10.0 - numbers,
+        episodes=np.full(20, 20),
+    )
+    return elites_of(archive)
+
+
+@pytest.fixture
+def selection(elites):
+    return Selection(elites)
+
+
+def test_ranges_keep_what_lies_in_all_of_them(selection):
+    assert selection.kept.tolist() == list(range(20))
+    selection.brush("goal_rate", 0.25, 0.5)  # ends included
+    assert selection.kept.tolist() == [5, 6, 7, 8, 9, 10]
+    selection.brush("collision_rate", 0.5, 1.0)
+    assert selection.kept.tolist() == [5, 7, 9]
+    selection.brush("goal_rate", 0.0, 0.95)  # its full range
+    assert selection.ranges == {"collision_rate": (0.5, 1.0)}
+    assert selection.kept.tolist() == list(range(1, 20, 2))
+    selection.clear()
+    assert selection.kept.tolist() == list(range(20)) and selection.ranges == {}
+
+
+def test_ranges_may_keep_nothing(selection):
+    selection.brush("goal_rate", 0.92, 0.94)
+    assert (selection.kept.tolist(), selection.listed, selection.num_pages) == ([], [], 1)
+    assert selection.step(1) == selection.picked == 0
+
+
+def test_a_range_runs_upward(selection):
+    with pytest.raises(ValueError, match=r"from low to high, got 0.5 to 0.2"):
+        selection.brush("goal_rate", 0.5, 0.2)
+
+
+def test_the_list_has_pages(selection):
+    assert PAGE == 8 and selection.num_pages == 3
+    selection.turn(1)
+    assert selection.listed == list(range(8, 16))
+    selection.turn(20)
+    assert selection.listed == [16, 17, 18, 19]
+    selection.turn(-20)
+    assert selection.page == 0
+    selection.turn(2)
+    selection.brush("collision_rate", 1.0, 1.0)
+    assert selection.listed == list(range(1, 17, 2))  # a new list is read from its beginning
+
+
+def test_a_pick_stays_when_a_range_leaves_it_out(selection):
+    assert selection.pick(12) and not selection.pick(12)
+    assert selection.page == 1
+    selection.brush("collision_rate", 1.0, 1.0)
+    assert selection.picked == 12
+    assert (selection.step(1), selection.step(-1)) == (13, 11)
+    with pytest.raises(ValueError, match="no elite 20: expected 0 to 19"):
+        selection.pick(20)
+
+
+def test_numbers_of_fresh_episodes_come_first():
+    archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
+    fresh = fresh_values(archive)
+    fresh = dataclasses.replace(
+        fresh, collision_rate=np.array([0.5, 0.25, 0.0]), invalid_episodes=np.array([0, 0, 39]), fitness=np.zeros(3)
+    )
+    elites = elites_of(dataclasses.replace(archive, fresh=fresh))
+    assert elites.fresh.tolist() == [True, True, False]
+    assert elites.counted.tolist() == [40, 40, 4]
+    assert elites.axis("collision_rate").values.tolist() == [0.5, 0.25, 1.0]
+    assert elites.axis("fitness").values.tolist() == [0.0, 0.0, archive.fitness[2]]
+    # Wilson, z^2 = 3.8415, of 20 of 40: .5 +- 1.96 sqrt(.25/40 + 3.8415/6400) / 1.0960 = .5 +- .148
+    assert elites.rate_text("collision_rate", 0) == "50 % (35-65)"
+    assert "collision 50 % (35-65)" in elites.line(0) and "of 40 fresh episodes" in elites.details(0)
+    assert "of 4 found episodes" in elites.details(2)
+
+
+def test_an_axis_reaches_over_all_values_in_whole_steps(elites):
+    axis = elites.axis("goal_rate")
+    assert (axis.low, axis.high) == (0.0, 0.95)
+    same = elites_of(dataclasses.replace(small_archive(1), fitness=np.array([1.0]), goal_rate=np.array([0.5])))
+    for axis in same.axes:  # of one elite too
+        assert axis.low <= axis.values[0] <= axis.high and axis.high > axis.low
+
+
+def test_time_goes_by_at_its_speed():
+    clock = Clock()
+    clock.load(2.0)
+    assert not clock.tick(1.0) and clock.time_s == 0.0  # it does not play yet
+    clock.toggle()
+    clock.speed = 0.5
+    assert clock.tick(1.0) and clock.time_s == 0.5
+    clock.speed = 4.0
+    assert clock.tick(1.0) and (clock.time_s, clock.playing) == (2.0, False)  # at its end
+    clock.toggle()
+    assert (clock.time_s, clock.playing) == (0.0, True)  # from the beginning
+    clock.toggle()
+    clock.seek(1.23)
+    assert clock.frame(0.02, 101) == 62  # 61.5, to the even one
+    clock.seek(99.0)
+    assert clock.time_s == 2.0 and clock.frame(0.02, 90) == 89
+    clock.seek(-1.0)
+    assert clock.frame(0.02, 90) == 0
+    clock.load(1.0)
+    assert clock.duration_s == 1.0

@@ -1,0 +1,121 @@
+"""The ablation of the standard deviations in the fitness, over the stand-in evaluator."""
+
+import json
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from qd.run.cli import Interrupted
+from qd.run.directory import RunDirectory
+from qd.studies.ablation import AblationCfg, ablation, numbers_of
+from tests.qd.stand_in import open_stand_in
+
+
+def config(folder, **changes) -> AblationCfg:
+    return AblationCfg(**{"preset": "small", "iterations": 4, "device": "cpu", "run_dir": folder / "both", **changes})
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ablation")
+    return folder, ablation(config(folder), open_evaluator=open_stand_in)
+
+
+def test_both_searches_and_their_looks(finished):
+    folder, report = finished
+    assert report == json.loads((folder / "both" / "ablation.json").read_text())
+    assert (folder / "both" / "ablation.png").stat().st_size > 10_000
+    assert report["iterations"] == [2, 4]
+    settings = {name: RunDirectory(folder / "both" / name).read_cfg() for name in ("alpha_1", "alpha_0")}
+    assert settings["alpha_1"].fitness.alpha == 1.0 and settings["alpha_0"].fitness.alpha == 0.0
+    for name in settings:
+        rows = RunDirectory(folder / "both" / name).read_metrics()
+        assert [rows[k]["mean_std"] for k in (1, 3)] == report["mean_std"][name]
+        assert [rows[k]["elites"] for k in (1, 3)] == report["elites"][name]
+        assert all(low <= mean <= high for (low, high), mean in zip(
+            report["intervals"][name], report["mean_std"][name], strict=True))  # fmt: skip
+
+
+@contextmanager
+def never(cfg):
+    raise AssertionError("nothing is left to evaluate")
+    yield
+
+
+def test_done_it_is_drawn_again_without_evaluating(finished):
+    folder, report = finished
+    again = ablation(config(folder, out=folder / "again.json"), open_evaluator=never)
+    assert again["mean_std"] == report["mean_std"]
+
+
+def test_a_run_that_is_there_is_the_one_with_alpha_1(finished, tmp_path):
+    folder, report = finished
+    found = ablation(config(tmp_path, preset=None, run=folder / "both" / "alpha_1"), open_evaluator=open_stand_in)
+    assert not (tmp_path / "both" / "alpha_1").exists()
+    assert found["mean_std"] == report["mean_std"]  # the stand-in is the same for the same seed
+    longer = ablation(config(tmp_path, iterations=2, run=folder / "both" / "alpha_1"), open_evaluator=open_stand_in)
+    assert longer["iterations"] == [2]
+
+
+def test_stopped_the_same_command_goes_on(finished, tmp_path):
+    _, report = finished
+    calls = []
+
+    @contextmanager
+    def open_stopping(cfg):
+        with open_stand_in(cfg) as evaluate:
+
+            def stopping(*args):
+                calls.append(1)
+                if len(calls) == 8:
+                    raise KeyboardInterrupt
+                return evaluate(*args)
+
+            yield stopping
+
+    with pytest.raises(Interrupted, match="The same command goes on"):
+        ablation(config(tmp_path), open_evaluator=open_stopping)
+    assert 0 < RunDirectory(tmp_path / "both" / "alpha_0").iterations_done() < 4
+    assert ablation(config(tmp_path), open_evaluator=open_stand_in)["mean_std"] == report["mean_std"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"run": "{folder}/nowhere"}, "no run at"),
+        ({"run": "{folder}/both/alpha_0"}, "alpha 1; it has 0.0, got 1.0"),
+        ({"run": "{folder}/both/alpha_1", "robot": "cassie"}, "is a run of robot anymal, got cassie"),
+        ({"run": "{folder}/both/alpha_1", "preset": "paper"}, "preset small, got paper"),
+        ({"preset": "huge"}, "unknown preset 'huge'"),
+        ({"out": Path("numbers.png")}, "out must be a file named *.json"),
+        ({"iterations": 1}, "no iteration up to 1 at which elites"),
+    ],
+)
+def test_what_cannot_be_compared_is_named(finished, tmp_path, changes, message):
+    folder, _ = finished
+    given = {
+        key: folder.parent / value.format(folder=folder) if key == "run" else value for key, value in changes.items()
+    }
+    with pytest.raises((ValueError, FileNotFoundError)) as error:
+        ablation(config(tmp_path, **given), open_evaluator=open_stand_in)
+    assert message in str(error.value)
+
+
+def test_too_few_iterations_are_refused_before_any_search(tmp_path):
+    with pytest.raises(ValueError, match=r"no iteration up to 1 .* which is every 2: give at least 2 --iterations"):
+        ablation(config(tmp_path, iterations=1), open_evaluator=never)
+    assert not (tmp_path / "both").exists()
+
+
+def test_intervals_that_do_not_overlap():
+    def rows(mean, interval):
+        return [
+            {"iteration": 1},
+            {"iteration": 2, "mean_std": mean, "mean_std_interval": interval, "elites": 5, "mean_fitness": 1.0},
+        ]
+
+    apart = numbers_of({"alpha_1": rows(1.0, [0.9, 1.1]), "alpha_0": rows(1.5, [1.2, 1.8])}, 2)
+    assert apart["below_by_more_than_intervals"] == [True] and apart["iterations"] == [2]
+    near = numbers_of({"alpha_1": rows(1.0, [0.9, 1.3]), "alpha_0": rows(1.5, [1.2, 1.8])}, 2)
+    assert near["below_by_more_than_intervals"] == [False]

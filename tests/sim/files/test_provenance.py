@@ -1,0 +1,58 @@
+"""Provenance, and files that are whole or absent."""
+
+import json
+import re
+
+import pytest
+
+from sim.files.atomic import to_json, write_atomically
+from sim.files.provenance import code_fingerprint, provenance
+
+
+def test_provenance_has_its_keys(monkeypatch):
+    monkeypatch.setenv("FAULTLINE_COMMIT", "abc123")
+    origin = provenance("cpu", 7)
+    assert list(origin) == ["command", "commit", "device", "versions", "seed", "date"]
+    assert origin["commit"] == "abc123" and origin["seed"] == 7
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", origin["date"])
+    assert all(re.match(r"\d+\.", number) for number in origin["versions"].values())
+    json.dumps(origin, allow_nan=False)
+
+
+def test_commit_comes_from_git_otherwise(monkeypatch):
+    monkeypatch.delenv("FAULTLINE_COMMIT", raising=False)
+    commit = provenance("cpu", 0)["commit"]
+    assert commit is None or re.fullmatch(r"[0-9a-f]{40}", commit)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    write_atomically(path, to_json({"x": 1}))
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_atomically(path, to_json({"x": float("nan")}))
+    assert json.loads(path.read_text()) == {"x": 1}
+    with pytest.raises(OSError, match="absent"):
+        write_atomically(tmp_path / "absent" / "a", b"")
+    assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_lists_of_numbers_take_one_line_and_mean_what_they_meant():
+    content = {"a": [0.1, -2e-30, None], "b": [[1, 2], []], "c": ["[\n 1,  2]", "x"], "e": [{"f": [3]}]}
+    text = to_json(content).decode()
+    assert json.loads(text) == content
+    assert '"a": [0.1, -2e-30, null],' in text and "[1, 2],\n" in text and '"f": [3]' in text
+
+
+def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):
+    monkeypatch.setattr("sim.files.provenance._ROOT", tmp_path)
+    for room in ("one", "two"):
+        (tmp_path / room).mkdir()
+        (tmp_path / room / "a.py").write_text("x = 1")
+    before = code_fingerprint(["one"])
+    (tmp_path / "two" / "a.py").write_text("x = 2")
+    (tmp_path / "one" / "notes.txt").write_text("nothing that runs")
+    assert code_fingerprint(["one"]) == before != code_fingerprint(["one", "two"])
+    (tmp_path / "one" / "robot.xml").write_text("<mujoco/>")
+    with_robot = code_fingerprint(["one"])
+    monkeypatch.setattr("sim.files.provenance.versions", lambda: {"torch": "0"})
+    assert len({before, with_robot, code_fingerprint(["one"])}) == 3

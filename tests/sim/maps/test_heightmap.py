@@ -1,0 +1,186 @@
+"""A user's own heightmap: where it comes to lie, and every mistake named before any work."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sim.maps.heightmap import Heightmap, as_terrain, fitted, read_heightmap
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+
+X = SPACING * np.arange(NUM_COLS)
+Y = SPACING * np.arange(NUM_ROWS)
+
+
+def sampled(function, size, nodes):
+    """A map of a function of x and y, its middle in the middle of the terrain; nodes along x and along y."""
+    x = 8.0 + np.linspace(-0.5, 0.5, nodes[0]) * size[0]
+    y = 4.0 + np.linspace(-0.5, 0.5, nodes[1]) * size[1]
+    return Heightmap(heights=function(x[None, :], y[:, None]) + np.zeros((nodes[1], nodes[0])), size_m=size)
+
+
+def test_a_map_of_the_terrains_own_nodes_is_taken_as_it_is():
+    heights = np.random.default_rng(0).normal(size=(NUM_ROWS, NUM_COLS)).astype(np.float32)
+    terrain = as_terrain(Heightmap(heights=heights.astype(np.float64), size_m=(16.0, 8.0)))
+    np.testing.assert_array_equal(terrain, heights)
+    assert terrain.dtype == np.float32
+
+
+@pytest.mark.parametrize("nodes", [(2, 2), (17, 33), (321, 161), (161, 81), (97, 401), (801, 1601)])
+def test_a_slope_stays_the_slope_whatever_the_nodes_of_the_map(nodes):
+    # Linear interpolation and any symmetric mean keep a plane; at the rim a finer map's mean is one-sided, by a cell.
+    slope = sampled(lambda x, y: 0.1 * x - 0.05 * y, (16.0, 8.0), nodes)
+    terrain = as_terrain(slope)
+    expected = 0.1 * X[None, :] - 0.05 * Y[:, None]
+    np.testing.assert_allclose(terrain[1:-1, 1:-1], expected[1:-1, 1:-1], atol=1e-6)
+    np.testing.assert_allclose(terrain, expected, atol=0.002)
+
+
+def test_rows_are_y_and_columns_x():
+    wave = sampled(lambda x, y: np.sin(x) + 0.5 * np.cos(2 * y), (16.0, 8.0), (641, 321))
+    expected = np.sin(X[None, :]) + 0.5 * np.cos(2 * Y[:, None])
+    np.testing.assert_allclose(as_terrain(wave)[2:-2, 2:-2], expected[2:-2, 2:-2], atol=1e-3)
+
+
+def test_a_small_map_is_continued_by_the_height_of_its_edge():
+    ramp = sampled(lambda x, y: x - 8.0, (4.0, 8.0), (81, 161))
+    terrain = as_terrain(ramp)
+    np.testing.assert_allclose(terrain, np.broadcast_to(np.clip(X - 8.0, -2.0, 2.0), terrain.shape), atol=1e-6)
+    assert fitted(ramp) == "81 x 161 nodes over 4 x 8 m, continued by the height of its edge to 16 m along x"
+
+
+def test_of_a_large_map_the_middle_is_crossed():
+    wide = sampled(lambda x, y: 0.1 * (x - 8.0) + 0.2 * (y - 4.0), (40.0, 10.0), (401, 101))
+    np.testing.assert_allclose(as_terrain(wide), 0.1 * (X[None, :] - 8) + 0.2 * (Y[:, None] - 4), atol=1e-6)
+    assert fitted(wide).endswith("over 40 x 10 m, cut to its middle 16 m along x, cut to its middle 8 m along y")
+
+
+def test_a_finer_map_is_averaged_not_picked_from():
+    # Ridges 5 mm apart, every second 1 m high: a node sees their mean, not whichever it happens to lie on.
+    comb = np.zeros((161, 3201))
+    comb[:, ::2] = 1.0
+    terrain = as_terrain(Heightmap(heights=comb, size_m=(16.0, 8.0)))
+    np.testing.assert_allclose(terrain[:, 1:-1], 0.5, atol=0.02)
+
+
+def write_png(path, gray, **meaning):
+    Image.fromarray(gray).save(path)
+    if meaning:
+        path.with_suffix(".json").write_text(json.dumps(meaning))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_an_image_with_its_scale_beside_it_or_given(tmp_path, dtype):
+    gray = np.zeros((9, 17), dtype)
+    gray[0, 3] = 200  # the topmost row: y = 8 m
+    path = tmp_path / "hill.png"
+    write_png(path, gray)
+    given = read_heightmap(path, size_m=(16, 8), scale_m=0.01, offset_m=-0.5)
+    write_png(path, gray, size_m=[16, 8], scale_m=0.02, offset_m=-1.0, colour="of no interest")
+    beside = read_heightmap(path)
+    mixed = read_heightmap(path, scale_m=0.01)
+    for heightmap, scale, offset in ((given, 0.01, -0.5), (beside, 0.02, -1.0), (mixed, 0.01, -1.0)):
+        expected = np.full((9, 17), offset)
+        expected[8, 3] += 200 * scale
+        np.testing.assert_allclose(heightmap.heights, expected)
+        assert heightmap.size_m == (16.0, 8.0)
+    assert as_terrain(beside)[160, 60] == pytest.approx(3.0)
+
+
+def test_an_npz_with_its_size_in_it_or_given(tmp_path):
+    path, heights = tmp_path / "hill.npz", np.float32([[0, 1, 2], [3, 4, 5]])
+    np.savez(path, heights=heights, size_m=[16.0, 8.0])
+    assert read_heightmap(path).size_m == (16.0, 8.0)
+    np.testing.assert_array_equal(read_heightmap(path).heights, heights)
+    assert read_heightmap(path, size_m=(10, 5)).size_m == (10.0, 5.0)
+    np.testing.assert_array_equal(read_heightmap(path, scale_m=0.5, offset_m=-1).heights, 0.5 * heights - 1)
+    # A JSON beside it belongs to an image of the same name: it must not scale metres.
+    (tmp_path / "hill.json").write_text(json.dumps({"scale_m": 0.001, "size_m": [8, 8]}))
+    np.testing.assert_array_equal(read_heightmap(path).heights, heights)
+    assert read_heightmap(path).size_m == (16.0, 8.0)
+
+
+GOOD = {"heights": np.zeros((5, 9)), "size_m": np.array([16.0, 8.0])}
+NPZ_MISTAKES = {
+    "no heights": ({"heights": None, "ground": np.zeros((5, 9))}, r"must hold an array 'heights', got ground, size_m"),
+    "no size": ({"size_m": None}, "how large is it"),
+    "integers": ({"heights": np.zeros((5, 9), int)}, r"must be floats \[m\] of shape \(nrow, ncol\), got int64"),
+    "complex": ({"heights": np.zeros((5, 9), complex)}, "got complex128"),
+    "objects": ({"heights": np.array([[{}]], dtype=object)}, "Object arrays cannot be loaded"),
+    "three axes": ({"heights": np.zeros((1, 5, 9))}, r"of shape \(1, 5, 9\)"),
+    "a line": ({"heights": np.zeros((1, 9))}, "2 to 10000 nodes a side, got 1 x 9"),
+    "nothing": ({"heights": np.zeros((0, 9))}, "nodes a side, got 0 x 9"),
+    "NaN": ({"heights": np.array([[0.0, np.nan], [0.0, np.inf]])}, "2 of 4 heights are NaN or infinite"),
+    "too high": ({"heights": np.full((5, 9), 431.0)}, r"must lie in \+-10 m, got 431 to 431 m: are they metres"),
+    "too deep": ({"heights": np.full((5, 9), -10.5)}, "got -10.5 to -10.5 m"),
+    "one size": ({"size_m": np.array(16.0)}, "two lengths of 1 to 100 m"),
+    "too small": ({"size_m": np.array([16.0, 0.5])}, r"got \[16.0, 0.5\]"),
+    "too large": ({"size_m": np.array([16000.0, 8.0])}, r"got \[16000.0, 8.0\]"),
+    "a size of NaN": ({"size_m": np.array([np.nan, 8.0])}, r"got \[nan, 8.0\]"),
+    "a size in words": ({"size_m": np.array(["a", "b"])}, r"got \['a', 'b'\]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "message"), NPZ_MISTAKES.values(), ids=NPZ_MISTAKES)
+def test_mistakes_in_an_npz(tmp_path, changes, message):
+    path = tmp_path / "hill.npz"
+    np.savez(path, **{name: value for name, value in (GOOD | changes).items() if value is not None})
+    with pytest.raises(ValueError, match=message):
+        read_heightmap(path)
+
+
+GRAY = np.zeros((5, 9), np.uint16)
+PNG_MISTAKES = {
+    "no scale": (GRAY, {"size_m": [16, 8]}, "how many metres is a gray level"),
+    "no size": (GRAY, {"scale_m": 0.1}, "how large is it"),
+    "a scale of 0": (GRAY, {"size_m": [16, 8], "scale_m": 0}, "must be a finite number of metres, a scale not 0"),
+    "a scale in words": (GRAY, {"size_m": [16, 8], "scale_m": "1 cm"}, "got 1 cm"),
+    "a scale that is true": (GRAY, {"size_m": [16, 8], "scale_m": True}, "got True"),
+    "a scale beyond floats": (GRAY, {"size_m": [16, 8], "scale_m": 10**400}, "scale_m must be a finite number"),
+    "millimetres for metres": (GRAY + 700, {"size_m": [16, 8], "scale_m": 1.0}, r"got 700 to 700 m: are they metres"),
+    "colours": (np.zeros((5, 9, 3), np.uint8), {"size_m": [16, 8], "scale_m": 0.1}, "grayscale .* mode 'RGB'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("gray", "meaning", "message"), PNG_MISTAKES.values(), ids=PNG_MISTAKES)
+def test_mistakes_in_an_image(tmp_path, gray, meaning, message):
+    write_png(tmp_path / "hill.png", gray, **meaning)
+    with pytest.raises(ValueError, match=message):
+        read_heightmap(tmp_path / "hill.png")
+
+
+def test_damaged_and_foreign_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no heightmap at"):
+        read_heightmap(tmp_path / "none.npz")
+    (tmp_path / "a.tif").write_bytes(b"II*\0")
+    with pytest.raises(ValueError, match=r"must be an \.npz or a \.png file"):
+        read_heightmap(tmp_path / "a.tif")
+    np.savez(tmp_path / "a.npz", **GOOD)
+    write_png(
+        tmp_path / "a.png",
+        np.random.default_rng(0).integers(0, 9000, (50, 90), np.uint16),
+        size_m=[16, 8],
+        scale_m=1e-3,
+    )
+    read_heightmap(tmp_path / "a.png")
+    for name in ("a.npz", "a.png"):
+        whole = (tmp_path / name).read_bytes()
+        flipped = bytearray(whole)
+        flipped[len(whole) // 3] ^= 8
+        for content in (whole[: len(whole) // 2], b"hello", b"", bytes(flipped)):
+            (tmp_path / name).write_bytes(content)
+            with pytest.raises(ValueError, match="damaged or another file"):
+                read_heightmap(tmp_path / name)
+    write_png(tmp_path / "a.png", GRAY)
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(ValueError, match="must be a JSON file"):
+        read_heightmap(tmp_path / "a.png")
+
+
+def test_an_npz_that_would_fill_the_memory_is_not_read(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "bomb.npz", heights=np.zeros((200, 200)), size_m=[16.0, 8.0])
+    assert read_heightmap(tmp_path / "bomb.npz").heights.shape == (200, 200)
+    monkeypatch.setattr("sim.maps.heightmap._MAX_BYTES", 300_000)
+    with pytest.raises(ValueError, match=r"heights of 320,128 bytes, at most 300,000 are read"):
+        read_heightmap(tmp_path / "bomb.npz")

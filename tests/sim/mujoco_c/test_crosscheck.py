@@ -1,0 +1,150 @@
+"""Comparing two simulators: intervals by hand, agreement of known rates, and what the command refuses."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from kernels.episode import Outcome
+from sim.files.intervals import bootstrap_interval, wilson_interval
+from sim.mujoco_c.agreement import Pair, summarise
+from sim.mujoco_c.crosscheck import Crosscheck, CrosscheckCfg, read_pool
+from sim.terrain import hard_random_genes
+
+
+def test_wilson_interval_by_hand():
+    # 10 of 20: centre 0.5, half width 1.96 sqrt(0.0125 + 0.0480) / (1 + 0.192) = 0.2007 (Wilson 1927).
+    np.testing.assert_allclose(wilson_interval(10, 20), [0.2993, 0.7007], atol=1e-4)
+    # 0 of 20: from 0 to z^2 / (n + z^2) = 3.841 / 23.841.
+    np.testing.assert_allclose(wilson_interval(0, 20), [0.0, 0.1611], atol=1e-4)
+    assert wilson_interval(20, 20)[1] == 1.0
+    for hits, count in ((1, 0), (3, 2), (-1, 2)):
+        with pytest.raises(ValueError, match="hits"):
+            wilson_interval(hits, count)
+
+
+def test_bootstrap_interval():
+    low, high = bootstrap_interval(np.array([0.0, 1.0] * 50), np.random.default_rng(0))
+    # The mean of 100 draws of 0 or 1: 0.5 +- 1.96 * 0.05.
+    np.testing.assert_allclose([low, high], [0.40, 0.60], atol=0.02)
+    assert bootstrap_interval(np.array([]), np.random.default_rng(0)) is None
+
+
+def outcomes(goal, collision, time_out, invalid=0):
+    kinds = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.INVALID)
+    return np.repeat(np.uint8(kinds), (goal, collision, time_out, invalid))
+
+
+def test_rates_and_bias_by_hand():
+    pairs = [
+        # 15 of 20 succeed and 10 arrive; 150 of 200, 100 of 200: no difference.
+        Pair(index=3, first=0.7, ours=outcomes(10, 5, 5), plain=outcomes(100, 50, 50)),
+        # 4 of 20 (two more are invalid) against 180 of 200: far outside.
+        Pair(index=3, first=0.4, ours=outcomes(4, 16, 0, invalid=2), plain=outcomes(180, 20, 0)),
+    ]
+    report = summarise(pairs, seed=0)
+    assert report["success"]["inside"] == report["goal"]["inside"] == 1
+    assert [row["success"]["inside"] for row in report["terrains"]] == [True, False]
+    np.testing.assert_allclose(report["success"]["ours"], (0.75 + 0.2) / 2)
+    np.testing.assert_allclose(report["success"]["mujoco_c"], (0.75 + 0.9) / 2)
+    np.testing.assert_allclose(report["success"]["bias"], 0.35)
+    np.testing.assert_allclose(report["goal"]["bias"], 0.35)
+    np.testing.assert_allclose(report["success"]["bias_interval"], [0.0, 0.7], atol=1e-9)
+    assert report["invalid"] == {"ours": 2, "mujoco_c": 0}
+    json.dumps(report, allow_nan=False)
+
+
+def test_a_terrain_without_valid_episodes_is_left_out_and_named():
+    lost = Pair(index=7, first=0.5, ours=outcomes(0, 0, 0, invalid=3), plain=outcomes(1, 1, 1))
+    with pytest.raises(ValueError, match="no terrain has a valid episode"):
+        summarise([lost], seed=0)
+    fine = Pair(index=3, first=0.5, ours=outcomes(1, 1, 0), plain=outcomes(1, 1, 0))
+    report = summarise([lost, fine], seed=0)
+    assert report["left_out"] == [7] and len(report["terrains"]) == 1 and report["invalid"]["ours"] == 3
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"other": np.zeros((3, 64))},
+        {"genes": np.zeros((3, 63))},
+        {"genes": np.full((3, 64), np.nan)},
+        {"genes": np.full((3, 64), 1e300)},
+        {"genes": np.zeros((0, 64))},
+        {"genes": np.array([[None]], dtype=object)},
+    ],
+    ids=["no genes", "shape", "not finite", "too large", "empty", "objects"],
+)
+def test_a_pool_that_is_none_is_refused(tmp_path, content):
+    file = tmp_path / "pool.npz"
+    np.savez(file, **content)
+    with pytest.raises(ValueError, match="--genes"):
+        read_pool(file)
+
+
+def test_a_pool_that_is_no_file_is_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("not an archive")
+    for name in ("missing.npz", "text.npz", "."):
+        with pytest.raises(ValueError, match="--genes"):
+            read_pool(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"terrains": 0},
+        {"episodes": 0},
+        {"between": (0.9, 0.3)},
+        {"between": (0.0, 1.5)},
+        {"processes": -1},
+        {"seed": -1},
+    ],
+)
+def test_numbers_without_sense_are_refused(settings):
+    with pytest.raises(ValueError, match=r"positive|at least"):
+        Crosscheck(CrosscheckCfg(device="cpu", **settings))
+
+
+def test_a_pool_without_middling_terrains_says_how_many_it_has(tmp_path):
+    np.savez(tmp_path / "flat.npz", genes=np.zeros((2, 64), np.float32))  # all bumps of height 0
+    check = Crosscheck(CrosscheckCfg(device="cpu", genes=tmp_path / "flat.npz", terrains=1, episodes=1))
+    with pytest.raises(ValueError, match="only 0 of 2 terrains"):
+        check.choose()
+
+
+def test_terrains_of_a_pool_can_be_named_whatever_their_rates(tmp_path):
+    pool = tmp_path / "pool.npz"
+    genes = np.arange(5, dtype=np.float32)[:, None].repeat(64, axis=1)
+    np.savez(pool, genes=genes)
+    choice = Crosscheck(CrosscheckCfg(device="cpu", genes=pool, elite="4 1")).choose()
+    assert choice.index == [4, 1] and choice.first == [None, None]
+    np.testing.assert_array_equal(choice.genes, genes[[4, 1]])
+    with pytest.raises(ValueError, match=r"pool\.npz has no elite 5: expected all, or numbers of 0 to 4"):
+        Crosscheck(CrosscheckCfg(device="cpu", genes=pool, elite="5"))
+    with pytest.raises(ValueError, match="say which"):
+        Crosscheck(CrosscheckCfg(device="cpu", elite="all"))
+
+
+def test_named_terrains_are_crossed_in_both_simulators(tmp_path):
+    genes = np.zeros((3, 64), np.float32)  # flat, but for the last
+    genes[2] = hard_random_genes(1, np.random.default_rng(3))[0]
+    np.savez(tmp_path / "pool.npz", genes=genes)
+    counts = {"episodes": 1, "plain_episodes": 1, "processes": 1}
+    report = Crosscheck(CrosscheckCfg(device="cpu", genes=tmp_path / "pool.npz", elite="2 0", **counts)).run()
+    assert [row["index"] for row in report["terrains"]] == [2, 0] and report["left_out"] == []
+    assert [row["episodes"] for row in report["terrains"]] == [[1, 1], [1, 1]]
+    flat = report["terrains"][1]
+    assert flat["first_success"] is None and flat["goal"]["ours"] == flat["goal"]["mujoco_c"] == 1.0
+
+
+def test_command_line_helps_and_refuses(tmp_path):
+    def call(*flags):
+        command = [sys.executable, "-m", "sim.mujoco_c.crosscheck", *flags]
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+    assert "--plain-episodes" in call("--help").stdout
+    refused = call("--device", "cpu", "--genes", str(tmp_path / "none.npz"))
+    assert refused.returncode == 2
+    assert "Traceback" not in refused.stderr and "none.npz" in refused.stderr

@@ -1,0 +1,285 @@
+"""The second simulator: written from the definitions, it must say what the kernels say about the same state."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from kernels.episode import Outcome
+from kernels.penalties import PENALTIES
+from sim.bench import oracle
+from sim.crossing import CrossingCfg
+from sim.mujoco_c.crossing import _Episodes, cross, draw_starts, join, to_mujoco
+from sim.mujoco_c.model import crossing_model, goal_commands, observations, step_penalties, surface_heights
+from sim.mujoco_c.processes import run_plain
+from sim.policy.loaders import load_policy
+from sim.rollout import Rollout
+from sim.simulation import GROUND_FRICTION, SolverCfg
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING, hard_random_genes
+from tests.sim.policies import stand
+
+EPISODES = 3
+BASE_COM = np.array([0.1, -0.02, 0.03])
+
+
+@pytest.fixture(scope="module")
+def heights():
+    return np.float32(0.3) * np.sin(np.arange(NUM_COLS) / 9.0, dtype=np.float32) * np.ones((NUM_ROWS, 1), np.float32)
+
+
+def states(robot, num=5):
+    rng = np.random.default_rng(2)
+    q = rng.normal(size=(num, 7 + robot.num_joints))
+    q[:, :2] = rng.uniform([3, 2], [13, 6], (num, 2))
+    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+    return q, rng.normal(size=(num, 6 + robot.num_joints))
+
+
+def test_surface_heights_are_those_of_the_oracle(heights):
+    x, y = np.random.default_rng(1).uniform([-1, -1], [17, 9], (40, 2)).T
+    expected = [oracle.surface_height(heights, SPACING, *point) for point in zip(x, y, strict=True)]
+    np.testing.assert_allclose(surface_heights(np.float64(heights), x, y), expected, atol=1e-9)
+
+
+def test_observation_command_and_penalties_are_those_of_the_oracle(robot, heights):
+    q, qd = states(robot)
+    plain = to_mujoco(q, qd, BASE_COM)
+    cfg = CrossingCfg()
+    command = goal_commands(plain.qpos, cfg)
+    action = np.random.default_rng(3).normal(size=(len(q), robot.num_joints))
+    rows = observations(robot, np.float64(heights), plain.qpos, plain.qvel, command, action)
+    forces = np.random.default_rng(4).normal(scale=400.0, size=(len(q), len(robot.geom_names), 3))
+    found = step_penalties(robot, plain.qpos, plain.qvel, command, forces)
+    scan = np.stack(robot.scan_points(), axis=1)
+    feet = [k for k, name in enumerate(robot.geom_names) if name in robot.foot_geoms]
+    others = [k for k in range(len(robot.geom_names)) if k not in feet]
+    for k in range(len(q)):
+        wanted = oracle.goal_command(q[k, :2], oracle.yaw_of(q[k, 3:7]), cfg.goal)
+        np.testing.assert_allclose(command[k], wanted, atol=1e-9)
+        row = oracle.observation(
+            q[k], qd[k], wanted, action[k], heights, SPACING, np.array(robot.default_joint_pos), scan, BASE_COM
+        )
+        np.testing.assert_allclose(rows[k], row, atol=1e-6)
+        penalties = oracle.penalties(q[k], qd[k], BASE_COM, wanted, forces[k], feet, others, robot.contact_force_limit)
+        np.testing.assert_allclose(found[k], penalties, atol=1e-9)
+    assert found.shape == (len(q), len(PENALTIES))
+
+
+def test_starts_are_those_of_the_rollout(robot):
+    genes = hard_random_genes(1, 5)
+    rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
+    rollout.begin(genes, np.array([77], np.uint32))
+    expected = to_mujoco(
+        rollout.sim.joint_q.numpy(), rollout.sim.joint_qd.numpy(), np.array(rollout.sim.sensors.base_com)
+    )
+    # Asking for more episodes does not change the first.
+    found = draw_starts(robot, rollout.sim.bank.heights.numpy()[0], 77, EPISODES + 4, "cpu")
+    np.testing.assert_array_equal(found.qpos[:EPISODES], expected.qpos)
+    np.testing.assert_array_equal(found.qvel[:EPISODES], expected.qvel)
+
+
+def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_converge(robot, heights):
+    model = crossing_model(robot, heights)
+    ground = model.geom("ground").id
+    assert model.geom_solmix[ground] == 0.0
+    assert model.geom_friction[ground, 0] == GROUND_FRICTION
+    assert model.opt.iterations == 100
+    assert model.opt.timestep == robot.physics_dt
+    fine = crossing_model(robot, heights, time_constant_s=0.003)
+    assert (fine.geom_solref == [0.003, 1.0]).all() and (model.geom_solref[:, 0] > 0.003).all()
+    # The surface, between the nodes too, edge heights continued beyond it: what a ray from above meets.
+    heights = heights + np.random.default_rng(6).uniform(-0.1, 0.1, heights.shape).astype(np.float32)
+    model = crossing_model(robot, heights)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 50.0
+    mujoco.mj_forward(model, data)
+    for x, y in [(3.03, 2.2), (8.0, 4.0), (12.31, 7.9), (17.5, 9.5), (-1.5, -1.5), (5.025, 3.025), (6.01, 4.04)]:
+        down, geom = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
+        distance = mujoco.mj_ray(model, data, np.array([x, y, 5.0]), down, None, 1, -1, geom)
+        assert geom[0] == ground
+        np.testing.assert_allclose(5.0 - distance, oracle.surface_height(heights, SPACING, x, y), atol=1e-5)
+
+
+def test_flat_ground_is_crossed_alike_in_both(anymal):
+    # The same contacts, so the same walk: 4 s of it, penalties within 5 % (neighbouring facets, float32 and float64).
+    flat = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
+    cfg = CrossingCfg(max_duration_s=4.0)
+    rollout = Rollout(anymal, anymal.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg)
+    ours = rollout.evaluate(flat, np.array([5], np.uint32))
+    starts = draw_starts(anymal, flat[0], 5, EPISODES, "cpu")
+    policy = load_policy(anymal.policy_file, anymal, "cpu")
+    plain = cross(anymal, policy, flat[0], starts, cfg)
+    assert (plain.outcome == Outcome.TIME_OUT).all()
+    np.testing.assert_array_equal(ours.outcome[0], plain.outcome)
+    np.testing.assert_array_equal(plain.duration_s, 4.0)
+    velocities = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y")]
+    np.testing.assert_allclose(ours.penalties[0][:, velocities], plain.penalties[:, velocities], rtol=0.05)
+
+
+def test_cassie_goes_over_alike_in_both(cassie):
+    # Nobody balances it: in a second or two it has fallen onto its pelvis, in both at the same time, at the same price.
+    flat = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
+    ours = Rollout(cassie, stand, num_terrains=1, num_replicas=EPISODES, device="cpu").evaluate(flat, np.uint32([5]))
+    starts = draw_starts(cassie, flat[0], 5, EPISODES, "cpu")
+    plain = cross(cassie, stand, flat[0], starts)
+    assert (ours.outcome == Outcome.BASE_COLLISION).all() and (plain.outcome == Outcome.BASE_COLLISION).all()
+    np.testing.assert_allclose(ours.duration_s[0], plain.duration_s, atol=0.05)
+    assert (plain.duration_s > 0.5).all() and (plain.duration_s < 3.0).all()
+    np.testing.assert_allclose(ours.penalties[0][:, :3], plain.penalties[:, :3], rtol=0.1, atol=0.05)
+
+
+FINE = {"physics_dt": 0.001, "decimation": 20}
+SETTINGS = pytest.mark.parametrize(
+    ("changes", "time_constant_s"), [({}, None), (FINE, 0.003), (FINE, 0.02)], ids=["shipped", "stiff", "soft"]
+)
+
+
+def side_by_side(robot, policy, changes, time_constant_s, cfg=None):
+    """The robot in both simulators at the same start, MuJoCo's heightfield replaced by its plane: the same contacts."""
+    robot = dataclasses.replace(robot, **changes)
+    solver = SolverCfg(time_constant_s=time_constant_s)
+    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg, solver=solver)
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    rollout.begin(flat[None], np.array([1000], np.uint32))
+    model = crossing_model(robot, flat, time_constant_s=time_constant_s)
+    ground = model.geom("ground").id
+    model.geom_type[ground], model.geom_dataid[ground], model.geom_rbound[ground] = mujoco.mjtGeom.mjGEOM_PLANE, -1, 0.0
+    model.geom_size[ground], model.geom_pos[ground] = (0.0, 0.0, 0.05), 0.0
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its tree knows the heightfield
+    return robot, rollout, _Episodes(robot, model, draw_starts(robot, flat, 1000, EPISODES, "cpu"))
+
+
+def walk(robot, policy, plain, seconds):
+    """Let the plain robots walk on level ground; yields their command after each physics step."""
+    policy, everyone = load_policy(policy, robot, "cpu"), np.arange(EPISODES)
+    flat, action = np.zeros((NUM_ROWS, NUM_COLS)), np.zeros((EPISODES, robot.num_joints))
+    for _ in range(round(seconds / robot.control_dt)):
+        command = goal_commands(plain.qpos, CrossingCfg())
+        rows = observations(robot, flat, plain.qpos, plain.qvel, command, action)
+        with torch.inference_mode():
+            action = policy(torch.as_tensor(rows, dtype=torch.float32)).numpy().astype(np.float64)
+        plain.hold(everyone, np.array(robot.default_joint_pos) + robot.action_scale * action)
+        for _ in range(robot.decimation):
+            plain.step(everyone)
+            yield command
+
+
+@SETTINGS
+def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_constant_s):
+    # ANYmal walks for 0.2 s. Cassie needs 0.15 s to come down, and swings on its legs for 0.25 s, since to balance it
+    # lets every difference grow. The softer a contact, the more of a toe lies on the ground, where MuJoCo has the two
+    # ends alone.
+    seconds, metres, radians = {"anymal": (0.2, 2e-4, 6e-3), "cassie": (0.4, 3e-3, 0.04)}[robot.name]
+    if robot.name == "cassie" and time_constant_s == 0.003:
+        metres, radians = 5e-4, 0.01
+    policy = robot.policy_file if robot.name == "anymal" else "tests.sim.policies:sway"
+    robot, rollout, plain = side_by_side(robot, policy, changes, time_constant_s)
+    pushed = sum(np.abs(plain.forces[:, :, 2]).sum(1) for _ in walk(robot, policy, plain, seconds))
+    for _ in range(round(seconds / robot.control_dt)):
+        rollout.control_step()
+    found = rollout.sim.joint_q.numpy()
+    assert np.abs(plain.qpos[:, 2] - robot.default_base_height).max() > 0.003  # it moves
+    assert (pushed * robot.physics_dt > 10.0).all()  # and the ground has a part in it
+    np.testing.assert_allclose(found[:, :3], plain.qpos[:, :3], atol=metres)
+    np.testing.assert_allclose(found[:, 7:], plain.qpos[:, 7:], atol=radians)
+
+
+def test_walking_on_a_plane_costs_the_same_in_both(robot):
+    # 4 s: long enough for steps to fall otherwise, so that only what they cost can be held against each other.
+    cfg = CrossingCfg(max_duration_s=4.0)
+    _, rollout, plain = side_by_side(robot, robot.policy_file, {}, None, cfg)
+    sums = sum(
+        robot.physics_dt * step_penalties(robot, plain.qpos, plain.qvel, command, plain.forces)
+        for command in walk(robot, robot.policy_file, plain, cfg.max_duration_s)
+    )
+    ours = rollout.evaluate(np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([1000], np.uint32))
+    assert (ours.outcome == Outcome.TIME_OUT).all() and (plain.qpos[:, 0] > 4.0).all()
+    columns = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y", "contact_force")]
+    np.testing.assert_allclose(ours.penalties[0][:, columns].mean(0), np.mean(sums, axis=0)[columns], rtol=0.08)
+
+
+@SETTINGS
+def test_sliding_on_its_back_it_is_braked_alike_in_both(anymal, changes, time_constant_s):
+    robot, rollout, plain = side_by_side(anymal, anymal.policy_file, changes, time_constant_s)
+    everyone, sim = np.arange(EPISODES), rollout.sim
+    q, qd = sim.joint_q.numpy().copy(), np.zeros(sim.joint_qd.shape, np.float32)
+    q[:, 2], q[:, 3:7], q[:, 7:] = 0.1, (1.0, 0.0, 0.0, 0.0), robot.default_joint_pos
+    qd[:, :2] = 1.5, 0.5
+    sim.joint_q.assign(q)
+    sim.joint_qd.assign(qd)
+    sim.targets.assign(np.concatenate([np.zeros((EPISODES, 7)), q[:, 7:]], axis=1).astype(np.float32))
+    sim.refresh()
+    same = to_mujoco(q, qd, np.array(sim.sensors.base_com))
+    for data, qpos, qvel in zip(plain.data, same.qpos, same.qvel, strict=True):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+    plain.hold(everyone, q[:, 7:])
+    for step in range(round(0.2 / robot.physics_dt)):
+        plain.step(everyone)
+        sim.physics_step()
+        if step == round(0.05 / robot.physics_dt):
+            speed = np.linalg.norm(plain.qvel[:, :2], axis=1)
+            assert (speed > 0.2).all() and (speed < 1.5).all()  # friction is at work
+    # MuJoCo puts a contact under either end of the base, we put a third between: 7 % of the braking distance.
+    assert (plain.qpos[:, 0] - q[:, 0] > 0.1).all()
+    np.testing.assert_allclose(sim.joint_q.numpy()[:, :3], plain.qpos[:, :3], atol=8e-3)
+    contact = sim.solver.mjw_data.contact
+    count = int(sim.solver.mjw_data.nacon.numpy()[0])
+    assert count >= EPISODES
+    assert not contact.solreffriction.numpy()[:count].any()  # friction takes the contact's own time constant
+
+
+def test_what_ends_a_crossing(robot):
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    starts = draw_starts(robot, flat, 5, 4, "cpu")
+    starts.qpos[0, :2] = 13.7, 4.0  # at the goal
+    starts.qpos[1, 1] = 10.5  # outside
+    starts.qpos[2, 2] = 0.05  # its belly in the ground
+    starts.qvel[3, 8] = 5000.0  # a joint far too fast
+    policy = load_policy(robot.policy_file, robot, "cpu")
+    found = cross(robot, policy, flat, starts, CrossingCfg(max_duration_s=0.1))
+    assert found.outcome.tolist() == [Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]
+    assert np.isnan(found.penalties[3]).all() and np.isfinite(found.penalties[:3]).all()
+    np.testing.assert_allclose(found.duration_s, 0.005)
+    both = join([found, found])
+    assert both.outcome.shape == (8,) and both.penalties.shape == (8, len(PENALTIES))
+
+
+def test_episodes_shared_out_over_processes_come_back_in_order(anymal):
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    heights = np.stack([flat, flat + np.float32(0.2)])
+    starts = [draw_starts(anymal, grid, seed, 30, "cpu") for seed, grid in enumerate(heights)]
+    for start in starts:
+        start.qpos[:, 1] = 10.5  # over at once, but for one
+        start.qpos[27, :2] = 13.8, 4.0
+    found = run_plain(anymal, str(anymal.policy_file), heights, starts, processes=1)
+    for crossings in found:
+        assert len(crossings.outcome) == 30
+        assert np.flatnonzero(crossings.outcome == Outcome.GOAL).tolist() == [27]
+
+
+class Remembers:
+    """Stands; notes how many robots it is asked for."""
+
+    def __init__(self):
+        self.asked, self.resets = [], 0
+
+    def reset(self):
+        self.resets += 1
+
+    def __call__(self, row):
+        self.asked.append(len(row))
+        return stand(row)
+
+
+def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    starts = draw_starts(anymal, flat, 5, 3, "cpu")
+    starts.qpos[0, :2] = 13.7, 4.0  # at the goal: it ends at once
+    policy, cfg = Remembers(), CrossingCfg(max_duration_s=0.1)
+    found = cross(anymal, policy, flat, starts, cfg)
+    assert (policy.resets, policy.asked) == (1, [3] * 5)
+    expected = cross(anymal, stand, flat, starts, cfg)
+    np.testing.assert_array_equal(found.outcome, expected.outcome)
+    np.testing.assert_array_equal(found.penalties, expected.penalties)

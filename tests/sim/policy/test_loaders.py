@@ -1,0 +1,303 @@
+"""Controllers from files and callables: what is accepted, and that nothing else runs."""
+
+import dataclasses
+import os
+import pickle
+import sys
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+
+from sim.policy.loaders import MlpPolicy, load_policy
+from sim.policy.runner import PolicyRunner
+
+OBSERVATIONS, ACTIONS = 235, 12
+
+
+def rsl_rl_actor(observations=OBSERVATIONS, actions=ACTIONS, normalised=False):
+    """rsl_rl's own actor, with a normaliser that has seen something."""
+    torch.manual_seed(0)
+    rows = TensorDict({"policy": torch.randn(64, observations) * 3 + 1}, batch_size=64)
+    distribution = {"class_name": "GaussianDistribution", "init_std": 1.0}
+    actor = MLPModel(
+        rows, {"actor": ["policy"]}, "actor", actions, (32, 16), "elu", normalised, distribution_cfg=distribution
+    )
+    if normalised:
+        actor.train()
+        actor.obs_normalizer.update(rows["policy"])
+    return actor.eval()
+
+
+def save_checkpoint(path, state, **more):
+    """As rsl_rl's runner saves it."""
+    torch.save({"actor_state_dict": state, "critic_state_dict": {}, "iter": 7, "infos": None} | more, path)
+    return path
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_an_rsl_rl_checkpoint_acts_as_rsl_rl_does(tmp_path, anymal, device, normalised):
+    actor = rsl_rl_actor(normalised=normalised)
+    policy = load_policy(save_checkpoint(tmp_path / "model_7.pt", actor.state_dict()), anymal, device)
+    rows = torch.randn(9, OBSERVATIONS) * 2
+    with torch.inference_mode():
+        expected = actor(TensorDict({"policy": rows}, batch_size=9))
+        got = policy(rows.to("cuda" if device.startswith("cuda") else "cpu"))
+    torch.testing.assert_close(got.cpu(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_shipped_controller_loads(anymal, device):
+    policy = load_policy(anymal.policy_file, anymal, device)
+    assert isinstance(policy, MlpPolicy)
+    assert policy.sizes == (OBSERVATIONS, ACTIONS)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+@pytest.mark.parametrize("suffix", [".pt", ".ts"])
+def test_torchscript_loads(tmp_path, anymal, device, suffix):
+    module = torch.nn.Sequential(torch.nn.Linear(OBSERVATIONS, ACTIONS), torch.nn.Tanh())
+    path = tmp_path / f"policy{suffix}"
+    torch.jit.trace(module, torch.zeros(4, OBSERVATIONS)).save(str(path))
+    policy = load_policy(str(path), anymal, device)
+    rows = torch.randn(5, OBSERVATIONS)
+    got = policy(rows.to("cuda" if device.startswith("cuda") else "cpu"))
+    torch.testing.assert_close(got.detach().cpu(), module(rows).detach(), rtol=1e-5, atol=1e-5)
+
+
+def test_a_callable_loads(anymal, device):
+    policy = load_policy("tests.sim.policies:stand", anymal, device)
+    assert policy(torch.zeros(3, OBSERVATIONS)).shape == (3, ACTIONS)
+
+
+def test_a_factory_is_given_robot_and_device(anymal):
+    policy = load_policy("tests.sim.policies:Controller", anymal, "cpu")
+    assert policy.num_joints == ACTIONS
+    assert (policy(torch.zeros(2, OBSERVATIONS)) == 0.25).all()
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions", "message"),
+    [(48, 12, "48 observations to 12 actions.*235 observations"), (235, 10, "to 10 actions.*12 joints")],
+)
+def test_a_checkpoint_of_another_robot_is_named(tmp_path, anymal, observations, actions, message):
+    path = save_checkpoint(tmp_path / "other.pt", rsl_rl_actor(observations, actions).state_dict())
+    with pytest.raises(ValueError, match=message):
+        load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+def test_torchscript_of_another_robot_is_named(tmp_path, anymal):
+    path = tmp_path / "policy.ts"
+    torch.jit.trace(torch.nn.Linear(169, 10), torch.zeros(4, 169)).save(str(path))
+    with pytest.raises(ValueError, match=r"failed on observations of shape \(4, 235\).*anymal"):
+        load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("too_few_actions", r"\(num_envs, 12\).*got \(4, 11\)"),
+        ("list_of_actions", "got list"),
+        ("not_finite", "not finite"),
+        ("fails", "expected 48 columns"),
+        ("NOT_CALLABLE", "must be callable, got int"),
+        ("no_such_name", "cannot be imported.*no_such_name"),
+    ],
+)
+def test_a_callable_that_does_not_fit_is_named(anymal, name, message):
+    with pytest.raises(ValueError, match=message):
+        load_policy(f"tests.sim.policies:{name}", anymal, "cpu")
+
+
+def test_a_module_that_is_not_there_is_named(anymal):
+    with pytest.raises(ValueError, match=r"no_such_module.*module:callable"):
+        load_policy("no_such_module:policy", anymal, "cpu")
+
+
+def test_a_checkpoint_with_nan_is_refused(tmp_path, anymal):
+    state = rsl_rl_actor().state_dict()
+    state["mlp.0.bias"] = state["mlp.0.bias"] * float("nan")
+    with pytest.raises(ValueError, match="not finite"):
+        load_policy(save_checkpoint(tmp_path / "nan.pt", state), anymal, "cpu")
+
+
+class Bomb:
+    """Unpickling it creates the file it names."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+@pytest.mark.parametrize("how", ["torch", "pickle", "inside a checkpoint"])
+def test_code_in_a_file_does_not_run(tmp_path, anymal, how):
+    proof, path = tmp_path / "it_ran", tmp_path / "bomb.pt"
+    if how == "pickle":
+        path.write_bytes(pickle.dumps(Bomb(str(proof))))
+    elif how == "torch":
+        torch.save(Bomb(str(proof)), path)
+    else:
+        save_checkpoint(path, rsl_rl_actor().state_dict(), infos=Bomb(str(proof)))
+    with pytest.raises(ValueError, match="neither a checkpoint of plain tensors nor a TorchScript"):
+        load_policy(path, anymal, "cpu")
+    assert not proof.exists()
+    pickle.loads(pickle.dumps(Bomb(str(proof))))
+    assert proof.exists(), "the bomb is a dud: this test proves nothing"
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_a_truncated_file_is_refused(tmp_path, anymal, share):
+    path = save_checkpoint(tmp_path / "model.pt", rsl_rl_actor().state_dict())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=r"model\.pt"):
+        load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"model_state_dict": {"actor.0.weight": torch.zeros(2, 2)}, "iter": 3}, "found model_state_dict, iter"),
+        ({"actor_state_dict": {"rnn.weight": torch.zeros(2)}}, "mlp.0.weight"),
+        ([1, 2, 3], "found list"),
+        (torch.zeros(3), "found Tensor"),
+    ],
+)
+def test_a_foreign_file_is_named(tmp_path, anymal, content, message):
+    torch.save(content, tmp_path / "foreign.pt")
+    with pytest.raises(ValueError, match=message):
+        load_policy(tmp_path / "foreign.pt", anymal, "cpu")
+
+
+@pytest.mark.parametrize("damage", ["no bias", "a layer that does not fit", "no tensor", "a short bias"])
+def test_a_checkpoint_with_a_damaged_layer_is_refused(tmp_path, anymal, damage):
+    state = dict(rsl_rl_actor().state_dict())
+    if damage == "no bias":
+        del state["mlp.2.bias"]
+    elif damage == "a layer that does not fit":
+        state["mlp.2.weight"] = torch.zeros(16, 31)
+    elif damage == "no tensor":
+        state["mlp.2.weight"] = "lost"
+    else:
+        state["mlp.2.bias"] = torch.zeros(3)
+    path = save_checkpoint(tmp_path / "damaged.pt", state)
+    with pytest.raises(ValueError, match=r"damaged\.pt"):
+        load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.parametrize("opcodes", [b"\x80\x02.", b"\x80\x02\x86.", b"\x80\x02K", b"hello world\n"])
+def test_a_broken_stream_of_opcodes_is_refused(tmp_path, anymal, opcodes):
+    (tmp_path / "broken.pt").write_bytes(opcodes)
+    with pytest.raises(ValueError, match=r"broken\.pt.*truncated, foreign"):
+        load_policy(tmp_path / "broken.pt", anymal, "cpu")
+
+
+def test_the_reason_is_the_finding_without_torchs_advice(tmp_path, anymal):
+    torch.save(Bomb(str(tmp_path / "it_ran")), tmp_path / "bomb.pt")
+    with pytest.raises(ValueError, match=r"posix\.mkdir") as caught:
+        load_policy(tmp_path / "bomb.pt", anymal, "cpu")
+    assert "Re-running" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("def policy(:", "cannot be imported: SyntaxError"),
+        ("1 / 0", "cannot be imported: ZeroDivisionError"),
+        ("def policy(observation): raise ValueError", "failed on observations.*ValueError"),
+        ("def policy(observation): return {}['gone']", "failed on observations.*KeyError: 'gone'"),
+        (
+            "def policy(robot, device): raise KeyError('gone')\npolicy.faultline_factory = True",
+            "factory that failed: KeyError",
+        ),
+    ],
+)
+def test_code_that_fails_is_named(tmp_path, anymal, monkeypatch, source, message):
+    (tmp_path / "theirs.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "theirs", raising=False)
+    with pytest.raises(ValueError, match=message):
+        load_policy("theirs:policy", anymal, "cpu")
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path, anymal):
+    with pytest.raises(ValueError, match=r"gone\.pt.*no such file.*rsl_rl.*TorchScript.*module:callable"):
+        load_policy(tmp_path / "gone.pt", anymal, "cpu")
+
+
+def test_a_robot_without_a_controller_yet_says_how_to_train_one(tmp_path, anymal, monkeypatch):
+    monkeypatch.setattr(type(anymal), "policy_file", tmp_path / "anymal.pt")
+    for spec in (anymal.policy_file, str(anymal.policy_file)):
+        with pytest.raises(ValueError, match=r"no shipped controller yet.*anymal\.pt: .*`make train ROBOT=anymal`"):
+            load_policy(spec, anymal, "cpu")
+
+
+def test_a_folder_is_no_policy(tmp_path, anymal):
+    with pytest.raises(ValueError, match="no such file"):
+        load_policy(tmp_path, anymal, "cpu")
+
+
+def test_the_size_comes_from_the_robot(tmp_path, anymal):
+    small = dataclasses.replace(anymal, scan_x=(0.0,), scan_y=(0.0,))
+    path = save_checkpoint(tmp_path / "small.pt", rsl_rl_actor(49).state_dict())
+    assert load_policy(path, small, "cpu").sizes == (49, 12)
+
+
+def test_the_runner_writes_actions_into_its_buffer(anymal, device):
+    observation = wp.full((5, OBSERVATIONS), 0.5, dtype=float, device=device)
+    action = wp.zeros((5, ACTIONS), dtype=float, device=device)
+    policy = load_policy(anymal.policy_file, anymal, device)
+    runner = PolicyRunner(policy, observation, action)
+    runner()
+    with torch.inference_mode():
+        expected = policy(wp.to_torch(observation))
+    torch.testing.assert_close(wp.to_torch(action), expected)
+    observation.fill_(-1.0)
+    runner()
+    assert not torch.allclose(wp.to_torch(action), expected)
+
+
+def test_a_controller_may_keep_and_change_its_row(anymal):
+    kept = []
+
+    def policy(row):
+        kept.append(row)
+        row += 1.0
+        return row[:, :ACTIONS]
+
+    observation = wp.full((5, OBSERVATIONS), 0.5, dtype=float, device="cpu")
+    action = wp.zeros((5, ACTIONS), dtype=float, device="cpu")
+    runner = PolicyRunner(policy, observation, action)
+    runner()
+    np.testing.assert_array_equal(observation.numpy(), 0.5)
+    observation.fill_(-1.0)
+    runner()
+    assert [float(row[0, 0]) for row in kept] == [1.5, 0.0]
+    np.testing.assert_array_equal(action.numpy(), 0.0)
+
+
+def fails(_):
+    raise RuntimeError("enough\nof it")
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (lambda row: torch.zeros(1, ACTIONS), r"shape \(5, 12\), got \(1, 12\)"),
+        (lambda row: torch.zeros(5, ACTIONS, dtype=torch.int64), "plain floats, got torch.int64"),
+        (lambda row: torch.zeros(5, ACTIONS, dtype=torch.complex64), "plain floats, got torch.complex64"),
+        (lambda row: torch.zeros(5, ACTIONS, device="meta"), "plain floats, got .* on meta"),
+        (lambda row: torch.zeros(5, ACTIONS).to_sparse(), "plain floats, got .*sparse"),
+        (lambda row: None, "got NoneType"),
+        (fails, "failed in the middle of a crossing: RuntimeError: enough$"),
+    ],
+)
+def test_what_goes_wrong_in_a_crossing_is_named(policy, message):
+    observation, action = (wp.zeros((5, size), dtype=float, device="cpu") for size in (OBSERVATIONS, ACTIONS))
+    with pytest.raises(ValueError, match=message):
+        PolicyRunner(policy, observation, action)()

@@ -1,0 +1,214 @@
+"""Recordings: of the very episodes that an evaluation runs, whole on disk, and checked when they are read."""
+
+import dataclasses
+import hashlib
+import io
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from kernels.episode import Outcome
+from sim.crossing import CrossingCfg
+from sim.mujoco_c.model import surface_heights
+from sim.recording.file import read_recording, write_recording
+from sim.recording.recorder import FRAME_ARRAYS, Recording, record
+from sim.rollout import Rollout
+from sim.terrain import uniform_random_genes
+from tests.sim.scenes import slope
+from tests.sim.test_rollout import FLAT, spike
+
+SHORT = CrossingCfg(max_duration_s=1.0, poll_every_s=0.5)
+SEEDS = np.array([5, 6], np.uint32)
+SLOPE = slope(np.deg2rad(4), np.deg2rad(-3))  # other along x than along y, and no mirror image of itself
+
+
+@pytest.fixture(scope="module")
+def rollout(anymal, device):
+    return Rollout(anymal, anymal.policy_file, num_terrains=2, num_replicas=4, device=device, cfg=SHORT)
+
+
+@pytest.fixture(scope="module")
+def recorded(rollout, anymal):
+    """Episodes that end in the middle of a control step, on a spike, beside some that last."""
+    return record(rollout, np.stack([spike(), SLOPE]), SEEDS, policy=anymal.policy_file, labels=["spike", "slope"])
+
+
+@pytest.fixture(scope="module")
+def recording(recorded) -> Recording:
+    return recorded[1]
+
+
+def test_recorded_episodes_are_those_of_an_evaluation(rollout, recorded):
+    result, recording = recorded
+    evaluated = rollout.evaluate(np.stack([spike(), SLOPE]), SEEDS)
+    names = ("outcome", "penalties", "duration_s", "fallen", "final_position")
+    for name in names if rollout.sim.device == "cpu" else ("outcome",):
+        np.testing.assert_array_equal(getattr(result, name), getattr(evaluated, name))
+    assert (result.base_collision[0] & ~result.base_collision[1]).all()
+    for name in ("outcome", "duration_s", "fallen"):
+        np.testing.assert_array_equal(getattr(recording, name), getattr(result, name))
+    for t, k in np.ndindex(2, 4):
+        last = recording.num_frames[t, k] - 1
+        # float32 sums, kept as they are: equal, not close
+        np.testing.assert_array_equal(recording.penalties[t, k, last], result.penalties[t, k])
+        # The last frame is up to a control step after the end, at less than 2 m/s.
+        assert last * recording.dt - 0.02 - 1e-6 < result.duration_s[t, k] <= last * recording.dt + 1e-6
+        np.testing.assert_allclose(recording.base_position[t, k, last], result.final_position[t, k], atol=0.04)
+
+
+def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anymal):
+    rollout.begin(np.stack([spike(), SLOPE]), SEEDS)
+    start = np.array(rollout.sim.joint_q.numpy()).reshape(2, 4, -1)
+    np.testing.assert_array_equal(recording.base_position[:, :, 0], start[..., :3])
+    np.testing.assert_array_equal(recording.base_quaternion[:, :, 0], start[..., [6, 3, 4, 5]])
+    np.testing.assert_allclose(recording.joint_position[:, :, 0], start[..., 7:], atol=5e-4)
+    assert (recording.penalties[:, :, 0] == 0).all() and (recording.foot_force[:, :, 0] == 0).all()
+    # Toward the goal, from the start on, at 0.75 m/s; once ended, no command.
+    np.testing.assert_allclose(np.linalg.norm(recording.command[:, :, 0, :2], axis=-1), 0.75, atol=1e-3)
+    assert (recording.command[0, 0, recording.num_frames[0, 0] - 1] == 0).all()
+    assert (np.diff(recording.penalties[1], axis=1) >= 0).all()
+    assert (recording.num_frames[1] == 51).all() and (recording.num_frames[0] < 51).all()
+    assert recording.base_position.shape == (2, 4, 51, 3)
+    for name in FRAME_ARRAYS:
+        array = getattr(recording, name)
+        assert np.isnan(array[0, 0, recording.num_frames[0, 0] :]).all()
+        assert np.isfinite(array[0, 0, : recording.num_frames[0, 0]]).all()
+    # A robot that walks is carried by its feet: 50.6 kg, give or take its bouncing.
+    upward = recording.foot_force[1, :, 25:, :, 2].sum(axis=2).mean()
+    mass = mujoco.MjModel.from_xml_path(str(anymal.model_file)).body_mass.sum()
+    assert upward == pytest.approx(9.81 * mass, rel=0.1)
+
+
+def test_feet_that_push_are_on_the_ground(recording, anymal):
+    """The poses as MuJoCo places them: a foot with force touches the surface, and none lies below it."""
+    model = mujoco.MjModel.from_xml_path(str(anymal.model_file))
+    data = mujoco.MjData(model)
+    gaps, forces = [], []
+    for frame, qpos in enumerate(recording.qpos(1, 2)):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        feet = np.array([data.geom(name).xpos for name in recording.foot_names])
+        gaps.append(feet[:, 2] - 0.03 - surface_heights(SLOPE, feet[:, 0], feet[:, 1]))
+        forces.append(np.linalg.norm(recording.foot_force[1, 2, frame], axis=1))
+    gaps, forces = np.array(gaps), np.array(forces)
+    assert (forces > 50).sum() > 40
+    assert np.abs(gaps[forces > 50]).max() < 0.01
+    assert gaps.min() > -0.01 and gaps.max() > 0.02
+
+
+def test_of_all_episodes_some_may_be_recorded(rollout, recording, anymal):
+    terrains = np.stack([spike(), SLOPE])
+    result, some = record(rollout, terrains, SEEDS, policy=anymal.policy_file, replicas=[3, 1])
+    assert result.outcome.shape == (2, 4) and some.outcome.shape == (2, 2)
+    assert some.replicas.tolist() == [3, 1] and some.labels == ("terrain 0", "terrain 1")
+    if rollout.sim.device == "cpu":
+        for name in (*FRAME_ARRAYS, "outcome", "duration_s", "num_frames"):
+            np.testing.assert_array_equal(getattr(some, name), getattr(recording, name)[:, [3, 1]])
+    for wrong in ([4], [-1], []):
+        with pytest.raises(ValueError, match=r"replicas must be some of 0\.\.3"):
+            record(rollout, terrains, SEEDS, policy=anymal.policy_file, replicas=wrong)
+
+
+def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
+    def break_one(step, most):
+        values = np.array(rollout.sim.joint_q.numpy())
+        values[6, 8] = np.nan
+        rollout.sim.joint_q.assign(values)
+
+    terrains = np.stack([FLAT, FLAT])
+    _, recording = record(rollout, terrains, SEEDS, policy=anymal.policy_file, progress=break_one)
+    assert recording.outcome[1, 2] == Outcome.INVALID
+    assert recording.num_frames[1, 2] == 26  # broken after 0.5 s, in the 26th control step; frames 0 to 25
+    np.testing.assert_allclose(recording.duration_s[1, 2], 0.505, atol=1e-6)
+    assert np.isfinite(recording.qpos(1, 2)[:25]).all()
+
+
+def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
+    for name in ("a.npz", "b.npz"):
+        write_recording(tmp_path / name, recording)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    back = read_recording(tmp_path / "a.npz")
+    for field in dataclasses.fields(Recording):
+        value, expected = getattr(back, field.name), getattr(recording, field.name)
+        np.testing.assert_array_equal(value, expected)
+        assert type(value) is type(expected) and getattr(value, "dtype", 0) == getattr(expected, "dtype", 0)
+    assert back.origin["policy_sha256"] == hashlib.sha256(anymal.policy_file.read_bytes()).hexdigest()
+    assert {"policy", "command", "commit", "device", "versions", "seed", "date"} <= back.origin.keys()
+    assert back.labels == ("spike", "slope") and back.robot == "anymal" and back.genes is None
+    with np.load(tmp_path / "a.npz") as content:
+        assert {name: content[name].dtype for name in FRAME_ARRAYS} == FRAME_ARRAYS
+    # A frame is 3 + 4 + 6 floats of 4 bytes and 12 + 12 + 3 of 2; with two height grids no more than that.
+    assert (tmp_path / "a.npz").stat().st_size < 8 * 51 * 106 + 2 * 161 * 321 * 4
+
+
+def test_terrains_given_by_genes_are_kept_as_genes(rollout, anymal, tmp_path):
+    genes = uniform_random_genes(2, 3)
+    _, recording = record(rollout, genes, SEEDS, policy=anymal.policy_file, replicas=[0])
+    write_recording(tmp_path / "a.npz", recording)
+    with np.load(tmp_path / "a.npz") as content:
+        assert "heights" not in content
+    back = read_recording(tmp_path / "a.npz")
+    np.testing.assert_array_equal(back.genes, genes)
+    np.testing.assert_allclose(back.heights, recording.heights, atol=1e-5)
+    assert np.ptp(back.heights) > 0.1
+
+
+CHANGES = {
+    "another version": {"format": np.array("faultline recording 0")},
+    "no format": {"format": None},
+    "a lost array": {"command": None},
+    "floats as integers": {"outcome": np.ones((2, 4))},
+    "halves as doubles": {"joint_position": np.zeros((2, 4, 51, 12))},
+    "a joint too few": {"joint_names": np.array(["a"] * 11)},
+    "another number of terrains": {"seeds": np.arange(3, dtype=np.uint32)},
+    "running episodes": {"outcome": np.zeros((2, 4), np.uint8)},
+    "more frames than there are": {"num_frames": np.full((2, 4), 52, np.int32)},
+    "fewer frames than there are": {"num_frames": np.full((2, 4), 3, np.int32)},
+    "no time": {"dt": np.array(0.0)},
+    "ground that is not a number": {"heights": np.full((2, 161, 321), np.nan, np.float32)},
+    "an origin that is no object": {"origin": np.array("[1]")},
+    "objects": {"robot": np.array({"a": 1}, dtype=object)},
+}
+
+
+@pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
+def test_what_is_no_recording_is_refused(recording, tmp_path, changes):
+    path = tmp_path / "a.npz"
+    write_recording(path, recording)
+    with np.load(path) as content:
+        content = dict(content) | changes
+    np.savez(path, **{name: value for name, value in content.items() if value is not None})
+    with pytest.raises(ValueError, match=r"must be a recording of crossings, but .*: record it again"):
+        read_recording(path)
+
+
+def test_poses_that_mean_nothing_are_refused(recording, tmp_path):
+    for change in ({"base_quaternion": 0.5}, {"base_position": 1e6}):
+        arrays = {name: getattr(recording, name) * np.float32(factor) for name, factor in change.items()}
+        write_recording(tmp_path / "a.npz", dataclasses.replace(recording, **arrays))
+        with pytest.raises(ValueError, match=next(iter(change))):
+            read_recording(tmp_path / "a.npz")
+
+
+def test_a_damaged_file_is_refused(recording, tmp_path):
+    path = tmp_path / "a.npz"
+    write_recording(path, recording)
+    whole = path.read_bytes()
+    for content in (whole[:-100], whole[: len(whole) // 2], b"hello", b""):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="damaged or another file"):
+            read_recording(path)
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 4
+    path.write_bytes(flipped)
+    with pytest.raises(ValueError, match="damaged or another file"):
+        read_recording(path)
+    with pytest.raises(FileNotFoundError, match="no recording at"):
+        read_recording(tmp_path / "elsewhere.npz")
+    buffer = io.BytesIO()
+    np.savez(buffer, genes=np.zeros((1, 64)), settings=json.dumps({}))
+    path.write_bytes(buffer.getvalue())
+    with pytest.raises(ValueError, match="its format must be 'faultline recording 1', got none"):
+        read_recording(path)

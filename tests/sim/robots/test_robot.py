@@ -1,0 +1,229 @@
+"""The robot's file: published numbers, the same robot to Newton and to MuJoCo, and clear errors."""
+
+import dataclasses
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from kernels.penalties import BASE, FOOT, LIMB
+from sim.bench import oracle
+from sim.robots.model import build_robot, leaf_name
+from sim.robots.robot import ROBOTS, get_robot
+from tests.sim import mujoco_c
+from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE, lying
+
+LEGS = ("LF", "RF", "LH", "RH")
+JOINTS = {
+    "anymal": [f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE")],
+    "cassie": [
+        f"{joint}_{side}"
+        for side in ("left", "right")
+        for joint in ("hip_abduction", "hip_rotation", "hip_flexion", "thigh_joint", "ankle_joint", "toe_joint")
+    ],
+}
+LEFT_BODIES = {
+    "anymal": [f"{leg}_{part}" for leg in ("LF", "LH") for part in ("HIP", "THIGH", "SHANK")],
+    "cassie": [f"left_{part}" for part in ("pelvis_rotation", "hip", "thigh", "shin", "tarsus", "toe")],
+}
+
+
+def mirrored(name):
+    """The right-hand name of a left-hand one."""
+    return name.replace("left", "right") if "left" in name else name.replace("LF", "RF").replace("LH", "RH")
+
+
+@pytest.fixture(scope="module")
+def c_model(robot):
+    return mujoco.MjModel.from_xml_path(str(robot.model_file))
+
+
+@pytest.fixture(scope="module")
+def builder(robot):
+    return build_robot(robot)
+
+
+def test_published_mass(robot, c_model, builder):
+    # ANYmal C: 52.13 kg over its 13 moving bodies. Cassie: a pelvis of 10.33 + 0.1 kg and two legs of
+    # 1.82 + 1.17 + 5.52 + 0.577 + 0.782 + 0.15 = 10.019 kg in six bodies each.
+    mass, tolerance = {"anymal": (52.13, 0.01), "cassie": (10.43 + 2 * 10.019, 1e-6)}[robot.name]
+    assert c_model.body_mass.sum() == pytest.approx(mass, abs=tolerance)
+    assert sum(builder.body_mass) == pytest.approx(mass, abs=tolerance)
+    assert builder.body_count == 13
+
+
+def test_inertias_are_the_same_in_newton_and_mujoco(c_model, builder):
+    for k, label in enumerate(builder.body_label):
+        body = c_model.body(leaf_name(label))
+        axes = oracle.rotation_matrix(np.roll(body.iquat, -1))
+        np.testing.assert_allclose(np.array(builder.body_com[k]), body.ipos, atol=1e-6)
+        inertia = np.array(builder.body_inertia[k]).reshape(3, 3)
+        np.testing.assert_allclose(inertia, axes @ np.diag(body.inertia) @ axes.T, atol=1e-6)
+
+
+def test_joints_are_in_policy_order(robot, c_model, builder):
+    expected = JOINTS[robot.name]
+    assert list(robot.joint_names) == expected
+    assert [c_model.joint(k).name for k in range(1, 13)] == expected
+    assert [c_model.actuator(k).name for k in range(12)] == expected
+    assert [leaf_name(label) for label in builder.joint_label][1:] == expected
+
+
+def limits_of(builder):
+    return np.column_stack([builder.joint_limit_lower[6:], builder.joint_limit_upper[6:]])
+
+
+def test_gains_and_limits_are_the_same_in_newton_and_mujoco(robot, c_model, builder):
+    # That Newton's solver heeds the limits of effort: test_simulation.
+    kp, kd, effort = map(np.array, GAINS[robot.name])
+    np.testing.assert_array_equal(c_model.actuator_gainprm[:, 0], kp)
+    np.testing.assert_array_equal(c_model.actuator_biasprm[:, :3], np.column_stack([0 * kp, -kp, -kd]))
+    np.testing.assert_array_equal(c_model.actuator_forcerange, np.column_stack([-effort, effort]))
+    np.testing.assert_array_equal(builder.joint_target_ke[6:], kp)
+    np.testing.assert_array_equal(builder.joint_target_kd[6:], kd)
+    np.testing.assert_allclose(builder.joint_armature[6:], c_model.dof_armature[6:])
+    limited = c_model.jnt_limited[1:] == 1
+    np.testing.assert_allclose(c_model.jnt_range[1:][limited], limits_of(builder)[limited], atol=1e-6)
+    assert (np.abs(limits_of(builder)[~limited]) > 1e6).all()
+    assert c_model.opt.timestep == robot.physics_dt
+
+
+@ONLY_ANYMAL
+def test_anymals_hips_are_limited(robot, c_model, builder):
+    abduction = np.array([name.endswith("HAA") for name in robot.joint_names])
+    # Legs turn in by 0.72 rad and out by 0.49 rad: mirrored on the right.
+    np.testing.assert_allclose(limits_of(builder)[abduction], [[-0.72, 0.49], [-0.49, 0.72]] * 2, atol=1e-6)
+    np.testing.assert_array_equal(c_model.jnt_limited[1:], abduction)
+
+
+@ONLY_CASSIE
+def test_cassies_published_limits_and_frames(c_model, builder):
+    others = [[-0.3927, 0.3927], [-0.8727, 1.3963], [-2.8623, -0.6458], [0.6458, 2.8623], [-2.4435, -0.5236]]
+    expected = [[-0.2618, 0.3927], *others, [-0.3927, 0.2618], *others]  # abduction: farther out than in
+    np.testing.assert_allclose(limits_of(builder), expected, atol=1e-6)
+    # Reflected through its gears the motor of a toe adds .01 kg m^2 to what is of the toe itself: .010449 in all.
+    np.testing.assert_array_equal(c_model.dof_armature[6:], [0, 0, 0, 0, 0, 0.01] * 2)
+    data = mujoco.MjData(c_model)
+    mujoco.mj_kinematics(c_model, data)
+    # With all angles 0 the leg hangs straight down, its x axis along it. Below the pelvis, by the offsets of the chain:
+    # .09 + .12 + .4348 + .408 m; forward -.07 + .021 + .02 - .04 m; sideways .135 - .0045 m.
+    below = data.body("left_toe").xpos - data.body("pelvis").xpos
+    np.testing.assert_allclose(below, [-0.069, 0.1305, -1.0528], atol=1e-6)
+    np.testing.assert_allclose(data.body("left_toe").xmat.reshape(3, 3)[:, 0], [0, 0, -1], atol=1e-6)
+    # The hip's rotation turns about the vertical; flexion and the joints below, about the axis to the right.
+    for joint, axis in (("hip_rotation", [0, 0, 1]), ("hip_flexion", [0, -1, 0]), ("toe_joint", [0, -1, 0])):
+        np.testing.assert_allclose(data.joint(f"{joint}_left").xaxis, axis, atol=1e-6)
+
+
+def test_the_default_pose_is_symmetric(robot, c_model):
+    q = np.concatenate([lying(1, 0, 0, robot.default_base_height)[0], robot.default_joint_pos])
+    left = [name for name in robot.foot_geoms if name != mirrored(name)]
+    at = dict(zip(robot.foot_geoms, mujoco_c.geom_positions(c_model, q, robot.foot_geoms), strict=True))
+    assert len(at) == 2 * len(left)
+    for name in left:
+        np.testing.assert_allclose(at[name] * [1, -1, 1], at[mirrored(name)], atol=1e-6)
+    if robot.name == "anymal":
+        np.testing.assert_allclose(at["LF_FOOT"] * [-1, 1, 1], at["LH_FOOT"], atol=1e-6)
+    # ANYmal's feet of .03 m hang at most 6 cm over the ground; Cassie's toes of .02 m begin .15 m over it (legged_gym's
+    # 1 m), level to 3 degrees; none in it, within the stance that the start looks at.
+    low, high = {"anymal": (0.03, 0.09), "cassie": (0.15, 0.18)}[robot.name]
+    for position in at.values():
+        assert low <= position[2] < high
+        assert (np.abs(position[:2]) < robot.footprint).all()
+
+
+def test_masses_and_inertias_are_those_of_a_real_body(robot, c_model):
+    inertia = np.sort(c_model.body_inertia[1:], axis=1)
+    assert (inertia[:, 0] > 0).all()
+    assert (inertia[:, 2] <= inertia[:, 0] + inertia[:, 1]).all()  # the triangle inequality
+    left = LEFT_BODIES[robot.name]
+    np.testing.assert_allclose(
+        [c_model.body(name).mass[0] for name in left], [c_model.body(mirrored(name)).mass[0] for name in left]
+    )
+
+
+def test_mujoco_reads_every_geom_with_a_role(robot, c_model):
+    assert {c_model.geom(k).name for k in range(c_model.ngeom)} == set(robot.geom_names)
+
+
+def test_roles(anymal, cassie):
+    assert anymal.role_of("base") == BASE
+    assert anymal.role_of("LH_FOOT") == FOOT
+    assert anymal.role_of("RF_SHANK") == anymal.role_of("LF_THIGH") == LIMB
+    assert anymal.role_of("ground") == 0
+    roles = [anymal.role_of(name) for name in anymal.geom_names]
+    assert [roles.count(role) for role in (BASE, LIMB, FOOT)] == [1, 8, 4]
+    assert [cassie.role_of(name) for name in cassie.geom_names] == [BASE, FOOT, FOOT]
+
+
+def test_sizes(anymal, cassie):
+    # 12 + 3 * 12 + 17 * 11 = 235 observations, with 11 x 11 points 169; 4 * 0.005 s = 50 Hz.
+    assert (anymal.num_scan_points, cassie.num_scan_points) == (187, 121)
+    assert (anymal.observation_size, cassie.observation_size) == (235, 169)
+    assert anymal.control_dt == cassie.control_dt == pytest.approx(0.02)
+
+
+def test_what_is_asked_of_each_robot(anymal, cassie):
+    # The paper: six penalties of ANYmal and no bit; five of Cassie and whether the pelvis collides.
+    assert anymal.penalties == ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
+    assert cassie.penalties == anymal.penalties[:-1]
+    assert (anymal.collision_bit, cassie.collision_bit) == (False, True)
+    assert (anymal.contact_force_limit, cassie.contact_force_limit) == (500.0, 300.0)
+
+
+def test_the_scan_runs_along_y_first(anymal, cassie):
+    for robot, first in ((anymal, -0.8), (cassie, -0.5)):
+        x, y = robot.scan_points()
+        expected = [first, -0.5, first, -0.4, first + 0.1, -0.5]
+        np.testing.assert_allclose([x[0], y[0], x[1], y[1], x[11], y[11]], expected, atol=1e-6)
+        np.testing.assert_allclose([x[-1], y[-1]], [-first, 0.5], atol=1e-6)
+
+
+def test_an_unknown_robot_is_named():
+    with pytest.raises(ValueError, match=rf"unknown robot 'spot'.*{', '.join(sorted(ROBOTS))}"):
+        get_robot("spot")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"foot_geoms": ("LF_FOOT", "LF_TOE")}, "no geom named LF_TOE .*the file has base, .*RH_FOOT"),
+        ({"base_geoms": ("pelvis",)}, "no geom named pelvis"),
+        ({"joint_names": ("LF_HAA", "LF_ANKLE")}, "no joint named LF_ANKLE .*the file has LF_HAA, .*RH_KFE"),
+        ({"default_joint_pos": (0.0, 0.4)}, "needs 12 angles, got 2"),
+    ],
+)
+def test_what_the_file_lacks_is_named(anymal, change, message):
+    with pytest.raises(ValueError, match=message):
+        build_robot(dataclasses.replace(anymal, **change))
+
+
+def test_joints_in_another_order_are_refused(anymal):
+    swapped = (*anymal.joint_names[3:], *anymal.joint_names[:3])
+    with pytest.raises(ValueError, match=r"file's order \('LF_HAA'.*got \('RF_HAA'"):
+        build_robot(dataclasses.replace(anymal, joint_names=swapped))
+
+
+def test_a_missing_file_is_named(anymal, tmp_path):
+    with pytest.raises(ValueError, match=r"gone\.xml, no such file"):
+        build_robot(dataclasses.replace(anymal, model_file=tmp_path / "gone.xml"))
+
+
+def test_a_robot_without_scales_says_how_to_measure_them(cassie, monkeypatch, tmp_path):
+    monkeypatch.setattr(type(cassie), "scales_file", tmp_path / "none.json")
+    with pytest.raises(ValueError, match=r"no penalty scales of robot 'cassie'.*`make calibrate ROBOT=cassie`"):
+        cassie.read_penalty_scales()
+
+
+def test_penalty_scales_are_read(anymal, monkeypatch, tmp_path):
+    file = tmp_path / "scales.json"
+    monkeypatch.setattr(type(anymal), "scales_file", file)
+    with pytest.raises(ValueError, match="make calibrate ROBOT=anymal"):
+        anymal.read_penalty_scales()
+    scales = {name: 0.5 + k for k, name in enumerate(anymal.penalties)}
+    file.write_text(json.dumps({"scales": scales}))
+    assert anymal.read_penalty_scales() == (0.5, 1.5, 2.5, 3.5, 4.5, 5.5)
+    file.write_text(json.dumps({"scales": scales | {"stumble": 0.0}}))
+    with pytest.raises(ValueError, match="no positive scale for stumble"):
+        anymal.read_penalty_scales()

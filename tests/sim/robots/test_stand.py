@@ -1,0 +1,89 @@
+"""The look at a robot before any work: what it says of robots that are fine, and of those that are not."""
+
+import dataclasses
+import re
+import sys
+
+import pytest
+
+from sim.robots import stand as command
+from sim.robots.robot import get_robot
+from sim.robots.stand import describe_model, describe_standing, stand
+from tests.sim.dogs import KINDS, LEGS, MASS, write_dog
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def dog(request, tmp_path_factory):
+    return get_robot(str(write_dog(tmp_path_factory.mktemp("dog"), **KINDS[request.param])))
+
+
+def test_a_dog_stands_on_its_feet(dog, device):
+    found = stand(dog, device=device, drops=8)
+    assert found.stands and found.finite and not found.overflowed
+    assert set(found.carried) == {f"{leg}_foot" for leg in LEGS}
+    assert sum(found.carried.values()) == pytest.approx(1.0, abs=0.03)
+    # Thigh and shank of 0.15 m lean by 0.6 rad to either side: soles 0.3 cos 0.6 + 0.025 = 0.2726 m under the hips.
+    assert found.gap == pytest.approx(0.29 - 0.2726, abs=1e-3)
+    assert found.lowest in dog.foot_geoms
+    assert found.height[0] == 0.29 and 0.24 < found.height[1] < 0.29
+    assert found.tilt_deg < 2.0 and found.joint_error < 0.1
+    assert 1.0 < found.contacts < dog.nconmax and 12 < found.rows <= dog.njmax
+    text, fine = describe_standing(dog, found)
+    assert fine and text.endswith("It stands.")
+
+
+def test_what_was_read_is_listed(dog):
+    text = describe_model(dog)
+    assert f"{MASS:.2f} kg in 9 bodies, 8 joints, 51 observations" in text
+    rows = {line.split()[0]: line.split() for line in text.splitlines()[3:]}
+    assert rows["HR_knee"] == ["HR_knee", "-1.200", "-2.60", "to", "-0.10", "60", "2", "0.01"]
+    assert rows["FL_foot"][:3] == ["FL_foot", "foot", "FL_shank"]
+    assert rows["trunk"][1] == "base" and rows["HL_thigh"][1] == "limb"
+
+
+def test_who_is_off_the_ground_does_not_stand(dog, device):
+    found = stand(dog, device=device, seconds=0.5, drops=1)
+    assert found.stands
+    assert not dataclasses.replace(found, carried={}).stands
+    assert not dataclasses.replace(found, height=(0.29, 0.1)).stands
+    assert not dataclasses.replace(found, tilt_deg=16.0).stands
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"default_base_height": 0.2}, r"To mend: its feet start 0\.07\d m in the ground"),
+        ({"default_joint_pos": (0.0, -2.6) * 4}, "in the default pose (F|H)(L|R)_(shank|thigh) is lower than the feet"),
+        ({"njmax": 8}, "To mend: a buffer of the solver was too small: raise nconmax and njmax"),
+        ({"default_joint_pos": (1.5, -0.1) * 4}, "It does not stand by itself"),
+    ],
+)
+def test_what_has_to_be_mended_is_said(tmp_path, device, change, says):
+    robot = dataclasses.replace(get_robot(str(write_dog(tmp_path))), **change)
+    text, fine = describe_standing(robot, stand(robot, device=device, seconds=1.0, drops=4))
+    assert re.search(says, text)
+    assert fine == ("To mend" not in text)
+
+
+def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
+    found = stand(cassie, device=device, drops=4)
+    text, fine = describe_standing(cassie, found)
+    assert not found.stands and fine
+    assert "as a biped may" in text and "pelvis" in found.carried
+
+
+def run_main(monkeypatch, *argv):
+    monkeypatch.setattr(sys, "argv", ["stand", *argv, "--device", "cpu"])
+    return command.main()
+
+
+def test_the_command(tmp_path, monkeypatch, capsys):
+    file = write_dog(tmp_path)
+    assert run_main(monkeypatch, "--robot", str(file), "--seconds", "1", "--drops", "2") == 0
+    assert capsys.readouterr().out.endswith("It stands.\n")
+    file.write_text(file.read_text().replace("0.29", "0.2"))
+    assert run_main(monkeypatch, "--robot", str(file), "--seconds", "1", "--drops", "2") == 1
+    file.write_text(file.read_text().replace('"hip"', '"hop"'))
+    assert run_main(monkeypatch, "--robot", str(file)) == 2
+    assert "no joint named FL_hop, FR_hop, HL_hop, HR_hop in" in capsys.readouterr().err
+    assert run_main(monkeypatch, "--robot", "anymal", "--drops", "0") == 2

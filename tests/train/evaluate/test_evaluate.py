@@ -1,0 +1,276 @@
+"""The evaluation command: the paper's tables from end to end on short crossings, what goes on after a kill, errors."""
+
+import json
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from qd.archive import write_archive
+from qd.workers.evaluator import EvaluatorCfg
+from sim.crossing import CrossingCfg
+from sim.files.command import split_words
+from sim.policy.names import controllers_of
+from sim.robots.robot import get_robot
+from sim.rollout import Rollout
+from tests.train.archives import make_archive
+from train.evaluate.cfg import EvaluateCfg, size_of
+from train.evaluate.crossings import cross_all
+from train.evaluate.evaluate import evaluate_base, main
+from train.evaluate.evaluate import tables_job as tables
+from train.evaluate.kept import KeptCrossings
+from train.evaluate.sets import make_sets, split_elites
+from train.evaluate.tables_job import evaluate_tables
+
+PROTOTYPE = "tests.sim.policies:stretch"
+STANDER = "tests.sim.policies:stand"
+
+
+class Crossings:
+    """Crosses in this process for a fraction of a second; counts, and may be killed after so many sets."""
+
+    def __init__(self, die_after: int = 1000) -> None:
+        self.opened: list[EvaluatorCfg] = []
+        self.sets: list[tuple[str, int]] = []
+        self.die_after = die_after
+
+    @contextmanager
+    def open(self, cfg: EvaluatorCfg):
+        self.opened.append(cfg)
+        rollout = Rollout(
+            get_robot(cfg.robot), cfg.policy, num_terrains=cfg.num_terrains, num_replicas=cfg.num_replicas,
+            device=cfg.device, cfg=CrossingCfg(max_duration_s=0.1, start=(13.6, 4.0), reward=cfg.reward),
+        )  # fmt: skip
+
+        def evaluate(terrains, seeds, progress=None):
+            if len(self.sets) == self.die_after:
+                raise KeyboardInterrupt
+            self.sets.append((cfg.policy, len(seeds)))
+            return rollout.evaluate(terrains, seeds, progress=lambda done, most: progress(done / most))
+
+        yield evaluate
+
+
+@pytest.fixture
+def archive(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    write_archive(run / "archive.npz", make_archive(30))
+    return run
+
+
+def config(tmp_path, **changes):
+    values = {
+        "policies": (f"base={STANDER}", f"C-G={PROTOTYPE}"), "device": "cpu", "terrains": 2, "episodes": 2,
+        "run_dir": tmp_path / "tables",
+    }  # fmt: skip
+    return EvaluateCfg(**values | changes)
+
+
+def test_the_tables_from_end_to_end(tmp_path, archive, capsys):
+    crossings = Crossings()
+    report = evaluate_tables(config(tmp_path, archive=archive, terrains=4), open_evaluator=crossings.open)
+    written = json.loads((tmp_path / "tables" / "tables.json").read_text())
+    assert written == json.loads(json.dumps(report))
+    assert (tmp_path / "tables" / "tables.png").stat().st_size > 10_000
+    for key in ("command", "commit", "device", "versions", "seed", "date"):
+        assert key in written, key
+    assert list(written["success"]) == ["hand_crafted", "hard_random", "generated", "generated_far"]
+    for name in ("success", "goal", "reward"):
+        assert all(list(row) == ["base", "C-G"] for row in written[name].values())
+        assert all(len(limits) == 2 for row in written["intervals"][name].values() for limits in row.values())
+    assert list(written["penalties"]["generated"]["C-G"]) == list(get_robot("anymal").penalties)
+    assert written["archive"] == {
+        "path": str(archive), "elites": 30, "iterations": 3, "train": 24, "test": 6, "split_seed": 0,
+    }  # fmt: skip
+    assert written["terrains"] == {"hand_crafted": 4, "hard_random": 4, "generated": 4, "generated_far": 2}
+    assert written["controllers"]["C-G"]["policy"] == PROTOTYPE
+    held_out = set(split_elites(make_archive(30), "anymal").test[:4].tolist())
+    groups = written["traversable"]["generated"]
+    assert set(groups["crossed"]["terrains"]) | set(groups["never_crossed"]["terrains"]) == held_out
+    # Each controller crossed three sets, in one simulation since they are of one size; the far ones are among them.
+    assert crossings.sets == [(STANDER, 4)] * 3 + [(PROTOTYPE, 4)] * 3 and len(crossings.opened) == 2
+    assert all(cfg.reward for cfg in crossings.opened)
+    said = capsys.readouterr().out
+    assert "base on hand_crafted: success 1.000" in said and "written to" in said
+
+
+def test_all_controllers_meet_the_same_terrains_and_starts(tmp_path, archive):
+    # The same controller under two names: whatever is drawn is drawn alike.
+    cfg = config(tmp_path, policies=(f"a={STANDER} b={STANDER}",), archive=archive)
+    report = evaluate_tables(cfg, open_evaluator=Crossings().open)
+    for name in ("success", "goal", "fallen", "reward", "penalties"):
+        assert all(row["a"] == row["b"] for row in report[name].values())
+    assert report["reward"]["hand_crafted"]["a"] > 0.0
+
+
+def test_rates_of_one_controller_go_under_runs(tmp_path, monkeypatch, capsys):
+    # Never under results/, where the published ones stand.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("train.evaluate.evaluate.open_evaluator", Crossings().open)
+    report = evaluate_base(EvaluateCfg(policy=STANDER, device="cpu", terrains=2, episodes=1))
+    # A controller other than the shipped one has a file of its own.
+    written = "runs/anymal-tests.sim.policies-stand-rates.json"
+    assert json.loads(Path(written).read_text()) == json.loads(json.dumps(report))
+    assert set(report) >= {"hand_crafted", "hard_random", "flat", "command", "commit", "seed"}
+    assert f"written to {written}" in capsys.readouterr().out
+    shipped = evaluate_base(EvaluateCfg(device="cpu", terrains=2, episodes=1))
+    assert json.loads(Path("runs/anymal-rates.json").read_text()) == json.loads(json.dumps(shipped))
+
+
+def test_a_killed_evaluation_goes_on(tmp_path, archive, capsys):
+    cfg = config(tmp_path, archive=archive)
+    killed = Crossings(die_after=4)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_tables(cfg, open_evaluator=killed.open)
+    assert not (tmp_path / "tables" / "tables.json").exists()
+    again = Crossings()
+    report = evaluate_tables(cfg, open_evaluator=again.open)
+    assert len(killed.sets) == 4 and again.sets == [(PROTOTYPE, 2)] * 2
+    assert "4 of 6 crossings of a set are kept from before" in capsys.readouterr().out
+    at_once = evaluate_tables(
+        config(tmp_path, archive=archive, run_dir=tmp_path / "other"), open_evaluator=Crossings().open
+    )
+    for name in ("success", "goal", "reward", "penalties", "intervals", "differences", "traversable"):
+        assert report[name] == at_once[name]
+    done = Crossings()
+    evaluate_tables(cfg, open_evaluator=done.open)
+    assert not done.opened
+
+
+def test_one_controller_more_crosses_alone(tmp_path):
+    cfg = config(tmp_path, policies=(f"base={STANDER}",), sets=("hard_random",))
+    evaluate_tables(cfg, open_evaluator=Crossings().open)
+    more = Crossings()
+    report = evaluate_tables(config(tmp_path, sets=("hard_random",)), open_evaluator=more.open)
+    assert more.sets == [(PROTOTYPE, 2)]
+    assert list(report["differences"]["hard_random"]) == ["base -> C-G"]
+
+
+def test_sets_of_other_sizes_have_simulations_of_their_own(tmp_path):
+    found = make_archive(5)  # one elite is held out
+    sets = make_sets(["hard_random", "generated"], 3, 0, archive=found, split=split_elites(found, "anymal"))
+    crossings, kept = Crossings(), KeptCrossings(tmp_path, robot="anymal", episodes=2, device="cpu")
+    evaluator = EvaluatorCfg(robot="anymal", policy="", num_terrains=9, num_replicas=2, reward=True)
+    results = cross_all({"base": STANDER}, sets, evaluator, kept, open_evaluator=crossings.open)
+    assert [cfg.num_terrains for cfg in crossings.opened] == [3, 1]
+    assert results["generated"]["base"].outcome.shape == (1, 2)
+
+
+def test_the_far_set_is_part_of_the_generated_one_and_the_same_alone(tmp_path):
+    found = make_archive(30)
+    split = split_elites(found, "anymal")
+    evaluator = EvaluatorCfg(robot="anymal", policy="", num_terrains=9, num_replicas=4, reward=True)
+    rewards = []
+    for names in (["generated", "generated_far"], ["generated_far"]):
+        sets = make_sets(names, 6, 0, archive=found, split=split)
+        kept = KeptCrossings(tmp_path / str(len(names)), robot="anymal", episodes=4, device="cpu")
+        crossings = Crossings()
+        results = cross_all({"base": PROTOTYPE}, sets, evaluator, kept, open_evaluator=crossings.open)
+        assert len(crossings.sets) == 1
+        rewards.append(results["generated_far"]["base"].reward)
+    assert rewards[0].shape == (2, 4)
+    np.testing.assert_array_equal(*rewards)
+
+
+def test_controllers_are_named():
+    robot = get_robot("anymal")
+    assert controllers_of((), robot) == {"base": str(robot.policy_file)}
+    named = controllers_of(("base=shipped C-HC=a dir/x.pt", "C-G=m.n:f"), robot)  # as make hands over, and the shell
+    assert named == {"base": str(robot.policy_file), "C-HC": "a dir/x.pt", "C-G": "m.n:f"}
+    assert split_words(["generated, hard_random"]) == ["generated", "hard_random"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the sizes of a machine without a GPU")
+def test_sizes(capsys):
+    def size(**given):
+        chosen = size_of(EvaluateCfg(device="cpu", **given))
+        return chosen.terrains, chosen.episodes
+
+    assert size(sets=("hard_random",)) == (24, 4)
+    assert "24 terrains x 4 episodes a set instead of 300 x 20" in capsys.readouterr().out
+    assert size(robot="cassie", sets=("hard_random",)) == (24, 4)
+    assert "instead of 180 x 20" in capsys.readouterr().out
+    assert size(terrains=5) == (5, 4) and size(episodes=7, policies=("a=b",)) == (24, 7)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--sets", "easy"], "sets must be some of hand_crafted, hard_random, generated, generated_far, got easy"),
+        (["--sets", "generated"], "generated is made of elites: give the run that found them (--archive RUN)"),
+        (["--sets", "hard_random hard_random"], "each set may be named once"),
+        (["--archive", "{folder}/none"], "no archive at {folder}/none"),
+        (["--archive", "{folder}/cassie"], "must be of robot 'anymal', got one of 'cassie'"),
+        (["--archive", "{folder}/empty"], "needs at least 5 elites, got 0"),
+        (["--archive", "{folder}/few"], "needs at least 5 elites, got 4"),
+        (["--archive", "{folder}/noise"], "must be the archive of a search, but it is damaged"),
+        (["--archive", "{folder}/good", "--split-seed", "-1"], "split_seed must be at least 0, got -1"),
+        (["--policies", "a=shipped", "a=shipped"], "different names, got 'a' twice"),
+        (["--policies", "shipped"], "policies must be NAME=FILE each, .* got 'shipped'"),
+        (["--policies", "a="], "policies must be NAME=FILE each, .* got 'a='"),
+        (["--policies", "../a=shipped"], "policies must be NAME=FILE each"),
+        (["--policies", "a={folder}/none.pt"], "policy '{folder}/none.pt': no such file"),
+        (["--policies", "a=sim/robots/anymal.xml"], "is neither a checkpoint"),
+        (
+            ["--policies", "base=shipped", "C-G={folder}/small.pt"],
+            "maps 48 observations to 12 actions, but robot 'anymal'",
+        ),
+        (["--policy", "x.pt", "--sets", "hard_random"], "give --policies NAME=x.pt instead of --policy"),
+        (["--sets", "hard_random", "--robot", "spot"], "unknown robot 'spot'"),
+        (["--sets", "hard_random", "--terrains", "0"], "terrains must be at least 1, got 0"),
+        (["--sets", "hard_random", "--episodes", "-2"], "episodes must be at least 1, got -2"),
+        (["--sets", "hard_random", "--seed", "-3"], "seed must be at least 0, got -3"),
+        (["--sets", "hard_random", "--out", "{folder}/tables.png"], "out must be a file named *.json"),
+        (["--sets", "hard_random", "--out", "/proc/nowhere/t.json"], "cannot write to /proc/nowhere"),
+        (["--sets", "hard_random", "--run-dir", "/proc/nowhere"], "cannot write to /proc/nowhere"),
+        (["--sets", "hard_random", "--device", "cuda"], "no CUDA device was found"),
+        (["--terrains", "0"], "terrains must be at least 1, got 0"),  # of the base evaluation too
+    ],
+)
+@pytest.mark.skipif(torch.cuda.is_available(), reason="one of the errors is the absence of CUDA")
+def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monkeypatch, capsys):
+    for name, elites, robot in (
+        ("good", 30, "anymal"),
+        ("cassie", 30, "cassie"),
+        ("empty", 0, "anymal"),
+        ("few", 4, "anymal"),
+    ):
+        (tmp_path / name).mkdir()
+        write_archive(tmp_path / name / "archive.npz", make_archive(elites, robot=robot))
+    (tmp_path / "noise").mkdir()
+    (tmp_path / "noise" / "archive.npz").write_bytes(b"noise")
+    layers = {"mlp.0.weight": torch.zeros(12, 48), "mlp.0.bias": torch.zeros(12)}
+    torch.save({"actor_state_dict": layers}, tmp_path / "small.pt")
+    for module in ("train.evaluate.evaluate", "train.evaluate.tables_job"):
+        monkeypatch.setattr(f"{module}.open_evaluator", None)  # crossing anything would fail with another error
+    monkeypatch.setattr(tables, "cross_all", None)
+    flags = [flag.format(folder=tmp_path) for flag in flags]
+    home = [] if "--run-dir" in flags else ["--run-dir", str(tmp_path / "tables")]
+    device = [] if "--device" in flags else ["--device", "cpu"]
+    monkeypatch.setattr(sys, "argv", ["train.evaluate.evaluate", *flags, *home, *device])
+    assert main() == 2
+    error = [line for line in capsys.readouterr().err.splitlines() if "Warp" not in line]
+    assert len(error) == 1 and error[0].startswith("error: ")
+    for part in message.format(folder=tmp_path).split(".*"):
+        assert part.strip() in error[0]
+
+
+def test_a_robot_without_scales_is_told_how_to_get_them(tmp_path, monkeypatch):
+    monkeypatch.setattr("sim.robots.robot._ROBOTS_DIR", Path(tmp_path))
+    with pytest.raises(ValueError, match=r"no penalty scales of robot 'anymal'.*make calibrate"):
+        evaluate_tables(config(tmp_path), open_evaluator=Crossings().open)
+
+
+def test_ctrl_c_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def stop(cfg):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("train.evaluate.evaluate.evaluate_tables", stop)
+    monkeypatch.setattr(sys, "argv", ["train.evaluate.evaluate", "--device", "cpu", "--sets", "hard_random"])
+    assert main() == 130
+    assert capsys.readouterr().err.endswith("\nStopped. What is crossed is kept: the same command goes on.\n")

@@ -1,0 +1,151 @@
+"""Checkpoints: training goes on where it stopped, and nothing else is taken for one."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from train.ppo.learner import CHECKPOINT_FORMAT, Learner, read_checkpoint
+from train.ppo.ppo import PpoCfg
+from train.task.vec_env import CommandVecEnv
+
+CFG = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=2, mini_batches=2)
+
+
+@pytest.fixture
+def learner(shared_task):
+    return Learner(CommandVecEnv(shared_task), CFG, seed=0)
+
+
+def state_of(learner):
+    return {**learner.alg.get_policy().state_dict(), **learner.alg.critic.state_dict(prefix="critic.")}
+
+
+def test_an_iteration_learns(learner):
+    before = {key: value.clone() for key, value in state_of(learner).items()}
+    step = learner.iterate()
+    assert learner.iteration == 1 and learner.steps_per_iteration == 24
+    assert step.collection_s > 0 and step.learning_s > 0
+    assert all(math.isfinite(loss) for loss in step.losses.values()) and step.losses.keys() == {
+        "value", "surrogate", "entropy",
+    }  # fmt: skip
+    assert all((value != before[key]).any() for key, value in state_of(learner).items())
+    assert learner.noise_std == pytest.approx(1.0, abs=0.05)
+
+
+def test_episodes_begin_at_random_ages(learner):
+    assert len(learner.env.episode_length_buf.unique()) > 1
+
+
+def test_resumed_training_is_repeatable(learner, tmp_path):
+    learner.iterate()
+    levels = torch.arange(6)
+    learner.env.task.restart_all(levels)
+    learner.save(tmp_path / "c.pt", {"note": [1, None, "x"]})
+    saved_state = {key: value.clone() for key, value in state_of(learner).items()}
+    rate, counter = learner.alg.learning_rate, int(learner.env.task.counter)
+    ends = []
+    for _ in range(2):
+        again = Learner(learner.env, CFG, seed=99)
+        again.env.task.restart_all(torch.zeros(6))
+        content = read_checkpoint(tmp_path / "c.pt", "anymal")
+        assert content["extra"] == {"note": [1, None, "x"]}
+        again.resume(content)
+        assert again.iteration == 1 and again.alg.learning_rate == pytest.approx(rate)
+        assert again.env.task.levels.tolist() == levels.tolist()
+        # One step of the counter is the restart's own.
+        assert int(again.env.task.counter) == counter + 1
+        assert all(value.equal(saved_state[key]) for key, value in state_of(again).items())
+        losses = again.iterate().losses
+        ends.append((losses, {key: value.clone() for key, value in state_of(again).items()}))
+    assert ends[0][0] == ends[1][0]
+    assert all(value.equal(ends[1][1][key]) for key, value in ends[0][1].items())
+    assert not (tmp_path / ".c.pt.part").exists()
+
+
+def test_levels_are_dealt_out_to_another_number_of_environments(learner, make_task, tmp_path):
+    learner.env.task.restart_all(torch.tensor([0, 1, 2, 3, 4, 5]))
+    learner.save(tmp_path / "c.pt", {})
+    other = Learner(CommandVecEnv(make_task(num_envs=8)), CFG, seed=0)
+    other.resume(read_checkpoint(tmp_path / "c.pt", "anymal"))
+    assert other.env.task.levels.tolist() == [0, 1, 2, 3, 4, 5, 0, 1]
+
+
+def test_a_full_size_checkpoint_is_small(shared_task, tmp_path):
+    learner = Learner(CommandVecEnv(shared_task), PpoCfg(steps_per_env=4, epochs=1, mini_batches=1), seed=0)
+    learner.iterate()
+    learner.save(tmp_path / "c.pt", {})
+    assert (tmp_path / "c.pt").stat().st_size < 8e6
+
+
+@pytest.mark.parametrize("captured", [True, False])
+def test_the_last_share_of_the_iterations_has_its_own_pace(shared_task, captured, monkeypatch):
+    cfg = replace(CFG, final_share=0.26, final_kl=0.004, final_entropy=0.0, captured=captured)
+    learner = Learner(CommandVecEnv(shared_task), cfg, seed=0)
+    paces = []
+    if captured:
+        monkeypatch.setattr(learner.alg, "set_pace", lambda *pace: paces.append(pace))
+    for learner.iteration in range(100):
+        learner.set_pace(100)
+        if not captured:
+            paces.append((learner.alg.desired_kl, learner.alg.entropy_coef))
+    assert paces == [(cfg.desired_kl, cfg.entropy)] * 74 + [(0.004, 0.0)] * 26
+
+
+def test_losses_that_are_not_finite_stop_training(learner, monkeypatch):
+    monkeypatch.setattr(learner.alg, "update", lambda: {"value": float("nan"), "surrogate": 0.0, "entropy": 0.0})
+    with pytest.raises(FloatingPointError, match="losses are not finite"):
+        learner.iterate()
+    assert learner.iteration == 0
+
+
+def test_weights_that_the_last_step_spoiled_stop_training(learner, monkeypatch):
+    update = learner.alg.update
+
+    def spoil():
+        losses = update()
+        with torch.no_grad():
+            learner.alg.critic.state_dict()["mlp.0.weight"][3, 5] = float("nan")
+        return losses
+
+    monkeypatch.setattr(learner.alg, "update", spoil)
+    with pytest.raises(FloatingPointError, match="iteration 0: the networks' weights are not finite"):
+        learner.iterate()
+    assert learner.iteration == 0
+
+
+def bad_files(folder, learner):
+    whole = folder / "whole.pt"
+    learner.save(whole, {})
+    (folder / "truncated.pt").write_bytes(whole.read_bytes()[:5000])
+    (folder / "text.pt").write_text("hello")
+    torch.save({"format": CHECKPOINT_FORMAT, "robot": "cassie"}, folder / "cassie.pt")
+    torch.save({"actor_state_dict": {}}, folder / "foreign.pt")
+    torch.save(learner.alg.optimizer, folder / "code.pt")  # a pickled object, not data
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("absent.pt", "no checkpoint at"),
+        ("truncated.pt", "truncated, foreign, or holding code"),
+        ("text.pt", "truncated, foreign, or holding code"),
+        ("code.pt", "truncated, foreign, or holding code"),
+        ("foreign.pt", "another kind of file"),
+        ("cassie.pt", "is of robot 'cassie', expected 'anymal'"),
+    ],
+)
+def test_bad_checkpoints_are_refused(learner, tmp_path, name, message):
+    bad_files(tmp_path, learner)
+    with pytest.raises(ValueError, match=message) as error:
+        read_checkpoint(tmp_path / name, "anymal")
+    assert "\n" not in str(error.value)
+
+
+def test_other_networks_are_refused(learner, tmp_path):
+    learner.save(tmp_path / "c.pt", {})
+    wider = Learner(learner.env, PpoCfg(hidden_dims=(32, 8), steps_per_env=4), seed=0)
+    with pytest.raises(ValueError, match="networks do not fit") as error:
+        wider.resume(read_checkpoint(tmp_path / "c.pt", "anymal"))
+    assert "\n" not in str(error.value)

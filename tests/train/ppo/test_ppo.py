@@ -1,0 +1,156 @@
+"""The captured PPO against rsl_rl's own, and its settings."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+
+from train.ppo.ppo import CapturedPPO, PpoCfg, check_ppo, runner_settings
+
+NUM_ENVS, NUM_OBS, NUM_ACTIONS = 6, 5, 2
+
+
+class DummyEnv(VecEnv):
+    """Random observations; the reward is higher the nearer the first action is to the first observation."""
+
+    def __init__(self) -> None:
+        self.num_envs, self.num_actions, self.max_episode_length = NUM_ENVS, NUM_ACTIONS, 10
+        self.episode_length_buf = torch.zeros(NUM_ENVS, dtype=torch.long)
+        self.device = "cpu"
+        self.cfg = {}
+        self.generator = torch.Generator().manual_seed(0)
+        self.obs = self._draw()
+
+    def _draw(self) -> TensorDict:
+        return TensorDict({"policy": torch.randn(NUM_ENVS, NUM_OBS, generator=self.generator)}, [NUM_ENVS])
+
+    def get_observations(self) -> TensorDict:
+        return self.obs
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        reward = -(actions[:, 0] - self.obs["policy"][:, 0]).square()
+        self.obs = self._draw()
+        done = torch.rand(NUM_ENVS, generator=self.generator) < 0.1
+        return self.obs, reward, done.long(), {"time_outs": done & (reward > -1.0)}
+
+
+def make_runner(algorithm: type[PPO], cfg: PpoCfg) -> OnPolicyRunner:
+    torch.manual_seed(3)
+    settings = runner_settings(cfg)
+    settings["algorithm"]["class_name"] = algorithm
+    return OnPolicyRunner(DummyEnv(), settings, log_dir=None, device="cpu")
+
+
+def parameters(runner: OnPolicyRunner) -> list[torch.Tensor]:
+    return [*runner.alg.actor.parameters(), *runner.alg.critic.parameters()]
+
+
+CFG = PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=3, mini_batches=2)
+
+
+@pytest.mark.parametrize("desired_kl", [1e-5, 0.01, 10.0])  # the learning rate falls, moves both ways, rises
+def test_update_equals_rsl_rl(desired_kl: float) -> None:
+    cfg = PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=3, mini_batches=2, desired_kl=desired_kl)
+    ours, theirs = make_runner(CapturedPPO, cfg), make_runner(PPO, cfg)
+    for runner in (ours, theirs):
+        torch.manual_seed(5)
+        runner.learn(1)
+    assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-5)
+    assert ours.alg.learning_rate != cfg.learning_rate
+    for mine, other in zip(parameters(ours), parameters(theirs), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
+
+
+def test_a_pace_set_later_is_the_one_of_a_ppo_that_has_it() -> None:
+    ours, theirs = make_runner(CapturedPPO, CFG), make_runner(PPO, replace(CFG, desired_kl=1e-5, entropy=0.5))
+    ours.alg.set_pace(1e-5, 0.5)
+    for runner in (ours, theirs):
+        torch.manual_seed(5)
+        runner.learn(1)
+    assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-5)
+    for mine, other in zip(parameters(ours), parameters(theirs), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
+
+
+def test_losses_are_the_means_of_rsl_rl(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = make_runner(CapturedPPO, CFG), make_runner(PPO, CFG)
+    losses = []
+    for runner in (ours, theirs):
+        torch.manual_seed(5)
+        monkeypatch.setattr(runner.logger, "log", lambda loss_dict, **_: losses.append(loss_dict))
+        runner.learn(1)
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+
+
+def test_checkpoint_continues_with_the_same_numbers(tmp_path: Any) -> None:
+    whole = make_runner(CapturedPPO, CFG)
+    whole.learn(1)
+    whole.save(str(tmp_path / "a.pt"))
+    saved = torch.load(tmp_path / "a.pt", weights_only=True)
+    assert isinstance(saved["optimizer_state_dict"]["param_groups"][0]["lr"], float)
+    half = make_runner(CapturedPPO, CFG)
+    half.load(str(tmp_path / "a.pt"))
+    assert half.alg.learning_rate == pytest.approx(whole.alg.learning_rate)
+    for runner in (whole, half):
+        runner.env = DummyEnv()
+        torch.manual_seed(9)
+        runner.learn(1)
+    for mine, other in zip(parameters(whole), parameters(half), strict=True):
+        torch.testing.assert_close(mine, other, rtol=0.0, atol=0.0)
+
+
+def test_settings_are_fresh() -> None:
+    first = runner_settings(PpoCfg())
+    first["algorithm"]["gamma"] = 0.0
+    first["actor"]["hidden_dims"].append(1)
+    assert runner_settings(PpoCfg())["algorithm"]["gamma"] == 0.99
+    assert runner_settings(PpoCfg())["actor"]["hidden_dims"] == [512, 256, 128]
+
+
+def test_rsl_rls_own_ppo_can_be_chosen() -> None:
+    settings = runner_settings(PpoCfg(hidden_dims=(16, 8), captured=False))
+    assert type(OnPolicyRunner(DummyEnv(), settings, log_dir=None, device="cpu").alg) is PPO
+
+
+def test_unsupported_features_are_refused() -> None:
+    settings = runner_settings(CFG)
+    settings["algorithm"]["normalize_advantage_per_mini_batch"] = True
+    with pytest.raises(ValueError, match="leave these three settings"):
+        OnPolicyRunner(DummyEnv(), settings, log_dir=None, device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps_per_env": 0}, "ppo.steps_per_env must be at least 1, got 0"),
+        ({"epochs": 0}, "ppo.epochs must be at least 1, got 0"),
+        ({"mini_batches": 0}, "ppo.mini_batches must be at least 1, and at most half of the 6 x 16 transitions"),
+        ({"mini_batches": 49}, "at most half of the 6 x 16 transitions of an iteration, got 49"),
+        ({"learning_rate": float("nan")}, "ppo.learning_rate must be above 0, got nan"),
+        ({"gamma": 2.0}, "ppo.gamma must be in 0..1, got 2.0"),
+        ({"lam": -0.1, "clip": 0.0}, "ppo.lam must be in 0..1, got -0.1; ppo.clip must be above 0, got 0.0"),
+        ({"desired_kl": 0.0, "entropy": -1.0}, "ppo.desired_kl must be above 0, got 0.0; ppo.entropy must be at least"),
+        ({"hidden_dims": (8, 0)}, "ppo.hidden_dims must be at least one layer, each at least 1 wide, got (8, 0)"),
+        ({"init_noise_std": -1.0}, "ppo.init_noise_std must be above 0, got -1.0"),
+        ({"final_share": 1.5, "final_kl": 0.0}, "ppo.final_share must be in 0..1, got 1.5; ppo.final_kl must be above"),
+        (
+            {"final_share": 0.2, "desired_kl": 0.005},
+            "ppo.final_kl must be above 0, and with a ppo.final_share at most ppo.desired_kl, 0.005, got 0.008",
+        ),
+    ],
+)
+def test_settings_that_nothing_is_learned_with_are_named(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_ppo(PpoCfg(**changes), NUM_ENVS)
+
+
+def test_an_iteration_has_at_least_two_transitions() -> None:
+    check_ppo(PpoCfg(steps_per_env=2, mini_batches=1), 1)
+    with pytest.raises(ValueError, match="an iteration must have at least 2 transitions, got 1"):
+        check_ppo(PpoCfg(steps_per_env=1, mini_batches=1), 1)

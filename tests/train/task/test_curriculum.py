@@ -1,0 +1,60 @@
+"""Training tiles: grid order, shares, first levels."""
+
+import numpy as np
+import pytest
+
+from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, training_tiles
+from train.task.curriculum import CurriculumCfg, first_levels, make_tiles
+
+
+@pytest.fixture(scope="module")
+def tiles():
+    return make_tiles(CurriculumCfg(num_columns=5, noise_columns=2), seed=3)
+
+
+def test_grid_order(tiles):
+    assert tiles.heights.shape == (NUM_LEVELS * 7, NUM_ROWS, NUM_COLS)
+    assert (tiles.num_levels, tiles.num_columns) == (NUM_LEVELS, 7)
+    assert tiles.type_of_column[-2:] == ("noise", "noise")
+    without_noise = tiles.heights.reshape(NUM_LEVELS, 7, NUM_ROWS, NUM_COLS)[:, :5].reshape(-1, NUM_ROWS, NUM_COLS)
+    rng = np.random.default_rng(3).spawn(2)[0]
+    np.testing.assert_array_equal(without_noise, training_tiles(NUM_LEVELS, 5, rng)[0])
+
+
+def test_noise_grows_with_the_level(tiles):
+    for level in range(NUM_LEVELS):
+        tile = tiles.heights[level * 7 + 6]
+        bound = 0.02 + 0.08 * level / 10
+        assert 0.9 * bound < np.abs(tile).max() <= bound
+    assert (tiles.heights[5] != tiles.heights[6]).any()
+
+
+def test_seed_decides():
+    cfg = CurriculumCfg(num_columns=1, noise_columns=1)
+    np.testing.assert_array_equal(make_tiles(cfg, 1).heights, make_tiles(cfg, 1).heights)
+    assert (make_tiles(cfg, 1).heights != make_tiles(cfg, 2).heights).any()
+
+
+def test_every_column_gets_its_share(tiles):
+    counts = np.bincount(tiles.columns_of(700))
+    assert counts.tolist() == [100] * 7
+    assert set(np.bincount(tiles.columns_of(703))) == {100, 101}
+    assert tiles.columns_of(3).max() < 7
+
+
+def test_noise_alone():
+    tiles = make_tiles(CurriculumCfg(num_columns=0, noise_columns=1), seed=0)
+    assert tiles.type_of_column == ("noise",)
+
+
+def test_first_levels_are_uniform():
+    levels = first_levels(6000, CurriculumCfg(max_first_level=2), np.random.default_rng(0))
+    counts = np.bincount(levels)
+    assert len(counts) == 3 and (np.abs(counts - 2000) < 150).all()  # standard deviation 37
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(ValueError, match="at least one column"):
+        make_tiles(CurriculumCfg(num_columns=0, noise_columns=0), seed=0)
+    with pytest.raises(ValueError, match=r"max_first_level must be in 0\.\.9, got 10"):
+        first_levels(1, CurriculumCfg(max_first_level=10), np.random.default_rng(0))

@@ -1,0 +1,171 @@
+"""Terrains of a fine-tuning: shares, exchanges, what is remembered of elites, and going on from a checkpoint."""
+
+import numpy as np
+import pytest
+
+from sim.bank import TerrainBank
+from sim.terrain import CROSSING_TYPES, TILE_TYPES, hard_random_genes
+from train.task.mix import Mix, MixCfg
+
+ELITES = hard_random_genes(7, 0)
+
+
+def make_mix(*, elites=ELITES, crosses=True, seed=0, **changes) -> Mix:
+    cfg = MixCfg(**{"terrains": 6, "swap_every": 2, **changes})
+    genes = elites if cfg.mix == "generated" else np.zeros((0, 64), np.float32)
+    return Mix(cfg=cfg, genes=genes, crosses=crosses, seed=seed, device="cpu")
+
+
+def heights_of(genes):
+    bank = TerrainBank(len(genes), device="cpu")
+    bank.set_genes(genes)
+    return bank.heights.numpy()
+
+
+def counts(goals, episodes, time_outs=None, invalid=None):
+    """What became of the episodes of 12 robots on 6 terrains, two on each."""
+    return {
+        "goal": np.repeat(np.float32(goals), 2),
+        "time_out": np.repeat(np.float32(goals if time_outs is None else time_outs), 2),
+        "episodes": np.repeat(np.float32(episodes), 2),
+        "invalid": np.repeat(np.float32([0] * 6 if invalid is None else invalid), 2),
+    }
+
+
+def test_half_is_hand_crafted_and_half_are_elites():
+    mix = make_mix()
+    tiles = mix.next()
+    assert (tiles.num_levels, tiles.num_columns) == (1, 6)
+    assert tiles.type_of_column == (*CROSSING_TYPES[:3], *["generated"] * 3)
+    np.testing.assert_array_equal(tiles.heights[3:], heights_of(ELITES[mix.rows]))
+    assert len(set(mix.rows)) == 3
+    # Robots begin a crossing at x = 2 on flat ground before the feature.
+    assert (tiles.heights[:3, :, :80] == 0.0).all() and np.abs(tiles.heights[:3, :, 100:220]).max() > 0.0
+
+
+def test_the_other_mixes():
+    tiles = make_mix(mix="hand-crafted").next()
+    assert tiles.type_of_column == CROSSING_TYPES
+    mix = make_mix(mix="hard-random", terrains=5)
+    first, second = mix.next(), mix.next()
+    assert first.type_of_column == (*CROSSING_TYPES[:2], *["hard-random"] * 3)
+    assert not any(np.array_equal(one, other) for one in first.heights[2:] for other in second.heights[2:])
+
+
+def test_robots_told_velocities_get_tiles_of_the_training():
+    tiles = make_mix(mix="hand-crafted", crosses=False, terrains=40).next()
+    assert set(tiles.type_of_column) <= set(TILE_TYPES) and len(set(tiles.type_of_column)) > 2
+
+
+def test_exchanges_differ_and_follow_from_the_seed():
+    one, same, other = make_mix(), make_mix(), make_mix(seed=1)
+    first, again, foreign = one.next(), same.next(), other.next()
+    np.testing.assert_array_equal(first.heights, again.heights)
+    assert not np.array_equal(first.heights, foreign.heights)
+    second = one.next()
+    assert not np.array_equal(first.heights[:3], second.heights[:3])
+    np.testing.assert_array_equal(second.heights, same.next().heights)
+
+
+def test_few_elites_come_more_than_once_but_none_is_left_out():
+    mix = make_mix(terrains=40, elites=ELITES)
+    mix.next()
+    # 20 terrains of 7 elites: each twice, and 6 of them a third time.
+    assert sorted(np.bincount(mix.rows, minlength=7)) == [2, 3, 3, 3, 3, 3, 3]
+
+
+def test_what_is_remembered_of_an_elite_is_its_last_exchange():
+    mix = make_mix(terrains=6)
+    mix.next()
+    first = mix.rows.copy()
+    mix.next(counts([9, 9, 9, 4, 0, 2], [9, 9, 9, 4, 5, 4]))
+    np.testing.assert_array_equal(mix.episodes[first], [8, 10, 8])  # of both robots
+    np.testing.assert_array_equal(mix.crossed[first], [8, 0, 4])
+    np.testing.assert_allclose(mix.success()[first], [1.0, 0.0, 0.5])
+    assert mix.episodes.sum() == 26
+    second = mix.rows.copy()
+    mix.next(counts([0, 0, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]))  # no episode ended on the second of them
+    assert mix.episodes[second[0]] == 2 and mix.crossed[second[0]] == 2
+    assert mix.episodes[second[1]] == dict(zip(first, [8, 10, 8], strict=True)).get(second[1], 0)  # as before
+
+
+def test_invalid_episodes_say_nothing_of_an_elite():
+    mix = make_mix()
+    mix.next()
+    first = mix.rows.copy()
+    mix.next(counts([0, 0, 0, 1, 0, 2], [4] * 6, invalid=[0, 0, 0, 3, 4, 0]))
+    np.testing.assert_array_equal(mix.episodes[first], [2, 0, 8])
+    np.testing.assert_allclose(mix.success()[first], [1.0, 0.0, 0.5])
+
+
+def test_a_resume_between_exchanges_counts_what_was_before_it_too():
+    straight, cut, again = make_mix(), make_mix(), make_mix()
+    straight.next(), cut.next()
+    again.restore(cut.state(counts([0, 0, 0, 3, 2, 1], [4] * 6)))
+    again.next(counts([0, 0, 0, 1, 0, 0], [1] * 6))
+    straight.next(counts([0, 0, 0, 4, 2, 1], [5] * 6))
+    np.testing.assert_array_equal(again.episodes, straight.episodes)
+    np.testing.assert_array_equal(again.crossed, straight.crossed)
+    assert again.episodes.max() == 10 and again.crossed.max() == 8
+    later = counts([1] * 6, [2] * 6)
+    assert again.state(later) == straight.state(later)  # and nothing of it is left for the next
+
+
+def test_without_a_goal_it_is_the_end_of_the_time_that_counts():
+    mix = make_mix(crosses=False)
+    mix.next()
+    first = mix.rows.copy()
+    mix.next(counts([0] * 6, [4] * 6, time_outs=[4] * 6))
+    assert (mix.success()[first] == 1.0).all()
+
+
+def test_failing_elites_are_drawn_more_often():
+    drawn = np.zeros(7)
+    for seed in range(300):
+        mix = make_mix(draw="failing", terrains=4, seed=seed)
+        mix.next()
+        mix.episodes[:], mix.crossed[:] = 10, [10, 10, 10, 10, 10, 0, 0]
+        mix.rows = np.zeros(0, np.int64)
+        drawn[mix._draw_rows()] += 1
+    # Two of seven without replacement, weights .1 (five of them) and 1.1 (two): a failing one comes first with
+    # 1.1/2.7, second with 5 * .1/2.7 * 1.1/2.6 after another kind and 1.1/2.7 * 1.1/1.6 after its like: .77 in all.
+    assert drawn[5:].mean() / 300 == pytest.approx(0.77, abs=0.06)
+    assert drawn[:5].mean() / 300 == pytest.approx((2 - 2 * 0.77) / 5, abs=0.05)
+
+
+def test_it_goes_on_from_its_state():
+    straight, cut = make_mix(draw="failing"), make_mix(draw="failing")
+    known = counts([1, 2, 3, 3, 0, 1], [4] * 6)
+    straight.next(), cut.next()
+    again = make_mix(draw="failing")
+    tiles = again.restore(cut.state(known))
+    np.testing.assert_array_equal(tiles.heights, cut.terrains().heights)
+    np.testing.assert_array_equal(again.next(counts([0] * 6, [0] * 6)).heights, straight.next(known).heights)
+    assert again.state(counts([0] * 6, [0] * 6)) == straight.state(counts([0] * 6, [0] * 6))
+
+
+@pytest.mark.parametrize(
+    "damage", [{"swap": "1"}, {"swap": -1}, {"rows": [0, 1]}, {"rows": [0, 1, 7]}, {"episodes": [1]}, {"crossed": None}]
+)
+def test_a_state_of_something_else_is_refused(damage):
+    mix = make_mix()
+    mix.next()
+    state = {**mix.state(counts([0] * 6, [0] * 6)), **damage}
+    with pytest.raises(ValueError, match="the terrains of the checkpoint"):
+        make_mix().restore({key: value for key, value in state.items() if value is not None})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mix": "easy"}, "mix must be one of generated, hard-random, hand-crafted, got 'easy'"),
+        ({"draw": "lucky"}, "draw must be one of uniform, failing, got 'lucky'"),
+        ({"draw": "failing", "mix": "hard-random"}, "draw failing chooses among elites, of which"),
+        ({"swap_every": 0}, "swap_every must be at least 1, got 0"),
+        ({"terrains": 1}, "terrains must be at least 2 for mix generated, got 1"),
+        ({"elites": ELITES[:0]}, "needs elites to train on, got none"),
+    ],
+)
+def test_bad_settings_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_mix(**changes)

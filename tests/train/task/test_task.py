@@ -1,0 +1,134 @@
+"""The command-following task as a whole: restart, repeatability, statistics."""
+
+import numpy as np
+import pytest
+import torch
+
+from kernels.training import End
+from train.task.cfg import NoiseCfg
+from train.task.task import CommandTask
+
+BASE, JOINTS, RATES, ACTION = slice(0, 12), slice(12, 24), slice(24, 36), slice(36, 48)
+
+
+def joint_q(task: CommandTask) -> torch.Tensor:
+    return torch.from_dlpack(task.sim.joint_q)
+
+
+def test_a_standing_robot_keeps_standing(shared_task):
+    task = shared_task
+    task.restart_all(torch.zeros(task.num_envs))
+    for _ in range(50):
+        task.step(torch.zeros(task.num_envs, 12))
+    assert (task.end == int(End.RUNNING)).all()
+    assert (task.episode_steps == 50).all()
+    assert task.observation.isfinite().all() and task.observation.shape == (task.num_envs, 235)
+    assert (task.observation[:, 8] < -0.8).all()  # projected gravity's z: upright
+    sums = task.read_statistics()
+    assert sums["steps"] == 50 * task.num_envs and sums["episodes"] == 0
+    assert sums["tracking_lin_vel"] > 0 > sums["torques"]
+    assert all(value == 0 for value in task.read_statistics().values())  # reading clears
+
+
+def test_only_ended_episodes_restart(shared_task):
+    task = shared_task
+    task.restart_all(torch.full((task.num_envs,), 3))
+    action = torch.full((task.num_envs, 12), 0.25)
+    for _ in range(3):
+        task.step(action)
+    joint_q(task)[1, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # on its back
+    joint_q(task)[4, 0] = float("nan")
+    before = joint_q(task).clone()
+    task.step(action)
+    ended = torch.tensor([False, True, False, False, True, False])
+    assert (task.end != 0).equal(ended)
+    assert task.end[4] == int(End.INVALID)
+    assert task.episode_steps.tolist() == [4, 0, 4, 4, 0, 4]
+    assert (task.observation[ended, ACTION] == 0).all() and (task.observation[~ended, ACTION] == 0.25).all()
+    start = torch.tensor([8.0, 4.0])
+    assert ((joint_q(task)[ended, :2] - start).abs() <= 1.0).all()
+    assert ((joint_q(task) - before)[~ended, :3].abs() < 0.1).all()
+    assert task.observation.isfinite().all() and task.reward.isfinite().all()
+    assert task.reward[4] == 0.0
+    assert task.levels.tolist()[4] == 3  # an invalid state says nothing of the level
+
+
+def test_an_exchange_counts_anew_and_forgets_nothing_that_is_yet_to_be_told(shared_task):
+    task = shared_task
+    task.restart_all(torch.zeros(task.num_envs))
+    for _ in range(3):
+        task.step(torch.zeros(task.num_envs, 12))
+    task.read_statistics()
+    joint_q(task)[1, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # on its back
+    task.step(torch.zeros(task.num_envs, 12))
+    assert task.counts()["steps"].tolist() == [4] * 6 and task.counts()["episodes"].sum() == 1
+    task.exchange(task.tiles)
+    assert all((values == 0).all() for values in task.counts().values())
+    task.step(torch.zeros(task.num_envs, 12))
+    assert task.counts()["steps"].tolist() == [1] * 6 and task.counts()["episodes"].sum() == 0
+    sums = task.read_statistics()
+    assert sums["steps"] == 2 * 6 and sums["episodes"] == 1  # one step before the exchange, one after
+    assert task.counts()["steps"].tolist() == [1] * 6
+
+
+def test_robots_stand_on_the_tile_of_their_level(shared_task):
+    task = shared_task
+    levels = torch.arange(task.num_envs)
+    task.restart_all(levels)
+    columns = task.tiles.columns_of(task.num_envs)
+    np.testing.assert_array_equal(task.sim.terrain_of_env.numpy(), np.arange(task.num_envs) * 3 + columns)
+    assert task.level_by_type().keys() == dict.fromkeys(task.tiles.type_of_column).keys()
+    # Default height over the highest ground beneath: the scan sees nothing above the base's height less .5 m.
+    assert (joint_q(task)[:, 2] > 0.6 - 0.25 * 9).all()
+    assert (task.observation[:, 48:] > -0.6).all()  # ground no higher than .1 m + noise above base - .5 m, times 5
+
+
+def rollout(task: CommandTask, steps: int) -> tuple[np.ndarray, ...]:
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for _ in range(steps):
+        task.step(torch.randn(task.num_envs, 12, generator=generator) * 3.0)
+        found.append([task.observation.clone(), task.reward.clone(), task.end.clone()])
+    return tuple(torch.stack(part).numpy() for part in zip(*found, strict=True))
+
+
+def test_same_seed_same_numbers(make_task):
+    one, two = make_task(seed=5), make_task(seed=5)
+    for mine, other in zip(rollout(one, 60), rollout(two, 60), strict=True):
+        np.testing.assert_array_equal(mine, other)
+    assert (one.end.numpy() != 99).all() and int(one.counter) == int(two.counter)
+    other_seed = make_task(seed=6)
+    assert (rollout(other_seed, 1)[0] != rollout(one, 1)[0]).any()
+
+
+def test_randomisation_reaches_the_model(make_task):
+    task = make_task(friction=(0.6, 0.7), added_base_mass=(2.0, 3.0))
+    model = task.sim.model
+    mass = model.body_mass.numpy().reshape(task.num_envs, -1)
+    assert ((mass[:, 0] >= 28.37) & (mass[:, 0] <= 29.38)).all() and len(np.unique(mass[:, 0])) == task.num_envs
+    on_robot = model.shape_body.numpy() >= 0
+    friction = model.shape_material_mu.numpy()[on_robot].reshape(task.num_envs, -1)
+    assert ((friction >= 0.6) & (friction <= 0.7)).all() and len(np.unique(friction[:, 0])) == task.num_envs
+
+
+def test_bad_input_is_refused(shared_task, make_task):
+    with pytest.raises(ValueError, match=r"action must have shape \(6, 12\), got \(6, 11\)"):
+        shared_task.step(torch.zeros(6, 11))
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+        make_task(num_envs=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"friction": (np.nan, 1.0)}, "task.friction must be a least and a largest number, got nan and 1"),
+        ({"lin_vel_x": (1.0, -1.0)}, "task.lin_vel_x must be"),
+        ({"episode_s": 0.0}, "task.episode_s must be a number from 0.02 on, got 0"),
+        ({"push_interval_s": np.inf}, "task.push_interval_s must be a number from 0 on, got inf"),
+        ({"start_joint_range": -0.1}, "training.start_joint_range must be a number from 0 on, got -0.1"),
+        ({"noise": NoiseCfg(scan=-1.0)}, "task.noise.scan must be a number from 0 on, got -1"),
+    ],
+)
+def test_settings_that_no_task_can_have_are_named(make_task, changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_task(**changes)

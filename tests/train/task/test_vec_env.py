@@ -1,0 +1,52 @@
+"""The contract of rsl_rl's environments."""
+
+import torch
+
+from train.task.vec_env import CommandVecEnv
+
+
+def test_shapes_and_settings(shared_task):
+    env = CommandVecEnv(shared_task)
+    observations, rewards, dones, extras = env.step(torch.zeros(6, 12))
+    assert (env.num_envs, env.num_actions, env.max_episode_length) == (6, 12, 1000)
+    assert observations.batch_size == (6,) and observations["policy"].shape == (6, 235)
+    assert rewards.shape == dones.shape == extras["time_outs"].shape == (6,)
+    assert observations["policy"].dtype == rewards.dtype == torch.float32
+
+
+def test_nothing_handed_out_changes_later(shared_task):
+    env = CommandVecEnv(shared_task)
+    handed = [env.get_observations()["policy"], env.episode_length_buf]
+    observations, rewards, dones, extras = env.step(torch.zeros(6, 12))
+    handed += [observations["policy"], rewards, dones, extras["time_outs"]]
+    kept = [tensor.clone() for tensor in handed]
+    for _ in range(3):
+        env.step(torch.ones(6, 12))
+    assert all(tensor.equal(copy) for tensor, copy in zip(handed, kept, strict=True))
+    assert not env.get_observations()["policy"].equal(handed[0])
+
+
+def test_actions_are_not_kept(shared_task):
+    env = CommandVecEnv(shared_task)
+    actions = torch.full((6, 12), 0.1)
+    env.step(actions)
+    assert (actions == 0.1).all()
+
+
+def test_steps_run_under_inference_mode_and_after_it(shared_task):
+    env = CommandVecEnv(shared_task)
+    with torch.inference_mode():
+        env.step(torch.zeros(6, 12))
+    env.step(torch.zeros(6, 12))
+
+
+def test_time_outs_are_the_dones_of_the_clock(shared_task):
+    env = CommandVecEnv(shared_task)
+    shared_task.restart_all(torch.zeros(6))
+    env.episode_length_buf = torch.tensor([0, 998, 999, 999, 5, 5])
+    joint_q = torch.from_dlpack(shared_task.sim.joint_q)
+    joint_q[3:5, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # on their backs
+    _, _, dones, extras = env.step(torch.zeros(6, 12))
+    assert dones.tolist() == [False, False, True, True, True, False]
+    assert extras["time_outs"].tolist() == [False, False, True, False, False, False]
+    assert env.episode_length_buf.tolist() == [1, 999, 0, 0, 0, 6]

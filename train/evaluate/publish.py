@@ -1,0 +1,208 @@
+"""All published numbers beside the paper's, from results/ alone, into the README: ``python -m train.evaluate.publish``."""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from sim.files.atomic import read_json, write_atomically
+from sim.files.command import exit_code_of
+from sim.policy.names import kind_of
+from train.evaluate.paper import PAPER_ARCHIVES, published
+from train.evaluate.seeds import firsts
+
+BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"
+_NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}
+_SETS = {
+    "hand_crafted": "hand-crafted",
+    "hard_random": "hard-random",
+    "generated": "generated",
+    "generated_far": "generated, far from training",
+}
+_NONE = "-"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishCfg:
+    """Write the published numbers of all robots, with the paper's beside them, into the README.
+
+    They come from results/<robot>/archive/archive.json, tables.json, distances.json and ablation.json; what is not
+    there yet is left out.
+    """
+
+    results: Path = Path("results")
+    """Where the results are."""
+    readme: Path = Path("README.md")
+    """File that holds the lines `<!-- numbers: begin -->` and `<!-- numbers: end -->`; between them is replaced."""
+    check: bool = False
+    """Write nothing; fail if the file says something else than the results."""
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def numbers_of(results: Path) -> str:
+    """The Markdown of everything published.
+
+    Args:
+        results: A directory with one a robot.
+
+    Raises:
+        ValueError: If there is none, or a file is damaged or lacks a number.
+    """
+    robots = sorted(folder.name for folder in results.glob("*") if (folder / "archive").is_dir()) if results else []
+    if not robots:
+        raise ValueError(f"no results of a robot under {results}: expected {results}/<robot>/archive")
+    return "\n\n".join(_robot(results / name, name) for name in robots)
+
+
+def _robot(folder: Path, robot: str) -> str:
+    parts = [f"**{_NAMES.get(robot, robot)}**"]
+    for file, section in (
+        ("archive/archive.json", _archive),
+        ("tables.json", _tables),
+        ("distances.json", _distances),
+        ("ablation.json", _ablation),
+    ):
+        path = folder / file
+        if path.exists():
+            parts.append(_section(section, path, robot))
+    return "\n\n".join(parts)
+
+
+def _section(section: Callable[[dict[str, Any], str], str], path: Path, robot: str) -> str:
+    content = read_json(path)
+    try:
+        return section(content, robot)
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"{path} lacks a number ({type(error).__name__}: {error}): make it again") from error
+
+
+def _archive(found: dict[str, Any], robot: str) -> str:
+    """The archive beside the paper's, which stands at 1,000 iterations."""
+    paper = PAPER_ARCHIVES.get(robot, {})
+    rows = [
+        ("iterations", f"{found['iterations']:,}", "1,000"),
+        ("episodes", f"{found['episodes']:,}", "4,000,000"),
+        ("elites", f"{found['elites']:,}", _count(paper.get("elites"))),
+        ("... reproduced by fresh episodes", _count(found["elites_reproduced"]), _NONE),
+        (
+            "coverage of the reachable cells",
+            f"{found['reachable_coverage']:.1%}",
+            f"{paper['elites'] / found['reachable_cells']:.1%}" if paper else _NONE,
+        ),
+        (
+            "with / without a base collision",
+            f"{found['with_collision']:,} / {found['without_collision']:,}",
+            _of(paper),
+        ),
+        ("mean fitness", f"{found['mean_fitness']:.1f}", f"about {paper['fitness']}" if "fitness" in paper else _NONE),
+        ("QD score", f"{found['qd_score']:,.0f}", _NONE),
+        ("... corrected by fresh episodes", _count(found["corrected_qd_score"]), _NONE),
+        ("search time", f"{found['wall_s'] / 60:.0f} min on {_gpus(found['gpus'])}", "about 8 h on two RTX 3070 Ti"),
+    ]
+    return table(("archive", "ours", "paper"), rows)
+
+
+def _of(paper: dict[str, Any]) -> str:
+    return f"{paper['with_collision']} / {paper['without_collision']}" if "with_collision" in paper else _NONE
+
+
+def _count(value: float | None) -> str:
+    return _NONE if value is None else f"{value:,.0f}"
+
+
+def _gpus(count: int) -> str:
+    return "one GPU" if count == 1 else f"up to {count} GPUs" if count else "the CPU"
+
+
+def _tables(found: dict[str, Any], robot: str) -> str:
+    """Rates and rewards of every kind of controller, the mean of its seeds where it has several."""
+    paper = published(robot) or {}
+    rows = []
+    for name, label in _SETS.items():
+        count = found["terrains"].get(name)
+        for who in firsts(found["success"].get(name, {})):
+            kind = kind_of(who)
+            cells = [_rate(found, measure, name, who) for measure in ("success", "goal")]
+            reward = _rate(found, "reward", name, who, digits=1)
+            theirs = [paper.get(measure, {}).get(name, {}).get(kind) for measure in ("success", "reward")]
+            beside = _NONE if None in theirs else f"{theirs[0]:.3f}, {theirs[1]:.1f}"
+            rows.append((f"{label} ({count})", kind, *cells, reward, beside))
+    header = ("terrains", "controller", "success (95 %)", "goal (95 %)", "reward (95 %)", "paper: success, reward")
+    about = found["archive"]
+    where = f"; elites of the archive after {about['iterations']:,} iterations" if about else ""
+    title = f"In brackets the terrains of a set; {found['episodes']} episodes each{where}."
+    return f"{title}\n\n{table(header, rows)}"
+
+
+def _rate(found: dict[str, Any], measure: str, name: str, who: str, digits: int = 3) -> str:
+    """A mean with its interval over seeds where there are several, else over terrains."""
+    several = found["over_seeds"].get(measure, {}).get(name, {}).get(kind_of(who))
+    mean, limits = found[measure][name][who], found["intervals"][measure][name][who]
+    if several is not None:
+        mean, limits = several["mean"], several["interval"]
+    if mean is None:
+        return _NONE
+    interval = "" if limits is None else f" ({limits[0]:.{digits}f} to {limits[1]:.{digits}f})"
+    seeds = "" if several is None else f", {len(several['values'])} seeds"
+    return f"{mean:.{digits}f}{interval}{seeds}"
+
+
+def _distances(found: dict[str, Any], robot: str) -> str:
+    """How near the elites trained on are."""
+    each = [f"{_SETS[name]} {100 * row['median']:.1f} cm" for name, row in found["nearest_m"].items()]
+    return f"RMS distance of the terrains' heights to the nearest elite trained on, medians: {'; '.join(each)}."
+
+
+def _ablation(found: dict[str, Any], robot: str) -> str:
+    """Mean STD of the elites with and without it in the fitness; the paper shows its curves without numbers."""
+    rows = [
+        (f"{iteration:,}", *(_std(found, name, k) for name in ("alpha_1", "alpha_0")))
+        for k, iteration in enumerate(found["iterations"])
+    ]
+    return table(("iteration", "mean STD, alpha 1 (95 %)", "mean STD, alpha 0 (95 %)"), rows)
+
+
+def _std(found: dict[str, Any], name: str, k: int) -> str:
+    low, high = found["intervals"][name][k]
+    return f"{found['mean_std'][name][k]:.2f} ({low:.2f} to {high:.2f})"
+
+
+def publish(cfg: PublishCfg) -> int:
+    """The command; returns its exit code.
+
+    Raises:
+        ValueError: If results or README are not as they must be, or with ``check`` say different things.
+        FileNotFoundError: If there is no README.
+    """
+    numbers = numbers_of(cfg.results)
+    text = cfg.readme.read_text(encoding="utf-8")
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"{cfg.readme} must hold the lines {BEGIN} and {END}, got none: put them where numbers belong")
+    wanted = f"{before}{BEGIN}\n{numbers}\n{END}{after}"
+    if cfg.check:
+        if text != wanted:
+            raise ValueError(f"{cfg.readme} says something else than {cfg.results}: run `make tables`")
+        return 0
+    write_atomically(cfg.readme, wanted.encode())
+    print(f"{numbers}\n\nwritten to {cfg.readme}")
+    return 0
+
+
+def main() -> int:
+    """Command line; returns the exit status."""
+    cfg = tyro.cli(PublishCfg, description=PublishCfg.__doc__)
+    return exit_code_of(lambda: publish(cfg))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

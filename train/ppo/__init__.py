@@ -1,0 +1,1 @@
+"""PPO: rsl_rl's algorithm, its runs, checkpoints and speed."""

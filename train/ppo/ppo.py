@@ -1,0 +1,282 @@
+"""PPO settings as a fresh dict per call, and rsl_rl's PPO with its minibatch step captured as one CUDA graph."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from torch import nn
+
+from sim.robots.robot import RobotCfg
+from sim.robots.training import PaceCfg
+
+_FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on
+_EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoCfg(PaceCfg):
+    """Settings of the learner; the defaults are legged_gym's but for the steps."""
+
+    hidden_dims: tuple[int, ...] = (512, 256, 128)
+    """Hidden layers (ELU) of actor and critic."""
+    steps_per_env: int = 16
+    """Control steps an iteration, per environment; legged_gym's 24 are for half as many environments."""
+    epochs: int = 5
+    """Passes over the data of an iteration."""
+    mini_batches: int = 4
+    """Minibatches a pass."""
+    learning_rate: float = 1e-3
+    """Learning rate at the start; adapted to the KL divergence from then on."""
+    gamma: float = 0.99
+    """Discount per control step."""
+    lam: float = 0.95
+    """Lambda of generalised advantage estimation."""
+    clip: float = 0.2
+    """Clip range of the probability ratio and of the value."""
+    captured: bool = True
+    """Update with :class:`CapturedPPO`; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
+
+    @classmethod
+    def of(cls, robot: RobotCfg) -> "PpoCfg":
+        """The settings that a robot's controller is learned with."""
+        return cls(**{setting.name: getattr(robot.learning, setting.name) for setting in fields(PaceCfg)})
+
+
+def check_ppo(cfg: PpoCfg, num_envs: int) -> None:
+    """Refuse settings that nothing can be learned with.
+
+    Args:
+        cfg: Settings of the learner.
+        num_envs: Environments of one process.
+
+    Raises:
+        ValueError: Naming all that are out of range.
+    """
+    ranges = {
+        "hidden_dims": (
+            bool(cfg.hidden_dims) and min(cfg.hidden_dims) >= 1,
+            "at least one layer, each at least 1 wide",
+        ),
+        "steps_per_env": (cfg.steps_per_env >= 1, "at least 1"),
+        "epochs": (cfg.epochs >= 1, "at least 1"),
+        "mini_batches": (
+            1 <= cfg.mini_batches <= max(num_envs * cfg.steps_per_env // 2, 1),
+            f"at least 1, and at most half of the {num_envs} x {cfg.steps_per_env} transitions of an iteration",
+        ),
+        "learning_rate": (0.0 < cfg.learning_rate < math.inf, "above 0"),
+        "desired_kl": (0.0 < cfg.desired_kl < math.inf, "above 0"),
+        "gamma": (0.0 <= cfg.gamma <= 1.0, "in 0..1"),
+        "lam": (0.0 <= cfg.lam <= 1.0, "in 0..1"),
+        "clip": (0.0 < cfg.clip < math.inf, "above 0"),
+        "entropy": (0.0 <= cfg.entropy < math.inf, "at least 0"),
+        "init_noise_std": (0.0 < cfg.init_noise_std < math.inf, "above 0"),
+        "final_share": (0.0 <= cfg.final_share <= 1.0, "in 0..1"),
+        "final_kl": (
+            0.0 < cfg.final_kl < math.inf and (cfg.final_share == 0.0 or cfg.final_kl <= cfg.desired_kl),
+            f"above 0, and with a ppo.final_share at most ppo.desired_kl, {cfg.desired_kl}",
+        ),
+        "final_entropy": (0.0 <= cfg.final_entropy < math.inf, "at least 0"),
+    }
+    wrong = [
+        f"ppo.{name} must be {range_}, got {getattr(cfg, name)}" for name, (ok, range_) in ranges.items() if not ok
+    ]
+    if num_envs * cfg.steps_per_env == 1:
+        wrong.append("an iteration must have at least 2 transitions, got 1: more num_envs or ppo.steps_per_env")
+    if wrong:
+        raise ValueError("; ".join(wrong))
+
+
+def runner_settings(cfg: PpoCfg) -> dict[str, Any]:
+    """Settings for ``OnPolicyRunner``; a new dict each call because rsl_rl writes into the one it is given."""
+    network = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": False}
+    noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_noise_std, "std_type": "scalar"}
+    return {
+        "num_steps_per_env": cfg.steps_per_env,
+        "save_interval": 10**9,
+        "check_for_nan": False,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "algorithm": {
+            "class_name": CapturedPPO if cfg.captured else "PPO",
+            "num_learning_epochs": cfg.epochs,
+            "num_mini_batches": cfg.mini_batches,
+            "learning_rate": cfg.learning_rate,
+            "desired_kl": cfg.desired_kl,
+            "schedule": "adaptive",
+            "gamma": cfg.gamma,
+            "lam": cfg.lam,
+            "clip_param": cfg.clip,
+            "entropy_coef": cfg.entropy,
+            "value_loss_coef": 1.0,
+            "use_clipped_value_loss": True,
+            "max_grad_norm": 1.0,
+        },
+        "actor": {**network, "hidden_dims": list(cfg.hidden_dims), "distribution_cfg": noise},
+        "critic": {**network, "hidden_dims": list(cfg.hidden_dims)},
+    }
+
+
+class CapturedPPO(PPO):
+    """rsl_rl's PPO for feed-forward actors, without a host synchronisation inside an update.
+
+    The arithmetic is rsl_rl's own. What differs is where it runs: learning rate and losses stay on the device, so that
+    on CUDA one minibatch step (gather, both networks, backward, clip, Adam) is one graph launch instead of hundreds of
+    launches and five synchronisations. On the CPU the same function runs eagerly.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Construct rsl_rl's PPO and move its learning rate to the device.
+
+        Raises:
+            ValueError: If a feature of rsl_rl's PPO is asked for that this update does not compute.
+        """
+        super().__init__(*args, **kwargs)
+        if self.rnd or self.symmetry or self.actor.is_recurrent or self.use_mixed_precision:
+            raise ValueError(
+                "CapturedPPO computes the plain feed-forward update, got RND, symmetry, a recurrent actor or mixed "
+                'precision: use rsl_rl\'s own ("class_name": "PPO") for these'
+            )
+        if self.schedule != "adaptive" or self.normalize_advantage_per_mini_batch or not self.use_clipped_value_loss:
+            raise ValueError(
+                "CapturedPPO computes the adaptive schedule with rollout-wide advantages and a clipped value loss: "
+                "leave these three settings of rsl_rl's PPO at their defaults"
+            )
+        on_cuda = torch.device(self.device).type == "cuda"
+        self._lr = torch.tensor(float(self.learning_rate), device=self.device)
+        self._actor_learns = torch.ones((), device=self.device)
+        self._kl, self._entropy_weight = self._lr.new_tensor(self.desired_kl), self._lr.new_tensor(self.entropy_coef)
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(parameters, lr=self._lr, fused=on_cuda or None, capturable=on_cuda)
+        count = self.storage.num_envs * self.storage.num_transitions_per_env
+        self._index = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=self.device)
+        self._advantages = torch.zeros(count, 1, device=self.device)
+        self._losses = torch.zeros(3, device=self.device)
+        self._stream = torch.cuda.Stream(self.device) if on_cuda else None
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._eager_steps = 0
+
+    def set_pace(self, desired_kl: float, entropy: float) -> None:
+        """From now on aim at another KL divergence, with another weight of the entropy bonus."""
+        self._kl.fill_(desired_kl)
+        self._entropy_weight.fill_(entropy)
+
+    def let_actor_learn(self, learns: bool) -> None:
+        """Whether updates change the actor; without, the critic alone learns, and the learning rate stays.
+
+        A critic that has seen nothing yet would lead a trained actor astray.
+        """
+        self._actor_learns.fill_(float(learns))
+
+    def begin_actor(self) -> None:
+        """Forget the optimiser's moments of the actor, and let it learn in small steps at first.
+
+        While the critic learned alone, the actor's gradients were zero: Adam would take its first steps three times too
+        large, for a moment of squares that has counted zeros.
+        """
+        for parameter in self.actor.parameters():
+            for value in self.optimizer.state.get(parameter, {}).values():
+                value.zero_()
+        self._lr.clamp_(max=_FIRST_ACTOR_RATE)
+
+    def update(self) -> dict[str, float]:
+        """Run all epochs over the stored rollout; returns the mean value, surrogate and entropy losses."""
+        self._advantages.copy_(self.storage.advantages.flatten(0, 1))
+        self._losses.zero_()
+        size = self._index.shape[0]
+        order = torch.randperm(self.num_mini_batches * size, device=self.device)
+        if self._stream is None:
+            self._run_epochs(order)
+        else:
+            # One stream of our own for every backward pass: autograd remembers the stream of a parameter's first use,
+            # and a capture must not meet another one.
+            self._stream.wait_stream(torch.cuda.current_stream(self.device))
+            with torch.cuda.stream(self._stream):
+                self._run_epochs(order)
+            torch.cuda.current_stream(self.device).wait_stream(self._stream)
+        self.storage.clear()
+        value, surrogate, entropy = (self._losses / (self.num_learning_epochs * self.num_mini_batches)).tolist()
+        self.learning_rate = self._lr.item()
+        return {"value": value, "surrogate": surrogate, "entropy": entropy}
+
+    def save(self) -> dict[str, Any]:
+        """Rsl_rl's state dicts, with the learning rate as a plain number."""
+        state = super().save()
+        for group in state["optimizer_state_dict"]["param_groups"]:
+            group["lr"] = float(group["lr"])
+        return state
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Load rsl_rl's state dicts; the captured graph is dropped because it holds the old optimiser's tensors."""
+        again = super().load(loaded_dict, load_cfg, strict)
+        self._lr.fill_(float(self.learning_rate))
+        for group in self.optimizer.param_groups:
+            group.update(lr=self._lr, capturable=self._stream is not None, fused=self._stream is not None or None)
+        for state in self.optimizer.state.values():  # a checkpoint of the other kind of device keeps its step elsewhere
+            state["step"] = state["step"].to(self._lr.device)
+        self._graph = None
+        self._eager_steps = 0
+        return again
+
+    def _run_epochs(self, order: torch.Tensor) -> None:
+        for _ in range(self.num_learning_epochs):
+            for index in order.view(self.num_mini_batches, -1):
+                self._index.copy_(index)
+                self._run_minibatch()
+
+    def _run_minibatch(self) -> None:
+        # A collective is not captured: processes would have to capture and replay in step.
+        if self._stream is None or self._eager_steps < _EAGER_STEPS or self.is_multi_gpu:
+            self._learn_minibatch()
+            self._eager_steps += 1
+            return
+        if self._graph is None:
+            self.optimizer.zero_grad(set_to_none=True)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph, stream=self._stream):
+                self._learn_minibatch()
+        self._graph.replay()
+
+    def _learn_minibatch(self) -> None:
+        """One optimiser step on the transitions of ``_index``; reads and writes fixed memory only."""
+        stored, index = self.storage, self._index
+        observations: Any = {key: value.flatten(0, 1)[index] for key, value in stored.observations.items()}
+        old_mean_std = tuple(value.flatten(0, 1)[index] for value in stored.distribution_params or ())
+        distribution: Any = self.actor.distribution
+        distribution.update(self.actor.mlp(self.actor.get_latent(observations)))
+        log_prob = self.actor.get_output_log_prob(stored.actions.flatten(0, 1)[index])
+        entropy = self.actor.output_entropy.mean()
+        self._adapt_learning_rate(old_mean_std)
+        advantages = self._advantages[index].squeeze(1)
+        ratio = torch.exp(log_prob - stored.actions_log_prob.flatten(0, 1)[index].squeeze(1))
+        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+        value_loss = self._value_loss(observations)
+        actor_loss = surrogate_loss - self._entropy_weight * entropy
+        loss = self._actor_learns * actor_loss + self.value_loss_coef * value_loss
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if self.is_multi_gpu:
+            self.reduce_parameters()
+        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._losses.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
+
+    def _value_loss(self, observations: Any) -> torch.Tensor:
+        values = self.critic(observations)
+        old_values = self.storage.values.flatten(0, 1)[self._index]
+        returns = self.storage.returns.flatten(0, 1)[self._index]
+        clipped = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+        return torch.max((values - returns).pow(2), (clipped - returns).pow(2)).mean()
+
+    @torch.no_grad()
+    def _adapt_learning_rate(self, old_mean_std: tuple[torch.Tensor, ...]) -> None:
+        kl = self.actor.get_kl_divergence(old_mean_std, self.actor.output_distribution_params).mean()
+        if self.is_multi_gpu:
+            torch.distributed.all_reduce(kl)
+            kl = kl / self.gpu_world_size
+        lower = torch.where(kl > 2.0 * self._kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
+        higher = (self._lr * 1.5).clamp(max=1e-2)
+        adapted = torch.where((kl < 0.5 * self._kl) & (kl > 0.0), higher, lower)
+        self._lr.copy_(torch.where(self._actor_learns > 0.0, adapted, self._lr))

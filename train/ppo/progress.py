@@ -1,0 +1,174 @@
+"""How training goes: printed rows, TensorBoard scalars, and the training record."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from kernels.rewards import REWARDS
+from train.ppo.learner import Iteration, Learner
+from train.ppo.scalars import ScalarFile
+
+_ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out")
+STATE = {"settings": (dict,), "curve": (list,), "pieces": (list,), "env_steps": (int,), "wall_s": (float, int)}
+"""Entries of :meth:`Progress.state` and their types."""
+_HEADER = (
+    f"{'iteration':>12} {'env-steps':>10} {'steps/s':>9} {'collect':>8} {'learn':>8} {'reward':>7} {'length':>7} "
+    f"{'falls':>6} {'goal':>6} {'v err':>6} {'w err':>6} {'level':>6} {'std':>5} {'rate':>8} {'ETA':>7}"
+)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+class Progress:
+    """Collects iterations into rows; a row is printed, written to TensorBoard and kept for the record.
+
+    Attributes:
+        iterations: Iterations in all.
+        warm: False until the first iteration, which compiles and captures, is over.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        learner: Learner,
+        iterations: int,
+        *,
+        rows: int,
+        about: dict[str, Any],
+        saved: dict[str, Any] | None = None,
+    ) -> None:
+        """Begin a piece of training.
+
+        Args:
+            run_dir: Where TensorBoard's file goes.
+            learner: What is trained.
+            iterations: Iterations in all.
+            rows: Rows over all iterations.
+            about: Provenance and ``settings`` of this piece.
+            saved: :meth:`state` of the pieces before.
+        """
+        self._learner = learner
+        self.iterations = iterations
+        self._every = max(1, iterations // rows)
+        self._curve: list[dict[str, Any]] = list(saved["curve"]) if saved else []
+        self._pieces: list[dict[str, Any]] = list(saved["pieces"]) if saved else []
+        self._env_steps = int(saved["env_steps"]) if saved else 0
+        self._wall_s = float(saved["wall_s"]) if saved else 0.0
+        self._pieces.append({**about, "from_iteration": learner.iteration})
+        self._about = about
+        self._scalars = ScalarFile(run_dir)
+        self._window: list[Iteration] = []
+        self._piece_began = time.monotonic()
+        self.warm = False
+        print(_HEADER, flush=True)
+
+    def add(self, step: Iteration) -> None:
+        """Count an iteration; finish a row where one is due."""
+        self._window.append(step)
+        self._env_steps += self._learner.steps_per_iteration
+        self.warm = True
+        if self._learner.iteration % self._every == 0:
+            self._finish_row()
+
+    def close(self) -> None:
+        """Finish the last row."""
+        if self._window:
+            self._finish_row()
+        self._wall_s += time.monotonic() - self._piece_began
+        self._piece_began = time.monotonic()
+
+    def state(self) -> dict[str, Any]:
+        """What the next piece needs, plain data."""
+        wall_s = self._wall_s + time.monotonic() - self._piece_began
+        return {
+            "settings": self._about["settings"],
+            "curve": self._curve,
+            "pieces": self._pieces,
+            "env_steps": self._env_steps,
+            "wall_s": wall_s,
+        }
+
+    def record(self) -> dict[str, Any]:
+        """The training record: provenance, settings, totals, the pieces it was trained in, and the curve."""
+        return {
+            **self._about,
+            "robot": self._learner.env.task.robot.name,
+            "iterations": self._learner.iteration,
+            "num_envs": self._learner.env.num_envs,
+            "env_steps": self._env_steps,
+            "wall_s": round(self.state()["wall_s"], 1),
+            "pieces": self._pieces,
+            "curve": self._curve,
+        }
+
+    def _finish_row(self) -> None:
+        learner, window = self._learner, self._window
+        collection_s = sum(step.collection_s for step in window)
+        learning_s = sum(step.learning_s for step in window)
+        sums = learner.env.task.read_statistics()
+        episodes, steps = sums["episodes"], max(sums["steps"], 1.0)
+        dt = learner.env.task.robot.control_dt
+        row = {
+            "iteration": learner.iteration,
+            "env_steps": self._env_steps,
+            "wall_s": self.state()["wall_s"],
+            "env_steps_per_s": len(window) * learner.steps_per_iteration / (collection_s + learning_s),
+            "collection_s": collection_s / len(window),
+            "learning_s": learning_s / len(window),
+            "episodes": int(episodes),
+            "reward": sums["episode_reward"] / episodes if episodes else None,
+            "length_s": sums["episode_steps"] / episodes * dt if episodes else None,
+            "fall_rate": (sums["base_collision"] + sums["tilt"]) / episodes if episodes else None,
+            "goal_rate": sums["goal"] / episodes if episodes and learner.env.task.cfg.crosses else None,
+            "ends": {name: int(sums[name]) for name in _ENDS},
+            "overflows": int(sums["overflow"]),
+            "lin_vel_error": sums["lin_vel_error"] / steps,
+            "yaw_rate_error": sums["yaw_rate_error"] / steps,
+            "level": float(learner.env.task.levels.float().mean()),
+            "level_by_type": learner.env.task.level_by_type(),
+            "terms": {name: sums[name] / (steps * dt) for name in REWARDS},
+            "losses": window[-1].losses,
+            "learning_rate": learner.alg.learning_rate,
+            "noise_std": learner.noise_std,
+        }
+        self._curve.append(_rounded(row))
+        self._window = []
+        self._print(row)
+        self._write_scalars(row)
+
+    def _print(self, row: dict[str, Any]) -> None:
+        left = (self.iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
+        print(
+            f"{row['iteration']:>6}/{self.iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
+            f"{row['env_steps_per_s']:>9,.0f} "
+            f"{row['collection_s'] * 1e3:>6.0f}ms {row['learning_s'] * 1e3:>6.0f}ms {_number(row['reward'], '.2f'):>7} "
+            f"{_number(row['length_s'], '.1f'):>6}s {_number(row['fall_rate'], '.3f'):>6} "
+            f"{_number(row['goal_rate'], '.3f'):>6} {row['lin_vel_error']:>6.3f} {row['yaw_rate_error']:>6.3f} "
+            f"{row['level']:>6.2f} {row['noise_std']:>5.2f} {row['learning_rate']:>8.1e} "
+            f"{_clock(left):>7}",
+            flush=True,
+        )
+        if row["ends"]["invalid"] or row["overflows"]:
+            print(f"  {row['ends']['invalid']} invalid states reset, {row['overflows']} steps with a solver overflow")
+
+    def _write_scalars(self, row: dict[str, Any]) -> None:
+        scalars = {}
+        for group, value in row.items():
+            entries = value if isinstance(value, dict) else {"": value}
+            for name, number in entries.items():
+                if number is not None and group != "iteration":
+                    scalars[f"{group}/{name}" if name else f"train/{group}"] = number
+        self._scalars.write(row["iteration"], scalars)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return float(f"{value:.5g}") if isinstance(value, float) else value

@@ -1,0 +1,1 @@
+"""The task that controllers are trained on: environment, terrains and settings."""

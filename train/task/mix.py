@@ -1,0 +1,204 @@
+"""Which terrains a controller is fine-tuned on: half of one kind and half of another, exchanged every so often."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.bank import TerrainBank
+from sim.terrain import (
+    CROSSING_TYPES,
+    NUM_COLS,
+    NUM_LEVELS,
+    NUM_ROWS,
+    TILE_TYPES,
+    hand_crafted_crossings,
+    hard_random_genes,
+    training_tile,
+)
+from train.task.curriculum import Tiles
+
+MIXES = ("generated", "hard-random", "hand-crafted")
+"""What a controller is fine-tuned on, the paper's C-G, C-HR and C-HC: hand-crafted terrains and, but for the last, half
+of the kind that it is named after."""
+DRAWS = ("uniform", "failing")
+
+_MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
+_TILE_SHARES = (0.1, 0.1, 0.35, 0.25, 0.2)  # legged_gym's, of TILE_TYPES
+_LEAST_WEIGHT = 0.1  # of a terrain that is always crossed, beside 1 more for one that never is
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixCfg:
+    """The terrains of a fine-tuning."""
+
+    mix: str = "generated"
+    """generated (hand-crafted terrains and elites in equal shares), hard-random (likewise) or hand-crafted alone."""
+    terrains: int = 500
+    """Terrains trained on at a time."""
+    swap_every: int = 400
+    """They are exchanged for others every so many iterations."""
+    draw: str = "uniform"
+    """How elites are drawn: uniform, or failing: the likelier, the less often they were crossed the last time."""
+
+    def __post_init__(self) -> None:
+        if self.mix not in MIXES:
+            raise ValueError(f"mix must be one of {', '.join(MIXES)}, got '{self.mix}'")
+        if self.draw not in DRAWS:
+            raise ValueError(f"draw must be one of {', '.join(DRAWS)}, got '{self.draw}'")
+        if self.draw == "failing" and self.mix != "generated":
+            raise ValueError(f"draw failing chooses among elites, of which mix {self.mix} has none: use mix generated")
+        if self.swap_every < 1:
+            raise ValueError(f"swap_every must be at least 1, got {self.swap_every}")
+        least = 1 if self.mix == "hand-crafted" else 2
+        if self.terrains < least:
+            raise ValueError(f"terrains must be at least {least} for mix {self.mix}, got {self.terrains}")
+
+    @property
+    def hand_crafted(self) -> int:
+        """How many of the terrains are hand-crafted."""
+        return self.terrains if self.mix == "hand-crafted" else self.terrains // 2
+
+
+@dataclass(kw_only=True)
+class Mix:
+    """Draws the terrains of each exchange, and remembers how often each elite was crossed when it was last trained on.
+
+    What is drawn follows from the seed, the number of the exchange and, for ``failing``, what was crossed before: a
+    resumed training goes on with the same terrains.
+    """
+
+    cfg: MixCfg
+    genes: NDArray[np.float32]
+    """Elites to train on, shape (E, 64); none but for mix generated."""
+    crosses: bool
+    """Whether robots cross; else they are told velocities in the middle."""
+    seed: int
+    device: str
+    swap: int = -1
+    """Number of the present exchange, from 0."""
+    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Which elites are trained on, in the order of their terrains after the hand-crafted ones."""
+    episodes: NDArray[np.int64] = field(init=False)
+    """Valid episodes that ended on each elite when it was last trained on before the present exchange, shape (E,)."""
+    crossed: NDArray[np.int64] = field(init=False)
+    """How many of them reached the goal; where robots do not cross, the end of the time."""
+
+    def __post_init__(self) -> None:
+        if self.cfg.mix == "generated" and len(self.genes) == 0:
+            raise ValueError("mix generated needs elites to train on, got none: give an archive that has some")
+        self.episodes = np.zeros(len(self.genes), np.int64)
+        self.crossed = np.zeros(len(self.genes), np.int64)
+        self._before_resume = np.zeros((2, len(self.genes)), np.int64)
+
+    def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
+        """The terrains of the next exchange.
+
+        Args:
+            counts: What became of the episodes on the present ones (:meth:`train.task.task.CommandTask.counts`).
+        """
+        if counts is not None:
+            self._remember(counts)
+        self.swap += 1
+        self.rows = self._draw_rows()
+        return self.terrains()
+
+    def terrains(self) -> Tiles:
+        """The terrains of the present exchange: one level, a terrain a column, hand-crafted ones first."""
+        rng = self._rng(0)
+        heights, types = self._hand_crafted(rng)
+        if self.cfg.mix != "hand-crafted":
+            count = self.cfg.terrains - self.cfg.hand_crafted
+            genes = self.genes[self.rows] if self.cfg.mix == "generated" else hard_random_genes(count, rng)
+            bank = TerrainBank(count, device=self.device)
+            bank.set_genes(genes)
+            heights = np.concatenate([heights, bank.heights.numpy()])
+            types += (self.cfg.mix,) * count
+        return Tiles(heights=heights, type_of_column=types)
+
+    def state(self, counts: dict[str, NDArray[Any]]) -> dict[str, Any]:
+        """Plain values for a checkpoint, with what was counted on the present terrains so far."""
+        present = self._present(counts)
+        return {
+            "swap": self.swap,
+            "rows": self.rows.tolist(),
+            "episodes": self.episodes.tolist(),
+            "crossed": self.crossed.tolist(),
+            "present_episodes": present[0].tolist(),
+            "present_crossed": present[1].tolist(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> Tiles:
+        """Go on where a checkpoint was; returns its terrains.
+
+        Raises:
+            ValueError: If the state is none of this mix.
+        """
+        count = len(self.genes)
+        expected = self.cfg.terrains - self.cfg.hand_crafted if self.cfg.mix == "generated" else 0
+        of_elites = ("episodes", "crossed", "present_episodes", "present_crossed")
+        whole = {key: np.asarray(state.get(key, ()), np.int64) for key in ("rows", *of_elites)}
+        shapes = {"rows": (expected,), **dict.fromkeys(of_elites, (count,))}
+        rows = whole["rows"]
+        if type(state.get("swap")) is not int or any(whole[key].shape != shape for key, shape in shapes.items()):
+            raise ValueError(f"the terrains of the checkpoint are not those of a mix of {count} elites")
+        if state["swap"] < 0 or (len(rows) and not 0 <= rows.min() <= rows.max() < count):
+            raise ValueError(f"the terrains of the checkpoint name elites beyond the {count} there are")
+        self.swap, self.rows = state["swap"], rows
+        self.episodes, self.crossed = whole["episodes"], whole["crossed"]
+        self._before_resume = np.stack([whole["present_episodes"], whole["present_crossed"]])
+        return self.terrains()
+
+    def success(self) -> NDArray[np.float64]:
+        """Share of the episodes on each elite that crossed it; 0 where there was none, shape (E,)."""
+        return self.crossed / np.maximum(self.episodes, 1)
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        return np.random.default_rng([_MIX_KEY, self.seed, self.swap, stream])
+
+    def _hand_crafted(self, rng: np.random.Generator) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+        count = self.cfg.hand_crafted
+        if count == 0:
+            return np.zeros((0, NUM_ROWS, NUM_COLS), np.float32), ()
+        if self.crosses:
+            heights, types, _ = hand_crafted_crossings(count, rng)
+            return heights, tuple(CROSSING_TYPES[kind] for kind in types)
+        kinds = rng.choice(len(TILE_TYPES), size=count, p=_TILE_SHARES)
+        levels = rng.integers(NUM_LEVELS, size=count)
+        inverted = rng.integers(2, size=count)
+        tiles = [
+            training_tile(TILE_TYPES[kind], int(level), rng, inverted=bool(turned))
+            for kind, level, turned in zip(kinds, levels, inverted, strict=True)
+        ]
+        return np.stack(tiles), tuple(TILE_TYPES[kind] for kind in kinds)
+
+    def _draw_rows(self) -> NDArray[np.int64]:
+        """Elites of the next exchange: none twice, unless there are too few."""
+        if self.cfg.mix != "generated":
+            return np.zeros(0, np.int64)
+        rng, count, wanted = self._rng(1), len(self.genes), self.cfg.terrains - self.cfg.hand_crafted
+        whole = np.tile(np.arange(count), wanted // count)
+        weights = np.ones(count) if self.cfg.draw == "uniform" else 1.0 - self.success() + _LEAST_WEIGHT
+        rest = rng.choice(count, size=wanted - len(whole), replace=False, p=weights / weights.sum())
+        return np.concatenate([whole, rest])
+
+    def _remember(self, counts: dict[str, NDArray[Any]]) -> None:
+        """What became of the present elites replaces what was known of them: the controller was another then."""
+        episodes, crossed = self._present(counts)
+        known = episodes > 0
+        self.episodes[known], self.crossed[known] = episodes[known], crossed[known]
+        self._before_resume[:] = 0
+
+    def _present(self, counts: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+        """Valid episodes on each elite since the last exchange, and those that crossed it, shape (2, E)."""
+        present = self._before_resume.copy()
+        if self.cfg.mix == "generated":
+            num_envs = len(counts["episodes"])
+            terrain = np.arange(num_envs) * self.cfg.terrains // num_envs  # as Tiles.columns_of deals them out
+            on_elite = terrain >= self.cfg.hand_crafted
+            rows = self.rows[terrain[on_elite] - self.cfg.hand_crafted]
+            valid = counts["episodes"] - counts["invalid"]
+            for sums, part in zip(present, (valid, counts["goal" if self.crosses else "time_out"]), strict=True):
+                sums += np.bincount(rows, part[on_elite], len(self.genes)).astype(np.int64)
+        return present

@@ -1,0 +1,226 @@
+"""The command-following task: a robot on rough terrain told a velocity and a heading, rewarded for keeping to them.
+
+One control step is one captured graph: action, physics, end of episodes, rewards, curriculum, restart, commands,
+pushes, observation. The host copies actions in and results out, and draws no random number.
+"""
+
+from dataclasses import asdict
+
+import numpy as np
+import torch
+
+from kernels.observation import Noise, apply_action, write_observation
+from kernels.restart import command_episodes, promote_episodes, remember_steps, restart_episodes
+from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
+from kernels.training import STATISTICS, End, judge_steps, make_episodes, note_base_forces, record_steps
+from sim.bank import TerrainBank
+from sim.motion import make_motion
+from sim.policy.loaders import prepare_torch
+from sim.robots.robot import RobotCfg
+from sim.simulation import Simulation
+from train.task.cfg import TaskCfg, fill, make_rules, make_start_ranges, task_problems
+from train.task.curriculum import Tiles, first_levels, make_tiles
+
+
+class CommandTask:
+    """``num_envs`` robots following commands on the tiles of the curriculum.
+
+    Torch tensors below are views of the memory the graph works in: the next step overwrites them.
+
+    Attributes:
+        observation: Observation row of each environment, shape (num_envs, observation_size).
+        reward: Reward of the step just made, shape (num_envs,).
+        end: How the episode ended with it (:class:`kernels.training.End`), int32, shape (num_envs,).
+        episode_steps: Control steps of the episode so far, int32, shape (num_envs,).
+        levels: Terrain level, int32, shape (num_envs,).
+        counter: Control steps since the seed's first number: the state of all random numbers, int32, shape (1,).
+        max_episode_steps: Control steps of the longest episode.
+    """
+
+    def __init__(
+        self, robot: RobotCfg, cfg: TaskCfg, *, num_envs: int, device: str, seed: int, tiles: Tiles | None = None
+    ) -> None:
+        """Build the terrain, the robots and the graph; every episode begins.
+
+        Args:
+            robot: Robot settings.
+            cfg: Task settings.
+            num_envs: Number of robots.
+            device: Warp device name.
+            seed: Of everything drawn.
+            tiles: The terrains; those of the curriculum if left out.
+
+        Raises:
+            ValueError: If a count or range is not usable.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        problems = task_problems(cfg, robot.control_dt)
+        if problems:
+            raise ValueError("; ".join(problems))
+        prepare_torch(device)
+        self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
+        tile_seed, level_seed, model_seed, count_seed = np.random.SeedSequence(seed).generate_state(4)
+        first_count = int(count_seed) % 2**30  # far from where a 32-bit counter wraps
+        self.tiles = tiles or make_tiles(cfg.curriculum, int(tile_seed))
+        columns = self.tiles.columns_of(num_envs)
+        levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(level_seed)) % self.tiles.num_levels
+        self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
+        self._rules = make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
+        self.max_episode_steps: int = self._rules.max_steps
+        self._episodes = make_episodes(
+            columns,
+            levels,
+            num_joints=robot.num_joints,
+            observation_size=robot.observation_size,
+            first_count=first_count,
+            device=device,
+        )
+        self._make_structs()
+        self._make_views()
+        self._graph = self.sim.capture(self._control_step)  # makes one step, which is undone here
+        self.counter.fill_(first_count)
+        self.restart_all(torch.from_numpy(levels))
+
+    def _build_simulation(self, terrain_of_env: np.ndarray, rng: np.random.Generator) -> Simulation:
+        bank = TerrainBank(len(self.tiles.heights), device=self.device)
+        bank.set_heights(self.tiles.heights)
+        return Simulation(
+            self.robot,
+            bank,
+            terrain_of_env,
+            friction=rng.uniform(*self.cfg.friction, self.num_envs).astype(np.float32),
+            added_base_mass=rng.uniform(*self.cfg.added_base_mass, self.num_envs).astype(np.float32),
+        )
+
+    def _make_structs(self) -> None:
+        sim, robot, cfg = self.sim, self.robot, self.cfg
+        self._noise = fill(Noise(), **asdict(cfg.noise))
+        self._weights = fill(RewardWeights(), **asdict(cfg.rewards))
+        geoms, episodes = len(robot.geom_names), self._episodes
+        self._feet = make_feet(self.num_envs, geoms, self.device, min_air_time_s=cfg.min_air_time_s)
+        self._ranges = make_start_ranges(cfg, robot)
+        self._motion = make_motion(
+            sim,
+            cfg,
+            command=episodes.command,
+            action=episodes.last_action,
+            previous_action=episodes.previous_action,
+            previous_joint_vel=episodes.previous_joint_vel,
+            fallen=episodes.fallen,
+        )
+
+    def _make_views(self) -> None:
+        episodes = self._episodes
+        self._action = torch.from_dlpack(episodes.action)
+        self.observation = torch.from_dlpack(episodes.observation)
+        self.reward = torch.from_dlpack(episodes.reward)
+        self.end = torch.from_dlpack(episodes.end)
+        self.episode_steps = torch.from_dlpack(episodes.steps)
+        self.levels = torch.from_dlpack(episodes.level)
+        self.counter = torch.from_dlpack(episodes.counter)
+        self._column = torch.from_dlpack(episodes.column)
+        self._terrain_of_env = torch.from_dlpack(self.sim.terrain_of_env)
+        self._statistics = torch.from_dlpack(episodes.statistics)
+        self._counted = torch.zeros_like(self._statistics)
+        self._reward_terms = torch.from_dlpack(episodes.reward_terms)
+
+    def step(self, action: torch.Tensor) -> None:
+        """Make one control step; an episode that ends restarts within it.
+
+        Args:
+            action: Policy output, shape (num_envs, num_joints).
+
+        Raises:
+            ValueError: If ``action`` has another shape.
+        """
+        if action.shape != self._action.shape:
+            raise ValueError(f"action must have shape {tuple(self._action.shape)}, got {tuple(action.shape)}")
+        self._action.copy_(action)
+        self.sim.launch(self._graph)
+
+    def restart_all(self, levels: torch.Tensor) -> None:
+        """Begin every episode anew on the given terrain levels, shape (num_envs,), with nothing counted yet."""
+        self._restart_on(levels)
+        self.read_statistics()
+        self._counted.zero_()
+
+    def exchange(self, tiles: Tiles) -> None:
+        """Put other terrains, as many, in place of the present ones, and begin every episode anew on its first level.
+
+        Raises:
+            ValueError: If they are of another number, or a height is not finite.
+        """
+        self.sim.bank.set_heights(tiles.heights)
+        self.tiles = tiles
+        self._restart_on(torch.zeros_like(self.levels))
+        torch.neg(self._statistics, out=self._counted)  # what read_statistics has yet to tell is of the terrains before
+
+    def _restart_on(self, levels: torch.Tensor) -> None:
+        self.levels.copy_(levels)
+        self._terrain_of_env.copy_(self.levels * self.tiles.num_columns + self._column)
+        self.end.fill_(int(End.TIME_OUT))
+        self._begin_episodes()
+
+    def counts(self) -> dict[str, np.ndarray]:
+        """Since the terrains were last exchanged, of each environment: :data:`STATISTICS`, shape (num_envs,) each.
+
+        Synchronises with the device.
+        """
+        return dict(zip(STATISTICS, (self._counted + self._statistics).T.cpu().numpy(), strict=True))
+
+    def read_statistics(self) -> dict[str, float]:
+        """Sums over all environments since the last call: :data:`STATISTICS`, then each weighted reward term.
+
+        Synchronises with the device.
+        """
+        sums = torch.cat((self._statistics.sum(0), self._reward_terms.sum(0))).tolist()
+        self._counted += self._statistics
+        self._statistics.zero_()
+        self._reward_terms.zero_()
+        return dict(zip((*STATISTICS, *REWARDS), sums, strict=True))
+
+    def level_by_type(self) -> dict[str, float]:
+        """Mean terrain level of the environments of each type. Synchronises with the device."""
+        levels = self.levels.cpu().numpy()
+        types = np.array(self.tiles.type_of_column)[self._column.cpu().numpy()]
+        return {str(name): float(levels[types == name].mean()) for name in dict.fromkeys(types)}
+
+    def _control_step(self) -> None:
+        sim, episodes = self.sim, self._episodes
+        apply_action(episodes.action, sim.sensors, self.robot.action_scale, episodes.last_action, sim.targets)
+        sim.refresh()
+        for step in range(self.robot.decimation):
+            sim.physics_step()
+            # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.
+            if self.cfg.crosses or step == self.robot.decimation - 1:
+                sim.read_geom_forces()
+                note_base_forces(sim.geom_force, sim.geom_role, episodes)
+        judge_steps(sim.joint_q, sim.joint_qd, self._rules, episodes)
+        reward_steps(
+            self._motion,
+            self._weights,
+            only_positive=self.cfg.only_positive,
+            valid=episodes.valid,
+            feet_out=self._feet,
+            reward_out=episodes.reward,
+            terms_out=episodes.reward_terms,
+        )
+        record_steps(sim.joint_q, sim.joint_qd, sim.sensors.base_com, sim.overflow, self._rules, episodes)
+        promote_episodes(sim.joint_q, self._rules, sim.terrain_of_env, episodes)
+        self._begin_episodes()
+
+    def _begin_episodes(self) -> None:
+        sim, episodes, terrain = self.sim, self._episodes, self.sim.bank.terrain
+        base_com, default_pose = sim.sensors.base_com, sim.sensors.default_joint_pos
+        restart_episodes(
+            sim.terrain_of_env, terrain, self._ranges, base_com, default_pose,
+            sim.joint_q, sim.joint_qd, self._feet, episodes,
+        )  # fmt: skip
+        sim.clear_solver(episodes.end)
+        command_episodes(self._rules, sim.joint_q, sim.joint_qd, episodes)
+        write_observation(
+            sim.joint_q, sim.joint_qd, episodes.command, episodes.last_action, sim.terrain_of_env, terrain,
+            sim.sensors, self._noise, episodes.counter, episodes.observation,
+        )  # fmt: skip
+        remember_steps(sim.joint_qd, episodes)

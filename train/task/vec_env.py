@@ -1,0 +1,54 @@
+"""The command-following task as an rsl_rl environment."""
+
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from kernels.training import End
+from train.task.task import CommandTask
+
+
+class CommandVecEnv(VecEnv):
+    """rsl_rl's view of a :class:`CommandTask`: one observation group, ``policy``, for actor and critic.
+
+    Every tensor handed out is a copy: rsl_rl keeps the observation it acted on, and the task overwrites its memory in
+    the next step.
+    """
+
+    def __init__(self, task: CommandTask) -> None:
+        """Wrap a task."""
+        self.task = task
+        self.num_envs = task.num_envs
+        self.num_actions = task.robot.num_joints
+        self.max_episode_length = task.max_episode_steps
+        self.device = str(task.observation.device)
+        self.cfg = asdict(task.cfg)
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Control steps of each episode so far, shape (num_envs,); assigning writes into the task."""
+        return self.task.episode_steps.clone()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self.task.episode_steps.copy_(steps)
+
+    def get_observations(self) -> TensorDict:
+        """The present observations, ``policy``: shape (num_envs, observation_size)."""
+        return TensorDict({"policy": self.task.observation.clone()}, batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Make one control step with ``actions`` (num_envs, num_actions).
+
+        Returns:
+            Observations after it (of the new episode where one ended), rewards (num_envs,), dones (num_envs,) and
+            ``{"time_outs": (num_envs,)}``, the dones that no failure caused. No host synchronisation.
+        """
+        self.task.step(actions)
+        end = self.task.end
+        # A robot at its goal or out of the world did not fail: as with the clock, its value goes on.
+        cut = (end == int(End.TIME_OUT)) | (end == int(End.GOAL)) | (end == int(End.OUT))
+        return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": cut}
