@@ -4,6 +4,7 @@ import hashlib
 import importlib.util
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -27,7 +28,7 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
         seed: Seed of the run.
     """
     return {
-        "command": shlex.join(["python", "-m", _module(), *sys.argv[1:]]),
+        "command": _command(),
         "commit": os.environ.get("FAULTLINE_COMMIT") or _output(["git", "rev-parse", "HEAD"]),
         "device": device_name(device),
         "versions": versions(),
@@ -73,10 +74,17 @@ def controller_hash(policy: str) -> str | None:
     return digest if spec.file is None else f"{digest} {spec.digest()}"
 
 
-def _module() -> str:
-    """Name of the module that runs, as after ``python -m``."""
+def _command() -> str:
+    """The command that runs, as one types it; of a path outside the working folder only the name is told."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
-    return spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
+    module = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
+    program = ["faultline"] if module == "faultline" else ["python", "-m", module]
+    return shlex.join([*program, *map(_without_machine, sys.argv[1:])])
+
+
+def _without_machine(word: str) -> str:
+    here = f"{Path.cwd()}{os.sep}"
+    return re.sub(r"(?<![\w.~-])/(?:[^/=:\s]+/)+(?=[^/])", "", word.replace(here, ""))
 
 
 def _version(package: str) -> str | None:
