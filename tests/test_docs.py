@@ -1,0 +1,178 @@
+"""README and docs/ are true: commands are taken, code works, links lead somewhere, numbers are those of results/."""
+
+import contextlib
+import importlib
+import io
+import re
+import runpy
+import shlex
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import tyro
+
+import faultline
+from sim.policy.loaders import load_policy
+from sim.robots.robot import get_robot
+from tests.docs import PAGES, ROOT, code_of, commands_of, mentions_of, numbers_of, run_by_make, text_of
+from tests.sim.dogs import mjcf
+from tests.sim.policy.test_loaders import rsl_rl_actor, save_checkpoint
+
+REGISTRY = {word: command for group in faultline.COMMANDS.values() for word, command in group.items()}
+
+
+def command_class(word: str) -> type:
+    """The dataclass of a word's flags."""
+    module, _, name = REGISTRY[word].where.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+@cache
+def help_of(word: str) -> str:
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), pytest.raises(SystemExit):
+        tyro.cli(command_class(word), args=["--help"], console_outputs=True)
+    return shown.getvalue()
+
+
+def test_readme_is_short_and_leads_to_every_page():
+    assert len(text_of("README.md").splitlines()) < 200
+    linked = set(re.findall(r"\]\((docs/[\w-]+\.md)", text_of("README.md")))
+    assert linked == set(PAGES) - {"README.md"}
+
+
+@pytest.mark.parametrize("line", [line for page in PAGES for line in commands_of(page)], ids=str)
+def test_commands_are_taken(line):
+    words = list(line.words)
+    if words[0] == "make":
+        words = run_by_make(line.words)
+        assert words[0].startswith(".venv/bin/") or "PATH" in words[0] or words[0].startswith("FAULTLINE_DEVICE")
+    if words[0].endswith("faultline") and words[1] != "--help":
+        tyro.cli(command_class(words[1]), args=words[2:])
+
+
+@pytest.mark.parametrize("line", [line for page in PAGES for line in mentions_of(page)], ids=str)
+def test_commands_named_in_sentences_exist(line):
+    if line.words[0] == "make":
+        run_by_make(line.words)
+    elif line.words[1] != "--help":
+        flags = [word for word in line.words[2:] if word.startswith("--") and word != "--help"]
+        assert [flag for flag in flags if flag not in help_of(line.words[1])] == [], line.words[1]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_and_figures_exist(page):
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text_of(page)) if "://" not in link]
+    for link in links:
+        path, _, anchor = link.partition("#")
+        target = (PAGES[page].parent / path).resolve() if path else PAGES[page]
+        assert target.exists(), link
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles], link
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_results_that_are_named_exist(page):
+    named = re.findall(r"results/[\w./@-]*\w", text_of(page))
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_numbers_are_those_of_results(page):
+    numbers = list(numbers_of(page))
+    assert [str(number) for number in numbers if not number.found] == [], "not in the text above"
+    assert [f"{number}, which is {number.value:.6g}" for number in numbers if not number.agrees] == []
+
+
+def test_the_main_tables_are_held_to_results():
+    assert len(list(numbers_of("README.md"))) >= 30
+    assert sum(len(list(numbers_of(page))) for page in PAGES) >= 300
+
+
+@pytest.mark.parametrize(("text", "agrees"), [("0.979", True), ("0.97", False), ("0.98", True), ("0.989", False)])
+def test_a_wrong_number_is_found(text, agrees):
+    number = next(iter(numbers_of("README.md")))._replace(
+        file="results/anymal/tables.json", text=text, expression="goal.hand_crafted.base"
+    )
+    assert number.agrees is agrees
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/own-robot.md"])
+def test_the_robot_is_read(page, tmp_path):
+    (text,) = [code for code in code_of(page, "python") if "ROBOT =" in code]
+    (tmp_path / "dog.py").write_text(text)
+    (tmp_path / "dog.xml").write_text(mjcf())
+    dog = get_robot(str(tmp_path / "dog.py"))
+    assert (dog.name, dog.num_joints, dog.observation_size) == ("dog", 8, 51)
+
+
+def test_the_controller_of_readme_acts(tmp_path, anymal):
+    (text,) = [code for code in code_of("README.md", "python") if "def act" in code]
+    (tmp_path / "walk.py").write_text(text)
+    actions = load_policy(f"{tmp_path}/walk.py:act", anymal, "cpu")(torch.randn(3, 235))
+    assert actions.shape == (3, 12) and not actions.any()
+
+
+def test_the_adapter_adapts(tmp_path, anymal):
+    (text,) = code_of("docs/own-controller.md", "python")
+    (tmp_path / "row.py").write_text(text)
+    actor = rsl_rl_actor(3 * 3 + 3 * 12)
+    policy = load_policy(
+        f"{tmp_path}/row.py:adapt@{save_checkpoint(tmp_path / 'm.pt', actor.state_dict())}", anymal, "cpu"
+    )
+    row = torch.randn(5, 235, generator=torch.Generator().manual_seed(0))
+    hind_first = [6, 7, 8, 9, 10, 11, 0, 1, 2, 3, 4, 5]
+    default = torch.tensor(anymal.default_joint_pos)
+    parts = [4 * row[:, 3:6], row[:, 6:9], row[:, 9:12] / torch.tensor([2.0, 2.0, 0.25])]
+    parts += [(row[:, 12:24] + default)[:, hind_first], 20 * row[:, 24:36][:, hind_first], row[:, 36:48][:, hind_first]]
+    with torch.inference_mode():
+        theirs = actor.mlp(torch.cat(parts, dim=1))
+        expected = torch.empty(5, 12)
+        expected[:, hind_first] = theirs
+        torch.testing.assert_close(policy(row), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_map_of_a_script_is_a_ramp_across_the_way(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (text,) = code_of("docs/own-terrain.md", "python")
+    Path("hill.py").write_text(text)
+    runpy.run_path("hill.py")
+    with np.load("hill.npz") as hill:
+        assert hill["heights"].shape == (161, 321) and hill["heights"].dtype == np.float32
+        at = hill["heights"][:, [0, 140, 170, 320]]  # x = 0, 7, 8.5 and 16 m
+        np.testing.assert_allclose(at, np.tile([0, 0.15, 0.3, 0], (161, 1)), atol=1e-6)
+
+
+COMMANDS = ["archive", "train", "finetune", "evaluate", "report", "view", "bench"]
+TARGETS = ["help", "setup", *COMMANDS, "test", "test-all", "test-gpu", "lint"]
+
+
+def test_make_help_teaches_every_target_and_variable():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert re.findall(r"^([a-z-]+):.*## ", makefile, re.MULTILINE) == TARGETS
+    assert re.findall(r"^(\w+) \?=", makefile, re.MULTILINE) == ["PYTHON", "ROBOT", "ARGS", "TORCH"]
+    assert [name for name in ("PYTHON", "ROBOT", "ARGS", "TORCH") if f"  {name}=" not in makefile] == []
+
+
+@pytest.mark.parametrize("name", ["a b", "it's", '"', "a#b", "a=b:c", "*", "ü\\", "`id`", "%", "~"])
+def test_make_hands_the_robot_on_as_it_is(name):
+    command = run_by_make(("make", "archive", f"ROBOT={name}", "ARGS=--preset small --seed 3"))
+    assert command == [".venv/bin/faultline", "archive", "--robot", name, "--preset", "small", "--seed", "3"]
+
+
+@pytest.mark.parametrize("target", COMMANDS)
+def test_targets_call_the_command_of_their_name(target):
+    assert run_by_make(("make", target)) == [".venv/bin/faultline", target]
+    command = run_by_make(("make", target, "ROBOT=cassie"))
+    assert command == shlex.split(f".venv/bin/faultline {target} --robot cassie")
+
+
+def test_the_quick_tests_leave_out_what_takes_long():
+    assert run_by_make(("make", "test"))[-1] == "not slow and not ray and not kills and not gpu"
+    assert run_by_make(("make", "test-all"))[-1] == "not gpu"
+    assert run_by_make(("make", "test-gpu"))[0] == "FAULTLINE_DEVICE=cuda:0"
+    assert "make test-all" in (ROOT / ".ci" / "run").read_text()
