@@ -98,7 +98,7 @@ def _archive(found: dict[str, Any], robot: str) -> str:
             f"{paper['elites'] / found['reachable_cells']:.1%}" if paper else _NONE,
         ),
         (
-            "with / without a base collision",
+            "with / without a base collision (ours: in the fresh episodes)",
             f"{found['with_collision']:,} / {found['without_collision']:,}",
             _of(paper),
         ),

@@ -1,0 +1,162 @@
+"""Runs every command of README and docs/ once, small, on the CPU: ``python -m tests.run_docs``; some 10 minutes.
+
+It works in a folder of its own with a copy of results/, and says which commands it leaves out and why. ``--only WORD``
+runs those of one word after what they need.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from faultline import COMMANDS
+from tests.docs import PAGES, ROOT, Line, code_of, commands_of, run_by_make
+from tests.sim.dogs import write_dog
+
+CPU = {"--device": "cpu"}
+SMALL: dict[str, dict[str, str]] = {
+    "archive": {**CPU, "--preset": "small", "--iterations": "2", "--replicas": "2", "--workers": "2"},
+    "reevaluate": {**CPU, "--workers": "2"},
+    "evaluate": {**CPU, "--terrains": "6", "--episodes": "2", "--workers": "2"},
+    "cross": {**CPU, "--episodes": "2"},
+    "replay": {**CPU, "--replicas": "2"},
+    "view": {"--port": "8765"},
+    "report": {**CPU, "--elites": "1", "--episodes": "2"},
+    "film": {**CPU, "--replicas": "2", "--no-shadows": "", "--elite": "0"},
+    "export": {"--elite": "0"},
+    "train": {**CPU, "--num-envs": "8", "--iterations": "2"},
+    "finetune": {**CPU, "--iterations": "2"},
+    "export-policy": {},
+    "stand": {**CPU, "--drops": "2"},
+    "calibrate": {**CPU, "--terrains": "20", "--replicas": "4", "--workers": "2"},
+    "compare": {**CPU, "--preset": "small", "--iterations": "2", "--seeds": "1", "--workers": "2"},
+    "ablation": {**CPU, "--preset": "small", "--iterations": "2", "--workers": "2"},
+    "beside": {},
+    "crosscheck": {**CPU, "--terrains": "1", "--episodes": "2", "--plain-episodes": "2"},
+    "distances": {},
+    "tables": {"--check": ""},
+}
+"""What makes a command small, in place of the page's own values; an empty value is a bare flag."""
+CHANGED = {
+    "--workers ray": {"--workers": "ray:2"},
+    "--resume runs/anymal-1": {"--iterations": "3", "--preset": None, "--replicas": None},
+    "--resume runs/anymal-generated-1": {"--iterations": "3"},
+    "--genes": {"--terrains": None},
+    "--recording": {"--replicas": None, "--elite": None},
+    "--terrain": {"--elite": None},
+    "--robot mine/dog.py": {},
+}
+"""What differs where a command has these words: None takes a flag away."""
+LEFT_OUT = {
+    "faultline bench": "compiles torch kernels for minutes; tests/sim/bench runs it small",
+    "faultline speed": "measures a GPU",
+    "faultline train-speed": "measures a GPU",
+    "faultline solver-options": "measures a GPU",
+    "faultline scale": "needs several GPUs",
+    "faultline train --robot anymal": "by torchrun, needs several GPUs",
+    "make test": "runs tests",
+    "make lint": "checks style",
+    "make setup": "installs",
+}
+"""Why commands that begin so are not run."""
+
+
+def prepare(folder: Path) -> None:
+    """What the pages take for granted: robot, controllers, a map, and runs."""
+    shutil.copytree(ROOT / "results", folder / "results")
+    write_dog(folder / "mine")
+    (walk,) = [code for code in code_of("README.md", "python") if "def act" in code]
+    (folder / "mine" / "walk.py").write_text(walk)
+    for name in ("mine/model.pt", "a.pt", "b.pt", "c.pt"):
+        shutil.copy(ROOT / "results" / "anymal" / "C-G.pt", folder / name)
+    Image.fromarray(np.tile(np.linspace(0, 200, 64, dtype=np.uint8), (32, 1))).save(folder / "hill.png")
+
+
+def first_commands() -> list[list[str]]:
+    """The runs that the pages go on with."""
+    return [
+        ["archive", "--robot", "anymal", "--run-dir", "runs/anymal-1", "--seed", "1"],
+        ["film", "--robot", "anymal", "--run", "runs/anymal-1"],
+        ["finetune", "--robot", "anymal", "--run-dir", "runs/anymal-generated-1"],
+    ]
+
+
+def small(words: list[str]) -> list[str]:
+    """A command with the values that make it small."""
+    flags = dict(SMALL[words[0]])
+    for given, other in CHANGED.items():
+        if given in " ".join(words):
+            flags.update(other)
+    kept, skips = [words[0]], False
+    for word in words[1:]:
+        skips = word in flags if word.startswith("--") else skips
+        if not skips:
+            kept.append(word)
+    return kept + [part for flag, value in flags.items() if value is not None for part in (flag, value) if part]
+
+
+def run(words: list[str], folder: Path) -> str:
+    """Runs a command in a folder; returns what was wrong, or nothing."""
+    command = [sys.executable, "-m", "faultline", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with (folder / "log.txt").open("w+") as log:
+        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        try:
+            status = process.wait(timeout=30 if words[0] == "view" else 600)
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            status = process.wait()
+            status = 0 if words[0] == "view" and status in (0, 130) else status
+        log.seek(0)
+        text = log.read()
+    return "" if status == 0 else f"exit status {status}: {text.strip()[-1500:]}"
+
+
+def faultline_words(line: Line) -> list[str]:
+    """The words after ``faultline``, of a make target those that it calls."""
+    return (run_by_make(line.words) if line.words[0] == "make" else list(line.words))[1:]
+
+
+def main() -> int:
+    """Runs them all; returns the number of those that failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", help="the word of the commands to run; all if left out")
+    only = parser.parse_args().only
+    lines = {str(line): line for page in PAGES for line in commands_of(page)}
+    left = {name: why for name in lines for begin, why in LEFT_OUT.items() if name.startswith(begin)}
+    left.pop("faultline train --robot mine/dog.py --export mine/dog.pt", None)
+    jobs = first_commands() + [faultline_words(line) for name, line in lines.items() if name not in left]
+    unnamed = {word for group in COMMANDS.values() for word in group} - {words[0] for words in jobs}
+    unnamed -= {name.split()[1] for name in left}
+    assert not unnamed, f"no page shows {', '.join(sorted(unnamed))}"
+    failed, done = 0, set()
+    with tempfile.TemporaryDirectory() as name:
+        prepare(folder := Path(name))
+        for number, words in enumerate(map(small, jobs)):
+            if str(words) in done or (only and words[0] != only and number >= len(first_commands())):
+                continue
+            done.add(str(words))
+            if words[0] == "beside":
+                for copy in ("a", "b"):
+                    shutil.copytree(folder / "runs" / "anymal-1", folder / "runs" / copy, dirs_exist_ok=True)
+            began = time.monotonic()
+            wrong = run(words, folder)
+            failed += bool(wrong)
+            print(f"{'FAILED' if wrong else 'ok':<7}{time.monotonic() - began:5.0f} s  {' '.join(words)}", flush=True)
+            if wrong:
+                print(wrong, flush=True)
+    for command, why in left.items():
+        print(f"left out        {command}: {why}")
+    print(f"{len(done)} commands run, {failed} failed, {len(left)} left out")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
