@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 
@@ -66,6 +66,13 @@ class _Command(Protocol):
     def execute(self) -> object: ...
 
 
+@runtime_checkable
+class _HasDefaults(Protocol):
+    """A command whose defaults follow from some of its flags, such as those of a robot that they name."""
+
+    def defaults(self, argv: Sequence[str]) -> Any: ...
+
+
 @contextmanager
 def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None]:
     """Ends work that stops or fails half way with what there is and how to go on.
@@ -103,8 +110,9 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
     import tyro
 
     signal.signal(signal.SIGTERM, _interrupt)
-    command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv))
     try:
+        defaults = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
+        command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **defaults)
         status = command.execute()
         return status if isinstance(status, int) else 0
     except (ValueError, OSError, FloatingPointError, UserError) as error:

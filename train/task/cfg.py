@@ -1,17 +1,14 @@
 """Settings of the command-following task, and what the kernels take of them."""
 
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kernels.start import StartRanges
-from kernels.training import Rules
-from sim import crossing
-from sim.robots.robot import RobotCfg
 from sim.robots.training import TrainingCfg, training_problems
-from sim.simulation import CAPACITY_OVERFLOWS
-from train.task.curriculum import CurriculumCfg
+
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
 
 _TILE_SIDE = 8.0
 _TILE_CENTRE = (8.0, 4.0)
@@ -27,6 +24,22 @@ class NoiseCfg:
     joint_pos: float = 0.01
     joint_vel: float = 1.5
     scan: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumCfg:
+    """Shares of the terrain types and where robots begin.
+
+    legged_gym's tiles have no rough ground on a level plane, which one in six hand-crafted crossings is made of:
+    columns of ``noise`` tiles are added beside them.
+    """
+
+    num_columns: int = 20
+    """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
+    noise_columns: int = 2
+    """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
+    max_first_level: int = 5
+    """Robots begin on levels 0 to this, drawn uniformly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +80,7 @@ class TaskCfg(TrainingCfg):
     """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
 
     @classmethod
-    def of(cls, robot: RobotCfg, **changes: Any) -> "TaskCfg":
+    def of(cls, robot: "RobotCfg", **changes: Any) -> "TaskCfg":
         """The task with a robot's own settings.
 
         Args:
@@ -113,8 +126,12 @@ def fill(struct: Any, **values: Any) -> Any:
     return struct
 
 
-def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
+def make_rules(cfg: TaskCfg, robot: "RobotCfg", num_levels: int, num_columns: int) -> Any:
     """Limits, ranges and intervals of the task as a kernel argument."""
+    from kernels.training import Rules
+    from sim import crossing
+    from sim.simulation import CAPACITY_OVERFLOWS
+
     control_dt = robot.control_dt
     return fill(
         Rules(),
@@ -140,8 +157,11 @@ def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int)
     )
 
 
-def make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
+def make_start_ranges(cfg: TaskCfg, robot: "RobotCfg") -> Any:
     """The randomised start of an episode as a kernel argument."""
+    from kernels.start import StartRanges
+    from sim import crossing
+
     if cfg.crosses:
         return crossing.make_start_ranges(crossing.CrossingCfg(), robot)
     return fill(
