@@ -29,10 +29,8 @@ from train.ppo.run import (
 from train.task.cfg import TaskCfg
 from train.task.mix import Mix, MixCfg
 
-PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
-"""The paper's sizes of a robot."""
-PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}
-"""The paper's for ANYmal, which other robots take too."""
+_PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
+_PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}  # the paper's ANYmal
 _SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain: episodes end
 _CRITIC_ITERATIONS = 50
 
@@ -123,7 +121,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
 
     robot, device = get_robot(flags.robot), device_of(flags)
     saved = read_saved(flags.resume, robot.name, finetuning=True) if flags.resume else None
-    size = _sizes(flags, robot.name, on_gpu=device.startswith("cuda"))
+    size = sizes_of(flags, robot.name, on_gpu=device.startswith("cuda"))
     if saved is None:
         path = flags.policy or robot.policy_file
         start, before = read_start(path, robot), sorted(recorded_marks(str(path)))
@@ -176,9 +174,9 @@ def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
     return f"Rewards: {given} (the robot's own: {', '.join(f'{usual[name]:g}' for name in other)})"
 
 
-def _sizes(flags: Finetune, robot: str, *, on_gpu: bool) -> dict[str, int]:
+def sizes_of(flags: Finetune, robot: str, *, on_gpu: bool) -> dict[str, int]:
     """Sizes of the training, with those left out as the device can do."""
-    sizes = PAPER.get(robot, PAPER_OTHERS) if on_gpu else _SMALL
+    sizes = _PAPER.get(robot, _PAPER_OTHERS) if on_gpu else _SMALL
     if not on_gpu and flags.num_envs is None and flags.iterations is None:
         print(
             f"No GPU: a small fine-tuning of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough "
