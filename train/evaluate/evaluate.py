@@ -16,8 +16,7 @@ import tyro
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, check_policy, open_evaluator, origin_of
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import exit_code_of
-from sim.policy.names import who_crossed
-from sim.policy.spec import ControllerSpec
+from sim.policy.spec import ControllerSpec, who_crossed
 from train.evaluate.base_rates import VELOCITY_FROM_S, evaluate_sets, print_rates
 from train.evaluate.cfg import EvaluateCfg, size_of
 from train.evaluate.tables_job import evaluate_tables

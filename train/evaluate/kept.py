@@ -16,7 +16,8 @@ import numpy as np
 
 from kernels.episode import Outcome
 from sim.files.atomic import check_zip, write_atomically
-from sim.files.provenance import code_fingerprint, controller_hash
+from sim.files.provenance import code_fingerprint
+from sim.policy.spec import controller_hash
 from sim.rollout import RolloutResult
 from train.evaluate.sets import TerrainSet
 

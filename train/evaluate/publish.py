@@ -10,7 +10,7 @@ import tyro
 
 from sim.files.atomic import read_json, write_atomically
 from sim.files.command import exit_code_of
-from sim.policy.names import kind_of
+from sim.policy.spec import kind_of
 from train.evaluate.paper import PAPER_ARCHIVES, published
 from train.evaluate.seeds import firsts
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from sim.files.intervals import MAX_T_VALUES, t_interval
-from sim.files.provenance import controller_hash
-from sim.policy.names import MARK, kind_of
+from sim.policy.spec import MARK, controller_hash, kind_of
 
 RATES = ("success", "goal", "fallen")
 """Measures that lie between 0 and 1, and so do their intervals."""

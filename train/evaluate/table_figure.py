@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim.files.atomic import write_atomically
-from sim.policy.names import kind_of
+from sim.policy.spec import kind_of
 from train.evaluate.seeds import firsts
 from train.evaluate.table_print import published_value
 

@@ -8,7 +8,7 @@ from qd.archive import Archive, read_archive
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import split_words
-from sim.policy.names import controllers_of
+from sim.policy.spec import controllers_of
 from sim.robots.own import robot_digest
 from train.evaluate.cfg import EvaluateCfg, Size, size_of
 from train.evaluate.crossings import Open, cross_all

@@ -13,7 +13,7 @@ from qd.archive import write_archive
 from qd.workers.evaluator import EvaluatorCfg
 from sim.crossing import CrossingCfg
 from sim.files.command import split_words
-from sim.policy.names import controllers_of
+from sim.policy.spec import controllers_of
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
