@@ -38,8 +38,8 @@ class Finetune(TrainingFlags):
     task: Literal["crossing", "commands"] = "crossing"
     """What robots are told: to cross, as in a search; or random velocities, as in the base's training."""
     rewards: RewardCfg
-    """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel. The
-    rewards of an evaluation keep the robot's own."""
+    """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel.
+    The rewards of an evaluation keep the robot's own."""
     terrains: int | None = setting(None, least=1)
     """Terrains at a time; on CUDA 500 (Cassie: 100), on the CPU 12."""
     swap_every: int | None = setting(None, least=1)

@@ -10,7 +10,7 @@ from qd.archive import read_archive
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.own import own_hash
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
@@ -117,8 +117,6 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     Raises:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
     """
-    from sim.robots.robot import get_robot
-
     robot, device = get_robot(flags.robot), device_of(flags)
     saved = read_saved(flags.resume, robot.name, finetuning=True) if flags.resume else None
     size = sizes_of(flags, robot.name, on_gpu=device.startswith("cuda"))
@@ -212,6 +210,6 @@ def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, 
     different = [line for line in check_resumed(flags, saved, settings) if not line.startswith(free)]
     if different:
         raise ValueError(
-            f"{flags.resume} was begun with other settings ({'; '.join(different)}): leave out what is given otherwise, "
-            "put an archive that has changed back, or begin a new run"
+            f"{flags.resume} was begun with other settings ({'; '.join(different)}): leave out what is given "
+            "otherwise, put an archive that has changed back, or begin a new run"
         )

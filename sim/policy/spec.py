@@ -6,7 +6,7 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -164,6 +164,14 @@ MARK = "@"
 def kind_of(name: str) -> str:
     """The kind of a controller by its name."""
     return name.split(MARK)[0]
+
+
+def firsts(names: Iterable[str]) -> list[str]:
+    """The first controller of each kind, in order."""
+    found: dict[str, str] = {}
+    for name in names:
+        found.setdefault(kind_of(name), name)
+    return list(found.values())
 
 
 def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]:

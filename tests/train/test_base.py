@@ -9,10 +9,10 @@ import pytest
 import torch
 import tyro
 
+from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from tests.train.conftest import CURRICULUM
-from sim.files.command import run_command
 from train.base import Train
 from train.ppo.cfg import PpoCfg
 from train.ppo.run import StopRequest, claimed

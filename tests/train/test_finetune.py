@@ -16,8 +16,8 @@ from tests.train.archives import make_archive
 from tests.train.starts import make_places, write_actor
 from train import tuning
 from train.finetune import Finetune
-from train.ppo.learner import read_checkpoint
 from train.ppo.cfg import PpoCfg
+from train.ppo.learner import read_checkpoint
 from train.ppo.run import CommandTask, claimed, read_saved
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)

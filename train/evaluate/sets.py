@@ -3,8 +3,8 @@
 A test set is drawn from random numbers used nowhere else: not in training, calibration or search. All controllers meet
 the same terrains with the same episode seeds.
 
-Which elites are held out follows from the archive and the seed of the split. An archive that grew, or another seed, holds
-out others, among them some that a controller was trained on before: marks in its record tell.
+Which elites are held out follows from the archive and the seed of the split. An archive that grew, or another seed,
+holds out others, among them some that a controller was trained on before: marks in its record tell.
 """
 
 import hashlib

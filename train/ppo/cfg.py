@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sim.files.command import OnDevice
 from sim.files.settings import problems, setting
 from sim.robots.training import PaceCfg
 
@@ -70,13 +71,11 @@ def ppo_problems(cfg: PpoCfg, num_envs: int) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingFlags:
+class TrainingFlags(OnDevice):
     """The flags of every training; a run that is resumed has its own settings as defaults."""
 
     robot: str = _ROBOT
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
     num_envs: int | None = setting(None, least=1)
     """Robots trained at once, per process; left out, as many as suit robot and device."""
     iterations: int | None = setting(None, least=1)

@@ -1,6 +1,6 @@
 """PPO on an environment, one iteration at a time: from a seed, from a trained controller, or from a checkpoint.
 
-Several processes of one training, as torchrun starts them, work one a GPU: gradients are averaged, the first one writes.
+Several processes of one training, as torchrun starts them, take a GPU each: gradients are averaged, the first writes.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""What all trainings share: a job that is checked, iterating until told to stop, checkpoints, the controller at the end."""
+"""What all trainings share: a job, iterating until told to stop, checkpoints, the controller at the end."""
 
 import io
 import signal
@@ -199,7 +199,8 @@ def settings_of(run: Path, saved: dict[str, Any], kinds: dict[str, type]) -> dic
                 found[name] = settings[name]
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
-                f"{run / CHECKPOINT} is damaged, or of another version: {error}; put a copy of it back, or begin a new run"
+                f"{run / CHECKPOINT} is damaged, or of another version: {error}; put a copy of it back, or begin a new "
+                "run"
             ) from None
     return found
 
