@@ -1,17 +1,15 @@
 """Settings of the command-following task, and what the kernels take of them."""
 
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kernels.start import StartRanges
-from kernels.training import Rules
-from sim import crossing
-from sim.robots.robot import RobotCfg
-from sim.robots.training import TrainingCfg, training_problems
-from sim.simulation import CAPACITY_OVERFLOWS
-from train.task.curriculum import CurriculumCfg
+from sim.files.settings import problems, setting
+from sim.robots.training import TrainingCfg
+
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
 
 _TILE_SIDE = 8.0
 _TILE_CENTRE = (8.0, 4.0)
@@ -21,12 +19,28 @@ _TILE_CENTRE = (8.0, 4.0)
 class NoiseCfg:
     """Half widths of the uniform observation noise, in the units of the measured quantity."""
 
-    lin_vel: float = 0.1
-    ang_vel: float = 0.2
-    gravity: float = 0.05
-    joint_pos: float = 0.01
-    joint_vel: float = 1.5
-    scan: float = 0.1
+    lin_vel: float = setting(0.1, least=0)
+    ang_vel: float = setting(0.2, least=0)
+    gravity: float = setting(0.05, least=0)
+    joint_pos: float = setting(0.01, least=0)
+    joint_vel: float = setting(1.5, least=0)
+    scan: float = setting(0.1, least=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumCfg:
+    """Shares of the terrain types and where robots begin.
+
+    legged_gym's tiles have no rough ground on a level plane, which one in six hand-crafted crossings is made of:
+    columns of ``noise`` tiles are added beside them.
+    """
+
+    num_columns: int = setting(20, least=0)
+    """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
+    noise_columns: int = setting(2, least=0)
+    """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
+    max_first_level: int = setting(5, least=0)
+    """Robots begin on levels 0 to this, drawn uniformly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,36 +52,36 @@ class TaskCfg(TrainingCfg):
     crosses: bool = False
     """Robots start at one side of a terrain and are told to go to the other, as in a search, instead of random
     velocities and headings from its middle."""
-    episode_s: float = 20.0
-    command_interval_s: float = 10.0
+    episode_s: float = setting(20.0, above=0)
+    command_interval_s: float = setting(10.0, above=0)
     """A new command every so often."""
-    lin_vel_x: tuple[float, float] = (-1.0, 1.0)
+    lin_vel_x: tuple[float, float] = setting((-1.0, 1.0), rising=True)
     """Range of the commanded forward velocity [m/s]."""
-    lin_vel_y: tuple[float, float] = (-1.0, 1.0)
+    lin_vel_y: tuple[float, float] = setting((-1.0, 1.0), rising=True)
     """Range of the commanded sideward velocity [m/s]."""
-    min_speed: float = 0.2
+    min_speed: float = setting(0.2, least=0)
     """Slower commands become 0 [m/s]."""
-    yaw_gain: float = 0.5
+    yaw_gain: float = setting(0.5, least=0)
     """Commanded yaw rate per heading error [1/s]."""
-    max_yaw_rate: float = 1.0
+    max_yaw_rate: float = setting(1.0, least=0)
     """Largest commanded yaw rate [rad/s]."""
-    push_interval_s: float = 15.0
+    push_interval_s: float = setting(15.0, least=0)
     """A push every so often; 0 for none."""
-    friction: tuple[float, float] = (0.5, 1.25)
+    friction: tuple[float, float] = setting((0.5, 1.25), least=0, rising=True)
     """Range of the robots' friction coefficients."""
-    start_position_range: float = 1.0
+    start_position_range: float = setting(1.0, least=0)
     """Starts lie within this of the tile's centre along x and y [m]."""
-    start_yaw_range: float = np.pi
+    start_yaw_range: float = setting(np.pi, least=0)
     """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
-    start_velocity_range: float = 0.5
+    start_velocity_range: float = setting(0.5, least=0)
     """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
-    base_force: float = 1.0
+    base_force: float = setting(1.0, least=0)
     """Contact force on the base that ends an episode [N]."""
     max_gravity_z: float = -0.1
     """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
 
     @classmethod
-    def of(cls, robot: RobotCfg, **changes: Any) -> "TaskCfg":
+    def of(cls, robot: "RobotCfg", **changes: Any) -> "TaskCfg":
         """The task with a robot's own settings.
 
         Args:
@@ -78,13 +92,6 @@ class TaskCfg(TrainingCfg):
         return cls(**{**own, **changes})
 
 
-_RANGES = ("friction", "lin_vel_x", "lin_vel_y")
-_FROM_0 = (
-    "episode_s", "command_interval_s", "min_speed", "yaw_gain", "max_yaw_rate", "push_interval_s",
-    "start_position_range", "start_yaw_range", "start_velocity_range", "base_force",
-)  # fmt: skip
-
-
 def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
     """What is wrong with the settings of a task, one line each.
 
@@ -92,18 +99,11 @@ def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
         cfg: The settings.
         control_dt: Control step of the robot [s].
     """
-    problems = training_problems(cfg)
-    for name in _RANGES:
-        low, high = getattr(cfg, name)
-        if not -np.inf < low <= high < np.inf or (name == "friction" and low < 0.0):
-            problems.append(f"task.{name} must be a least and a largest number, got {low:g} and {high:g}")
-    for name in _FROM_0:
-        least = control_dt if name in ("episode_s", "command_interval_s") else 0.0
-        if not least <= getattr(cfg, name) < np.inf:
-            problems.append(f"task.{name} must be a number from {least:g} on, got {getattr(cfg, name):g}")
-    noise = {name: value for name, value in asdict(cfg.noise).items() if not 0.0 <= value < np.inf}
-    problems += [f"task.noise.{name} must be a number from 0 on, got {value:g}" for name, value in noise.items()]
-    return problems
+    return problems(cfg, "task.") + [
+        f"task.{name} must be at least a control step, {control_dt:g} s, got {getattr(cfg, name):g}"
+        for name in ("episode_s", "command_interval_s")
+        if getattr(cfg, name) < control_dt
+    ]
 
 
 def fill(struct: Any, **values: Any) -> Any:
@@ -113,8 +113,12 @@ def fill(struct: Any, **values: Any) -> Any:
     return struct
 
 
-def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
+def make_rules(cfg: TaskCfg, robot: "RobotCfg", num_levels: int, num_columns: int) -> Any:
     """Limits, ranges and intervals of the task as a kernel argument."""
+    from kernels.training import Rules
+    from sim import crossing
+    from sim.simulation import CAPACITY_OVERFLOWS
+
     control_dt = robot.control_dt
     return fill(
         Rules(),
@@ -140,8 +144,11 @@ def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int)
     )
 
 
-def make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
+def make_start_ranges(cfg: TaskCfg, robot: "RobotCfg") -> Any:
     """The randomised start of an episode as a kernel argument."""
+    from kernels.start import StartRanges
+    from sim import crossing
+
     if cfg.crosses:
         return crossing.make_start_ranges(crossing.CrossingCfg(), robot)
     return fill(

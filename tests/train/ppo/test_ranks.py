@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from train.ppo.ranks import Ranks
+from train.ppo.learner import Ranks
 
 ROOT = Path(__file__).parents[3]
 
