@@ -5,6 +5,9 @@ fastest copy of at least as many bytes as it must move: as near to the processor
 launch, which would hold back a small copy as it does a small kernel.
 """
 
+# Kernels are compiled by Warp, whose types these are.
+# pyright: reportIndexIssue=false, reportArgumentType=false
+
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

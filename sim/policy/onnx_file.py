@@ -12,7 +12,7 @@ import torch
 PRODUCER = "faultline"
 """Who wrote a file, as the file says; ours carry a checksum."""
 _CHECKSUM = "faultline_sha256"
-_EXPORT = "write it from its rsl_rl checkpoint by `python -m sim.policy.export`"
+_EXPORT = "write it from its rsl_rl checkpoint by `faultline export-policy`"
 _CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 
 
