@@ -1,6 +1,5 @@
 """Robots: what the simulation and the search need to know of them; the shipped ones, and those of one's own."""
 
-import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.files.atomic import read_json
+from sim.files.command import command_line
 from sim.files.settings import setting
 from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg
 
@@ -125,7 +125,7 @@ class RobotCfg:
 
     @property
     def scales_file(self) -> Path:
-        """The penalty scales measured with that controller (``make calibrate``)."""
+        """The penalty scales measured with that controller (``faultline calibrate``)."""
         return self.home / f"{self.name}.scales.json"
 
     def role_of(self, geom: str) -> int:
@@ -145,7 +145,7 @@ class RobotCfg:
         Raises:
             ValueError: If they were never measured, or not for these penalties.
         """
-        remedy = f"run `make calibrate ROBOT={shlex.quote(self.spec)}`"
+        remedy = f"run `{command_line('calibrate', robot=self.spec)}`"
         if not self.scales_file.exists():
             raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
         scales = read_json(self.scales_file).get("scales")
