@@ -14,7 +14,11 @@ ROOT = Path(__file__).parents[2]
 
 def run(*words: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "faultline", *words, "--robot", "anymal"], cwd=ROOT, capture_output=True, text=True, timeout=600
+        [sys.executable, "-m", "faultline", *words, "--robot", "anymal"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
