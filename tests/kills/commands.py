@@ -1,6 +1,5 @@
 """Every command that reads a file which may be damaged, on stand-ins for what takes long, to be run in a child."""
 
-import dataclasses
 import os
 import resource
 from collections.abc import Callable
@@ -17,10 +16,10 @@ from qd.run.cli import run_command
 from qd.show import replay
 from qd.studies import calibrate
 from sim import rollout
-from sim.files.command import exit_code_of
+from sim.files.command import run_command as sim_run_command
 from tests.kills import searches, trainings
 from tests.qd import stand_in
-from train.evaluate.evaluate import evaluate
+from train.evaluate import evaluate, measures
 
 SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
 
@@ -46,9 +45,7 @@ def replay_elite(path: Path) -> None:
 
 def resume_training(run_dir: Path) -> int:
     """One iteration more than the training had."""
-    trainings.base.CommandTask = lambda *_, **__: trainings.TASK
-    cfg = dataclasses.replace(trainings.config(Path("none"), 3), run_dir=None, resume=run_dir)
-    return exit_code_of(lambda: trainings.base.train(cfg))
+    return trainings.train(run_dir, iterations=3, resume=run_dir)
 
 
 def calibrate_with(policy: Path) -> None:
@@ -62,10 +59,9 @@ def calibrate_with(policy: Path) -> None:
 def evaluate_with(policy: Path) -> int:
     """Crossings with a controller, up to where the simulation would be built."""
     evaluate.open_evaluator = stand_in.open_stand_in
-    evaluate.evaluate_sets = lambda crossings, count, seed: (_ for _ in ()).throw(SystemExit(0))
-    out = policy.parent / "rates.json"
-    cfg = evaluate.EvaluateCfg(policy=str(policy), device="cpu", terrains=2, episodes=1, out=out)
-    return exit_code_of(lambda: int(evaluate.evaluate(cfg) is None))
+    measures.base_rates = lambda crossings, count, seed: (_ for _ in ()).throw(SystemExit(0))
+    flags = ["--policy", str(policy), "--device", "cpu", "--terrains", "2", "--episodes", "1"]
+    return sim_run_command(evaluate.Evaluate, [*flags, "--out", str(policy.parent / "rates.json")], name="evaluate")
 
 
 def as_nobody(command: Callable[[Path], Any], path: Path) -> Any:

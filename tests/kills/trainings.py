@@ -5,35 +5,40 @@ from typing import Any
 
 import torch
 
-from sim.files.command import exit_code_of
+from sim.files.command import run_command
 from sim.robots.robot import get_robot
 from tests.kills.steps import Steps
-from train import base
+from train.base import Train
+from train.ppo import run
 from train.ppo.learner import read_checkpoint
-from train.ppo.cfg import PpoCfg
 from train.ppo.run import CHECKPOINT
-from train.task.cfg import TaskCfg
-from train.task.cfg import CurriculumCfg
+from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
 
 _ROBOT = get_robot("anymal")
 _CFG = TaskCfg(curriculum=CurriculumCfg(num_columns=2, noise_columns=1))
-_PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
 TASK = CommandTask(_ROBOT, _CFG, num_envs=6, device="cpu", seed=0)
 """As new in every child; a process that trains twice gets what the first training left."""
 
 
-def config(run_dir: Path, iterations: int) -> base.BaseCfg:
-    """Settings that begin a training, or go on with what is left of it; every iteration is saved."""
-    resume = run_dir if (run_dir / CHECKPOINT).exists() else None
-    sizes = {"num_envs": 6, "iterations": iterations, "rows": 100, "save_every_s": 0.0}
-    return base.BaseCfg(run_dir=run_dir, resume=resume, device="cpu", task=_CFG, ppo=_PPO, **sizes)
+_FLAGS = (
+    "--device cpu --num-envs 6 --rows 100 --save-every-s 0 --task.curriculum.num-columns 2 "
+    "--task.curriculum.noise-columns 1 --ppo.hidden-dims 16 8 --ppo.steps-per-env 4 --ppo.epochs 1 --ppo.mini-batches 2"
+)  # every iteration is saved
 
 
-def train(run_dir: Path, *, iterations: int) -> int:
-    """Begins a training or goes on with it; returns the command's exit code."""
-    base.CommandTask = lambda *_, **__: TASK
-    return exit_code_of(lambda: base.train(config(run_dir, iterations)))
+def train(run_dir: Path, *, iterations: int, resume: Path | None = None) -> int:
+    """Begins a training or goes on with what is left of it; returns the command's exit code.
+
+    Args:
+        run_dir: Where it works, and goes on if there is a checkpoint.
+        iterations: Iterations in all.
+        resume: Run to go on from in any case.
+    """
+    run.CommandTask = lambda *_, **__: TASK
+    resume = resume or (run_dir if (run_dir / CHECKPOINT).exists() else None)
+    flags = ["--run-dir", str(run_dir), *(["--resume", str(resume)] if resume else [])]
+    return run_command(Train, [*_FLAGS.split(), *flags, "--iterations", str(iterations)], name="train")
 
 
 def train_watched(run_dir: Path, *, iterations: int, **watched: Any) -> int:

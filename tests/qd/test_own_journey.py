@@ -139,16 +139,16 @@ def test_a_run_that_is_handed_over_runs_nothing_of_its_own(searched, tmp_path, h
 def test_it_is_trained_and_evaluated(project, calibrated, home, robot):
     sizes = ["--num-envs", "6", "--iterations", "2", "--ppo.hidden-dims", "16", "8", "--ppo.steps-per-env", "4"]
     where = ["--run-dir", str(home / "training"), "--export", str(home / "dog.pt")]
-    run("train.base", *robot, *sizes, *where)
+    run("faultline", "train", *robot, *sizes, *where)
     record = json.loads((home / "dog.train.json").read_text())
     assert record["robot"] == "dog" and record["iterations"] == 2 and len(record["settings"]["robot_sha256"]) == 64
     # Its own controller from now on, which needs no naming.
     out = home / "rates.json"
-    run("train.evaluate.evaluate", *robot, "--terrains", "2", "--episodes", "1", "--out", str(out))
+    run("faultline", "evaluate", *robot, "--terrains", "2", "--episodes", "1", "--out", str(out))
     report = json.loads(out.read_text())
     assert (report["robot"], report["policy"]) == ("dog", "dog.pt")
     assert report["hand_crafted"]["goal_rate"] == 0.0  # after two iterations
     tables = ["--policies", f"base=shipped trot={home}/dog_trot.py:Trot", "--sets", "hand_crafted"]
-    run("train.evaluate.evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--run-dir", str(home / "tables"))
+    run("faultline", "evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--run-dir", str(home / "tables"))
     crossed = json.loads((home / "tables" / "tables.json").read_text())
     assert crossed["robot"] == "dog" and set(crossed["controllers"]) == {"base", "trot"}

@@ -1,6 +1,9 @@
 """How training goes: printed rows, TensorBoard scalars, and the training record."""
 
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +70,9 @@ class Progress:
         self._pieces.append({**about, "from_iteration": learner.iteration})
         self._about = about
         self._run_dir = run_dir
-        self._scalars = FileWriter(str(run_dir))
+        threading.excepthook = _without_traceback
+        with self._naming_the_run():
+            self._scalars = FileWriter(str(run_dir))
         self._window: list[Iteration] = []
         self._piece_began = time.monotonic()
         self.warm = False
@@ -170,11 +175,23 @@ class Progress:
             for name, number in (value if isinstance(value, dict) else {"": value}).items():
                 if number is not None and group != "iteration":
                     summary.MergeFrom(scalar(f"{group}/{name}" if name else f"train/{group}", number))
-        try:
+        with self._naming_the_run():
             self._scalars.add_summary(summary, row["iteration"])
             self._scalars.flush()
+
+    @contextmanager
+    def _naming_the_run(self) -> Iterator[None]:
+        """An error of TensorBoard's file says what was to be written, and what to do."""
+        try:
+            yield
         except OSError as error:
             raise unwritable(self._run_dir, error) from error
+
+
+def _without_traceback(args: threading.ExceptHookArgs) -> None:
+    """TensorBoard writes in a thread; its error on a full disk is raised again by the next flush, in one line."""
+    if not issubclass(args.exc_type, OSError):
+        threading.__excepthook__(args)
 
 
 def _rounded(value: Any) -> Any:

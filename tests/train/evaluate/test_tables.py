@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim.policy.spec import firsts
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 from train.evaluate.measures import measure
 from train.evaluate.publish import published
 from train.evaluate.sets import plain_set
 from train.evaluate.show import draw_tables, print_tables, write_figure
-from train.evaluate.tables import make_tables, split_by_goal
+from train.evaluate.tables import KINDS, check_seeds, difference, differences, make_tables, over_seeds, split_by_goal
 
 SEED = 0
 
@@ -133,3 +134,106 @@ def test_a_set_of_which_nothing_is_valid_can_be_shown(anymal, capsys):
     print_tables(report)
     assert "0 terrains that some controller crossed" in capsys.readouterr().out
     draw_tables(report).canvas.draw()
+
+
+NUMBERS = np.array([10, 3, 7, 5, 8])
+
+
+def measured(goals, *, of=20, reward=10.0, bad=()):
+    """A controller that reached the goal in so many of ``of`` episodes of each terrain; ``bad`` ones are invalid."""
+    rows = [[GOAL] * k + [HIT if k % 2 else LATE] * (of - k) for k in goals]
+    for terrain in bad:
+        rows[terrain] = [BAD] * of
+    return measure(result_of(rows, reward=np.full((len(goals), of), reward)), (1.0, 1.0))
+
+
+def test_a_terrain_is_failed_below_half():
+    # Goal rates     before: 0    .45  .5   .95  1
+    #                after:  1    .5   .45  .95  .1
+    before, after = measured([0, 9, 10, 19, 20]), measured([20, 10, 9, 19, 2])
+    found = difference(before, after, NUMBERS, 0)
+    assert found["compared"] == 5
+    assert {kind: found[kind]["terrains"] for kind in KINDS} == {
+        "mended": [3, 10], "still_failing": [], "newly_broken": [7, 8], "fine": [5],
+    }  # fmt: skip
+    assert [found[kind]["count"] for kind in KINDS] == [2, 0, 2, 1]
+    assert [found[kind]["share"] for kind in KINDS] == [0.4, 0.0, 0.4, 0.2]
+    # .45 to .5 may be chance: the Wilson intervals are (.26, .66) and (.30, .70). 0 to 1 and 1 to .1 are not.
+    assert (found["mended"]["clear"], found["newly_broken"]["clear"]) == (1, 1)
+    low, high = found["mended"]["interval"]
+    assert 0.0 <= low < 0.4 < high <= 1.0
+    assert found["still_failing"]["interval"] == [0.0, 0.0]
+
+
+def test_both_failing_is_still_failing():
+    found = difference(measured([0, 9]), measured([9, 0]), NUMBERS[:2], 0)
+    assert found["still_failing"]["terrains"] == [3, 10] and found["still_failing"]["share"] == 1.0
+
+
+def test_gains_are_means_of_differences_terrain_by_terrain():
+    # Goal rates differ by +.5 on every terrain: no spread, however hard the terrains are.
+    found = difference(measured([0, 5, 10], reward=8.0), measured([10, 15, 20], reward=9.5), NUMBERS[:3], 0)
+    assert found["gain"]["goal"]["mean"] == pytest.approx(0.5)
+    assert found["gain"]["goal"]["interval"] == pytest.approx([0.5, 0.5])
+    assert found["gain"]["reward"] == {"mean": pytest.approx(1.5), "interval": pytest.approx([1.5, 1.5])}
+
+
+def test_a_terrain_invalid_to_one_is_not_compared():
+    found = difference(measured([0, 20, 0], bad=[0]), measured([20, 20, 20], bad=[2]), NUMBERS[:3], 0)
+    assert found["compared"] == 1
+    assert [found[kind]["terrains"] for kind in KINDS] == [[], [], [], [3]]
+    nothing = difference(measured([0], bad=[0]), measured([20]), NUMBERS[:1], 0)
+    assert nothing["compared"] == 0 and nothing["mended"]["share"] is None and nothing["gain"]["goal"]["mean"] is None
+    json.dumps([found, nothing], allow_nan=False)
+
+
+def test_every_two_controllers_are_compared_once():
+    crossed = {"base": measured([0, 0]), "C-HC": measured([20, 0]), "C-G": measured([20, 20])}
+    found = differences(crossed, NUMBERS[:2], 0)
+    assert list(found) == ["base -> C-HC", "base -> C-G", "C-HC -> C-G"]
+    assert [row["mended"]["terrains"] for row in found.values()] == [[10], [3, 10], [3]]
+    assert differences({"base": measured([0])}, NUMBERS[:1], 0) == {}
+
+
+TABLES = {
+    "success": {"near": {"base": 0.5, "C-G": 0.8, "C-G@1": 0.9, "C-G@2": 1.0, "C-HC@7": 0.4}},
+    "goal": {"near": {"base": 0.5, "C-G": 0.7, "C-G@1": None, "C-G@2": 0.9, "C-HC@7": 0.4}},
+}
+
+
+def test_the_first_of_each_kind():
+    assert firsts(TABLES["success"]["near"]) == ["base", "C-G", "C-HC@7"]
+
+
+def test_mean_and_interval_of_a_kind_with_several():
+    found = over_seeds(TABLES, ["success", "goal"])
+    assert found["success"]["near"].keys() == {"C-G"}
+    kind = found["success"]["near"]["C-G"]
+    assert kind["mean"] == pytest.approx(0.9) and kind["values"] == [0.8, 0.9, 1.0]
+    # Standard deviation .1, so .1 / sqrt(3) * 4.303 either way; a rate is at most 1.
+    assert kind["interval"] == pytest.approx([0.9 - 0.2484, 1.0], abs=1e-4)
+    rewards = over_seeds({"reward": {"near": {"C-G": 8.0, "C-G@1": 9.0, "C-G@2": 10.0}}}, ["reward"])
+    assert rewards["reward"]["near"]["C-G"]["interval"] == pytest.approx([9.0 - 2.484, 9.0 + 2.484], abs=1e-3)
+    assert found["goal"]["near"]["C-G"]["mean"] is None
+
+
+def test_one_training_is_not_several(tmp_path):
+    for name, content in (("a.pt", b"1"), ("b.pt", b"1"), ("c.pt", b"2")):
+        (tmp_path / name).write_bytes(content)
+    a, b, c = (str(tmp_path / name) for name in ("a.pt", "b.pt", "c.pt"))
+    check_seeds({"base": a, "C-G": c, "C-G@1": b})  # of different kinds, the same may stand twice
+    with pytest.raises(ValueError, match=r"C-G and C-G@2 must be of one kind from different seeds, got the same"):
+        check_seeds({"C-G": a, "C-G@1": c, "C-G@2": b})
+    with pytest.raises(ValueError, match=r"C-G@1 and C-G@2 must be"):
+        check_seeds({"C-G@1": "no.such:code", "C-G@2": "no.such:code"})
+
+
+@pytest.mark.parametrize("name", ["@1", "C-G@", "C-G@1@2", "@"])
+def test_a_name_is_a_kind_and_at_most_one_seed(name):
+    with pytest.raises(ValueError, match=f"a controller is named KIND or KIND@SEED, as C-G@1, got '{name}'"):
+        check_seeds({"base": "no.such:code", name: "no.other:code"})
+
+
+def test_more_than_an_interval_is_known_for():
+    row = {f"C-G@{k}": 0.5 for k in range(11)}
+    assert over_seeds({"goal": {"near": row}}, ["goal"])["goal"]["near"]["C-G"]["interval"] is None
