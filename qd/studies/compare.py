@@ -8,7 +8,7 @@ import itertools
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,7 +76,7 @@ def lock_step(entrants: Sequence[Entrant], evaluate: Evaluate, cfg: SearchCfg, b
         for entrant, row in zip(active, rows, strict=True):
             entrant.metrics.append({**row, "wall_s": wall_s / len(active), "episodes_per_s": row["episodes"] / wall_s})
             assert entrant.found is not None
-            entrant.run.save(as_settings(entrant.cfg), entrant.search, entrant.metrics, entrant.found)
+            entrant.run.save(entrant.cfg, entrant.search, entrant.metrics, entrant.found)
         crew = crew_status(evaluate)
         bar.show(_shown(active, wall_s), None if crew is None else str(crew))
 
@@ -111,7 +111,7 @@ def entrants_of(asked: Comparison, claims: ExitStack) -> Iterator[Entrant]:
     for method, seed in itertools.product(asked.methods, range(first, first + asked.seeds)):
         cfg, run = asked.cfg_of(method, seed), RunDirectory(asked.path / f"{method}-{seed}")
         claims.enter_context(claimed(run.path))
-        search, metrics = run.load(as_settings(cfg)) or (begin(cfg), [])
+        search, metrics = run.load(cfg) or (begin(cfg), [])
         if len(metrics) > iterations:
             raise ValueError(
                 f"iterations must be at least {len(metrics)}, as many as {run.path} has done, got {iterations}"
@@ -162,15 +162,15 @@ def _how_to_go_on(asked: Comparison) -> str:
 def _write_configs(asked: Comparison, entrants: Sequence[Entrant]) -> None:
     asked.write_config()
     for entrant in entrants:
-        origin = {**asked.origin, "seed": entrant.cfg.seed}
-        entrant.run.write_config(as_settings(entrant.cfg), asked.cfg.iterations, origin)
+        origin = {**asked.origin, "seed": entrant.cfg.seed, "sessions": []}
+        entrant.run.write_config(replace(entrant.cfg, iterations=asked.cfg.iterations), origin)
 
 
 def _finish(asked: Comparison, entrants: Sequence[Entrant]) -> None:
     """Archives, numbers and figure of a comparison that reached its iterations."""
     runs: dict[str, list[Metrics]] = {method: [] for method in asked.methods}
     for entrant in entrants:
-        found = archive_of(as_settings(entrant.cfg), entrant.search, entrant.done)
+        found = archive_of(entrant.cfg, entrant.search, entrant.done)
         entrant.run.write_derived(entrant.metrics, entrant.run.with_fresh_values(found))
         runs[entrant.method].append(entrant.metrics)
     cfg = asked.cfg

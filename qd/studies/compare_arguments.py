@@ -6,12 +6,25 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from qd.run.arguments import evaluator_of
+from qd.run.arguments import evaluator_of, own_file
+from qd.run.directory import RUNS, numbered, origin_in
 from qd.run.next_commands import next_command
-from qd.run.places import RUNS, numbered
-from qd.run.resuming import code_of, moved_policy, origin_in, own_file, refuse_changes, refuse_unnamed_code, resumed
-from qd.run.settings import SearchCfg, Settings, as_settings, changed, from_settings, measured_now, policy_spec, preset
-from qd.scheduler_cfg import SchedulerCfg
+from qd.run.settings import (
+    SchedulerCfg,
+    SearchCfg,
+    Settings,
+    as_settings,
+    changed,
+    code_of,
+    from_settings,
+    measured_now,
+    moved_policy,
+    policy_spec,
+    preset,
+    refuse_changes,
+    refuse_unnamed_code,
+    resumed,
+)
 from qd.workers.evaluator import EvaluatorCfg, origin_of, resolve_device
 from sim.files.atomic import is_leftover, prepare_output, read_json, to_json, write_atomically
 from sim.files.intervals import MAX_T_VALUES
@@ -28,8 +41,6 @@ METHODS: dict[str, dict[str, Any]] = {
     "cma_mae_sep": {"method": "cma_mae", "es": "sep_cma_es"},
     "cma_mae_narrow": {"method": "cma_mae", "es": "cma_es", "sigma0": 0.5},
     "mixed": {"method": "cma_mae+map_elites", "es": "cma_es"},
-    "directions": {"method": "directions", "es": "cma_es"},
-    "trio": {"method": "cma_mae+map_elites+directions", "es": "cma_es"},
 }
 """What is compared: changes of the search's settings."""
 
@@ -51,8 +62,8 @@ class Arguments:
     """Size of an iteration: paper (a GPU's work) or small; by default what the device can do."""
     methods: tuple[str, ...] | None = None
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
-    size .5), mixed (cma_mae+map_elites), directions, trio (cma_mae+map_elites+directions); all. Settings of the search
-    after a colon make another one of it: cma_mae:restart-rule=20,learning-rate=0.3."""
+    size .5), mixed (cma_mae+map_elites); all. Settings of the search after a colon make another one of it:
+    cma_mae:restart-rule=20,learning-rate=0.3."""
     seeds: int | None = None
     """Runs of each method, with seeds from --seed on; 3."""
     seed: int | None = None
@@ -142,7 +153,7 @@ def comparison_of(args: Arguments) -> Comparison:
         cfg, methods, seeds = _begun(robot, device, args)
         origin = origin_of(device, cfg.seed, args.workers) | own_file(robot)
     policy = moved or policy_spec(cfg, robot)
-    evaluator = evaluator_of(cfg, robot, policy, device, args, runs_on_gpu=len(methods) * seeds)
+    evaluator = evaluator_of(cfg, robot, policy, device, args.workers, runs_on_gpu=len(methods) * seeds)
     if args.out is not None:
         prepare_output(args.out)
     return Comparison(

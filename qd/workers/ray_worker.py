@@ -138,5 +138,5 @@ class RayWorker:
         since = self._building_since
         return self._share if since is None else since - time.monotonic()
 
-    def _note(self, done: int, most: int) -> None:
-        self._share = done / most
+    def _note(self, share: float) -> None:
+        self._share = share
