@@ -47,7 +47,7 @@ KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.
 def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
     cfg = dataclasses.replace(CFG, **changes)
     evaluator = EvaluatorCfg(
-        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, num_processes=1
+        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, workers="1"
     )
     begun = {**provenance("cpu", cfg.seed), "sessions": []}
     origin = origin_in(RunDirectory(path).read_config()) if resumes else begun
