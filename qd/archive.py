@@ -224,8 +224,8 @@ def _check_shapes(archive: Archive) -> None:
     from sim.space import get_space  # which imports Warp: not for `--help`
 
     num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
-    columns = dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), num_penalties)
-    columns["genes"] = get_space(archive.space).num_genes
+    columns = {"genes": get_space(archive.space).num_genes, "ratios": num_penalties}
+    columns |= {"penalty_mean": num_penalties, "penalty_std": num_penalties}
     for name, array in _arrays(archive).items():
         column = columns.get(name.removeprefix(_PREFIX))
         expected = (num_elites,) if column is None else (num_elites, column)

@@ -291,6 +291,7 @@ class RunDirectory:
 
 def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
     """What a search has found after a number of iterations."""
+    elites: dict[str, Any] = search.elites()
     return Archive(
         robot=cfg.robot,
         space=cfg.space,
@@ -299,5 +300,5 @@ def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
         intervals=cfg.intervals,
         collision_bit=cfg.collision_bit,
         iterations=iterations,
-        **search.elites(),
+        **elites,
     )
