@@ -1,4 +1,4 @@
-"""The real thing: a cluster of several Ray nodes on this host, and a search whose workers are killed under it."""
+"""A cluster of several Ray nodes on this host, which grows and loses a node under an evaluation."""
 
 import contextlib
 import os
@@ -10,22 +10,27 @@ import time
 import uuid
 from pathlib import Path
 
-import numpy as np
 import pytest
 
+from qd.workers.evaluator import resolve_device
 from tests.qd import stand_in
 from tests.qd.cluster_run import GENES, SEEDS
 
 pytest.importorskip("ray")
 
 ROOT = Path(__file__).parents[3]
-PATIENCE_S = 240.0
+PATIENCE_S = 120.0
 
 
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 class Node:
@@ -63,7 +68,10 @@ def test_a_cluster_is_used_as_it_grows_and_shrinks():
     environment = {**os.environ, **token, "RAY_ADDRESS": f"127.0.0.1:{port}"}
     expected = repr(float(stand_in.evaluate(GENES, SEEDS, 4).penalties.sum()))
     try:
-        time.sleep(5.0)  # the head must listen
+        end = time.monotonic() + PATIENCE_S
+        while not listens(port):
+            assert time.monotonic() < end
+            time.sleep(0.1)
         run = subprocess.Popen(
             [sys.executable, "-m", "tests.qd.cluster_run"], cwd=ROOT, env=environment, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
@@ -78,11 +86,6 @@ def test_a_cluster_is_used_as_it_grows_and_shrinks():
             return []
 
         assert ask(1) == ["1", expected]
-        stranger = subprocess.run(
-            [sys.executable, "-m", "qd.search", "--workers", "auto"], cwd=ROOT, text=True, capture_output=True,
-            env={**os.environ, "RAY_ADDRESS": environment["RAY_ADDRESS"]}, timeout=PATIENCE_S, check=False,
-        )  # fmt: skip
-        assert stranger.returncode == 2 and "wants its token: set RAY_AUTH_MODE=token" in stranger.stderr
         nodes.append(Node({**os.environ, **token}, f"--address=127.0.0.1:{port}"))
         assert ask(2) == ["2", expected]
         nodes.pop().kill()
@@ -95,55 +98,8 @@ def test_a_cluster_is_used_as_it_grows_and_shrinks():
             node.kill()
 
 
-def test_no_cluster_at_the_address_is_said_in_one_line():
-    flags = ["--robot", "anymal", "--device", "cpu", "--workers", "2"]
-    environment = {**os.environ, "RAY_ADDRESS": f"127.0.0.1:{free_port()}"}
-    done = subprocess.run(
-        [sys.executable, "-m", "qd.search", *flags], cwd=ROOT, env=environment, capture_output=True, text=True,
-        timeout=PATIENCE_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
-    assert "error: no Ray cluster at RAY_ADDRESS=127.0.0.1:" in done.stderr
-
-
-def workers_at_work(mark: str) -> list[int]:
-    """Ray workers of the search with a mark in its environment that cross a shard at this moment."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            at_work = (folder / "cmdline").read_bytes().startswith(b"ray::RayWorker.cross")
-            if at_work and mark.encode() in (folder / "environ").read_bytes():
-                found.append(int(folder.name))
-    return found
-
-
-def test_three_workers_killed_in_one_search_change_nothing(tmp_path):
-    size = ["--device", "cpu", "--emitters", "2", "--batch-size", "4", "--replicas", "2", "--iterations", "3"]
-    command = [sys.executable, "-m", "qd.search", "--robot", "anymal", *size]
-    quiet = {"cwd": ROOT, "stdout": subprocess.DEVNULL}
-    undisturbed = subprocess.Popen([*command, "--processes", "1", "--run-dir", str(tmp_path / "whole")], **quiet)
-    assert undisturbed.wait(PATIENCE_S) == 0
-    mark = f"FAULTLINE_TEST={uuid.uuid4()}"
-    environment = {**os.environ, "FAULTLINE_TEST": mark.partition("=")[2]}
-    log = (tmp_path / "log").open("w+")
-    search = subprocess.Popen(
-        [*command, "--workers", "2", "--run-dir", str(tmp_path / "killed")], env=environment, stderr=log, **quiet
-    )
-    killed: set[int] = set()
-    end = time.monotonic() + PATIENCE_S
-    while len(killed) < 3:
-        assert time.monotonic() < end and search.poll() is None, log.name
-        for pid in set(workers_at_work(mark)) - killed:
-            time.sleep(1.0)  # into the shard
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-                killed.add(pid)
-            break
-        time.sleep(0.2)
-    assert search.wait(PATIENCE_S) == 0, (tmp_path / "log").read_text()
-    said = (tmp_path / "log").read_text()
-    assert said.count("are crossed again by another") == 3, said
-    whole, found = (np.load(tmp_path / name / "archive.npz") for name in ("whole", "killed"))
-    for name in whole.files:
-        np.testing.assert_array_equal(found[name], whole[name])
+def test_no_cluster_at_the_address_is_said_in_one_line(monkeypatch):
+    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{free_port()}")
+    monkeypatch.setattr("ray.is_initialized", lambda: False)  # other tests have a Ray of their own
+    with pytest.raises(OSError, match=r"no Ray cluster at RAY_ADDRESS=127.0.0.1:\d+: .* start one with"):
+        resolve_device("cpu", "ray:2")
