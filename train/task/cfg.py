@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from kernels.start import StartRanges
+from kernels.episode import Task
+from kernels.restart import StartRanges
 from kernels.training import Rules
 from sim import crossing
 from sim.robots.robot import RobotCfg
@@ -113,15 +114,27 @@ def fill(struct: Any, **values: Any) -> Any:
     return struct
 
 
+def make_task(cfg: TaskCfg, robot: RobotCfg) -> Task:
+    """Goal, command and limits of an episode as a kernel argument; its steps are control steps."""
+    task = crossing.make_task(crossing.CrossingCfg(), robot, to_goal=cfg.crosses)
+    if not cfg.crosses:
+        endless = {"lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
+        fill(task, yaw_gain=cfg.yaw_gain, max_yaw_rate=cfg.max_yaw_rate, **endless)
+    return fill(
+        task,
+        max_steps=round(cfg.episode_s / robot.control_dt),
+        base_force=cfg.base_force,
+        max_gravity_z=cfg.max_gravity_z,
+        overflow_mask=0,  # counted, and no reason to end an episode
+    )
+
+
 def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
-    """Limits, ranges and intervals of the task as a kernel argument."""
+    """Commands, pushes and levels of the task as a kernel argument."""
     control_dt = robot.control_dt
     return fill(
         Rules(),
-        max_steps=round(cfg.episode_s / control_dt),
-        base_force=cfg.base_force,
-        max_gravity_z=cfg.max_gravity_z,
-        max_speed=robot.max_speed,
+        crosses=int(cfg.crosses),
         overflow_mask=CAPACITY_OVERFLOWS,
         num_levels=num_levels,
         num_columns=num_columns,
@@ -131,12 +144,8 @@ def make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int)
         lin_vel_x=cfg.lin_vel_x,
         lin_vel_y=cfg.lin_vel_y,
         min_speed=cfg.min_speed,
-        yaw_gain=cfg.yaw_gain,
-        max_yaw_rate=cfg.max_yaw_rate,
         push_steps=round(cfg.push_interval_s / control_dt),
         push_speed=cfg.push_speed,
-        crosses=int(cfg.crosses),
-        crossing=crossing.make_task(crossing.CrossingCfg(), robot),
     )
 
 
