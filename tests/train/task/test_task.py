@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from kernels.training import End
+from kernels.episode import Outcome
 from train.task.cfg import NoiseCfg
 from train.task.task import CommandTask
 
@@ -20,7 +20,7 @@ def test_a_standing_robot_keeps_standing(shared_task):
     task.restart_all(torch.zeros(task.num_envs))
     for _ in range(50):
         task.step(torch.zeros(task.num_envs, 12))
-    assert (task.end == int(End.RUNNING)).all()
+    assert (task.end == int(Outcome.RUNNING)).all()
     assert (task.episode_steps == 50).all()
     assert task.observation.isfinite().all() and task.observation.shape == (task.num_envs, 235)
     assert (task.observation[:, 8] < -0.8).all()  # projected gravity's z: upright
@@ -42,7 +42,7 @@ def test_only_ended_episodes_restart(shared_task):
     task.step(action)
     ended = torch.tensor([False, True, False, False, True, False])
     assert (task.end != 0).equal(ended)
-    assert task.end[4] == int(End.INVALID)
+    assert task.end[4] == int(Outcome.INVALID)
     assert task.episode_steps.tolist() == [4, 0, 4, 4, 0, 4]
     assert (task.observation[ended, ACTION] == 0).all() and (task.observation[~ended, ACTION] == 0.25).all()
     start = torch.tensor([8.0, 4.0])
