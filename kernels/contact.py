@@ -1,8 +1,8 @@
 """Terrain contact: strips of sphere probes against height grids, written as contact records for the physics solver.
 
-A strip is a row of equal spheres on one collision shape (:mod:`sim.robots.probes` makes them), straight but for meshes. Of the
-probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its two ends
-and on the highest point between, and a robot on its back cannot flood the solver.
+A strip is a row of equal spheres on one collision shape, straight but for meshes (:mod:`sim.robots.probes` makes them).
+Of the probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its
+two ends and on the highest point between, and a robot on its back cannot flood the solver.
 """
 
 from typing import Any

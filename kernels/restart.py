@@ -1,4 +1,4 @@
-"""What follows the end of an episode, of a crossing and of training alike: a randomised start, and nothing remembered."""
+"""The restart of an episode, of a crossing and of training alike: a randomised start, with nothing remembered."""
 
 from typing import Any
 

@@ -148,7 +148,9 @@ class Rollout:
             # Beside the crossing runs a second set of episodes, the same but without a goal: while one of them runs,
             # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
             falls = (Outcome.BASE_COLLISION,)
-            self._reward = Reward(self.sim, robot.training, command=self._command, action=self._last_action, falls=falls)
+            self._reward = Reward(
+                self.sim, robot.training, command=self._command, action=self._last_action, falls=falls
+            )
             self._rewards = self._reward.state
             self._stepped = make_episodes(num_envs)
             self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))

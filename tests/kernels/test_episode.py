@@ -1,7 +1,6 @@
 """An episode's command and the latch that ends it: oracle, properties, hand-computed numbers."""
 
 import numpy as np
-import pytest
 import warp as wp
 
 from kernels.episode import (

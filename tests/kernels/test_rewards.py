@@ -238,7 +238,9 @@ def test_one_foot_alone_on_the_ground(up, command, expected):
     assert Step(geom_force=loaded, command=[command]).term("no_fly") == expected
 
 
-def air_times(pattern: list[bool], command: tuple[float, float, float] = (1.0, 0.0, 0.0), least: float = 0.5) -> list[float]:
+def air_times(
+    pattern: list[bool], command: tuple[float, float, float] = (1.0, 0.0, 0.0), least: float = 0.5
+) -> list[float]:
     """The air-time term of each step of one foot that touches as told."""
     step = Step(command=[command])
     step.min_air_time_s = least

@@ -1,4 +1,4 @@
-"""The training reward: what it is computed from, and what a crossing is paid, until when, and nothing else by asking."""
+"""The training reward: what it is computed from, what a crossing is paid and until when."""
 
 import math
 from dataclasses import fields, replace
