@@ -13,7 +13,7 @@ from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from qd.scheduler_cfg import SchedulerCfg
 from sim.files.command import split_words
-from sim.files.remembered import built
+from sim.files.settings import built
 from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
 
 if TYPE_CHECKING:

@@ -1,6 +1,7 @@
 """95 % intervals of measured rates and means."""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -11,13 +12,15 @@ _BOOTSTRAP_DRAWS = 10_000
 
 
 def wilson_interval(hits: int, count: int) -> tuple[float, float]:
-    """95 % Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials.
+    """95 % Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials; 0 to 1 without any.
 
     Raises:
-        ValueError: If there are no trials or more hits than trials.
+        ValueError: If there are more hits than trials, or fewer than 0.
     """
-    if not 0 <= hits <= count or count == 0:
-        raise ValueError(f"a rate needs 0 <= hits <= count and a trial, got {hits} of {count}")
+    if not 0 <= hits <= count:
+        raise ValueError(f"a rate needs 0 <= hits <= count, got {hits} of {count}")
+    if count == 0:
+        return 0.0, 1.0
     rate, spread = hits / count, _Z * _Z / count
     centre = (rate + spread / 2) / (1 + spread)
     half = _Z * math.sqrt(rate * (1 - rate) / count + spread / (4 * count)) / (1 + spread)
@@ -25,12 +28,28 @@ def wilson_interval(hits: int, count: int) -> tuple[float, float]:
     return (0.0 if hits == 0 else centre - half), (1.0 if hits == count else centre + half)
 
 
-def rate_words(hits: int, count: int) -> str:
-    """A rate with its 95 % Wilson interval in words, such as ``3 of 4 (75%, 30 to 95%)``."""
+def value_words(value: float | None, limits: Sequence[float] | None, form: str = ".3f") -> str:
+    """A number with its interval: ``0.750 (0.301 to 0.954)``, by ``.0%`` ``75% (30 to 95%)``.
+
+    Args:
+        value: The number; "-" stands for None.
+        limits: Lower and upper limit; None if none is known, which leaves the number alone.
+        form: Format of each.
+    """
+    if value is None:
+        return "-"
+    if limits is None:
+        return format(value, form)
+    low, high = (format(limit, form) for limit in limits)
+    return f"{value:{form}} ({low.removesuffix('%')} to {high})"
+
+
+def rate_words(hits: int, count: int, *, short: bool = False) -> str:
+    """A rate with its 95 % Wilson interval: ``3 of 4 (75%, 30 to 95%)``, in short ``75% (30 to 95%)``."""
     if not count:
         return "no valid episode"
-    low, high = wilson_interval(hits, count)
-    return f"{hits} of {count} ({hits / count:.0%}, {100 * low:.0f} to {high:.0%})"
+    words = value_words(hits / count, wilson_interval(hits, count), ".0%")
+    return words if short else f"{hits} of {count} ({words.replace(' (', ', ')}"
 
 
 def bootstrap_interval(values: NDArray[np.floating], rng: np.random.Generator) -> list[float] | None:

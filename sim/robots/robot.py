@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kernels.observation import NUM_BASE_COLUMNS
-from kernels.penalties import BASE, FOOT, LIMB, PENALTIES
 from sim.files.atomic import read_json
+from sim.files.settings import setting
 from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg
 
 _ROBOTS_DIR = Path(__file__).parent
@@ -37,43 +36,43 @@ class RobotCfg:
     """Actuated joints in policy order, which is the file's order."""
     default_joint_pos: tuple[float, ...]
     """Default pose [rad]; an action of 0 holds it."""
-    default_base_height: float
+    default_base_height: float = setting(above=0)
     """Height of the base over flat ground at the start [m]."""
-    footprint: tuple[float, float]
+    footprint: tuple[float, float] = setting(above=0)
     """Half length and half width of the stance [m]."""
     scan_x: tuple[float, ...]
     """Height-scan points ahead of the base, yaw frame [m]."""
     scan_y: tuple[float, ...]
     """Height-scan points left of the base, yaw frame [m]."""
-    contact_force_limit: float
+    contact_force_limit: float = setting(above=0)
     """Contact force of a foot beyond which it is penalised [N]."""
     penalties: tuple[str, ...]
     """Raw penalties that count, a subset of :data:`kernels.penalties.PENALTIES`."""
     collision_bit: bool
     """Whether base collision is a descriptor of its own (the paper: Cassie)."""
-    action_scale: float = 0.5
+    action_scale: float = setting(0.5, above=0)
     """Radians per unit of action."""
-    physics_dt: float = 0.005
-    decimation: int = 4
+    physics_dt: float = setting(0.005, above=0, most=0.05)
+    decimation: int = setting(4, least=1)
     """Physics steps per control step."""
-    max_speed: float = 100.0
+    max_speed: float = setting(100.0, above=0)
     """A state with a velocity beyond is invalid [m/s or rad/s]: what the robot cannot reach, not even when it falls."""
-    nconmax: int = 40
+    nconmax: int = setting(40, least=1)
     """Contacts an environment on average; the buffer is shared by all."""
-    njmax: int = 100
+    njmax: int = setting(100, least=1)
     """Constraint rows an environment."""
-    stiffness: tuple[float, ...] | None = None
+    stiffness: tuple[float, ...] | None = setting(None, above=0)
     """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
-    damping: tuple[float, ...] | None = None
+    damping: tuple[float, ...] | None = setting(None, least=0)
     """Velocity gain of each joint [N m s/rad], together with ``stiffness``."""
-    effort_limit: tuple[float, ...] | None = None
+    effort_limit: tuple[float, ...] | None = setting(None, above=0)
     """Largest torque of each joint [N m]; the file's if None, and never more than that of its actuators."""
-    armature: tuple[float, ...] | None = None
+    armature: tuple[float, ...] | None = setting(None, least=0)
     """Inertia of each joint's rotor, behind its gears [kg m^2]; the file's if None."""
-    friction: float | None = None
+    friction: float | None = setting(None, above=0)
     """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF. Less than the ground's .3 counts as
     .3."""
-    contact_time_constant_s: float | None = None
+    contact_time_constant_s: float | None = setting(None, above=0)
     """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
     training: TrainingCfg = field(default_factory=TrainingCfg)
     """What the training of its controller takes of the robot."""
@@ -100,6 +99,8 @@ class RobotCfg:
     @property
     def observation_size(self) -> int:
         """Columns of the observation row."""
+        from kernels.observation import NUM_BASE_COLUMNS  # Warp loads only where the simulation does
+
         return NUM_BASE_COLUMNS + 3 * self.num_joints + self.num_scan_points
 
     @property
@@ -129,6 +130,8 @@ class RobotCfg:
 
     def role_of(self, geom: str) -> int:
         """Role bits of a geom (:mod:`kernels.penalties`)."""
+        from kernels.penalties import BASE, FOOT, LIMB
+
         return BASE * (geom in self.base_geoms) + FOOT * (geom in self.foot_geoms) + LIMB * (geom in self.limb_geoms)
 
     def scan_points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -163,6 +166,7 @@ def _steps(low: int, high: int) -> tuple[float, ...]:
 
 _LEGS = ("LF", "RF", "LH", "RH")
 _SIDES = ("left", "right")
+_PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble")
 
 ROBOTS = {
     "anymal": RobotCfg(
@@ -178,7 +182,7 @@ ROBOTS = {
         scan_x=_steps(-8, 8),
         scan_y=_steps(-5, 5),
         contact_force_limit=500.0,
-        penalties=PENALTIES,
+        penalties=(*_PENALTIES, "collision"),
         collision_bit=False,
         training=TrainingCfg(added_base_mass=(-5.0, 5.0)),
     ),
@@ -199,7 +203,7 @@ ROBOTS = {
         scan_x=_steps(-5, 5),
         scan_y=_steps(-5, 5),
         contact_force_limit=300.0,
-        penalties=tuple(name for name in PENALTIES if name != "collision"),
+        penalties=_PENALTIES,
         collision_bit=True,
         nconmax=7,  # the most there can be: a sphere, and 3 on each toe
         njmax=48,  # 3 rows a contact and 12 joint limits, in the solver's tiles of 16

@@ -100,7 +100,7 @@ def damaged(finished, tmp_path, damage):
     [
         (lambda settings: settings["task"].update(gravity=3.0), "task has no setting gravity"),
         (lambda settings: settings["ppo"].update(gamma="a lot"), "gamma must be float, got 'a lot'"),
-        (lambda settings: settings["task"].update(friction=0.5), "friction must be a list, got 0.5"),
+        (lambda settings: settings["task"].update(friction=0.5), "friction must be a tuple, got 0.5"),
         (lambda settings: settings["task"].update(friction=[0.5]), r"friction must have 2 values, got \[0.5\]"),
         (lambda settings: settings["task"].update(rewards=7), "rewards must be an object, got 7"),
         (lambda settings: settings.pop("ppo"), "'ppo'"),

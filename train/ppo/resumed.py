@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sim.files.atomic import read_json
-from sim.files.remembered import built
+from sim.files.settings import built
 from sim.robots.robot import RobotCfg
 from train.ppo.learner import check_entries
 from train.ppo.ppo import PpoCfg

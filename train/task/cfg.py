@@ -9,8 +9,9 @@ from kernels.episode import Task
 from kernels.restart import StartRanges
 from kernels.training import Rules
 from sim import crossing
+from sim.files.settings import problems as problems_of
 from sim.robots.robot import RobotCfg
-from sim.robots.training import TrainingCfg, training_problems
+from sim.robots.training import TrainingCfg
 from sim.simulation import CAPACITY_OVERFLOWS
 from train.task.curriculum import CurriculumCfg
 
@@ -93,7 +94,7 @@ def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
         cfg: The settings.
         control_dt: Control step of the robot [s].
     """
-    problems = training_problems(cfg)
+    problems = problems_of(cfg, "training.")
     for name in _RANGES:
         low, high = getattr(cfg, name)
         if not -np.inf < low <= high < np.inf or (name == "friction" and low < 0.0):

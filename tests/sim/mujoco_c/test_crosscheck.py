@@ -8,28 +8,9 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from sim.files.intervals import bootstrap_interval, wilson_interval
 from sim.mujoco_c.agreement import Pair, summarise
 from sim.mujoco_c.crosscheck import Crosscheck, CrosscheckCfg, read_pool
 from sim.terrain import hard_random_genes
-
-
-def test_wilson_interval_by_hand():
-    # 10 of 20: centre 0.5, half width 1.96 sqrt(0.0125 + 0.0480) / (1 + 0.192) = 0.2007 (Wilson 1927).
-    np.testing.assert_allclose(wilson_interval(10, 20), [0.2993, 0.7007], atol=1e-4)
-    # 0 of 20: from 0 to z^2 / (n + z^2) = 3.841 / 23.841.
-    np.testing.assert_allclose(wilson_interval(0, 20), [0.0, 0.1611], atol=1e-4)
-    assert wilson_interval(20, 20)[1] == 1.0
-    for hits, count in ((1, 0), (3, 2), (-1, 2)):
-        with pytest.raises(ValueError, match="hits"):
-            wilson_interval(hits, count)
-
-
-def test_bootstrap_interval():
-    low, high = bootstrap_interval(np.array([0.0, 1.0] * 50), np.random.default_rng(0))
-    # The mean of 100 draws of 0 or 1: 0.5 +- 1.96 * 0.05.
-    np.testing.assert_allclose([low, high], [0.40, 0.60], atol=0.02)
-    assert bootstrap_interval(np.array([]), np.random.default_rng(0)) is None
 
 
 def outcomes(goal, collision, time_out, invalid=0):
