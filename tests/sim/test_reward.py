@@ -6,11 +6,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from kernels.episode import Outcome
+from kernels.rewards import REWARDS
 from sim.crossing import CrossingCfg
 from sim.policy.loaders import load_policy
-from sim.reward import make_motion, soft_joint_limits
+from sim.reward import Reward, make_motion, soft_joint_limits
 from sim.robots.training import RewardCfg, TrainingCfg
 from sim.rollout import Rollout
 from tests.sim.policies import stand
@@ -223,3 +225,16 @@ def test_a_joint_that_is_not_there_is_named(eight, robot):
     with pytest.raises(ValueError, match="robot 'cassie' has no joint named knee: expected some of hip_abduction_left"):
         make_motion(eight, cfg, command=None, action=None)
     assert TrainingCfg().steady_joints == ()
+
+
+@ONLY_ANYMAL
+def test_what_torques_cost_by_hand(eight, robot):
+    # 12 joints at 10 N m, -1e-5 per (N m)^2 and second: 12 * 100 * -1e-5 * .02 s = -2.4e-4.
+    with wp.ScopedDevice(eight.device):
+        command, action = wp.zeros((8, 3), dtype=float), wp.zeros((8, 12), dtype=float)
+        reward = Reward(eight, robot.training, command=command, action=action, falls=())
+        before = eight.joint_torque.numpy().copy()
+        eight.joint_torque.fill_(10.0)
+        reward.pay(wp.zeros(8, dtype=int))
+        eight.joint_torque.assign(before)
+    np.testing.assert_allclose(reward.state.terms.numpy()[:, REWARDS.index("torques")], -2.4e-4, rtol=1e-5)

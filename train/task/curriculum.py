@@ -5,22 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, TILE_TYPES, crossing_terrain, training_tiles
-
-
-@dataclass(frozen=True, kw_only=True)
-class CurriculumCfg:
-    """Shares of the terrain types and where robots begin.
-
-    legged_gym's tiles have no rough ground on a level plane, which one in six hand-crafted crossings is made of:
-    columns of ``noise`` tiles are added beside them.
-    """
-
-    num_columns: int = 20
-    """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
-    noise_columns: int = 2
-    """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
-    max_first_level: int = 5
-    """Robots begin on levels 0 to this, drawn uniformly."""
+from train.task.cfg import CurriculumCfg
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,32 +5,37 @@ pushes, observation. The host copies actions in and results out, and draws no ra
 """
 
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import torch
 
 from kernels.episode import Outcome, end_all, latch_outcomes, make_episodes, note_base_forces
 from kernels.observation import Noise, apply_action, write_observation
-from kernels.restart import restart_episodes
+from kernels.restart import StartRanges, restart_episodes
 from kernels.rewards import REWARDS, remember_steps
 from kernels.training import (
     STATISTICS,
+    Rules,
     command_episodes,
     make_training,
     promote_episodes,
     record_steps,
     seed_restarts,
 )
+from sim import crossing
 from sim.bank import TerrainBank
 from sim.policy.loaders import prepare_torch
 from sim.reward import Reward
 from sim.robots.robot import RobotCfg
-from sim.simulation import Simulation
-from train.task.cfg import TaskCfg, fill, make_rules, make_start_ranges, make_task, task_problems
+from sim.simulation import CAPACITY_OVERFLOWS, Simulation
+from train.task.cfg import TaskCfg, task_problems
 from train.task.curriculum import Tiles, first_levels, make_tiles
 
 _FALLS = (Outcome.BASE_COLLISION, Outcome.TILT, Outcome.INVALID)
 """An invalid state costs what a fall does: were it free, falling robots would learn to whip their legs too fast."""
+_TILE_SIDE = 8.0
+_TILE_CENTRE = (8.0, 4.0)
 
 
 class CommandTask:
@@ -77,10 +82,10 @@ class CommandTask:
         columns = self.tiles.columns_of(num_envs)
         levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(level_seed)) % self.tiles.num_levels
         self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
-        self._task = make_task(cfg, robot)
-        self._rules = make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
-        self._ranges = make_start_ranges(cfg, robot)
-        self._noise = fill(Noise(), **asdict(cfg.noise))
+        self._task = _make_task(cfg, robot)
+        self._rules = _make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
+        self._ranges = _make_start_ranges(cfg, robot)
+        self._noise = _fill(Noise(), **asdict(cfg.noise))
         self.max_episode_steps: int = self._task.max_steps
         self._episodes = make_episodes(num_envs, device)
         self._training = training = make_training(
@@ -222,3 +227,61 @@ class CommandTask:
             sim.sensors, self._noise, training.counter, training.observation,
         )  # fmt: skip
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
+
+
+def _fill(struct: Any, **values: Any) -> Any:
+    """Set the fields of a kernel argument; returns it."""
+    for name, value in values.items():
+        setattr(struct, name, value)
+    return struct
+
+
+def _make_task(cfg: TaskCfg, robot: RobotCfg) -> Any:
+    """Goal, command and limits of an episode as a kernel argument; its steps are control steps."""
+    task = crossing.make_task(crossing.CrossingCfg(), robot, to_goal=cfg.crosses)
+    if not cfg.crosses:
+        endless = {"lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
+        _fill(task, yaw_gain=cfg.yaw_gain, max_yaw_rate=cfg.max_yaw_rate, **endless)
+    return _fill(
+        task,
+        max_steps=round(cfg.episode_s / robot.control_dt),
+        base_force=cfg.base_force,
+        max_gravity_z=cfg.max_gravity_z,
+        overflow_mask=0,  # counted, and no reason to end an episode
+    )
+
+
+def _make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
+    """Commands, pushes and levels of the task as a kernel argument."""
+    control_dt = robot.control_dt
+    return _fill(
+        Rules(),
+        crosses=int(cfg.crosses),
+        overflow_mask=CAPACITY_OVERFLOWS,
+        num_levels=num_levels,
+        num_columns=num_columns,
+        promotion_distance=0.5 * _TILE_SIDE,
+        demotion_time_s=0.5 * cfg.episode_s,
+        command_steps=round(cfg.command_interval_s / control_dt),
+        lin_vel_x=cfg.lin_vel_x,
+        lin_vel_y=cfg.lin_vel_y,
+        min_speed=cfg.min_speed,
+        push_steps=round(cfg.push_interval_s / control_dt),
+        push_speed=cfg.push_speed,
+    )
+
+
+def _make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
+    """The randomised start of an episode as a kernel argument."""
+    if cfg.crosses:
+        return crossing.make_start_ranges(crossing.CrossingCfg(), robot)
+    return _fill(
+        StartRanges(),
+        position=_TILE_CENTRE,
+        position_range=cfg.start_position_range,
+        yaw_range=cfg.start_yaw_range,
+        joint_scale_range=cfg.start_joint_range,
+        velocity_range=cfg.start_velocity_range,
+        base_height=robot.default_base_height,
+        footprint=(max(robot.footprint), max(robot.footprint)),  # whatever the heading
+    )
