@@ -164,10 +164,11 @@ def collide_strips(
             f"body_q must hold {num_envs} x {layout.bodies_per_env} poses, got {body_q.shape[0]}: "
             "one robot per entry of terrain_of_env"
         )
+    inputs = [body_q, terrain_of_env, terrain, probes, layout]
     wp.launch(
         _collide_strips_kernel,
-        dim=(probes.strip_radius.shape[0], num_envs),
-        inputs=[body_q, terrain_of_env, terrain, probes, layout],
+        (probes.strip_radius.shape[0], num_envs),
+        inputs,
         outputs=[contacts_out],
         device=body_q.device,
     )

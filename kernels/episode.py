@@ -151,13 +151,8 @@ def _command_goal_kernel(
 
 def command_goal(joint_q: Any, outcome: Any, task: Task, command_out: Any) -> None:
     """Write each environment's command, zero once its episode has ended; shape (num_envs, 3)."""
-    wp.launch(
-        _command_goal_kernel,
-        dim=outcome.shape[0],
-        inputs=[joint_q, outcome, task],
-        outputs=[command_out],
-        device=joint_q.device,
-    )
+    inputs = [joint_q, outcome, task]
+    wp.launch(_command_goal_kernel, outcome.shape[0], inputs, outputs=[command_out], device=joint_q.device)
 
 
 @wp.func
@@ -251,13 +246,8 @@ def latch_outcomes(
         task: Goal and limits.
         episodes_out: Updated in place; forgets what forces were noted.
     """
-    wp.launch(
-        _latch_outcomes_kernel,
-        dim=overflow.shape[0],
-        inputs=[joint_q, joint_qd, geom_force, geom_role, overflow, contact_count, contact_capacity, task],
-        outputs=[episodes_out],
-        device=joint_q.device,
-    )
+    inputs = [joint_q, joint_qd, geom_force, geom_role, overflow, contact_count, contact_capacity, task]
+    wp.launch(_latch_outcomes_kernel, overflow.shape[0], inputs, outputs=[episodes_out], device=joint_q.device)
 
 
 @wp.kernel
@@ -302,10 +292,11 @@ def park_ended(
         targets_out: Joint targets in columns 7 and up, shape (num_envs, 7 + num_joints).
         body_q_out: Body poses, shape (num_envs, num_bodies).
     """
+    inputs = [outcome, default_joint_pos]
     wp.launch(
         _park_ended_kernel,
-        dim=outcome.shape[0],
-        inputs=[outcome, default_joint_pos],
+        outcome.shape[0],
+        inputs,
         outputs=[joint_q_out, joint_qd_out, targets_out, body_q_out],
         device=outcome.device,
     )

@@ -91,12 +91,9 @@ def seed_starts(seed_of_terrain: Any, terrain_of_env: Any, num_replicas: int, ep
         num_replicas: Episodes a terrain; the replica of an environment is ``env % num_replicas``.
         episodes_out: Writes ``rng``.
     """
+    inputs = [seed_of_terrain, terrain_of_env, num_replicas]
     wp.launch(
-        _seed_starts_kernel,
-        dim=terrain_of_env.shape[0],
-        inputs=[seed_of_terrain, terrain_of_env, num_replicas],
-        outputs=[episodes_out],
-        device=terrain_of_env.device,
+        _seed_starts_kernel, terrain_of_env.shape[0], inputs, outputs=[episodes_out], device=terrain_of_env.device
     )
 
 
@@ -151,10 +148,11 @@ def restart_episodes(
         episodes_out: Set running, zero steps; starts are drawn from ``rng``.
         rewards_out: Nothing summed; empty where nothing is rewarded.
     """
+    inputs = [terrain_of_env, terrain, ranges, sensors]
     wp.launch(
         _restart_episodes_kernel,
-        dim=terrain_of_env.shape[0],
-        inputs=[terrain_of_env, terrain, ranges, sensors],
+        terrain_of_env.shape[0],
+        inputs,
         outputs=[joint_q_out, joint_qd_out, last_action_out, episodes_out, rewards_out],
         device=joint_q_out.device,
     )

@@ -331,13 +331,8 @@ def reward_steps(motion: Motion, weights: RewardWeights, outcome: Any, rewards_o
         outcome: :class:`kernels.episode.Outcome` after the step, shape (num_envs,).
         rewards_out: Updated, but for what :func:`remember_steps` writes.
     """
-    wp.launch(
-        _reward_steps_kernel,
-        dim=outcome.shape[0],
-        inputs=[motion, weights, outcome],
-        outputs=[rewards_out],
-        device=outcome.device,
-    )
+    inputs = [motion, weights, outcome]
+    wp.launch(_reward_steps_kernel, outcome.shape[0], inputs, outputs=[rewards_out], device=outcome.device)
 
 
 @wp.kernel
@@ -361,10 +356,5 @@ def remember_steps(action: Any, joint_qd: Any, rewards_out: Rewards, counter_out
         rewards_out: Writes ``previous_action`` and ``previous_joint_vel``.
         counter_out: Control steps so far, shape (1,).
     """
-    wp.launch(
-        _remember_steps_kernel,
-        dim=action.shape,
-        inputs=[action, joint_qd],
-        outputs=[rewards_out, counter_out],
-        device=action.device,
-    )
+    inputs = [action, joint_qd]
+    wp.launch(_remember_steps_kernel, action.shape, inputs, outputs=[rewards_out, counter_out], device=action.device)

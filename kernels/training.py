@@ -162,13 +162,8 @@ def record_steps(
         rewards: Totals.
         training_out: Writes ``ended``; adds to ``statistics``.
     """
-    wp.launch(
-        _record_steps_kernel,
-        dim=joint_q.shape[0],
-        inputs=[joint_q, joint_qd, base_com, overflow, rules, episodes, rewards],
-        outputs=[training_out],
-        device=joint_q.device,
-    )
+    inputs = [joint_q, joint_qd, base_com, overflow, rules, episodes, rewards]
+    wp.launch(_record_steps_kernel, joint_q.shape[0], inputs, outputs=[training_out], device=joint_q.device)
 
 
 @wp.func
@@ -220,10 +215,11 @@ def promote_episodes(
         terrain_of_env_out: Tile of each environment, shape (num_envs,).
         training_out: Updates ``level``.
     """
+    inputs = [joint_q, episodes, rules]
     wp.launch(
         _promote_episodes_kernel,
-        dim=joint_q.shape[0],
-        inputs=[joint_q, episodes, rules],
+        joint_q.shape[0],
+        inputs,
         outputs=[terrain_of_env_out, training_out],
         device=joint_q.device,
     )
@@ -295,10 +291,7 @@ def command_episodes(
         joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints); a push overwrites vx and vy.
         training_out: Updates ``heading`` and ``command``.
     """
+    inputs = [joint_q, episodes, rules, task]
     wp.launch(
-        _command_episodes_kernel,
-        dim=joint_q.shape[0],
-        inputs=[joint_q, episodes, rules, task],
-        outputs=[joint_qd_out, training_out],
-        device=joint_q.device,
+        _command_episodes_kernel, joint_q.shape[0], inputs, outputs=[joint_qd_out, training_out], device=joint_q.device
     )
