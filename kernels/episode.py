@@ -99,7 +99,7 @@ def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
 
 
 def begin_all(episodes_out: Episodes) -> None:
-    """Set every episode running, with no step made; where the robots stand is for others to say."""
+    """Set every episode running, with no step made; moves no robot."""
     episodes_out.outcome.zero_()
     episodes_out.steps.zero_()
     episodes_out.num_running.fill_(episodes_out.outcome.shape[0])
@@ -216,7 +216,7 @@ def _latch_outcomes_kernel(
     steps = episodes_out.steps[env] + 1
     bits = overflow[env]
     if contact_count[0] > contact_capacity:
-        bits = task.overflow_mask  # nobody knows whose contacts were dropped, so nobody's episode is trusted
+        bits = task.overflow_mask  # whose contacts were dropped is not known, so no episode is trusted
     force = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
     outcome = judge_state(joint_q, joint_qd, force, bits, steps, task, env)
     episodes_out.base_force[env] = 0.0
@@ -272,7 +272,7 @@ def _park_ended_kernel(
     for j in range(default_joint_pos.shape[0]):
         joint_q_out[env, 7 + j] = default_joint_pos[j]
         targets_out[env, 7 + j] = default_joint_pos[j]
-    for b in range(body_q_out.shape[1]):  # or the next contacts would be those of where it was
+    for b in range(body_q_out.shape[1]):  # or the next contacts would be found where it was
         body_q_out[env, b] = wp.transform(wp.vec3(0.0, 0.0, PARKING_HEIGHT), wp.quat_identity())
 
 
@@ -281,8 +281,8 @@ def park_ended(
 ) -> None:
     """Hold the robots whose episodes have ended at rest, high above the ground, where they touch nothing.
 
-    Left to walk on they would cost as much as the others, and robots on their backs more than that. To be called every
-    control step: in between they fall by millimetres.
+    They would otherwise cost as much as the others, and more on their backs. Call it every control step: in between,
+    they fall by millimetres.
 
     Args:
         outcome: Shape (num_envs,).

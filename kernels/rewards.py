@@ -1,7 +1,8 @@
 """Rewards of a control step: legged_gym's terms under its names where it has them, weighed, added, and summed.
 
-A term is one ``@_term`` function here and its weight, a field of that name, in :class:`sim.robots.training.RewardCfg`.
-It gives the unweighted rate of reward in one control step.
+A term is one ``@_term`` function here, and its weight is the field of that name in
+:class:`sim.robots.training.RewardCfg`. It gives the unweighted rate of reward in one control step. Terms are added in
+the order in which they stand here.
 """
 
 from collections.abc import Callable, Collection
@@ -247,11 +248,11 @@ def joint_deviation(motion: Motion, rewards: Rewards, env: int) -> float:
 
 _FUNCTIONS = tuple(_TERMS.values())
 REWARDS = (*_TERMS, "termination")
-"""Columns of the sums of terms; the last is the price of a fall, which is no term of the motion."""
+"""Columns of the sums of terms, in their order; the last is the price of a fall."""
 
 _NUM_TERMS = wp.constant(len(_TERMS))
 _TermWeights = wp.types.vector(len(_TERMS), float)
-wp.set_module_options({"max_unroll": len(_TERMS)})  # the loop over the terms names another function each time
+wp.set_module_options({"max_unroll": len(_TERMS)})  # the loop over the terms calls another function each time
 
 
 @wp.struct
@@ -322,8 +323,8 @@ def _reward_steps_kernel(motion: Motion, weights: RewardWeights, outcome: wp.arr
 def reward_steps(motion: Motion, weights: RewardWeights, outcome: Any, rewards_out: Rewards) -> None:
     """Reward one control step: the weighted sum of all terms times the control step.
 
-    A step is paid if its episode had not ended when it began. One that ends in an invalid state pays no term, and one
-    that ends in a fall, its price.
+    A step is paid if its episode had not ended before. A step that ends in an invalid state pays no term; one that ends
+    in a fall pays its price too.
 
     Args:
         motion: What the step ended in.

@@ -66,7 +66,7 @@ class RolloutResult:
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutState:
-    """Device arrays (Warp) of a rollout between two control steps, referred to, not copied; one row an environment."""
+    """Device arrays (Warp) of a rollout between two control steps, not copied; one row an environment."""
 
     joint_q: Any
     """Joint coordinates, shape (num_envs, 7 + num_joints)."""
@@ -143,23 +143,19 @@ class Rollout:
         self._episode = self._stepped = make_episodes(num_envs)
         self._latches = [(self._task, self._episode)]
         self._reward: Reward | None = None
-        self._rewards = Rewards()
         if self.cfg.reward:
-            # Beside the crossing runs a second set of episodes, the same but without a goal: while one of them runs,
+            # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them runs,
             # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
-            falls = (Outcome.BASE_COLLISION,)
-            self._reward = Reward(
-                self.sim, robot.training, command=self._command, action=self._last_action, falls=falls
-            )
-            self._rewards = self._reward.state
+            io = {"command": self._command, "action": self._last_action}
+            self._reward = Reward(self.sim, robot.training, falls=(Outcome.BASE_COLLISION,), **io)
             self._stepped = make_episodes(num_envs)
             self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
+        self._rewards = Rewards() if self._reward is None else self._reward.state
 
     def _start(self, seeds: np.ndarray) -> None:
         sim = self.sim
         self._seeds.assign(seeds)
-        for _, episode in self._latches:
-            begin_all(episode)
+        begin_all(self._stepped)
         end_all(self._episode)
         seed_starts(self._seeds, sim.terrain_of_env, self.num_replicas, self._episode)
         restart_episodes(
@@ -246,15 +242,12 @@ class Rollout:
 
     @property
     def state(self) -> RolloutState:
-        """What the rollout stands at, on the device."""
+        """The rollout's present state, on the device."""
+        sim, episode = self.sim, self._episode
         return RolloutState(
-            joint_q=self.sim.joint_q,
-            geom_force=self.sim.geom_force,
-            penalty_sums=self._sums,
-            command=self._command,
-            outcome=self._episode.outcome,
-            steps=self._episode.steps,
-        )
+            joint_q=sim.joint_q, geom_force=sim.geom_force, penalty_sums=self._sums, command=self._command,
+            outcome=episode.outcome, steps=episode.steps,
+        )  # fmt: skip
 
     def begin(self, terrains: np.ndarray, seeds: np.ndarray) -> None:
         """Set the terrains and put every robot at its start; arguments and errors as of :meth:`evaluate`."""
