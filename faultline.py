@@ -10,7 +10,7 @@ class Command(NamedTuple):
     """A word that may stand after ``faultline``."""
 
     where: str
-    """Module and class; the class is a dataclass of the flags whose ``execute`` does the work (:mod:`sim.files.command`)."""
+    """Module and class: a dataclass of the flags, whose ``execute`` does the work (:mod:`sim.files.command`)."""
     summary: str
 
 
@@ -31,26 +31,26 @@ COMMANDS: dict[str, dict[str, Command]] = {
     "Train": {
         "train": Command("train.base:Train", "train a base controller from scratch"),
         "finetune": Command("train.finetune:Finetune", "train a controller further on terrains that broke it"),
-        "export-policy": Command("sim.policy.export:ExportPolicy", "a controller as one ONNX file"),
+        "export-policy": Command("sim.commands:ExportPolicy", "a controller as one ONNX file"),
     },
     "Bring a robot": {
-        "stand": Command("sim.robots.stand:Stand", "look at a robot: its joints and geoms, whether it stands"),
+        "stand": Command("sim.commands:Stand", "look at a robot: its joints and geoms, whether it stands"),
         "calibrate": Command("qd.studies.calibrate:Calibrate", "measure the penalty scales of a robot"),
     },
     "Study the search": {
         "compare": Command("qd.studies.compare:Compare", "the search and its baselines on the same number of terrains"),
         "ablation": Command("qd.studies.ablation:Ablation", "with and without standard deviations in the fitness"),
         "beside": Command("qd.studies.beside:Beside", "searches against different controllers side by side"),
-        "crosscheck": Command("sim.mujoco_c.crosscheck:Crosscheck", "the same crossings in plain MuJoCo C"),
+        "crosscheck": Command("sim.commands:Crosscheck", "the same crossings in plain MuJoCo C"),
         "distances": Command("train.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
         "tables": Command("train.evaluate.publish:Tables", "the published numbers beside the paper's"),
     },
     "Measure speed": {
-        "bench": Command("sim.bench.report:Bench", "every kernel against torch and the device's ceiling"),
+        "bench": Command("sim.commands:Bench", "every kernel against torch and the device's ceiling"),
         "speed": Command("qd.studies.speed:Speed", "the search beside the bare physics it is made of"),
         "train-speed": Command("train.ppo.speed:TrainSpeed", "environment steps a second of training"),
         "scale": Command("qd.studies.scale:Scale", "what more devices bring"),
-        "solver-options": Command("sim.bench.options:SolverOptions", "what solver options cost and change"),
+        "solver-options": Command("sim.commands:SolverOptions", "what solver options cost and change"),
     },
 }
 """What can be done, by what it is for."""

@@ -1,8 +1,9 @@
 """Height grids on the device: sampling, block maxima, and the exact nearest surface point of a sphere.
 
 A terrain is a triangulated grid: node ``(row, col)`` stands at ``x = col * spacing``, ``y = row * spacing``, and every
-cell is cut along the diagonal from its (low x, high y) to its (high x, low y) corner. MuJoCo's heightfield is cut along
-the other one (:mod:`sim.maps.hfield` hands it the same surface). Beyond the grid, the height of the edge goes on.
+cell is cut along the diagonal from its (low x, high y) to its (high x, low y) corner; MuJoCo's heightfield along the
+other one (:mod:`sim.maps.terrain_files` hands it the same surface). Beyond the grid the height of the nearest edge
+node continues.
 """
 
 from typing import Any

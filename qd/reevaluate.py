@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from qd.archive import Archive
 from qd.fresh import Open, corrected
@@ -35,16 +35,13 @@ class ReevaluateCfg:
     """Run directory; the newest of the robot, or of anymal, under runs/."""
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
-    workers: int | Literal["auto"] | None = None
-    """Evaluate on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
-    processes: int | None = None
-    """Processes on the CPU, without Ray; one a core."""
+    workers: str | None = None
+    """Who works: a number of processes on the CPU (one a core if left out), ray for every device of a Ray cluster, or
+    ray:N for N of them. RAY_ADDRESS names a running cluster."""
     policy: str | None = None
     """Controller to evaluate with, even another than the run's; by default the run's, unless its file has changed."""
     seed: int | None = None
     """Seed of the fresh episodes; the run's."""
-    worker_limit_s: float = 300.0
-    """A Ray worker that gets no further for so many seconds is given up."""
 
 
 def reevaluate_run(args: ReevaluateCfg, *, open_evaluator: Open = open_evaluator) -> Archive:

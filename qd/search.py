@@ -15,7 +15,7 @@ from qd.run.progress import ProgressBar, clock, plan
 from qd.run.resuming import code_of
 from qd.run.settings import SearchCfg, as_settings
 from qd.show.figures import summary, write_figures
-from qd.workers.evaluator import Evaluate, crew_status, episode_seeds, open_evaluator, origin_of
+from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, worker_status
 from sim.files.atomic import to_json, write_atomically
 
 if TYPE_CHECKING:
@@ -49,12 +49,12 @@ def search_terrains(
             row |= _look_again(cfg, found, evaluate)
         ended = time.perf_counter()
         wall_s = ended - began  # from the end of the iteration before, so saving counts
-        crew = crew_status(evaluate)
-        staff = {"workers": crew.workers, "retries": crew.retries} if crew else {}
-        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **staff})
+        workers = worker_status(evaluate)
+        counts = {"workers": workers.workers, "retries": workers.retries} if workers else {}
+        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **counts})
         began = ended
         run.save(as_settings(cfg), search, metrics, found)
-        bar.show(metrics[-1], None if crew is None else str(crew))
+        bar.show(metrics[-1], None if workers is None else str(workers))
 
 
 def take_in(
@@ -135,7 +135,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
             raise ValueError(
                 f"iterations must be at least {done}, as many as {job.path} has done, got {cfg.iterations}"
             )
-        print(plan(cfg, job.path, done, job.device, job.evaluator.processes), flush=True)
+        print(plan(cfg, job.path, done, job.device, job.evaluator.num_workers), flush=True)
         _mention_fresh_values(job, run, done)
         with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(job)):
             with open_evaluator(job.evaluator) if done < cfg.iterations else nullcontext() as evaluate:

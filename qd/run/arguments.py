@@ -68,19 +68,14 @@ class Arguments:
     """Weight of the share of episodes without collision in the fitness."""
     reevaluate_every: int | None = None
     """Every so many iterations, look at up to 200 elites again in 40 fresh episodes; 0: never."""
-    processes: int | None = None
-    """Processes on the CPU, without Ray; one a core."""
-    workers: int | Literal["auto"] | None = None
-    """Search on so many Ray workers, a GPU or a CPU core each; auto: as many as there are. RAY_ADDRESS names a running
-    cluster; without it they are this machine's."""
-    worker_limit_s: float = 300.0
-    """A Ray worker that gets no further for so many seconds is given up, and its terrains go to another; building its
-    simulation has a limit of its own."""
+    workers: str | None = None
+    """Who works: a number of processes on the CPU (one a core if left out), ray for every device of a Ray cluster, or
+    ray:N for N of them. RAY_ADDRESS names a running cluster."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
     """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
 
 
-_PLACED = ("device", "processes", "workers", "worker_limit_s")
+_PLACED = ("device", "workers")
 _NOT_SETTINGS = (*_PLACED, "robot", "resume", "run_dir", "without", "reproduce")
 
 
@@ -191,9 +186,7 @@ def evaluator_of(
         num_terrains=cfg.scheduler.num_terrains * (runs_on_gpu if device.startswith("cuda") else 1),
         num_replicas=cfg.replicas,
         device=device,
-        num_processes=args.processes,
         workers=args.workers,
-        worker_limit_s=args.worker_limit_s,
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qd.archive import ARCHIVE_FILE, read_archive
-from sim.policy.names import controller_suffix
+from sim.policy.spec import controller_suffix
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg

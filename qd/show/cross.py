@@ -15,8 +15,7 @@ from qd.show.video import OWN_FOLDER
 from qd.workers.evaluator import check_policy, origin_of, resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.intervals import rate_words, wilson_interval
-from sim.policy.names import who_crossed
-from sim.policy.spec import ControllerSpec
+from sim.policy.spec import ControllerSpec, who_crossed
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
@@ -110,7 +109,7 @@ def _outputs(cfg: CrossCfg, who: str) -> tuple[Path, Path]:
 
 
 def _about(cfg: CrossCfg, robot: str, terrain: OwnTerrain, policy: str) -> dict[str, Any]:
-    from sim.files.provenance import controller_hash
+    from sim.policy.spec import controller_hash
 
     return {
         "robot": robot,

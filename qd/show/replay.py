@@ -18,8 +18,7 @@ from qd.show.paths_figure import draw_paths
 from qd.workers.evaluator import check_policy, episode_seeds, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.intervals import rate_words
-from sim.policy.names import is_same
-from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
+from sim.policy.spec import SHIPPED, ControllerSpec, is_same, spec_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

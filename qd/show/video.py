@@ -17,8 +17,7 @@ from qd.show.replay import as_searched
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import chosen_elites
-from sim.policy.names import who_crossed
-from sim.policy.spec import spec_of
+from sim.policy.spec import spec_of, who_crossed
 
 if TYPE_CHECKING:
     from sim.recording.recorder import Recording

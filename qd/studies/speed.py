@@ -141,7 +141,7 @@ def measure(args: Arguments) -> dict[str, Any]:
     Raises:
         ValueError: If something asked for cannot be had.
     """
-    from sim.bench.bare import measure_bare_physics
+    from sim.bench.physics import measure_bare_physics
     from sim.robots.robot import get_robot, robot_of
 
     if min(args.iterations, args.steps) < 1 or any(count < 1 or count % _CURVE_REPLICAS for count in args.curve):

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from numpy.typing import NDArray
 
+from sim.files.command import UserError
+
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
 
-class EvaluatorError(RuntimeError):
+class EvaluatorError(UserError):
     """The evaluation cannot go on; what was saved before is whole."""
 
 

@@ -1,19 +1,13 @@
-"""What solver and capacity options cost and change: ``python -m sim.bench.options --robot anymal``.
-
-The same crossings of hard-random terrains under each choice: wall time, rates, mean penalties.
-"""
+"""What solver and capacity options cost and change: the same crossings under each choice."""
 
 import statistics
-import sys
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
-from sim.files.command import exit_code_of, publish
+from sim.commands import SolverOptions
 from sim.files.provenance import provenance
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
@@ -21,45 +15,14 @@ from sim.simulation import SolverCfg, resolve_device
 from sim.terrain import hard_random_genes
 
 
-@dataclass(frozen=True, kw_only=True)
-class OptionsCfg:
-    """Time the crossings of the paper preset under several solver and capacity options."""
-
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    policy: str | None = None
-    """An rsl_rl checkpoint, a TorchScript or ONNX file, or module:callable; the shipped controller."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
-    terrains: int = 200
-    """Hard-random terrains."""
-    episodes: int = 20
-    """Episodes a terrain."""
-    iterations: tuple[int, ...] = (3, 4, 5, 6, 8, 50)
-    """Caps on the Newton iterations to try."""
-    ls_iterations: tuple[int, ...] = (10,)
-    """Caps on the line search to try with each."""
-    njmax: tuple[int, ...] = ()
-    """Constraint rows an environment to try with the shipped caps, beside the robot's own."""
-    nconmax: tuple[int, ...] = ()
-    """Contacts an environment to try with each of them, as many as --njmax."""
-    rounds: int = 3
-    """Rollouts of each choice; the median counts."""
-    seed: int = 0
-    """Draws terrains and starts."""
-    out: Path | None = None
-    """Where to write; printed alone if left out."""
-
-
-def choices(cfg: OptionsCfg, robot: RobotCfg) -> list[tuple[SolverCfg, RobotCfg]]:
+def choices(cfg: SolverOptions, robot: RobotCfg) -> list[tuple[SolverCfg, RobotCfg]]:
     """Every choice of solver options, then of capacities.
 
     Raises:
-        ValueError: If capacities do not come in pairs, or a number is not positive.
+        ValueError: If capacities do not come in pairs, or there is nothing to try.
     """
-    numbers = (*cfg.iterations, *cfg.ls_iterations, *cfg.njmax, *cfg.nconmax, cfg.rounds, cfg.terrains, cfg.episodes)
-    if min(numbers) < 1 or not ((cfg.iterations and cfg.ls_iterations) or cfg.njmax):
-        raise ValueError(f"all numbers must be positive, and there must be a choice to try, got {cfg}")
+    if not (cfg.iterations and cfg.ls_iterations) and not cfg.njmax:
+        raise ValueError("there must be a choice to try, got none: give --iterations or --njmax")
     if len(cfg.njmax) != len(cfg.nconmax):
         raise ValueError(f"--nconmax needs as many numbers as --njmax, got {cfg.nconmax} and {cfg.njmax}")
     found = [
@@ -88,7 +51,7 @@ def _cell(value: float | None, form: str) -> str:
     return format("-", f">{width}") if value is None else format(value, form)
 
 
-def measure(cfg: OptionsCfg) -> dict[str, Any]:
+def measure(cfg: SolverOptions) -> dict[str, Any]:
     """Everything of the results file.
 
     Raises:
@@ -127,7 +90,8 @@ def measure(cfg: OptionsCfg) -> dict[str, Any]:
     return {**provenance(device, cfg.seed), "robot": robot.name, "episodes": cfg.terrains * cfg.episodes, "rows": rows}
 
 
-def _print_table(report: dict[str, Any]) -> None:
+def print_rows(report: dict[str, Any]) -> None:
+    """Prints a row a choice."""
     names = list(report["rows"][0]["penalties"])
     head = f"{'iterations':>10} {'search':>6} {'rows':>5} {'contacts':>8} {'wall s':>7} {'M steps/s':>9}"
     print(f"{head} {'success':>7} {'goal':>6} {'invalid':>7} " + " ".join(f"{name:>13}" for name in names))
@@ -138,19 +102,3 @@ def _print_table(report: dict[str, Any]) -> None:
             f"{_cell(row['success_rate'], '7.4f')} {_cell(row['goal_rate'], '6.4f')} {row['invalid']:>7} "
             + " ".join(_cell(row["penalties"][name], "13.4f") for name in names)
         )
-
-
-def run(cfg: OptionsCfg) -> int:
-    """Measure, print the table, write the file; returns the exit status."""
-    publish(cfg.out, lambda: measure(cfg), _print_table)
-    return 0
-
-
-def main() -> int:
-    """Command line; returns the exit status."""
-    cfg = tyro.cli(OptionsCfg, description=__doc__)
-    return exit_code_of(lambda: run(cfg))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

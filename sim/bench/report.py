@@ -1,59 +1,128 @@
 """The benchmark as a whole: scene, rows, shares of the step, and the table."""
 
 import re
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+import warp as wp
+
 from sim.bench.cases import Case, make_cases
-from sim.bench.ceiling import BOUND_BY_RULE, measure_ceiling
+from sim.bench.ceiling import BOUND_BY_RULE, Ceiling, measure_ceiling
 from sim.bench.checks import Truth
-from sim.bench.measure import measure_case
+from sim.bench.physics import measure_step
 from sim.bench.scene import SceneCfg, build_scene
-from sim.bench.step import measure_step
-from sim.bench.timing import TimingCfg
-from sim.policy.loaders import prepare_torch
+from sim.bench.timing import TimingCfg, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns
+from sim.commands import Bench
+from sim.policy.loaders import prepare_torch, reason_of
 from sim.robots.robot import RobotCfg
+
+_FLUSH_BYTES = 256 << 20
+"""More than any cache holds."""
+_FLUSHED_LAUNCHES = 20
+
+
+def _torch_variant(call: Callable[..., Any], case: Case, device: str, timing: TimingCfg) -> Variant:
+    make = partial(repeat_torch, partial(call, *case.arguments), device=device)
+    return fit_launches(make, device, timing)
+
+
+def compile_variant(case: Case, device: str, timing: TimingCfg) -> tuple[Variant | None, str | None]:
+    """The counterpart through ``torch.compile``, or why there is none.
+
+    A compiler can fail with anything (on the CPU it needs one for C++): the column is then empty and says why.
+    """
+    try:
+        compiled = torch.compile(case.counterpart, dynamic=False, fullgraph=True)
+        return _torch_variant(compiled, case, device, timing), None
+    except Exception as error:
+        return None, f"{type(error).__name__}: {reason_of(error)}"[:300]
+
+
+def _time_cold(case: Case, device: str, timing: TimingCfg) -> float:
+    """Seconds a launch with the caches overwritten before each: its inputs come from memory, as in a whole step.
+
+    The time of overwriting alone is subtracted.
+    """
+    flushed: Any = wp.zeros(_FLUSH_BYTES // 4, dtype=float, device=device)
+
+    def flush_and_launch() -> None:
+        flushed.zero_()
+        case.launch()
+
+    pair = {
+        "both": repeat_warp(flush_and_launch, _FLUSHED_LAUNCHES, device),
+        "flush": repeat_warp(flushed.zero_, _FLUSHED_LAUNCHES, device),
+    }
+    seconds = time_in_turns(pair, device, timing)
+    return seconds["both"] - seconds["flush"]
+
+
+def measure_case(case: Case, ceiling: Ceiling, device: str, timing: TimingCfg, *, compiled: bool) -> dict[str, Any]:
+    """One row of the results.
+
+    Args:
+        case: The kernel.
+        ceiling: What the device can do.
+        device: Warp device name.
+        timing: How long.
+        compiled: Whether to compile the counterpart too.
+
+    Raises:
+        OutputError: If an output of any variant is not what the oracle says.
+    """
+    case.check_ours()
+    variants = {"torch": _torch_variant(case.counterpart, case, device, timing)}
+    compiled_variant, failure = compile_variant(case, device, timing) if compiled else (None, "not asked for")
+    if compiled_variant is not None:
+        variants["torch_compile"] = compiled_variant
+    for name, variant in variants.items():
+        variant.replay()
+        case.check_torch(name, variant.outputs[0])
+    variants["ours"] = fit_launches(partial(repeat_warp, case.launch, device=device), device, timing)
+    seconds = time_in_turns(variants, device, timing)
+    case.check_ours()  # and still after all those launches
+    cold = max(_time_cold(case, device, timing), seconds["ours"]) if device.startswith("cuda") else None
+    by_compile = seconds.get("torch_compile")
+    return {
+        "kernel": case.name,
+        "ours_ms": seconds["ours"] * 1e3,
+        "torch_ms": seconds["torch"] * 1e3,
+        "torch_compile_ms": None if by_compile is None else by_compile * 1e3,
+        "speedup": seconds["torch"] / seconds["ours"],
+        "speedup_compile": None if by_compile is None else by_compile / seconds["ours"],
+        **asdict(ceiling.judge(case.work, seconds["ours"])),
+        "ours_cold_ms": None if cold is None else cold * 1e3,
+        "per_control_step": case.per_control_step,
+        "part_of": case.part_of,
+        "torch_compile_failure": failure,
+        **asdict(case.work),
+    }
+
 
 _RUNS = Path("runs") / "bench"  # a measurement made in passing does not replace the published one
 
 
-@dataclass(frozen=True, kw_only=True)
-class BenchCfg:
-    """What is measured, and for how long."""
-
-    scene: SceneCfg
-    timing: TimingCfg
-    compiled: bool = True
-    """Whether to measure torch.compile."""
-    heightfield: bool = True
-    """Whether to measure the solver's own heightfield collision."""
-    replays: int = 3
-    """Rounds of the replayed crossings, of which the median counts."""
-
-
-def preset(device: str, *, seed: int) -> BenchCfg:
-    """The sizes of the paper's iteration on CUDA, those of one CPU process otherwise."""
-    if device.startswith("cuda"):
-        return BenchCfg(scene=SceneCfg(num_envs=4096, num_terrains=200, seed=seed), timing=TimingCfg())
-    return BenchCfg(
-        scene=SceneCfg(num_envs=16, num_terrains=8, seed=seed), timing=TimingCfg(rounds=10, replay_s=10e-3), replays=5
+def sizes_of(cfg: Bench, device: str) -> tuple[SceneCfg, TimingCfg]:
+    """The sizes asked for; else those of the paper's iteration on CUDA, of one CPU process otherwise."""
+    on_gpu = device.startswith("cuda")
+    scene = SceneCfg(
+        num_envs=cfg.num_envs or (4096 if on_gpu else 16),
+        num_terrains=cfg.num_terrains or (200 if on_gpu else 8),
+        walk_s=cfg.walk_s,
+        duration_s=cfg.duration_s,
+        seed=cfg.seed,
     )
+    return scene, TimingCfg(rounds=cfg.rounds or (20 if on_gpu else 10), replay_s=2e-3 if on_gpu else 10e-3)
 
 
 def file_of(device_name: str) -> Path:
     """Where numbers go by default: ``runs/bench/nvidia-h200.json`` for an NVIDIA H200, ``cpu.json`` for any CPU."""
     name = "cpu" if device_name.startswith("CPU") else re.sub(r"[^a-z0-9]+", "-", device_name.lower()).strip("-")
     return _RUNS / f"{name}.json"
-
-
-def _measure_rows(cases: list[Case], cfg: BenchCfg, device: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    ceiling = measure_ceiling(device, cfg.timing)
-    rows = []
-    for case in cases:
-        rows.append(measure_case(case, ceiling, device, cfg.timing, compiled=cfg.compiled))
-        print(f"  {case.name}: checked and timed", flush=True)
-    return rows, asdict(ceiling)
 
 
 def add_shares(rows: list[dict[str, Any]], step_ms: float) -> float:
@@ -67,34 +136,40 @@ def add_shares(rows: list[dict[str, Any]], step_ms: float) -> float:
     return sum(row["share_of_step"] for row in rows if row["part_of"] is None)
 
 
-def measure(robot: RobotCfg, cfg: BenchCfg, device: str) -> dict[str, Any]:
-    """Check and time everything.
+def measure(robot: RobotCfg, cfg: Bench, device: str) -> dict[str, Any]:
+    """Checks and times everything.
 
     Args:
         robot: Robot settings.
-        cfg: Sizes and durations.
+        cfg: Options of the command.
         device: Warp device name.
 
     Returns:
-        What the results file holds beside where it comes from.
+        The results file without its provenance.
 
     Raises:
         OutputError: If a kernel or its counterpart disagrees with the oracle; nothing is reported then.
     """
+    sizes, timing = sizes_of(cfg, device)
     prepare_torch(device)
-    print(f"walking {cfg.scene.num_envs} robots on {cfg.scene.num_terrains} terrains for {cfg.scene.walk_s:g} s")
-    scene = build_scene(robot, cfg.scene, device)
-    rows, ceiling = _measure_rows(make_cases(scene, Truth(scene)), cfg, device)
-    step, collision = measure_step(scene, rounds=cfg.replays, heightfield=cfg.heightfield)
+    print(f"walking {sizes.num_envs} robots on {sizes.num_terrains} terrains for {sizes.walk_s:g} s")
+    scene = build_scene(robot, sizes, device)
+    ceiling = measure_ceiling(device, timing)
+    rows = []
+    for case in make_cases(scene, Truth(scene)):
+        rows.append(measure_case(case, ceiling, device, timing, compiled=cfg.compile))
+        print(f"  {case.name}: checked and timed", flush=True)
+    replays = 3 if device.startswith("cuda") else 5
+    step, collision = measure_step(scene, rounds=replays, heightfield=cfg.heightfield)
     share = add_shares(rows, step["ours_ms"])
     return {
         "robot": robot.name,
-        "num_envs": cfg.scene.num_envs,
-        "num_terrains": cfg.scene.num_terrains,
+        "num_envs": sizes.num_envs,
+        "num_terrains": sizes.num_terrains,
         "rows": [*rows, step],
         "share_of_step": share,
         "bound_by_rule": BOUND_BY_RULE,
-        "ceiling": ceiling,
+        "ceiling": asdict(ceiling),
         "collision": collision,
     }
 

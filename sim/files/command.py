@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 
@@ -23,22 +23,34 @@ _DEBUG = "FAULTLINE_DEBUG"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Who:
-    """Options that say which robot, under which controller."""
+class OfRobot:
+    """The option that says which robot."""
 
     robot: str | None = None
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py); anymal if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Who(OfRobot):
+    """Options that say which robot, under which controller."""
+
     policy: str | None = None
     """Controller other than the robot's own: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
     module:callable, or file.py:adapter@FILE for a file that expects another observation."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Where:
-    """Options that say where a command works."""
+class OnDevice:
+    """The option that says on which device a command works."""
 
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Where(OnDevice):
+    """Options that say where a command works."""
+
     workers: str | None = None
     """Who works: a number of processes on the CPU (one a core if left out), ray for every device of a Ray cluster, or
     ray:N for N of them. RAY_ADDRESS names a running cluster."""
@@ -64,6 +76,13 @@ class Interrupted(KeyboardInterrupt):
 
 class _Command(Protocol):
     def execute(self) -> object: ...
+
+
+@runtime_checkable
+class _HasDefaults(Protocol):
+    """A command whose defaults follow from some of its flags, such as those of a robot that they name."""
+
+    def defaults(self, argv: Sequence[str]) -> Any: ...
 
 
 @contextmanager
@@ -96,15 +115,16 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
         name: The word that calls it.
 
     Returns:
-        Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user can mend
-        (ValueError, OSError, FloatingPointError, UserError); 130 for Ctrl-C and SIGTERM. FAULTLINE_DEBUG=1 shows the
-        traceback instead of the line.
+        Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user
+        can mend (ValueError, OSError, FloatingPointError, UserError); 130 for Ctrl-C and SIGTERM. FAULTLINE_DEBUG=1
+        shows the traceback instead of the line.
     """
     import tyro
 
     signal.signal(signal.SIGTERM, _interrupt)
-    command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv))
     try:
+        defaults = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
+        command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **defaults)
         status = command.execute()
         return status if isinstance(status, int) else 0
     except (ValueError, OSError, FloatingPointError, UserError) as error:

@@ -1,7 +1,6 @@
 """Where a result comes from: the keys that every results file carries."""
 
 import hashlib
-import importlib.util
 import os
 import platform
 import re
@@ -13,8 +12,6 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-from sim.policy.spec import ControllerSpec
 
 _ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
@@ -54,24 +51,6 @@ def code_fingerprint(rooms: Sequence[str]) -> str:
             if path.suffix in (".py", ".xml"):
                 digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
-
-
-def controller_hash(policy: str) -> str | None:
-    """SHA-256 of a controller's files, among them the module that a ``module:callable`` stands in; None without any.
-
-    What code reads beside its own file is not in it.
-    """
-    spec = ControllerSpec.parse(policy)
-    if spec.place is None or spec.place.endswith(".py"):
-        return spec.digest()
-    try:
-        module = importlib.util.find_spec(spec.place)
-    except (ImportError, ValueError):  # no package of that name
-        module = None
-    if module is None or module.origin is None or not os.path.isfile(module.origin):
-        return None
-    digest = hashlib.sha256(Path(module.origin).read_bytes()).hexdigest()
-    return digest if spec.file is None else f"{digest} {spec.digest()}"
 
 
 def _command() -> str:

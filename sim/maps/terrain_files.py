@@ -1,11 +1,17 @@
 """Terrains as files that other programs read: npz, 16-bit PNG, MJCF and STL, each with what it means in a JSON beside.
 
 All lengths are metres; x runs along the course (0 to 16 m), y across it (0 to 8 m), z up.
+
+MuJoCo cuts every cell of a heightfield from its (low x, low y) to its (high x, high y) corner, for contacts as for
+rays; ours are cut from (low x, high y) to (high x, low y) (:mod:`kernels.heightfield`). On a grid that is turned by a
+quarter the one cut is the other, so our grids are handed over on their side, their columns along MuJoCo's rows: then
+both have the same surface, between the nodes too.
 """
 
 import io
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +20,45 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files.atomic import to_json, write_atomically
-from sim.maps.hfield import as_hfield
 from sim.simulation import GROUND_FRICTION
 from sim.terrain import SPACING
+
+_QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+_FLAT_EXTENT = 1e-3  # of flat ground, where data are all 0: a size may not be
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hfield:
+    """What an ``hfield`` asset and the ``geom`` that shows it need; world axes are those of the height grid."""
+
+    data: NDArray[np.float64]
+    """0 to 1, as in ``MjModel.hfield_data``; an asset's ``elevation`` has its rows in reverse."""
+    size: tuple[float, float, float, float]
+    """Half lengths along the asset's x and y, height of data 1, thickness below data 0 [m]."""
+    position: tuple[float, float, float]
+    """Of the geom [m]."""
+    quaternion: tuple[float, float, float, float] = _QUARTER_TURN
+    """Of the geom, w x y z: its x axis is the grid's y, its y axis the grid's -x."""
+
+
+def as_hfield(heights: NDArray[np.floating], *, margin: int = 0, thickness: float = 1.0) -> Hfield:
+    """A height grid as a heightfield with the same surface.
+
+    Args:
+        heights: [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`; node (0, 0) stands at x = y = 0.
+        margin: Nodes of edge height to add on every side.
+        thickness: Of the ground below its lowest point [m].
+    """
+    grid = np.pad(np.asarray(heights, dtype=np.float64), margin, mode="edge")
+    lowest, extent = float(grid.min()), float(np.ptp(grid)) or _FLAT_EXTENT
+    half_y, half_x = (0.5 * SPACING * (count - 1) for count in grid.shape)
+    centre_y, centre_x = (0.5 * SPACING * (count - 1) for count in heights.shape)
+    return Hfield(
+        data=((grid - lowest) / extent).T[::-1],
+        size=(half_y, half_x, extent, thickness),
+        position=(centre_x, centre_y, lowest),
+    )
+
 
 Heights = NDArray[np.floating]
 
@@ -60,8 +102,8 @@ def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None) -> bytes
 def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:
     """A scene of the terrain alone, in one file: its surface is the simulation's, between the nodes too.
 
-    The geom stands turned by a quarter, for the reason that :mod:`sim.maps.hfield` gives; x, y and z of the world are the
-    terrain's. Its friction is below every robot's own: of two MuJoCo takes the larger.
+    The geom stands turned by a quarter; x, y and z of the world are the terrain's. Its friction is below every robot's
+    own: of two MuJoCo takes the larger.
     """
     field = as_hfield(heights)
     root = ET.Element("mujoco", model=name)

@@ -1,31 +1,26 @@
-"""Do terrains break the controller in another simulator too? ``python -m sim.mujoco_c.crosscheck --robot anymal``.
-
-Of a pool of terrains, those are taken on which a first set of episodes succeeds in 30 to 90 %, or those that
-``--elite`` names. On each of them fresh episodes are then held against more of plain MuJoCo C: the same robot file,
-height grid, controller and starts, but MuJoCo's own heightfield contact, a converged solver, and a second
-implementation of everything round it.
-"""
+"""Whether terrains break the controller in plain MuJoCo C too: the choice of terrains, and the comparison."""
 
 import json
 import os
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.bank import TerrainBank
-from sim.files.command import chosen_elites, exit_code_of, publish
+from sim.commands import Crosscheck
+from sim.files.command import chosen_elites
+from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
 from sim.files.provenance import provenance
-from sim.mujoco_c.agreement import Pair, summarise
-from sim.mujoco_c.crossing import draw_starts
+from sim.files.settings import check
+from sim.mujoco_c.crossing import draw_starts, run_plain
 from sim.mujoco_c.model import crossing_model
-from sim.mujoco_c.processes import run_plain
 from sim.policy.spec import ControllerSpec
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
@@ -36,45 +31,6 @@ _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
 _FINE_DT = 0.001
 _FINE_TIME_CONSTANT_S = 0.003
-
-
-@dataclass(frozen=True, kw_only=True)
-class CrosscheckCfg:
-    """Hold the crossings of the parallel simulation against the same crossings in plain MuJoCo C.
-
-    The full check is 20 terrains x 200 episodes of MuJoCo: half an hour on two cores, two minutes on 16. Look at the
-    cheap one first: --terrains 4 --plain-episodes 20.
-    """
-
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    policy: str | None = None
-    """A checkpoint, a TorchScript or ONNX file, file.py:callable or module:callable; the shipped controller."""
-    device: str | None = None
-    """Of the parallel simulation: cpu, cuda or cuda:N; CUDA where there is one. Plain MuJoCo always runs on the CPU."""
-    genes: Path | None = None
-    """Pool of terrains: an archive.npz, or any .npz with genes (num_terrains, 64); drawn hard-random if left out."""
-    elite: str | None = None
-    """Exactly these of --genes instead of a choice by success rates: one number, several as in --elite "97 124", or
-    all; --terrains and --between then count for nothing."""
-    terrains: int = 20
-    """Terrains to compare on."""
-    between: tuple[float, float] = (0.3, 0.9)
-    """Success rate in the first set of episodes that a terrain must have."""
-    episodes: int = 20
-    """Episodes a terrain of the parallel simulation, in the first set and in the fresh one."""
-    plain_episodes: int = 200
-    """Episodes a terrain of plain MuJoCo; the first of them begin exactly as the fresh ones do."""
-    fine: Literal["neither", "mujoco", "both"] = "neither"
-    """Who resolves its contacts: steps of 1 ms, a time constant of 3 ms, five times the work. With the file's own 5
-    and 10 ms, feet sink into the ground and MuJoCo's heightfield holds them by the facets beside. `both` compares the
-    simulators, `mujoco` what the file's settings come to."""
-    processes: int | None = None
-    """Processes of plain MuJoCo; one a core."""
-    seed: int = 0
-    """Draws pool, choice and starts."""
-    out: Path | None = None
-    """Where to write; printed alone if left out."""
 
 
 def read_pool(path: Path) -> NDArray[np.float32]:
@@ -125,23 +81,16 @@ class Choice:
     """Terrains of the pool that were tried."""
 
 
-class Crosscheck:
-    """One comparison: the pool, the choice, both simulators."""
+class Comparison:
+    """The pool, the choice, both simulators."""
 
-    def __init__(self, cfg: CrosscheckCfg) -> None:
+    def __init__(self, cfg: Crosscheck) -> None:
         """Read and load everything.
 
         Raises:
             ValueError: If something asked for cannot be had.
         """
-        low, high = cfg.between
-        if not 0.0 <= low < high <= 1.0 or min(cfg.terrains, cfg.episodes, cfg.plain_episodes) < 1:
-            raise ValueError(
-                "terrains, episodes and plain-episodes must be positive and between two rising rates, got "
-                f"{cfg.terrains}, {cfg.episodes}, {cfg.plain_episodes} and {cfg.between}"
-            )
-        if (cfg.processes is not None and cfg.processes < 1) or cfg.seed < 0:
-            raise ValueError(f"processes must be at least 1 and seed at least 0, got {cfg.processes} and {cfg.seed}")
+        check(cfg)
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)
         crossing_model(self.robot, np.zeros((2, 2)))  # MuJoCo must read it too
@@ -161,7 +110,7 @@ class Crosscheck:
         if cfg.elite is None:
             return None
         if self._pool is None:
-            raise ValueError(f"--elite {cfg.elite!r} names terrains of a pool: say which (--genes, or GENES= of make)")
+            raise ValueError(f"--elite {cfg.elite!r} names terrains of a pool: give the pool too (--genes)")
         index = chosen_elites(cfg.elite, len(self._pool), cfg.genes)
         return Choice(genes=self._pool[index], index=index, first=[None] * len(index), looked_at=0)
 
@@ -231,7 +180,7 @@ class Crosscheck:
             for grid, seed in zip(heights, seeds, strict=True)
         ]
         simulated, plain_time_constant_s = self._resolved(cfg.fine != "neither")
-        processes = cfg.processes or os.cpu_count() or 1
+        processes = cfg.workers or os.cpu_count() or 1
         plain = run_plain(
             simulated, str(self.policy), heights, starts, processes=processes, time_constant_s=plain_time_constant_s
         )
@@ -256,42 +205,103 @@ class Crosscheck:
         }
 
 
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """Crossings of one terrain in both simulators."""
+
+    index: int
+    """Where the terrain stands in its pool."""
+    first: float | None
+    """Success rate of the set of episodes by which the terrain was chosen; None if it was named."""
+    ours: NDArray[np.uint8]
+    """:class:`kernels.episode.Outcome` of the parallel simulation, shape (num_episodes,)."""
+    plain: NDArray[np.uint8]
+    """The same of plain MuJoCo, shape (num_plain_episodes,)."""
+
+
+def _hits(outcome: NDArray[np.uint8], kind: str) -> tuple[int, int]:
+    """Episodes that count as a hit, and valid ones."""
+    valid = outcome[outcome != Outcome.INVALID]
+    hit = valid != Outcome.BASE_COLLISION if kind == "success" else valid == Outcome.GOAL
+    return int(hit.sum()), len(valid)
+
+
+def _compare(pair: Pair, kind: str) -> dict[str, Any]:
+    hits, count = _hits(pair.ours, kind)
+    plain_hits, plain_count = _hits(pair.plain, kind)
+    low, high = wilson_interval(hits, count)
+    plain_rate = plain_hits / plain_count
+    return {
+        "ours": hits / count,
+        "interval": [low, high],
+        "mujoco_c": plain_rate,
+        "mujoco_c_interval": list(wilson_interval(plain_hits, plain_count)),
+        "inside": low <= plain_rate <= high,
+    }
+
+
+def summarise(pairs: Sequence[Pair], seed: int) -> dict[str, Any]:
+    """Rates side by side, a row a terrain, and the bias of the mean: MuJoCo C's rate minus ours.
+
+    Args:
+        pairs: One a terrain.
+        seed: Of the bootstrap over terrains.
+
+    Raises:
+        ValueError: If no terrain has a valid episode in both; one that has none is left out and named.
+    """
+    left_out = [pair.index for pair in pairs if not _hits(pair.ours, "goal")[1] or not _hits(pair.plain, "goal")[1]]
+    invalid = {
+        "ours": int(sum((pair.ours == Outcome.INVALID).sum() for pair in pairs)),
+        "mujoco_c": int(sum((pair.plain == Outcome.INVALID).sum() for pair in pairs)),
+    }
+    pairs = [pair for pair in pairs if pair.index not in left_out]
+    if not pairs:
+        raise ValueError("no terrain has a valid episode in both simulators: nothing to compare")
+    rows = [
+        {
+            "index": pair.index,
+            "first_success": pair.first,
+            "episodes": [len(pair.ours), len(pair.plain)],
+            "success": _compare(pair, "success"),
+            "goal": _compare(pair, "goal"),
+        }
+        for pair in pairs
+    ]
+    totals = {}
+    for kind in ("success", "goal"):
+        ours = np.array([row[kind]["ours"] for row in rows])
+        plain = np.array([row[kind]["mujoco_c"] for row in rows])
+        totals[kind] = {
+            "inside": int(sum(row[kind]["inside"] for row in rows)),
+            "ours": float(ours.mean()),
+            "mujoco_c": float(plain.mean()),
+            "bias": float((plain - ours).mean()),
+            "bias_interval": bootstrap_interval(plain - ours, np.random.default_rng(seed)),
+        }
+    return {**totals, "invalid": invalid, "left_out": left_out, "terrains": rows}
+
+
 def _settings(robot: RobotCfg, time_constant_s: float | None) -> dict[str, Any]:
     return {"physics_dt": robot.physics_dt, "time_constant_s": time_constant_s or "of the robot's file"}
 
 
-def _print_table(report: dict[str, Any]) -> None:
-    print(f"{'terrain':>7} {'success: ours':>22} {'MuJoCo C':>9} {'':>8} {'goal: ours':>19} {'MuJoCo C':>9}")
+def print_comparison(report: dict[str, Any]) -> None:
+    """Prints a row a terrain, and the means."""
+    print(f"{'terrain':>7} {'success: ours':>22} {'MuJoCo C':>9} {'':>8} {'goal: ours':>22} {'MuJoCo C':>9}")
     for row in report["terrains"]:
         cells = [f"{row['index']:>7}"]
         for kind in ("success", "goal"):
-            low, high = row[kind]["interval"]
-            cells.append(f"{row[kind]['ours']:>8.2f} [{low:.2f} {high:.2f}] {row[kind]['mujoco_c']:>9.2f}")
+            ours = value_words(row[kind]["ours"], row[kind]["interval"], ".2f")
+            cells.append(f"{ours:>22} {row[kind]['mujoco_c']:>9.2f}")
             cells.append("inside  " if row[kind]["inside"] else "outside ")
         print(" ".join(cells))
     for kind in ("success", "goal"):
         total = report[kind]
-        low, high = total["bias_interval"]
+        bias = value_words(total["bias"], total["bias_interval"], "+.3f")
         print(
             f"{kind}: {total['inside']} of {len(report['terrains'])} rates of MuJoCo C inside our interval; mean "
-            f"{total['ours']:.3f} against {total['mujoco_c']:.3f}, bias {total['bias']:+.3f} [{low:+.3f} {high:+.3f}]"
+            f"{total['ours']:.3f} against {total['mujoco_c']:.3f}, bias {bias}"
         )
     print(f"invalid episodes: {report['invalid']}")
     print("mean penalties: " + json.dumps(report["penalties"]))
-
-
-def run(cfg: CrosscheckCfg) -> int:
-    """Compare, print the table, write the file; returns the exit status."""
-    check = Crosscheck(cfg)
-    publish(cfg.out, check.run, _print_table)
-    return 0
-
-
-def main() -> int:
-    """Command line; returns the exit status."""
-    cfg = tyro.cli(CrosscheckCfg, description=__doc__)
-    return exit_code_of(lambda: run(cfg))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

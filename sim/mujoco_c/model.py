@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
-from sim.maps.hfield import as_hfield
+from sim.maps.terrain_files import as_hfield
 from sim.robots.robot import RobotCfg
 from sim.simulation import GROUND_FRICTION
 from sim.terrain import SPACING

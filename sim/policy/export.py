@@ -1,41 +1,21 @@
-"""Write a controller as one ONNX file: ``python -m sim.policy.export --policy FILE --robot anymal --out policy.onnx``."""
+"""Controllers written as ONNX files, each compared with its original."""
 
-import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from onnx import TensorProto, helper, numpy_helper
 
 from sim.files.atomic import prepare_output, write_atomically
-from sim.files.command import exit_code_of
 from sim.policy.loaders import MlpPolicy, load_policy, prepare_torch
 from sim.policy.onnx_file import OnnxPolicy, load_onnx, onnx_policy, seal
-from sim.robots.robot import get_robot
+from sim.robots.robot import RobotCfg
 
 INPUT, OUTPUT = "observation", "action"
 TOLERANCE = 1e-5
 """How far actions may be from the original's, as a part of the largest action (of 1 if that is smaller)."""
 _OPSET, _IR_VERSION = 17, 8  # of 2022: what runs on robots is rarely new
 _BATCHES = (1, 64)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportCfg:
-    """Write a controller as one ONNX file, weights inside, for any batch size.
-
-    Input `observation` (batch, observation_size) and output `action` (batch, num_joints), float32; the row and what
-    actions mean stand in the README under "Your own controller". The file is loaded back and held against the original.
-    """
-
-    policy: str | None = None
-    """An rsl_rl checkpoint (.pt), such as the policy.pt of a training run; the shipped controller of the robot."""
-    robot: str = "anymal"
-    """Which robot the controller walks."""
-    out: Path = Path("policy.onnx")
-    """File to write; one that is there is replaced once the new one is known to be right."""
 
 
 def to_onnx(policy: MlpPolicy) -> bytes:
@@ -124,32 +104,22 @@ def _difference(policy: MlpPolicy, exported: OnnxPolicy, path: Path) -> float:
     return largest
 
 
-def export(cfg: ExportCfg) -> int:
-    """Export as told; returns the exit status.
+def read_checkpoint(policy: str | None, robot: RobotCfg) -> MlpPolicy:
+    """A robot's controller that can be written as ONNX, on the CPU.
+
+    Args:
+        policy: An rsl_rl checkpoint; the shipped controller if None.
+        robot: The robot it walks.
 
     Raises:
-        ValueError: If the controller is no rsl_rl checkpoint of the robot, or cannot be written.
+        ValueError: If it is another kind of controller.
     """
-    robot = get_robot(cfg.robot)
-    spec = cfg.policy or str(robot.policy_file)
+    spec = policy or str(robot.policy_file)
     prepare_torch("cpu")
-    policy = load_policy(spec, robot, "cpu")
-    if not isinstance(policy, MlpPolicy):
+    found = load_policy(spec, robot, "cpu")
+    if not isinstance(found, MlpPolicy):
         raise ValueError(
             f"policy '{spec}' must be an rsl_rl checkpoint (.pt with actor_state_dict), got another kind of "
-            f"controller ({type(policy).__name__}): export it with the tool that made it, its first axis dynamic"
+            f"controller ({type(found).__name__}): export it with the tool that made it, its first axis dynamic"
         )
-    apart = export_onnx(policy, cfg.out)
-    sizes = f"{INPUT} (batch, {policy.sizes[0]}) -> {OUTPUT} (batch, {policy.sizes[1]})"
-    print(f"Written to {cfg.out}: {sizes}, {cfg.out.stat().st_size / 1e6:.2f} MB.")
-    print(f"Loaded back, its actions are within {apart:.1g} of the original's. Try it: --policy {cfg.out}")
-    return 0
-
-
-def main() -> int:
-    """Command line; returns the exit status."""
-    return exit_code_of(lambda: export(tyro.cli(ExportCfg)))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return found

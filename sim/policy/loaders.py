@@ -12,10 +12,9 @@ import torch
 import warp as wp
 
 from sim.files.atomic import check_zip
-from sim.policy.named_code import find_named
 from sim.policy.onnx_file import load_onnx
 from sim.policy.runner import action_problem
-from sim.policy.spec import ControllerSpec
+from sim.policy.spec import ControllerSpec, find_named
 from sim.robots.robot import RobotCfg
 
 _FORMATS = (

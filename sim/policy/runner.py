@@ -6,7 +6,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from sim.policy.named_code import in_one_line
+from sim.policy.spec import in_one_line
 
 
 def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:

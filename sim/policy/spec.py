@@ -1,10 +1,16 @@
 """How a controller is named on a command line: a file, code, or code that adapts a file."""
 
 import hashlib
+import importlib
+import importlib.util
+import os
 import re
+import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -80,3 +86,134 @@ class ControllerSpec:
 def spec_of(policy: str, robot: "RobotCfg") -> str:
     """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
     return str(robot.policy_file) if policy == SHIPPED else policy
+
+
+def controller_hash(policy: str) -> str | None:
+    """SHA-256 of a controller's files, among them the module that a ``module:callable`` stands in; None without any.
+
+    What code reads beside its own file is not in it.
+    """
+    spec = ControllerSpec.parse(policy)
+    if spec.place is None or spec.place.endswith(".py"):
+        return spec.digest()
+    try:
+        module = importlib.util.find_spec(spec.place)
+    except (ImportError, ValueError):  # no package of that name
+        module = None
+    if module is None or module.origin is None or not os.path.isfile(module.origin):
+        return None
+    digest = hashlib.sha256(Path(module.origin).read_bytes()).hexdigest()
+    return digest if spec.file is None else f"{digest} {spec.digest()}"
+
+
+def in_one_line(error: BaseException) -> str:
+    """Kind of an error and the first line of what it says."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return ": ".join([type(error).__name__, *lines[:1]])
+
+
+def run_file(path: Path) -> ModuleType:
+    """Runs a Python file as a module of its own, as it is now; its neighbours can be imported from it.
+
+    Raises:
+        ValueError: If there is no such file, or it fails.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    path = path.resolve()
+    name = f"faultline_file_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} is no Python file: expected a name that ends in .py")
+    module = importlib.util.module_from_spec(spec)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # last: a neighbour must not stand in for an installed package
+    importlib.invalidate_caches()
+    sys.modules[name] = module
+    try:
+        exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)  # no .pyc that an edit could outrun
+    except (Exception, SystemExit) as error:  # a file can fail with anything
+        del sys.modules[name]
+        raise ValueError(f"{path} fails: {in_one_line(error)}") from error
+    return module
+
+
+def find_named(place: str, name: str) -> Any:
+    """What a module or a Python file calls ``name``.
+
+    Args:
+        place: An importable module, or a file whose name ends in .py.
+        name: Dots reach into classes.
+
+    Raises:
+        Exception: Anything, if it cannot be run or has no such name.
+    """
+    found: Any = run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
+    for part in name.split("."):
+        found = getattr(found, part)
+    return found
+
+
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
+
+MARK = "@"
+"""Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""
+
+
+def kind_of(name: str) -> str:
+    """The kind of a controller by its name."""
+    return name.split(MARK)[0]
+
+
+def firsts(names: Iterable[str]) -> list[str]:
+    """The first controller of each kind, in order."""
+    found: dict[str, str] = {}
+    for name in names:
+        found.setdefault(kind_of(name), name)
+    return list(found.values())
+
+
+def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]:
+    """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
+
+    Args:
+        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; several may stand in one, apart by
+            spaces, as make hands them over.
+        robot: The robot, whose controller is the shipped one.
+
+    Raises:
+        ValueError: If one has no name, or two have the same.
+    """
+    text = " ".join(policies).strip() or f"base={SHIPPED}"
+    found: dict[str, str] = {}
+    for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is
+        name, _, policy = item.partition("=")
+        if not re.fullmatch(r"[\w.+@-]+", name) or not policy:
+            raise ValueError(
+                f"policies must be NAME=FILE each, the name of letters, digits and . _ + @ -, got '{item}': "
+                "write for example C-G=runs/tuned/policy.pt"
+            )
+        if name in found:
+            raise ValueError(f"policies must have different names, got '{name}' twice: rename one of them")
+        found[name] = spec_of(policy, robot)
+    return found
+
+
+def controller_suffix(policy: str, usual: str) -> str:
+    """What the name of a file about a controller ends with: nothing for the usual one, else such as -C-G."""
+    if is_same(policy, usual):
+        return ""
+    label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")
+    return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
+
+
+def who_crossed(robot: "RobotCfg", policy: str) -> str:
+    """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
+    return robot.name + controller_suffix(policy, str(robot.policy_file))
+
+
+def is_same(policy: str, other: str) -> bool:
+    """Whether two names are of the same controller, by name or by its files."""
+    digest = controller_hash(policy)
+    return policy == other or (digest is not None and digest == controller_hash(other))

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.files.provenance import controller_hash, provenance
+from sim.files.provenance import provenance
+from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
 
 if TYPE_CHECKING:  # who reads a recording has no simulation to wait for

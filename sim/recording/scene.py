@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
-from sim.maps.hfield import as_hfield
-from sim.robots.mujoco_spec import robot_model, robot_spec
+from sim.maps.terrain_files import as_hfield
 from sim.robots.robot import RobotCfg
+from sim.robots.skeleton import robot_model, robot_spec
 from sim.terrain import SPACING
 
 _mj: Any = mujoco  # its types are not written down
@@ -81,7 +81,7 @@ def scene_model(
     model.vis.map.shadowclip = _SHADOWED / model.stat.extent
     texture = model.texture(_GROUND)
     first = int(texture.adr[0])
-    # The asset lies on its side (sim.maps.hfield): the rows of its texture run along x, its columns along y.
+    # The asset lies on its side (sim.maps.terrain_files): the rows of its texture run along x, its columns along y.
     model.tex_data[first : first + paint.size] = paint.swapaxes(0, 1).ravel()
     return model
 

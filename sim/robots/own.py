@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim.files.settings import problems
-from sim.policy.named_code import run_file
+from sim.policy.spec import run_file
 from sim.robots.model_files import read_model_files
 from sim.robots.robot import ROBOTS, RobotCfg
 
@@ -33,7 +33,7 @@ def load_robot(path: Path) -> RobotCfg:
     robot: Any = getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
-        raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (README, Bring your own robot)")
+        raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/own-robot.md)")
     if isinstance(robot.model_file, str):
         robot = replace(robot, model_file=Path(robot.model_file))
     found = settings_problems(robot)
@@ -56,7 +56,7 @@ def settings_problems(robot: RobotCfg) -> list[str]:
 
     if fine("name"):
         if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", robot.name):
-            found.append(f"name must be letters, digits, . _ and -, since files are called after it, got {robot.name!r}")
+            found.append(f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}")
         elif robot.name in ROBOTS:
             found.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
     if fine(*_NAMES):
@@ -66,9 +66,7 @@ def settings_problems(robot: RobotCfg) -> list[str]:
     least = 2.0 * robot.physics_dt if fine("physics_dt") else 0.0
     time_constant_s = robot.contact_time_constant_s
     if fine("contact_time_constant_s") and time_constant_s is not None and time_constant_s < least * (1.0 - 1e-9):
-        found.append(
-            f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {time_constant_s:g}"
-        )
+        found.append(f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {time_constant_s:g}")
     return found
 
 

@@ -235,18 +235,19 @@ ROBOTS = {
 }
 
 
-def get_robot(spec: "str | RobotCfg") -> RobotCfg:
+def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     """Settings of a robot that the command line names; :func:`robot_of` is for what a file names.
 
     Args:
-        spec: Name of a shipped robot, or the Python file of another, which is run and must set ``ROBOT``; settings are
-            returned as they are.
+        spec: Name of a shipped robot, or the Python file of another, which is run and must set ``ROBOT``; None is
+            ANYmal; settings are returned as they are.
 
     Raises:
         ValueError: If there is no such robot, or something in its settings or model is wrong.
     """
     if isinstance(spec, RobotCfg):
         return spec
+    spec = spec or "anymal"
     if spec in ROBOTS:
         return ROBOTS[spec]
     if spec.endswith(".py"):
@@ -255,7 +256,7 @@ def get_robot(spec: "str | RobotCfg") -> RobotCfg:
         return load_robot(Path(spec))
     raise ValueError(
         f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or a Python file that sets ROBOT "
-        "(README, Bring your own robot)"
+        "(docs/own-robot.md)"
     )
 
 

@@ -1,20 +1,17 @@
-"""What a robot's files hold, whether it stands, and what lying about takes: ``python -m sim.robots.stand --robot mine.py``."""
+"""What a robot's files hold, whether it stands, and how many contacts it needs when it lies."""
 
-import sys
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import tyro
 import warp as wp
 from numpy.typing import NDArray
 
 from sim.bank import TerrainBank
-from sim.files.command import exit_code_of
 from sim.robots.model import build_robot, geom_names, leaf_name
 from sim.robots.probes import placed
-from sim.robots.robot import RobotCfg, get_robot
-from sim.simulation import CAPACITY_OVERFLOWS, Simulation, resolve_device
+from sim.robots.robot import RobotCfg
+from sim.simulation import CAPACITY_OVERFLOWS, Simulation
 from sim.terrain import SPACING, hard_random_genes
 
 _GRAVITY = 9.81
@@ -22,26 +19,6 @@ _TERRAINS = 4
 _ROOM = 1.5  # highest ground that a dropped robot could touch is looked for this far round it [m]
 _UPRIGHT_DEG = 15.0
 _SUNK = 0.005  # deeper than this in the ground at the start is a mistake [m]
-
-
-@dataclass(frozen=True, kw_only=True)
-class StandCfg:
-    """Look at a robot before anything is searched or trained.
-
-    Prints its joints and geoms as they were read, whether it stands in its default pose, and how many contacts and
-    constraint rows it needs when it lies on rough ground.
-    """
-
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
-    seconds: float = 3.0
-    """How long it stands, and lies [s]."""
-    drops: int = 32
-    """Robots dropped in random poses on hard-random terrain."""
-    seed: int = 0
-    """Draws poses and terrains."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +64,8 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         seed: Draws their poses and terrains.
 
     Raises:
-        ValueError: If a number is out of range, or settings and model do not agree.
+        ValueError: If settings and model do not agree.
     """
-    if not 0.0 < seconds <= 60.0 or drops < 1 or seed < 0:
-        raise ValueError(
-            f"seconds must lie in 0..60, drops be positive, seed not negative, got {seconds}, {drops}, {seed}"
-        )
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)
     genes = np.concatenate([np.zeros((1, 64)), hard_random_genes(_TERRAINS, seed)])
@@ -236,23 +209,3 @@ def describe_standing(robot: RobotCfg, found: Standing) -> tuple[str, bool]:
         else "It does not stand by itself, as a biped may; of another robot look at gains, effort and the default pose."
     )
     return "\n".join(lines), not wrong
-
-
-def main() -> int:
-    """Command line; returns the exit status: 0, 1 if something has to be mended, 2 if it cannot be looked at."""
-    cfg = tyro.cli(StandCfg)
-
-    def command() -> int:
-        robot = get_robot(cfg.robot)
-        print(describe_model(robot), flush=True)
-        device = resolve_device(cfg.device)
-        found = stand(robot, device=device, seconds=cfg.seconds, drops=cfg.drops, seed=cfg.seed)
-        text, fine = describe_standing(robot, found)
-        print(text)
-        return 0 if fine else 1
-
-    return exit_code_of(command)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

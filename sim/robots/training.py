@@ -58,17 +58,17 @@ class TrainingCfg:
 class PaceCfg:
     """The settings of the learner that belong to the robot; the defaults are legged_gym's."""
 
-    init_noise_std: float = 1.0
+    init_noise_std: float = setting(1.0, above=0)
     """Standard deviation of the actions before the first update."""
-    desired_kl: float = 0.01
+    desired_kl: float = setting(0.01, above=0)
     """KL divergence an update aims at."""
-    entropy: float = 0.01
+    entropy: float = setting(0.01, least=0)
     """Weight of the entropy bonus."""
-    final_share: float = 0.0
+    final_share: float = setting(0.0, least=0, most=1)
     """Share of the iterations, the last ones, with final_kl and final_entropy in place of desired_kl and entropy:
     smaller steps and less noise."""
-    final_kl: float = 0.008
-    final_entropy: float = 0.002
+    final_kl: float = setting(0.008, above=0)
+    final_entropy: float = setting(0.002, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,10 @@ from sim.robots.robot import get_robot
 from tests.kills.steps import Steps
 from train import base
 from train.ppo.learner import read_checkpoint
-from train.ppo.ppo import PpoCfg
+from train.ppo.cfg import PpoCfg
 from train.ppo.run import CHECKPOINT
 from train.task.cfg import TaskCfg
-from train.task.curriculum import CurriculumCfg
+from train.task.cfg import CurriculumCfg
 from train.task.task import CommandTask
 
 _ROBOT = get_robot("anymal")

@@ -23,7 +23,7 @@ from qd.run.directory import RunDirectory
 from qd.run.settings import SchedulerCfg, SearchCfg
 from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError
-from sim.files.atomic import atomic as files
+from sim.files import atomic as files
 from sim.files.provenance import provenance
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
@@ -48,7 +48,7 @@ KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.
 def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
     cfg = dataclasses.replace(CFG, **changes)
     evaluator = EvaluatorCfg(
-        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, num_processes=1
+        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, workers="1"
     )
     return Job(
         cfg=cfg,

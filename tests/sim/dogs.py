@@ -141,7 +141,7 @@ CONTROLLER = '''"""A trot by the clock: hips swing, and a leg that swings forwar
 
 import torch
 
-from sim.policy.sensed import read_row
+from sim.policy.adapters import read_row
 
 
 class Trot:

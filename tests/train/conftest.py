@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from sim.robots.robot import get_robot
-from train.task.cfg import TaskCfg
-from train.task.curriculum import CurriculumCfg
+from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
 
 NUM_ENVS = 6

@@ -5,7 +5,7 @@ import sys
 import torch
 from torch import distributed
 
-from train.ppo.ranks import Ranks
+from train.ppo.learner import Ranks
 
 
 def main() -> None:

@@ -3,17 +3,18 @@
 import json
 import shutil
 import signal
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
+import tyro
 
+from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from tests.train.conftest import CURRICULUM
-from train.base import BaseCfg, main, read_arguments, train
-from train.ppo.ppo import PpoCfg
+from train.base import Train
+from train.ppo.cfg import PpoCfg
 from train.ppo.run import StopRequest, claimed
 from train.task.cfg import TaskCfg
 
@@ -22,13 +23,17 @@ PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
 
 def config(run_dir, **changes):
     values = {"num_envs": 6, "iterations": 2, "rows": 2, "device": "cpu", "ppo": PPO}
-    return BaseCfg(run_dir=run_dir, **{**values, "task": TaskCfg(curriculum=CURRICULUM), **changes})
+    return Train(run_dir=run_dir, **{**values, "task": TaskCfg(curriculum=CURRICULUM), **changes})
+
+
+def parsed(flags):
+    return tyro.cli(Train, args=flags, default=Train.defaults(flags))
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("run") / "first"
-    assert train(config(run_dir, export=run_dir.parent / "out" / "robot.pt")) == 0
+    assert config(run_dir, export=run_dir.parent / "out" / "robot.pt").execute() == 0
     return run_dir
 
 
@@ -58,13 +63,13 @@ def test_a_run_leaves_tensorboard_scalars(finished):
 
 def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
     before = (finished / "checkpoint.pt").read_bytes()
-    assert train(config(tmp_path / "second", resume=finished, iterations=3)) == 0
+    assert config(tmp_path / "second", resume=finished, iterations=3).execute() == 0
     assert (finished / "checkpoint.pt").read_bytes() == before
     record = json.loads((tmp_path / "second" / "policy.train.json").read_text())
     assert record["iterations"] == 3 and record["env_steps"] == 72
     assert [row["iteration"] for row in record["curve"]] == [1, 2, 3]
     assert [piece["from_iteration"] for piece in record["pieces"]] == [0, 2]
-    assert train(config(None, resume=tmp_path / "second", iterations=4)) == 0
+    assert config(None, resume=tmp_path / "second", iterations=4).execute() == 0
     assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
 
 
@@ -72,12 +77,12 @@ def test_a_resumed_run_goes_on_as_it_was_begun(tmp_path, capsys):
     # The robot's own settings may have changed since; what the command line gives counts.
     run = tmp_path / "begun"
     begun = config(run, task=TaskCfg(curriculum=CURRICULUM, push_speed=0.3, friction=(0.7, 0.8)))
-    assert train(begun) == 0
+    assert begun.execute() == 0
     (run / "config.json").unlink()  # is for people to read
-    resumed = read_arguments(["--resume", str(run), "--task.friction", "0.6", "0.9", "--device", "cpu"])
+    resumed = parsed(["--resume", str(run), "--task.friction", "0.6", "0.9", "--device", "cpu"])
     assert resumed.task == replace(begun.task, friction=(0.6, 0.9)) and resumed.ppo == PPO
     capsys.readouterr()
-    assert train(resumed) == 0
+    assert resumed.execute() == 0
     said = capsys.readouterr().out
     assert "6 robots on cpu, 2 iterations" in said
     assert [line for line in said.splitlines() if "Changed since" in line] == [
@@ -99,7 +104,7 @@ def damaged(finished, tmp_path, damage):
     ("damage", "message"),
     [
         (lambda settings: settings["task"].update(gravity=3.0), "task has no setting gravity"),
-        (lambda settings: settings["ppo"].update(gamma="a lot"), "gamma must be float, got 'a lot'"),
+        (lambda settings: settings["ppo"].update(gamma="a lot"), "gamma must be a finite number, got 'a lot'"),
         (lambda settings: settings["task"].update(friction=0.5), "friction must be a tuple, got 0.5"),
         (lambda settings: settings["task"].update(friction=[0.5]), r"friction must have 2 values, got \[0.5\]"),
         (lambda settings: settings["task"].update(rewards=7), "rewards must be an object, got 7"),
@@ -109,35 +114,21 @@ def damaged(finished, tmp_path, damage):
 def test_a_run_whose_settings_cannot_be_read_is_refused(finished, tmp_path, damage, message):
     run = damaged(finished, tmp_path, damage)
     with pytest.raises(ValueError, match=f"checkpoint.pt is damaged, or of another version: {message}; put a copy"):
-        read_arguments(["--resume", str(run)])
-
-
-def test_a_run_of_an_older_version_goes_on(finished, tmp_path, capsys):
-    # A setting that it does not know is the robot's; one that there is no more is left out.
-    def older(settings):
-        settings["task"].update(max_speed=100.0)
-        settings["task"]["rewards"].pop("stumble")
-
-    run = damaged(finished, tmp_path, older)
-    assert read_arguments(["--resume", str(run)]).task == TaskCfg(curriculum=CURRICULUM)
-    assert train(read_arguments(["--resume", str(run), "--iterations", "3", "--device", "cpu"])) == 0
-    assert [line.partition(": ")[2] for line in capsys.readouterr().out.splitlines() if "Changed" in line] == [
-        "iterations 2 -> 3", "task.rewards.stumble None -> -0.1"
-    ]  # fmt: skip
+        parsed(["--resume", str(run)])
 
 
 def test_a_run_of_another_kind_is_named_before_its_settings_are_read(finished, tmp_path):
     run = damaged(finished, tmp_path, lambda settings: settings.update(mix={}, task="crossing"))
-    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME="):
-        read_arguments(["--resume", str(run)])
+    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with .*finetune --robot anymal --resume"):
+        parsed(["--resume", str(run)])
     with pytest.raises(ValueError, match="is of robot 'anymal', expected 'cassie': name its robot"):
-        read_arguments(["--robot", "cassie", "--resume", str(finished)])
+        parsed(["--robot", "cassie", "--resume", str(finished)])
 
 
 def test_fewer_iterations_than_are_done_are_refused(finished):
     before = (finished / "policy.pt").stat().st_mtime_ns
     with pytest.raises(ValueError, match="has done 2 iterations already: give at least as many in all"):
-        train(config(None, resume=finished, iterations=1))
+        config(None, resume=finished, iterations=1).execute()
     assert (finished / "policy.pt").stat().st_mtime_ns == before
 
 
@@ -146,8 +137,8 @@ def test_a_fine_tuning_is_left_to_its_own_command(finished, tmp_path):
     content["extra"]["mix"] = {}
     torch.save(content, tmp_path / "checkpoint.pt")
     before = (tmp_path / "checkpoint.pt").read_bytes()
-    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME=.*finetune --resume"):
-        train(config(None, resume=tmp_path, iterations=3))
+    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with .*finetune --robot anymal --resume"):
+        config(None, resume=tmp_path, iterations=3).execute()
     assert [file.name for file in tmp_path.iterdir()] == ["checkpoint.pt"]
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
@@ -155,20 +146,21 @@ def test_a_fine_tuning_is_left_to_its_own_command(finished, tmp_path):
 def test_a_run_directory_takes_one_training_at_a_time(finished):
     before = (finished / "checkpoint.pt").read_bytes()
     with claimed(finished), pytest.raises(ValueError, match="another training works in"):
-        train(config(None, resume=finished, iterations=3))
+        config(None, resume=finished, iterations=3).execute()
     assert (finished / "checkpoint.pt").read_bytes() == before
 
 
 def test_changed_settings_are_named(finished, tmp_path, capsys):
     ppo = replace(PPO, entropy=0.5)
-    train(config(tmp_path / "changed", resume=finished, iterations=2, ppo=ppo))
+    config(tmp_path / "changed", resume=finished, iterations=2, ppo=ppo).execute()
     assert "Changed since the checkpoint: ppo.entropy 0.01 -> 0.5\n" in capsys.readouterr().out
 
 
 def test_out_of_time_saves_and_says_how_to_go_on(finished, tmp_path, capsys):
-    assert train(config(tmp_path / "late", resume=finished, iterations=50, max_seconds=1.0)) == 0
+    assert config(tmp_path / "late", resume=finished, iterations=50, max_seconds=1.0).execute() == 0
     assert (tmp_path / "late" / "checkpoint.pt").exists()
-    assert f"Stopped after 2 of 50 iterations. Go on with: --resume {tmp_path / 'late'}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Stopped after 2 of 50 iterations. Go on with:" in said and f"--resume {tmp_path / 'late'}" in said
 
 
 def test_an_interrupt_saves_and_says_how_to_go_on(finished, tmp_path, capsys, monkeypatch):
@@ -181,9 +173,9 @@ def test_an_interrupt_saves_and_says_how_to_go_on(finished, tmp_path, capsys, mo
         return iterate(learner)
 
     monkeypatch.setattr(Learner, "iterate", interrupted)
-    assert train(config(tmp_path / "cut", resume=finished, iterations=50)) == 130
+    assert config(tmp_path / "cut", resume=finished, iterations=50).execute() == 130
     assert torch.load(tmp_path / "cut" / "checkpoint.pt", weights_only=True)["iter"] == 3
-    assert "Go on with: --resume" in capsys.readouterr().out
+    assert "train --robot anymal --resume" in capsys.readouterr().out
 
 
 def test_handlers_are_put_back():
@@ -209,10 +201,9 @@ def test_handlers_are_put_back():
 )
 @pytest.mark.skipif(torch.cuda.is_available(), reason="one of the errors is the absence of CUDA")
 def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("train.base.CommandTask", None)  # building anything would fail with another error
+    monkeypatch.setattr("train.ppo.run.CommandTask", None)  # building anything would fail with another error
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.base", *(flag.format(empty=tmp_path) for flag in flags)])
-    assert main() == 2
+    assert run_command(Train, [flag.format(empty=tmp_path) for flag in flags], name="train") == 2
     error = capsys.readouterr().err
     assert message in error and error.startswith("error: ") and error.count("\n") == 1
 
@@ -220,14 +211,14 @@ def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monke
 def test_networks_that_do_not_fit_leave_the_run_as_it_was(finished):
     before = {file.name: file.read_bytes() for file in finished.glob("*.*") if "tfevents" not in file.name}
     with pytest.raises(ValueError, match="do not fit"):
-        train(config(None, resume=finished, iterations=3, ppo=replace(PPO, hidden_dims=(8, 8))))
+        config(None, resume=finished, iterations=3, ppo=replace(PPO, hidden_dims=(8, 8))).execute()
     assert {name: (finished / name).read_bytes() for name in before} == before
 
 
 def test_a_run_of_a_search_is_not_written_to(tmp_path):
     (tmp_path / "config.json").write_text('{"settings": {}, "iterations": 3}')
     with pytest.raises(ValueError, match="holds the run of a search"):
-        train(config(tmp_path))
+        config(tmp_path).execute()
     assert [file.name for file in tmp_path.iterdir()] == ["config.json"]
 
 
@@ -235,7 +226,7 @@ def test_a_run_is_not_overwritten(finished, tmp_path):
     before = (finished / "checkpoint.pt").read_bytes()
     for resume in (None, tmp_path / "other"):
         if resume is not None:
-            assert train(config(resume, resume=finished)) == 0
+            assert config(resume, resume=finished).execute() == 0
         with pytest.raises(ValueError, match="already holds a training run"):
-            train(config(finished, resume=resume))
+            config(finished, resume=resume).execute()
     assert (finished / "checkpoint.pt").read_bytes() == before

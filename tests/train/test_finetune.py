@@ -14,12 +14,11 @@ from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from tests.train.archives import make_archive
 from tests.train.starts import make_places, write_actor
-from train import finetune as command
-from train.finetune import finetune
-from train.finetune_job import FinetuneCfg, job_of
+from train import tuning
+from train.finetune import Finetune
+from train.ppo.cfg import PpoCfg
 from train.ppo.learner import read_checkpoint
-from train.ppo.ppo import PpoCfg
-from train.ppo.run import claimed, read_saved
+from train.ppo.run import CommandTask, claimed, read_saved
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
@@ -35,7 +34,20 @@ def config(places, **changes):
         "policy": places / "start.pt", "archive": places / "archive" / "archive.npz", "device": "cpu", "num_envs": 6,
         "terrains": 4, "swap_every": 2, "iterations": 3, "critic_iterations": 1, "rows": 3, "ppo": PPO, **changes,
     }  # fmt: skip
-    return FinetuneCfg(**values)
+    return Finetune(**{"rewards": Finetune.defaults([]).rewards, **values})
+
+
+def resumed(run, **changes):
+    """The command that goes on with a run."""
+    return replace(Finetune.defaults(["--resume", str(run)]), device="cpu", **changes)
+
+
+def finetune(flags):
+    return flags.execute()
+
+
+def job_of(flags):
+    return tuning.job_of(flags, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +77,7 @@ def test_without_the_packages_for_onnx_it_says_how_to_make_the_file(places, fini
     monkeypatch.setitem(sys.modules, "sim.policy.export", None)
     run = places / "without"
     assert finetune(config(places, run_dir=run, iterations=1)) == 0
-    assert f"python -m sim.policy.export --robot anymal --policy {run / 'policy.pt'}" in capsys.readouterr().out
+    assert f"export-policy --robot anymal --policy {run / 'policy.pt'}" in capsys.readouterr().out
     assert not (run / "policy.onnx").exists()
 
 
@@ -84,12 +96,12 @@ def test_a_critic_that_comes_along_is_taken(places):
     path = write_actor(places / "with_critic.pt", critic=True)
     job = job_of(config(places, policy=path, run_dir=places / "none"))
     assert job.settings["critic_iterations"] == 0
-    tuning = command.Tuning(job)
+    tuned = tuning.FineTuning(job)
     expected = torch.load(path, weights_only=True)["critic_state_dict"]
-    assert all(value.equal(expected[key]) for key, value in tuning.learner.alg.critic.state_dict().items())
-    assert float(tuning.learner.alg._lr) == pytest.approx(1e-3)
-    tuning.before_iteration()
-    assert float(tuning.learner.alg._lr) == pytest.approx(1e-4)  # a trained actor's first steps are small here too
+    assert all(value.equal(expected[key]) for key, value in tuned.learner.alg.critic.state_dict().items())
+    assert float(tuned.learner.alg._lr) == pytest.approx(1e-3)
+    tuned.before_iteration()
+    assert float(tuned.learner.alg._lr) == pytest.approx(1e-4)  # a trained actor's first steps are small here too
 
 
 @pytest.mark.parametrize(("iterations", "alone"), [(1, 0), (3, 1), (10, 5), (99, 49), (1200, 50)])
@@ -103,21 +115,22 @@ def test_it_ends_with_the_command_that_compares(places, capsys):
     assert finetune(config(places, run_dir=run, iterations=1, split_seed=3)) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Next, see what it did:"))
     words = shlex.split(line.partition("  ")[2])
-    assert words[:3] == ["make", "evaluate", "ROBOT=anymal"]
-    assert shlex.split(words[3].removeprefix("POLICIES=")) == ["base=shipped", f"tuned={run / 'policy.pt'}"]
-    assert [word.partition("=")[0] for word in words[4:]] == ["ARCHIVE", "SPLIT_SEED"] and words[5] == "SPLIT_SEED=3"
+    assert words[1:] == [
+        "evaluate", "--robot", "anymal", "--policies", "base=shipped", f"tuned={run / 'policy.pt'}",
+        "--archive", str(places / "archive" / "archive.npz"), "--split-seed", "3",
+    ]  # fmt: skip
 
 
 def test_it_says_where_the_controller_will_stay_as_it_is(places, capsys):
     assert finetune(config(places, run_dir=places / "stays", iterations=1, critic_iterations=1)) == 0
     assert "learns alone for the first 1 iterations: the controller stays as it is" in capsys.readouterr().out
-    assert finetune(FinetuneCfg(resume=places / "stays", device="cpu", iterations=2)) == 0
+    assert finetune(resumed(places / "stays", iterations=2)) == 0
     assert "stays as it is" not in capsys.readouterr().out
 
 
 def test_every_episode_is_whole(places):
     # With clocks set forward, some would end by the clock without having had the time to cross.
-    task = command.Tuning(job_of(config(places, run_dir=places / "none"))).task
+    task = tuning.FineTuning(job_of(config(places, run_dir=places / "none"))).task
     assert task.episode_steps.tolist() == [0] * 6
 
 
@@ -135,11 +148,11 @@ def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
     own = job_of(config(places, run_dir=places / "own")).task.rewards
     assert own == replace(ROBOT.training.rewards, termination=-200.0, tracking_lin_vel=2.0)
     run = places / "careful"
-    assert finetune(config(places, run_dir=run, rewards=("termination=-100 tracking_ang_vel=2",))) == 0
-    resumed = job_of(FinetuneCfg(resume=run, device="cpu"))
-    assert resumed.task.rewards == replace(ROBOT.training.rewards, termination=-100.0, tracking_ang_vel=2.0)
+    careful = replace(ROBOT.training.rewards, termination=-100.0, tracking_ang_vel=2.0)
+    assert finetune(config(places, run_dir=run, rewards=careful)) == 0
+    assert job_of(resumed(run)).task.rewards == careful
     with pytest.raises(ValueError, match=r"termination -100.0 -> -1.0; task.rewards.tracking_ang_vel 2.0 -> 0.5"):
-        job_of(FinetuneCfg(resume=run, device="cpu", rewards=("termination=-1",)))
+        job_of(resumed(run, rewards=replace(careful, termination=-1.0, tracking_ang_vel=0.5)))
 
 
 def test_it_says_which_rewards_weigh_otherwise_than_the_robots_own(places, capsys):
@@ -147,26 +160,43 @@ def test_it_says_which_rewards_weigh_otherwise_than_the_robots_own(places, capsy
     finetune(config(places, run_dir=places / "weights", iterations=1))
     expected = f"Rewards: tracking_lin_vel=2, termination=-200 (the robot's own: {own.tracking_lin_vel:g}, "
     assert f"{expected}{own.termination:g})\n" in capsys.readouterr().out
-    finetune(config(places, run_dir=places / "own_weights", iterations=1, rewards=("tracking_lin_vel=1",)))
+    finetune(config(places, run_dir=places / "own_weights", iterations=1, rewards=own))
     assert "Rewards: the robot's own\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [("num_envs", "x"), ("iterations", 2.5), ("seed", True), ("draw", 3), ("rewards", "a=1"), ("archive", 5)],
+    ("damage", "message"),
+    [
+        ({"num_envs": "x"}, "num_envs must be of type int, got 'x'"),
+        ({"iterations": 2.5}, "iterations must be of type int, got 2.5"),
+        ({"seed": True}, "seed must be of type int, got True"),
+        ({"mix": {"draw": 3}}, "draw must be"),
+        ({"mix": {"terrains": -1}}, "terrains must be at least 1"),
+        ({"ppo": {"gamma": "all"}}, "gamma must be"),
+    ],
 )
-def test_a_damaged_setting_of_the_resumed_run_is_named(key, value, finished, tmp_path):
-    for name in ("checkpoint.pt", "config.json"):
-        (tmp_path / name).write_bytes((finished / name).read_bytes())
-    settings = json.loads((finished / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps({**settings, key: value}))
-    with pytest.raises(ValueError, match=f"config.json is damaged at {key}: put a copy of it back"):
-        job_of(FinetuneCfg(resume=tmp_path, device="cpu"))
+def test_a_damaged_setting_of_the_resumed_run_is_named(damage, message, finished, tmp_path):
+    content = torch.load(finished / "checkpoint.pt", weights_only=True)
+    content["extra"]["settings"] |= damage
+    torch.save(content, tmp_path / "checkpoint.pt")
+    with pytest.raises(ValueError, match=f"checkpoint.pt is damaged.*{message}"):
+        resumed(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("robot", "paper"),  # Esquerre-Pourtere et al., the numbers of fine-tuning
+    [("cassie", (600, 100, 200, 3000)), ("anymal", (1500, 500, 400, 1200)), ("mine", (1500, 500, 400, 1200))],
+)
+def test_on_a_gpu_the_sizes_are_the_papers(robot, paper):
+    sizes = tuning.sizes_of(Finetune.defaults([]), robot, on_gpu=True)
+    assert tuple(sizes[name] for name in ("num_envs", "terrains", "swap_every", "iterations")) == paper
+    given = replace(Finetune.defaults([]), swap_every=7)
+    assert tuning.sizes_of(given, robot, on_gpu=True)["swap_every"] == 7
 
 
 def test_terrains_are_exchanged_when_due(places, monkeypatch):
     seen = []
-    exchange = command.CommandTask.exchange
+    exchange = CommandTask.exchange
 
     def watched(task, tiles):
         seen.append(int(task.counter))
@@ -174,7 +204,7 @@ def test_terrains_are_exchanged_when_due(places, monkeypatch):
         np.testing.assert_array_equal(task.sim.bank.heights.numpy(), tiles.heights)
         assert (task.episode_steps == 0).all()
 
-    monkeypatch.setattr(command.CommandTask, "exchange", watched)
+    monkeypatch.setattr(CommandTask, "exchange", watched)
     finetune(config(places, run_dir=places / "swaps", iterations=5, swap_every=2))
     assert len(seen) == 2  # before iterations 3 and 5
     assert seen[1] - seen[0] == 2 * 4 + 1  # two iterations of 4 steps, and the restart's own
@@ -182,10 +212,11 @@ def test_terrains_are_exchanged_when_due(places, monkeypatch):
 
 def test_resume_needs_the_directory_alone_and_goes_on_with_the_same_terrains(finished, places):
     state = read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["mix"]
-    assert finetune(FinetuneCfg(resume=finished, run_dir=places / "longer", device="cpu", iterations=4)) == 0
+    assert finetune(resumed(finished, run_dir=places / "longer", iterations=4)) == 0
     later = read_checkpoint(places / "longer" / "checkpoint.pt", "anymal")
     assert later["iter"] == 4 and later["extra"]["mix"]["rows"] == state["rows"]
-    assert later["extra"]["settings"] == read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["settings"]
+    before = read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["settings"]
+    assert later["extra"]["settings"] == {**before, "iterations": 4}
 
 
 def test_resume_needs_neither_the_first_controller_nor_the_archives_place(places):
@@ -196,18 +227,18 @@ def test_resume_needs_neither_the_first_controller_nor_the_archives_place(places
     start.unlink()
     archive.rename(moved)
     with pytest.raises(ValueError, match=r"no archive at .*gone.npz.*name it with --archive"):
-        finetune(FinetuneCfg(resume=run, device="cpu", iterations=2))
-    assert finetune(FinetuneCfg(resume=run, device="cpu", iterations=2, archive=moved)) == 0
-    assert finetune(FinetuneCfg(resume=run, device="cpu", iterations=3)) == 0  # it remembers where they lie now
+        finetune(resumed(run, iterations=2))
+    assert finetune(resumed(run, iterations=2, archive=moved)) == 0
+    assert finetune(resumed(run, iterations=3)) == 0  # it remembers where they lie now
     write_archive(moved, make_archive(10, seed=1))  # as many others
     with pytest.raises(ValueError, match=r"archive.elites_sha256 \w+ -> \w+.*put an archive that has changed back"):
-        finetune(FinetuneCfg(resume=run, device="cpu", iterations=4))
+        finetune(resumed(run, iterations=4))
 
 
 def test_fewer_iterations_than_are_done_are_refused(finished):
     before = (finished / "policy.pt").stat().st_mtime_ns
     with pytest.raises(ValueError, match="has done 3 iterations already: give at least as many in all"):
-        finetune(FinetuneCfg(resume=finished, device="cpu", iterations=2))
+        finetune(resumed(finished, iterations=2))
     assert (finished / "policy.pt").stat().st_mtime_ns == before
 
 
@@ -218,25 +249,25 @@ def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
     del content["extra"]["mix"], content["extra"]["settings"]["mix"]
     torch.save(content, run / "checkpoint.pt")
     (run / "config.json").write_text('{"task": {}}')
-    with pytest.raises(ValueError, match=r"training of a base controller.*go on with make train RESUME=.*train.base"):
-        finetune(FinetuneCfg(resume=run, device="cpu", iterations=4))
-    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with make finetune RESUME="):
+    with pytest.raises(ValueError, match=r"training of a base controller.*go on with .*train --robot anymal --resume"):
+        finetune(resumed(run, iterations=4))
+    with pytest.raises(ValueError, match=r"is a fine-tuning: go on with .*finetune --robot anymal --resume"):
         read_saved(finished, "anymal", finetuning=False)
 
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):
     before = (finished / "checkpoint.pt").read_bytes()
     with claimed(finished), pytest.raises(ValueError, match="another training works in"):
-        finetune(FinetuneCfg(resume=finished, device="cpu", iterations=4))
+        finetune(resumed(finished, iterations=4))
     assert (finished / "checkpoint.pt").read_bytes() == before
 
 
 def test_a_resume_of_other_settings_is_refused(finished, places):
     before = (finished / "checkpoint.pt").read_bytes()
     with pytest.raises(ValueError, match=r"was begun with other settings .*mix.swap_every 2 -> 3"):
-        finetune(FinetuneCfg(resume=finished, device="cpu", swap_every=3))
+        finetune(resumed(finished, swap_every=3))
     with pytest.raises(ValueError, match=r"was begun with other settings .*seed 0 -> 5"):
-        finetune(FinetuneCfg(resume=finished, device="cpu", seed=5))
+        finetune(resumed(finished, seed=5))
     assert (finished / "checkpoint.pt").read_bytes() == before
 
 
@@ -244,7 +275,7 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
     run = places / "nan"
     finetune(config(places, run_dir=run, iterations=2))
     kept = (run / "checkpoint.pt").read_bytes()
-    monkeypatch.setattr(command.CapturedPPO, "update", lambda alg: {"value": float("nan")})
+    monkeypatch.setattr(tuning.CapturedPPO, "update", lambda alg: {"value": float("nan")})
     with pytest.raises(FloatingPointError, match=r"losses are not finite.*the last checkpoint is kept in"):
-        finetune(FinetuneCfg(resume=run, device="cpu", iterations=3))
+        finetune(resumed(run, iterations=3))
     assert (run / "checkpoint.pt").read_bytes() == kept

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 def run(*words: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", *words, "--robot", "anymal"], cwd=ROOT, capture_output=True, text=True, timeout=600
+        [sys.executable, "-m", "faultline", *words, "--robot", "anymal"], cwd=ROOT, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -23,19 +23,19 @@ def run(*words: str) -> str:
 def test_from_a_file_of_the_user_to_the_tables(tmp_path):
     mine, tuned = write_actor(tmp_path / "mine.pt", hidden=(24, 20, 16)), tmp_path / "tuned"
     sizes = ("--num-envs", "8", "--terrains", "4", "--swap-every", "1", "--iterations", "2", "--critic-iterations", "1")
-    said = run("train.finetune", "--policy", str(mine), "--device", "cpu", "--run-dir", str(tuned), *sizes)
+    said = run("finetune", "--policy", str(mine), "--device", "cpu", "--run-dir", str(tuned), *sizes)
     assert "Fine-tuning 'anymal' on 4 terrains at a time (generated): 8 robots on cpu, 2 iterations" in said
     state = torch.load(tuned / "policy.pt", weights_only=True)["actor_state_dict"]
     assert [state[f"mlp.{k}.weight"].shape[0] for k in (0, 2, 4, 6)] == [24, 20, 16, 12]
 
-    run("sim.policy.export", "--policy", str(tuned / "policy.pt"), "--out", str(tmp_path / "again.onnx"))
+    run("export-policy", "--policy", str(tuned / "policy.pt"), "--out", str(tmp_path / "again.onnx"))
     assert (tmp_path / "again.onnx").read_bytes() == (tuned / "policy.onnx").read_bytes()
 
     controllers = (f"mine={mine}", f"C-G={tuned / 'policy.pt'}", f"C-G@onnx={tuned / 'policy.onnx'}")
     out = tmp_path / "tables.json"
     where = ("--archive", "results/anymal/archive", "--out", str(out), "--run-dir", str(tmp_path / "kept"))
     said = run(
-        "train.evaluate.evaluate",
+        "evaluate",
         "--policies",
         *controllers,
         *where,

@@ -6,16 +6,21 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
+import tyro
 
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from tests.train.conftest import CURRICULUM
-from train.base import BaseCfg, read_arguments, train
-from train.ppo.ppo import PpoCfg
+from train.base import Train
+from train.ppo.cfg import PpoCfg
 from train.task.cfg import TaskCfg
 
 CONTROL_DT = 0.02
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
+
+
+def parsed(flags):
+    return tyro.cli(Train, args=flags, default=Train.defaults(flags))
 
 
 def test_the_defaults_are_anymals_but_for_its_load():
@@ -40,13 +45,13 @@ def test_cassies_settings():
 
 @pytest.mark.parametrize("named", [["--robot", "cassie"], ["--robot=cassie"]])
 def test_the_command_line_begins_with_the_robots_settings(named):
-    cfg = read_arguments(["--task.rewards.no-fly", "0.5", *named, "--task.push-speed", "0.25", "--iterations", "7"])
+    cfg = parsed(["--task.rewards.no-fly", "0.5", *named, "--task.push-speed", "0.25", "--iterations", "7"])
     own = TaskCfg.of(get_robot("cassie"))
     assert (cfg.robot, cfg.iterations, cfg.task.push_speed) == ("cassie", 7, 0.25)
     assert asdict(cfg.task.rewards) == asdict(own.rewards) | {"no_fly": 0.5}
     assert not cfg.task.only_positive
     assert cfg.ppo == PpoCfg.of(get_robot("cassie"))
-    assert read_arguments([]).task == TaskCfg.of(get_robot("anymal"))
+    assert parsed([]).task == TaskCfg.of(get_robot("anymal"))
 
 
 def test_falls_are_paid_for_and_clipped_nowhere(make_task):
@@ -75,12 +80,12 @@ def test_falls_are_paid_for_and_clipped_nowhere(make_task):
 def config(run_dir, **changes):
     values = {"num_envs": 6, "iterations": 2, "rows": 2, "device": "cpu", "ppo": PPO, **changes}
     task = TaskCfg.of(get_robot("cassie"), curriculum=CURRICULUM)
-    return BaseCfg(robot="cassie", run_dir=run_dir, task=task, **values)
+    return Train(robot="cassie", run_dir=run_dir, task=task, **values)
 
 
 def test_a_run_of_another_robot_is_saved_and_resumed(tmp_path, capsys):
-    assert train(config(tmp_path / "run")) == 0
-    assert train(config(None, resume=tmp_path / "run", iterations=3)) == 0
+    assert config(tmp_path / "run").execute() == 0
+    assert config(None, resume=tmp_path / "run", iterations=3).execute() == 0
     assert [line for line in capsys.readouterr().out.splitlines() if "Changed since" in line] == [
         "Changed since the checkpoint: iterations 2 -> 3"
     ]
@@ -91,4 +96,4 @@ def test_a_run_of_another_robot_is_saved_and_resumed(tmp_path, capsys):
     policy = load_policy(tmp_path / "run" / "policy.pt", get_robot("cassie"), "cpu")
     assert policy(torch.randn(3, 169)).shape == (3, 12)
     with pytest.raises(ValueError, match="is of robot 'cassie', expected 'anymal'"):
-        train(BaseCfg(resume=tmp_path / "run", task=TaskCfg(), device="cpu"))
+        Train(resume=tmp_path / "run", task=TaskCfg(), device="cpu").execute()

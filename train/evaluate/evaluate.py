@@ -1,70 +1,240 @@
-"""How well controllers cross terrains that they were not trained on.
+"""How well controllers cross terrains that they were not trained on: the command, from its flags to its files.
 
-``python -m train.evaluate.evaluate --robot anymal`` says how often one controller gets through, by terrain type and level, and
-its velocity error on flat ground (``rates.json``). With ``--policies``, ``--archive`` or ``--sets`` it makes the tables
-of the paper instead: any controllers on the same hand-crafted, hard-random and held-out generated terrains, with
-rewards, penalties and intervals (``tables.json``, ``tables.png``). The terrains are drawn from seeds used nowhere else:
-not in training, calibration or search.
+The terrains are drawn from seeds used nowhere else: not in training, calibration or search.
 """
 
-import sys
+import hashlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import tyro
+from qd.archive import ARCHIVE_FILE, Archive, read_archive
+from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
+from sim.files.atomic import prepare_output
+from sim.files.command import Where, Who, naming_what_is_next, publish, split_words
+from sim.files.settings import check, setting
+from sim.policy.spec import ControllerSpec, controller_hash, controllers_of, who_crossed
 
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, check_policy, open_evaluator, origin_of
-from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.command import exit_code_of
-from sim.policy.names import who_crossed
-from sim.policy.spec import ControllerSpec
-from train.evaluate.base_rates import VELOCITY_FROM_S, evaluate_sets, print_rates
-from train.evaluate.cfg import EvaluateCfg, size_of
-from train.evaluate.tables_job import evaluate_tables
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
+    from train.evaluate.crossings import Open
+    from train.evaluate.sets import EliteSplit, TerrainSet
+
+_FULL = (300, 20)  # terrains a set and episodes a terrain of the published rates; tables take the paper's terrains
+_SMALL = (24, 4)  # on a machine without a GPU
 
 
-def evaluate_base(cfg: EvaluateCfg) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Who, Where):
+    """Rates of one controller by terrain type and level, or the paper's tables of several.
+
+    Rates say how often the controller gets through, and its velocity error on flat ground. With --policies, --archive
+    or --sets it makes tables: any controllers on the same hand-crafted, hard-random and held-out generated terrains,
+    with rewards, penalties and intervals. Tables that were killed go on by the same command.
+    """
+
+    policies: tuple[str, ...] = ()
+    """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped; the first
+    is the one that the others are held against; base=shipped. C-G, C-G@1, C-G@2 are one kind of several seeds, whose
+    mean is shown too."""
+    archive: Path | None = None
+    """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
+    split_seed: int = setting(0, least=0)
+    """Which elites are held out: what the fine-tuning was told."""
+    sets: tuple[str, ...] = ()
+    """Sets of the tables: hand_crafted, hard_random and, of an archive, generated and generated_far; all there are."""
+    terrains: int | None = setting(None, least=1)
+    """Terrains a set; 300 on CUDA (tables of Cassie: 180), 24 on the CPU."""
+    episodes: int | None = setting(None, least=1)
+    """Episodes a terrain; 20 on CUDA, 4 on the CPU."""
+    seed: int = setting(0, least=0)
+    """Draws other test sets."""
+    out: Path | None = None
+    """Where to write the numbers: runs/<robot>-rates.json, of another controller than the shipped
+    runs/<robot>-<its name>-rates.json; tables RUN_DIR/tables.json, their figure beside as .png."""
+    run_dir: Path | None = None
+    """Where tables keep what is crossed, so that they can go on; runs/<robot>-tables."""
+
+    @property
+    def makes_tables(self) -> bool:
+        """Whether the paper's tables are asked for."""
+        return bool(self.policies or self.sets or self.archive is not None)
+
+    def execute(self) -> None:
+        """Evaluates.
+
+        Raises:
+            ValueError: If something asked for cannot be had; raised before any long work.
+        """
+        if not self.makes_tables:
+            evaluate_rates(self)
+            return
+        with naming_what_is_next("what is crossed is kept", lambda: "The same command goes on."):
+            evaluate_tables(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """How much is crossed, by what, where."""
+
+    robot: "RobotCfg"
+    device: str
+    """Warp device name."""
+    terrains: int
+    """Terrains a set."""
+    episodes: int
+    """Episodes a terrain."""
+
+
+def size_of(flags: Evaluate) -> Size:
+    """How much is crossed; says so where it is less than on a GPU.
+
+    Raises:
+        ValueError: If robot or device is unknown, or a number is out of range.
+    """
+    from sim.robots.robot import get_robot
+    from train.evaluate.sets import paper_terrains
+
+    robot = get_robot(flags.robot or "anymal")
+    check(flags)
+    device = resolve_device(flags.device, flags.workers)
+    full = (paper_terrains(robot.name), _FULL[1]) if flags.makes_tables else _FULL
+    terrains, episodes = full if device.startswith("cuda") else _SMALL
+    if not device.startswith("cuda") and flags.terrains is None and flags.episodes is None:
+        print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {full[0]} x {full[1]}.")
+    return Size(robot=robot, device=device, terrains=flags.terrains or terrains, episodes=flags.episodes or episodes)
+
+
+def _evaluator_of(size: Size, flags: Evaluate, policy: str, **changes: Any) -> EvaluatorCfg:
+    return EvaluatorCfg(
+        robot=size.robot, policy=policy, num_terrains=size.terrains, num_replicas=size.episodes, device=size.device,
+        workers=flags.workers, **changes,
+    )  # fmt: skip
+
+
+def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     """Rates of one controller: print the table, write the file; returns its content.
 
     Raises:
         ValueError: If something asked for cannot be had; raised before any long work.
     """
-    size = size_of(cfg)
+    from train.evaluate.measures import VELOCITY_FROM_S, base_rates
+    from train.evaluate.show import print_rates
+
+    size = size_of(flags)
     robot = size.robot
-    policy = str(cfg.policy or robot.policy_file)
-    out = cfg.out or Path("runs") / f"{who_crossed(robot, policy)}-rates.json"
-    prepare_output(out)
-    check_policy(policy, robot, size.device)
-    evaluator = EvaluatorCfg(
-        robot=robot,
-        policy=policy,
-        num_terrains=size.terrains,
-        num_replicas=size.episodes,
-        device=size.device,
-        workers=cfg.workers,
-        penalties_from_s=VELOCITY_FROM_S,
+    policy = str(flags.policy or robot.policy_file)
+    out = flags.out or Path("runs") / f"{who_crossed(robot, policy)}-rates.json"
+
+    def measure() -> dict[str, Any]:
+        check_policy(policy, robot, size.device)
+        with open_evaluator(_evaluator_of(size, flags, policy, penalties_from_s=VELOCITY_FROM_S)) as crossings:
+            rates = base_rates(crossings, size.terrains, flags.seed)
+        about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
+        return {**origin_of(size.device, flags.seed, flags.workers), **about, **rates}
+
+    return publish(out, measure, print_rates)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    """Tables that can be made: everything a user may have got wrong has been checked."""
+
+    size: Size
+    scales: tuple[float, ...]
+    controllers: dict[str, str]
+    sets: "dict[str, TerrainSet]"
+    archive: dict[str, Any]
+    """What the tables say of the archive, as JSON values."""
+    kept: Path
+    """Folder of crossings."""
+    out: Path
+    """File of the numbers."""
+
+
+def _plan_of(flags: Evaluate) -> _Plan:
+    from train.evaluate.sets import FROM_ARCHIVE, SETS, check_held_out, check_names, make_sets, split_elites
+    from train.evaluate.tables import check_seeds
+
+    if flags.policy is not None:
+        raise ValueError(f"tables are of named controllers: give --policies NAME={flags.policy} instead of --policy")
+    size = size_of(flags)
+    robot = size.robot
+    controllers = controllers_of(flags.policies, robot)
+    archive = None if flags.archive is None else read_archive(flags.archive)
+    split = None if archive is None else split_elites(archive, robot.name, flags.split_seed)
+    names = split_words(flags.sets) or [name for name in SETS if archive is not None or name not in FROM_ARCHIVE]
+    check_names(names, has_archive=archive is not None)
+    run_dir = flags.run_dir or Path("runs") / f"{robot.name}-tables"
+    kept, out = run_dir / "crossings", flags.out or run_dir / "tables.json"
+    if out.suffix != ".json":
+        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
+    for file in (out, out.with_suffix(".png"), kept / "any"):
+        prepare_output(file)
+    scales = robot.read_penalty_scales()
+    for policy in controllers.values():
+        check_policy(policy, robot, size.device)
+    check_seeds(controllers)
+    sets = make_sets(names, size.terrains, flags.seed, archive=archive, split=split)
+    for name in FROM_ARCHIVE:
+        if name in sets:
+            check_held_out(controllers, sets[name].terrains, flags.split_seed)
+    return _Plan(
+        size=size, scales=scales, controllers=controllers, sets=sets, archive=_about(flags, archive, split),
+        kept=kept, out=out,
+    )  # fmt: skip
+
+
+def _about(flags: Evaluate, archive: Archive | None, split: "EliteSplit | None") -> dict[str, Any]:
+    """Where the generated terrains come from."""
+    if flags.archive is None or archive is None or split is None:
+        return {"archive": None, "archive_sha256": None}
+    parts = {"train": len(split.train), "test": len(split.test), "split_seed": flags.split_seed}
+    about = {"path": str(flags.archive), "elites": len(archive), "iterations": archive.iterations, **parts}
+    file = flags.archive / ARCHIVE_FILE if flags.archive.is_dir() else flags.archive
+    return {"archive": about, "archive_sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+
+
+def evaluate_tables(flags: Evaluate, *, open_evaluator: "Open" = open_evaluator) -> dict[str, Any]:
+    """Cross every set with every controller, print the tables, write them and their figure; returns their content.
+
+    Args:
+        flags: What to evaluate, on what, where.
+        open_evaluator: Opens what crosses terrains.
+
+    Raises:
+        ValueError: If something asked for cannot be had; raised before any long work.
+        FileNotFoundError: If there is no archive; likewise.
+        EvaluatorError: If a worker is lost; what was crossed is kept.
+    """
+    from sim.robots.own import robot_digest
+    from train.evaluate.crossings import KeptCrossings, cross_all
+    from train.evaluate.measures import measure
+    from train.evaluate.show import print_tables, write_figure
+    from train.evaluate.tables import make_tables
+
+    plan = _plan_of(flags)
+    size, robot = plan.size, plan.size.robot
+    kept = KeptCrossings(
+        plan.kept, robot=robot.name, robot_sha256=robot_digest(robot), episodes=size.episodes, device=size.device
     )
-    with open_evaluator(evaluator) as crossings:
-        sets = evaluate_sets(crossings, size.terrains, cfg.seed)
-    about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
-    report = {**origin_of(size.device, cfg.seed, cfg.workers), **about, **sets}
-    print_rates(report)
-    write_atomically(out, to_json(report))
-    print(f"written to {out}")
+
+    def tables() -> dict[str, Any]:
+        evaluator = _evaluator_of(size, flags, "", reward=True)
+        results = cross_all(plan.controllers, plan.sets, evaluator, kept, open_evaluator=open_evaluator)
+        crossed = {name: {who: measure(one, plan.scales) for who, one in row.items()} for name, row in results.items()}
+        about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in plan.controllers.items()}
+        return {
+            **origin_of(size.device, flags.seed, flags.workers),
+            "robot": robot.name,
+            "episodes": size.episodes,
+            "controllers": about,
+            **plan.archive,
+            **make_tables(crossed, plan.sets, robot, flags.seed),
+        }
+
+    report = publish(plan.out, tables, print_tables)
+    figure = plan.out.with_suffix(".png")
+    write_figure(figure, report)
+    print(f"figure written to {figure}")
     return report
-
-
-def evaluate(cfg: EvaluateCfg) -> dict[str, Any]:
-    """Evaluate as told: :func:`train.evaluate.tables_job.evaluate_tables` or :func:`evaluate_base`, with their errors."""
-    return evaluate_tables(cfg) if cfg.makes_tables else evaluate_base(cfg)
-
-
-def main() -> int:
-    """Command line; returns the exit status."""
-    cfg = tyro.cli(EvaluateCfg, description=__doc__)
-    stopped = "Stopped. What is crossed is kept: the same command goes on." if cfg.makes_tables else "Stopped."
-    return exit_code_of(lambda: int(evaluate(cfg) is None), stopped=stopped, also=(EvaluatorError,))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,17 +1,25 @@
-"""What crossings say of a controller, terrain by terrain: rates, reward and scaled penalties."""
+"""What crossings say of a controller: rates, reward and scaled penalties by terrain, by terrain type and by level."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from kernels.episode import Outcome
+from qd.fitness import MAX_INVALID_SHARE
+from qd.workers.evaluator import Evaluate
+from sim.files.intervals import bootstrap_interval
 from sim.rollout import RolloutResult
+from sim.terrain import CROSSING_TYPES
+from train.evaluate.sets import plain_set
 
 MEASURES = ("success", "goal", "fallen", "reward")
 """Names of the measures beside the penalties: three rates as fractions, and the reward in 20 s."""
-_MAX_INVALID_SHARE = 0.25
+VELOCITY_FROM_S = 2.0
+"""The velocity error counts from this time of an episode on [s]: before it the robot gets going."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +70,7 @@ def invalid_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
 def valid_episodes(result: RolloutResult) -> NDArray[np.bool_]:
     """Episodes that count, shape (T, R): not invalid, and not on a terrain more than a quarter of whose are."""
     valid = ~result.invalid
-    usable = valid.sum(axis=1) >= (1.0 - _MAX_INVALID_SHARE) * valid.shape[1]
+    usable = valid.sum(axis=1) >= (1.0 - MAX_INVALID_SHARE) * valid.shape[1]
     return valid & usable[:, None]
 
 
@@ -118,3 +126,81 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
         episodes=counted.sum(axis=1),
         outcomes=count_outcomes(result),
     )
+
+
+def _group(rates: dict[str, np.ndarray], members: np.ndarray) -> dict[str, Any]:
+    chosen = {name: values[members & ~np.isnan(values)] for name, values in rates.items()}
+    means = {name: float(values.mean()) if len(values) else None for name, values in chosen.items()}
+    return {"terrains": int(members.sum()), **means}
+
+
+def summarise(
+    result: RolloutResult, seed: int, *, types: np.ndarray | None = None, levels: np.ndarray | None = None
+) -> dict[str, Any]:
+    """Rates over a set of terrains, with 95 % intervals and, where known, by type and level.
+
+    Args:
+        result: Crossings of the set.
+        seed: Of the bootstrap.
+        types: Index into ``CROSSING_TYPES`` of each terrain, shape (num_terrains,).
+        levels: Level of each terrain, likewise.
+    """
+    rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
+    everywhere = np.ones(len(result.outcome), bool)
+    summary = _group(rates, everywhere)
+    rng = np.random.default_rng(seed)
+    for name, values in rates.items():
+        summary[f"{name}_interval"] = bootstrap_interval(values[~np.isnan(values)], rng)
+    summary["episodes"] = int(result.outcome.size)
+    summary["outcomes"] = count_outcomes(result)
+    summary["invalid_terrains"] = int(np.isnan(rates["success_rate"]).sum())
+    by_type = by_level = None
+    if types is not None:
+        by_type = {CROSSING_TYPES[k]: _group(rates, types == k) for k in np.unique(types)}
+    if levels is not None:
+        by_level = {str(level): _group(rates, levels == level) for level in np.unique(levels)}
+    return {**summary, "by_type": by_type, "by_level": by_level}
+
+
+def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
+    """Mean of ``|v_x - v_x,cmd|`` from 2 s to the end of each valid episode [m/s], base frame, every physics step.
+
+    Args:
+        result: Crossings whose penalties were summed from :data:`VELOCITY_FROM_S` on.
+        seed: Of the bootstrap.
+    """
+    counted_s = result.duration_s - VELOCITY_FROM_S
+    usable = ~result.invalid & (counted_s > 0.0)
+    error = result.penalties[..., result.penalty_names.index("vel_x")] / np.where(usable, counted_s, 1.0)
+    per_terrain = np.array([row[use].mean() for row, use in zip(error, usable, strict=True) if use.any()])
+    return {
+        "vx_error_mean": float(error[usable].mean()) if usable.any() else None,
+        "vx_error_interval": bootstrap_interval(per_terrain, np.random.default_rng(seed)),
+        "episodes": int(usable.sum()),
+        "goal_rate": float(result.reached_goal.mean()),
+    }
+
+
+def base_rates(evaluate: Evaluate, count: int, seed: int) -> dict[str, Any]:
+    """What ``base.json`` says of one controller on ``hand_crafted``, ``hard_random`` and ``flat``.
+
+    Args:
+        evaluate: Crosses terrains; its penalties count from :data:`VELOCITY_FROM_S` on.
+        count: Terrains a set.
+        seed: Draws the test sets.
+    """
+    sets = {name: plain_set(name, count, seed) for name in ("hand_crafted", "hard_random", "flat")}
+    results = {}
+    for name, chosen in sets.items():
+        with tqdm(desc=name, total=100, unit="%", disable=None) as bar:
+
+            def show(share: float, bar: tqdm = bar) -> None:
+                bar.update(round(100 * share) - bar.n)
+
+            results[name] = evaluate(chosen.terrains, chosen.seeds, show)
+    types, levels = sets["hand_crafted"].types, sets["hand_crafted"].levels
+    return {
+        "hand_crafted": summarise(results["hand_crafted"], seed, types=types, levels=levels),
+        "hard_random": summarise(results["hard_random"], seed),
+        "flat": velocity_error(results["flat"], seed),
+    }

@@ -1,18 +1,21 @@
-"""All published numbers beside the paper's, from results/ alone, into the README: ``python -m train.evaluate.publish``."""
+"""All published numbers beside the paper's, from results/ alone, into the page of results.
 
-import sys
+The paper is Esquerre-Pourtere, Kim and Park (arXiv 2506.01362). Its rewards are sums of its own training task's; the
+weights of its two added penalties are not published, so that they compare among its controllers, not with ours.
+"""
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from sim.files.atomic import read_json, write_atomically
-from sim.files.command import exit_code_of
-from sim.policy.names import kind_of
-from train.evaluate.paper import PAPER_ARCHIVES, published
-from train.evaluate.seeds import firsts
+from sim.files.command import command_line
+from sim.files.intervals import value_words
+from sim.policy.spec import firsts, kind_of
+
+PAGE = Path("docs/results.md")
+"""Where the published numbers stand."""
 
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"
 _NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}
@@ -24,10 +27,46 @@ _SETS = {
 }
 _NONE = "-"
 
+_CONTROLLERS = ("C-HC", "C-HR", "C-G")
+_PAPER_SETS = ("hand_crafted", "hard_random", "generated")
+
+_ROWS = {
+    "cassie": {
+        "success": ((0.997, 0.984, 0.999), (0.928, 0.982, 0.990), (0.743, 0.876, 0.957)),
+        "reward": ((32.7, 29.7, 32.9), (31.0, 31.6, 32.3), (25.7, 27.6, 29.9)),
+    },
+    "anymal": {
+        "success": ((0.971, 0.976, 0.980), (0.865, 0.954, 0.976), (0.598, 0.876, 0.914)),
+        "reward": ((25.6, 24.8, 25.4), (22.7, 24.9, 25.6), (16.6, 20.1, 23.3)),
+    },
+}
+
+PAPER_ARCHIVES = {
+    "cassie": {"elites": 930, "with_collision": 598, "without_collision": 332, "fitness": 4.7},
+    "anymal": {"elites": 1129},
+}
+"""What the paper says of its archives after 1,000 iterations."""
+
+Published = dict[str, dict[str, dict[str, float]]]
+"""Measure -> set -> controller -> value."""
+
+
+def published(robot: str) -> Published | None:
+    """The paper's success rates (fractions) and rewards of a robot by set and controller; None if it has none.
+
+    Source: its four tables, "Average rewards" and "Success rates" with the Cassie and with the ANYmal robot.
+    """
+    if robot not in _ROWS:
+        return None
+    return {
+        measure: {name: dict(zip(_CONTROLLERS, row, strict=True)) for name, row in zip(_PAPER_SETS, rows, strict=True)}
+        for measure, rows in _ROWS[robot].items()
+    }
+
 
 @dataclass(frozen=True, kw_only=True)
-class PublishCfg:
-    """Write the published numbers of all robots, with the paper's beside them, into the README.
+class Tables:
+    """Write the published numbers of all robots, with the paper's beside them, into the page of results.
 
     They come from results/<robot>/archive/archive.json, tables.json, distances.json and ablation.json; what is not
     there yet is left out.
@@ -35,10 +74,33 @@ class PublishCfg:
 
     results: Path = Path("results")
     """Where the results are."""
-    readme: Path = Path("README.md")
+    page: Path = PAGE
     """File that holds the lines `<!-- numbers: begin -->` and `<!-- numbers: end -->`; between them is replaced."""
     check: bool = False
     """Write nothing; fail if the file says something else than the results."""
+
+    def execute(self) -> None:
+        """Writes or checks the page.
+
+        Raises:
+            ValueError: If results or page are not as they must be, or with ``check`` say different things.
+            FileNotFoundError: If there is no page.
+        """
+        numbers = numbers_of(self.results)
+        text = self.page.read_text(encoding="utf-8")
+        before, begin, rest = text.partition(BEGIN)
+        _, end, after = rest.partition(END)
+        if not begin or not end:
+            raise ValueError(
+                f"{self.page} must hold the lines {BEGIN} and {END}, got none: put them where numbers belong"
+            )
+        wanted = f"{before}{BEGIN}\n{numbers}\n{END}{after}"
+        if self.check:
+            if text != wanted:
+                raise ValueError(f"{self.page} says something else than {self.results}: run {command_line('tables')}")
+            return
+        write_atomically(self.page, wanted.encode())
+        print(f"{numbers}\n\nwritten to {self.page}")
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -131,7 +193,7 @@ def _tables(found: dict[str, Any], robot: str) -> str:
         for who in firsts(found["success"].get(name, {})):
             kind = kind_of(who)
             cells = [_rate(found, measure, name, who) for measure in ("success", "goal")]
-            reward = _rate(found, "reward", name, who, digits=1)
+            reward = _rate(found, "reward", name, who, ".1f")
             theirs = [paper.get(measure, {}).get(name, {}).get(kind) for measure in ("success", "reward")]
             beside = _NONE if None in theirs else f"{theirs[0]:.3f}, {theirs[1]:.1f}"
             rows.append((f"{label} ({count})", kind, *cells, reward, beside))
@@ -142,17 +204,14 @@ def _tables(found: dict[str, Any], robot: str) -> str:
     return f"{title}\n\n{table(header, rows)}"
 
 
-def _rate(found: dict[str, Any], measure: str, name: str, who: str, digits: int = 3) -> str:
+def _rate(found: dict[str, Any], measure: str, name: str, who: str, form: str = ".3f") -> str:
     """A mean with its interval over seeds where there are several, else over terrains."""
     several = found["over_seeds"].get(measure, {}).get(name, {}).get(kind_of(who))
     mean, limits = found[measure][name][who], found["intervals"][measure][name][who]
     if several is not None:
         mean, limits = several["mean"], several["interval"]
-    if mean is None:
-        return _NONE
-    interval = "" if limits is None else f" ({limits[0]:.{digits}f} to {limits[1]:.{digits}f})"
-    seeds = "" if several is None else f", {len(several['values'])} seeds"
-    return f"{mean:.{digits}f}{interval}{seeds}"
+    seeds = f", {len(several['values'])} seeds" if several is not None and mean is not None else ""
+    return value_words(mean, limits, form) + seeds
 
 
 def _distances(found: dict[str, Any], robot: str) -> str:
@@ -171,38 +230,4 @@ def _ablation(found: dict[str, Any], robot: str) -> str:
 
 
 def _std(found: dict[str, Any], name: str, k: int) -> str:
-    low, high = found["intervals"][name][k]
-    return f"{found['mean_std'][name][k]:.2f} ({low:.2f} to {high:.2f})"
-
-
-def publish(cfg: PublishCfg) -> int:
-    """The command; returns its exit code.
-
-    Raises:
-        ValueError: If results or README are not as they must be, or with ``check`` say different things.
-        FileNotFoundError: If there is no README.
-    """
-    numbers = numbers_of(cfg.results)
-    text = cfg.readme.read_text(encoding="utf-8")
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"{cfg.readme} must hold the lines {BEGIN} and {END}, got none: put them where numbers belong")
-    wanted = f"{before}{BEGIN}\n{numbers}\n{END}{after}"
-    if cfg.check:
-        if text != wanted:
-            raise ValueError(f"{cfg.readme} says something else than {cfg.results}: run `make tables`")
-        return 0
-    write_atomically(cfg.readme, wanted.encode())
-    print(f"{numbers}\n\nwritten to {cfg.readme}")
-    return 0
-
-
-def main() -> int:
-    """Command line; returns the exit status."""
-    cfg = tyro.cli(PublishCfg, description=PublishCfg.__doc__)
-    return exit_code_of(lambda: publish(cfg))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return value_words(found["mean_std"][name][k], found["intervals"][name][k], ".2f")

@@ -2,17 +2,25 @@
 
 A test set is drawn from random numbers used nowhere else: not in training, calibration or search. All controllers meet
 the same terrains with the same episode seeds.
+
+Which elites are held out follows from the archive and the seed of the split. An archive that grew, or another seed,
+holds out others, among them some that a controller was trained on before: marks in its record tell.
 """
 
 import hashlib
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from sim.bank import TerrainBank
+from sim.bank import heights_of
+from sim.files.atomic import read_json
+from sim.policy.spec import ControllerSpec
 from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
 
 SETS = ("hand_crafted", "hard_random", "generated", "generated_far")
@@ -31,6 +39,10 @@ _TEST_KEY = 20250604  # with the set's number and the seed, the entropy of a tes
 _SPLIT_KEY = 20250605
 _NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3}
 _BANK = 50  # height maps that are compared at once
+
+TRAINED_ON = "trained_on"
+"""Key of the training record, and of checkpoint and controller, with the marks of all elites trained on."""
+_MARK_LENGTH = 12  # of 2,000 elites, two have the same with a chance of one in 100 million
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +99,12 @@ def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
     if archive.robot != robot:
         raise ValueError(
             f"the archive must be of robot '{robot}', got one of '{archive.robot}': its terrains were found to break "
-            f"another body; give an archive of '{robot}' (make archive ROBOT={robot})"
+            f"another body; give an archive of '{robot}' (faultline archive --robot {robot})"
         )
     if len(archive) < _MIN_ELITES:
         raise ValueError(
             f"an archive to be split into training and test terrains needs at least {_MIN_ELITES} elites, got "
-            f"{len(archive)}: let its search go on (make archive RESUME=... ITERATIONS=...)"
+            f"{len(archive)}: let its search go on (faultline archive --resume RUN --iterations N)"
         )
     if seed < 0:
         raise ValueError(f"the seed of the split must not be negative, got {seed}")
@@ -191,9 +203,7 @@ def nearest_distance(genes: NDArray[np.float32], training_genes: NDArray[np.floa
 
 def _heights(genes: NDArray[np.float32]) -> NDArray[np.float64]:
     """Height maps [m] as rows, float64 since their squares are subtracted from each other."""
-    bank = TerrainBank(len(genes), device="cpu")
-    bank.set_genes(genes)
-    return bank.heights.numpy().reshape(len(genes), -1).astype(np.float64)
+    return heights_of(genes).reshape(len(genes), -1).astype(np.float64)
 
 
 def make_sets(
@@ -235,3 +245,71 @@ def check_names(names: Sequence[str], *, has_archive: bool) -> None:
     missing = [name for name in names if name in FROM_ARCHIVE and not has_archive]
     if missing:
         raise ValueError(f"set {', '.join(missing)} is made of elites: give the run that found them (--archive RUN)")
+
+
+def marks_of(genes: NDArray[np.float32]) -> list[str]:
+    """A short mark of each elite that depends on its genes alone.
+
+    Args:
+        genes: Shape (E, 64).
+    """
+    rows = np.ascontiguousarray(genes, np.float32)
+    return [hashlib.sha256(row.tobytes()).hexdigest()[:_MARK_LENGTH] for row in rows]
+
+
+def recorded_marks(policy: str) -> set[str]:
+    """Marks of the elites that a controller was trained on; none where neither its file nor a record beside it has any.
+
+    Args:
+        policy: A controller as :class:`sim.policy.spec.ControllerSpec` takes it.
+
+    Raises:
+        ValueError: If the marks are damaged.
+    """
+    found: set[str] = set()
+    for file in ControllerSpec.parse(policy).files:
+        record = file.with_suffix(".train.json")
+        contents = [(record, read_json(record))] if record.is_file() else []
+        for place, content in (*contents, *((file, part) for part in _parts_of(file))):
+            marks = content.get(TRAINED_ON, [])
+            if not isinstance(marks, list) or not all(isinstance(mark, str) for mark in marks):
+                raise ValueError(f"{place} is damaged at {TRAINED_ON}: put a copy of it back")
+            found |= set(marks)
+    return found
+
+
+def _parts_of(file: Path) -> list[dict[str, Any]]:
+    """Where marks may stand in a file of weights: itself, and what a checkpoint has beside the networks."""
+    if file.suffix.lower() in (".py", ".onnx") or not file.is_file():
+        return []
+    try:
+        from sim.policy.loaders import read_weights
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of TorchScript files, which have none
+            content = read_weights(file)
+    except Exception:  # another kind of file, which has no marks
+        return []
+    parts = [content, content.get("extra")] if isinstance(content, dict) else []
+    return [part for part in parts if isinstance(part, dict)]
+
+
+def check_held_out(controllers: Mapping[str, str], genes: NDArray[np.float32], split_seed: int) -> None:
+    """Refuse to call terrains held out that a controller was trained on.
+
+    Args:
+        controllers: Policy of each controller by its name.
+        genes: Elites that are to be crossed, shape (T, 64).
+        split_seed: Of the split that held them out.
+
+    Raises:
+        ValueError: If one of the controllers was trained on some of them, as far as its record says; naming it.
+    """
+    marks = marks_of(genes)
+    for name, policy in controllers.items():
+        trained_on = recorded_marks(policy)
+        if count := sum(mark in trained_on for mark in marks):
+            raise ValueError(
+                f"{name} was trained on {count} of the {len(marks)} elites that split seed {split_seed} holds out of "
+                "this archive: give the archive as it was then and the split seed of its training"
+            )

@@ -2,23 +2,35 @@
 
 All numbers are means over the terrains of a set, each the mean over its valid episodes; intervals are 95 %, bootstrap
 over terrains, with the same resamples for every controller.
+
+A controller *fails* a terrain if fewer than half of its valid episodes there reach the goal; an episode with a base
+collision does not. Of two controllers, a terrain is then *mended* (the first fails, the second does not), *still
+failing* (both), *newly broken* (the second alone) or fine with both. A terrain that is a matter of luck to either falls
+on one side by chance: *clear* are those changes where the 95 % intervals (Wilson) of the two goal rates do not overlap.
 """
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.files.intervals import paired_interval
+from sim.files.intervals import MAX_T_VALUES, paired_interval, t_interval, wilson_interval
+from sim.policy.spec import MARK, controller_hash, firsts, kind_of
 from sim.robots.robot import RobotCfg
-from train.evaluate.differences import differences
 from train.evaluate.measures import MEASURES, Measured
-from train.evaluate.paper import published
-from train.evaluate.seeds import firsts, over_seeds
+from train.evaluate.publish import published
 from train.evaluate.sets import FROM_ARCHIVE, TerrainSet
 
+FAILING_BELOW = 0.5
+"""Goal rate below which a controller fails a terrain."""
+KINDS = ("mended", "still_failing", "newly_broken", "fine")
+"""What may have become of a terrain."""
+RATES = ("success", "goal", "fallen")
+"""Measures that lie between 0 and 1, and so do their intervals."""
 Crossed = Mapping[str, Mapping[str, Measured]]
 """Set -> controller -> what it made of the set's terrains."""
 
@@ -36,8 +48,8 @@ def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCf
         ``success``, ``goal``, ``fallen`` (fractions), ``reward`` (sum over 20 s): set -> controller -> mean;
         ``penalties``: set -> controller -> penalty -> mean, scaled; ``intervals``: the same five with [lower, upper];
         ``outcomes`` and ``invalid_terrains``: counts; ``over_seeds``: mean over the controllers of a kind
-        (:func:`train.evaluate.seeds.over_seeds`); ``differences`` of every two kinds' first controllers by set
-        (:mod:`train.evaluate.differences`); ``traversable`` by generated set (:func:`split_by_goal`); ``terrains``: set ->
+        (:func:`over_seeds`); ``differences`` of every two kinds' first controllers by set
+        (:func:`differences`); ``traversable`` by generated set (:func:`split_by_goal`); ``terrains``: set ->
         number of terrains; ``paper``: the paper's numbers likewise, None of a robot it has none of; ``reward_weights``.
     """
     means = _statistics(crossed, _mean)
@@ -76,8 +88,8 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
 
     Returns:
         ``crossed`` and ``never_crossed``: their ``count``, ``share`` with ``interval``, numbers as ``terrains``, and
-        each of :data:`train.evaluate.measures.MEASURES` as controller -> mean, with ``intervals``; invalid terrains, with every
-        controller, are in neither.
+        each of :data:`train.evaluate.measures.MEASURES` as controller -> mean, with ``intervals``; terrains that are
+        invalid with every controller are in neither.
     """
     judged = np.any([one.valid for one in row.values()], axis=0)
     ever = np.any([one.goals > 0 for one in row.values()], axis=0)
@@ -95,6 +107,135 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
             },
         }
     return found
+
+
+def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], seed: int) -> dict[str, Any]:
+    """What became of each terrain from one controller to another, and what the second gains in the mean.
+
+    Args:
+        before: What the first made of T terrains.
+        after: What the second made of the same.
+        numbers: Number of each terrain, shape (T,).
+        seed: Of the bootstrap over terrains.
+
+    Returns:
+        As JSON values: ``compared`` terrains (valid for both); for each of :data:`KINDS` their ``count``, ``share``,
+        the 95 % ``interval`` of the share, their numbers as ``terrains``, and of those mended or newly broken
+        how many are ``clear``; and ``gain``: measure -> mean difference with its interval, terrain by terrain.
+    """
+    both = before.valid & after.valid
+    fails = [np.where(both, one.values["goal"] < FAILING_BELOW, False) for one in (before, after)]
+    members = {
+        "mended": fails[0] & ~fails[1],
+        "still_failing": fails[0] & fails[1],
+        "newly_broken": ~fails[0] & fails[1],
+        "fine": ~fails[0] & ~fails[1] & both,
+    }
+    apart = _goal_rates_apart(before, after)
+    found: dict[str, Any] = {"compared": int(both.sum())}
+    for kind, member in members.items():
+        found[kind] = _counted(member, both, numbers, seed)
+        if kind in ("mended", "newly_broken"):
+            found[kind]["clear"] = int((member & apart).sum())
+    gains = {name: (after.values[name] - before.values[name])[both] for name in MEASURES}
+    found["gain"] = {
+        name: {"mean": _mean(gain), "interval": paired_interval(gain, seed)} for name, gain in gains.items()
+    }
+    return found
+
+
+def differences(crossed: dict[str, Measured], numbers: NDArray[np.int64], seed: int) -> dict[str, Any]:
+    """:func:`difference` of every two controllers, the earlier named one first, under ``first -> second``.
+
+    Args:
+        crossed: What each controller made of the same T terrains.
+        numbers: Number of each terrain, shape (T,).
+        seed: Of the bootstrap over terrains.
+    """
+    return {
+        f"{first} -> {second}": difference(crossed[first], crossed[second], numbers, seed)
+        for first, second in combinations(crossed, 2)
+    }
+
+
+def _counted(
+    member: NDArray[np.bool_], among: NDArray[np.bool_], numbers: NDArray[np.int64], seed: int
+) -> dict[str, Any]:
+    shares = member[among].astype(float)
+    return {
+        "count": int(member.sum()),
+        "share": _mean(shares),
+        "interval": paired_interval(shares, seed),
+        "terrains": np.sort(numbers[member]).tolist(),
+    }
+
+
+def _goal_rates_apart(before: Measured, after: Measured) -> NDArray[np.bool_]:
+    """Whether the Wilson intervals of two controllers' goal rates on a terrain do not overlap, shape (T,)."""
+    limits = [_wilson_limits(one) for one in (before, after)]
+    return (limits[0][:, 1] < limits[1][:, 0]) | (limits[1][:, 1] < limits[0][:, 0])
+
+
+def _wilson_limits(one: Measured) -> NDArray[np.float64]:
+    """Interval of the goal rate on each terrain, shape (T, 2); anything possible on an invalid one."""
+    counts = zip(one.goals.tolist(), one.episodes.tolist(), strict=True)
+    return np.array([wilson_interval(goals, episodes) if episodes else (0.0, 1.0) for goals, episodes in counts])
+
+
+def check_seeds(controllers: Mapping[str, str]) -> None:
+    """Refuse one training as several: the interval over its "seeds" would be none.
+
+    Args:
+        controllers: Policy of each controller by its name.
+
+    Raises:
+        ValueError: If two of a kind are the same controller, or a name is no kind with at most one seed.
+    """
+    for name in controllers:
+        if not re.fullmatch(f"[^{MARK}]+({MARK}[^{MARK}]+)?", name):
+            raise ValueError(f"a controller is named KIND or KIND{MARK}SEED, as C-G{MARK}1, got '{name}'")
+    known: dict[tuple[str, str], str] = {}
+    for name, policy in controllers.items():
+        key = (kind_of(name), controller_hash(policy) or policy)
+        if key in known:
+            raise ValueError(
+                f"{known[key]} and {name} must be of one kind from different seeds, got the same controller twice: "
+                "name another file, or leave one out"
+            )
+        known[key] = name
+
+
+def over_seeds(tables: dict[str, Any], measures: Iterable[str]) -> dict[str, Any]:
+    """Mean over the controllers of each kind that has several.
+
+    Args:
+        tables: Measure -> set -> controller -> value.
+        measures: Which of them.
+
+    Returns:
+        Measure -> set -> kind -> ``mean``, 95 % t ``interval`` over controllers and their ``values``; empty where no
+        kind has several. A mean is None where one of the values is, an interval too where there are more than
+        :data:`sim.files.intervals.MAX_T_VALUES`.
+    """
+    found: dict[str, Any] = {}
+    for measure in measures:
+        for name, row in tables[measure].items():
+            for kind in dict.fromkeys(map(kind_of, row)):
+                values = [value for who, value in row.items() if kind_of(who) == kind]
+                if len(values) > 1:
+                    summary = _summary(values, is_rate=measure in RATES)
+                    found.setdefault(measure, {}).setdefault(name, {})[kind] = summary
+    return found
+
+
+def _summary(values: list[float | None], *, is_rate: bool) -> dict[str, Any]:
+    numbers = [value for value in values if value is not None]
+    if len(numbers) < len(values):
+        return {"mean": None, "interval": None, "values": values}
+    interval = t_interval(np.array(numbers)) if len(numbers) <= MAX_T_VALUES else None
+    if interval is not None and is_rate:
+        interval = [max(interval[0], 0.0), min(interval[1], 1.0)]
+    return {"mean": sum(numbers) / len(numbers), "interval": interval, "values": values}
 
 
 def _statistics(crossed: Crossed, of: Callable[[NDArray[np.float64]], Any]) -> dict[str, Any]:

@@ -1,19 +1,26 @@
-"""PPO on an environment: one iteration at a time, and checkpoints from which training goes on where it stopped."""
+"""PPO on an environment, one iteration at a time: from a seed, from a trained controller, or from a checkpoint.
+
+Several processes of one training, as torchrun starts them, take a GPU each: gradients are averaged, the first writes.
+"""
 
 import contextlib
 import io
 import os
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.runners import OnPolicyRunner
+from torch import distributed
 
 from sim.files.atomic import write_atomically
-from sim.policy.loaders import read_weights, reason_of
-from train.ppo.ppo import CapturedPPO, PpoCfg, runner_settings
-from train.ppo.ranks import Ranks, Runner
+from sim.policy.loaders import MlpPolicy, load_policy, read_weights, reason_of
+from sim.robots.robot import RobotCfg
+from train.ppo.cfg import PpoCfg
+from train.ppo.ppo import CapturedPPO, runner_settings
 from train.task.vec_env import CommandVecEnv
 
 CHECKPOINT_FORMAT = "faultline training checkpoint 1"
@@ -26,6 +33,82 @@ _ENTRIES = {
     "rng_cuda": (torch.Tensor, type(None)),
     "extra": (dict,),
 }
+_STD = "distribution.std_param"
+State = dict[str, torch.Tensor]
+"""Weights under rsl_rl's keys."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranks:
+    """Which of how many processes this one is."""
+
+    rank: int = 0
+    local_rank: int = 0
+    """Its number on this machine, which is its GPU's."""
+    size: int = 1
+
+    @classmethod
+    def of_environment(cls) -> "Ranks":
+        """What torchrun put into RANK, LOCAL_RANK and WORLD_SIZE; one process without it."""
+        rank, local_rank, size = (int(os.environ.get(name, 0)) for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE"))
+        return cls(rank=rank, local_rank=local_rank, size=max(1, size))
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process prints and writes."""
+        return self.rank == 0
+
+    def device(self, name: str) -> str:
+        """The Warp device of this process, where ``name`` was asked for.
+
+        Raises:
+            ValueError: If one GPU was named for several processes.
+        """
+        if self.size == 1 or not name.startswith("cuda"):
+            return name
+        if name not in ("cuda", "cuda:0"):
+            raise ValueError(f"with torchrun each process takes its own GPU, got device {name}: give cuda, or leave it")
+        return f"cuda:{self.local_rank}"
+
+    def all_want(self, wish: bool, device: torch.device | str) -> bool:
+        """Whether every process wishes so; all get the same answer."""
+        if self.size == 1:
+            return wish
+        flag = torch.tensor(int(wish), device=device)
+        distributed.all_reduce(flag, op=distributed.ReduceOp.MIN)
+        return bool(flag.item())
+
+    def check_same(self, parameters: list[torch.Tensor]) -> None:
+        """That the processes hold the same numbers, as averaged gradients must leave them.
+
+        Raises:
+            FloatingPointError: If they do not.
+        """
+        if self.size == 1:
+            return
+        own = torch.cat([parameter.detach().flatten() for parameter in parameters])
+        first = own.clone()
+        distributed.broadcast(first, src=0)
+        if not self.all_want(bool(torch.equal(own, first)), own.device):
+            raise FloatingPointError("the networks of the processes have drifted apart: this training is not one")
+
+
+class Runner(OnPolicyRunner):
+    """rsl_rl's runner, which several processes may share on CPUs too."""
+
+    def _configure_multi_gpu(self) -> None:
+        if Ranks.of_environment().size == 1 or self.device.startswith("cuda"):
+            super()._configure_multi_gpu()
+            return
+        ranks = Ranks.of_environment()
+        self.is_distributed, self.gpu_world_size = True, ranks.size
+        self.gpu_local_rank, self.gpu_global_rank = ranks.local_rank, ranks.rank
+        self.cfg["multi_gpu"] = {
+            "global_rank": ranks.rank,
+            "local_rank": ranks.local_rank,
+            "world_size": ranks.size,
+        }
+        distributed.init_process_group("gloo")  # rsl_rl's own choice is NCCL, which CPUs do not have
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,3 +347,68 @@ def check_entries(content: dict[str, Any], expected: dict[str, tuple[type, ...]]
     if wrong:
         found = ", ".join(f"{name} must be {expected[name][0].__name__}, got {got}" for name, got in wrong.items())
         raise ValueError(f"{path} is a damaged checkpoint: {found}; put a copy of it back")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """A trained actor, and its critic where it is known."""
+
+    actor: State
+    critic: State | None
+    hidden_dims: tuple[int, ...]
+    """Hidden layers of both."""
+
+
+def read_start(path: Path, robot: RobotCfg) -> Start:
+    """Networks of an rsl_rl checkpoint, fit to be trained on.
+
+    A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
+    such a file is left: its own normaliser is another.
+
+    Args:
+        path: The checkpoint.
+        robot: Whose controller it is.
+
+    Raises:
+        ValueError: If it is no such file, of another robot, or its standard deviation or critic cannot be trained on.
+    """
+    policy = load_policy(path, robot, "cpu")
+    if not isinstance(policy, MlpPolicy):
+        raise ValueError(
+            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: {path}"
+        )
+    content = read_weights(path)
+    actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
+    if policy.normalised:
+        weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
+        actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
+    hidden = tuple(layer.out_features for layer in policy.layers if isinstance(layer, torch.nn.Linear))[:-1]
+    critic = None if policy.normalised else content.get("critic_state_dict")
+    _check_std(actor, robot, path)
+    if critic is not None:
+        _check_critic(critic, (policy.sizes[0], *hidden, 1), path)
+    return Start(actor=actor, critic=critic, hidden_dims=hidden)
+
+
+def _check_std(actor: State, robot: RobotCfg, path: Path) -> None:
+    std = actor.get(_STD)
+    fits = std is None or (std.shape == (robot.num_joints,) and bool((std > 0.0).all()) and bool(std.isfinite().all()))
+    if not fits:
+        raise ValueError(
+            f"{path}: {_STD}, the standard deviation of the actions, must be {robot.num_joints} numbers above 0, got "
+            f"{' '.join(str(std).split())}: leave it out, or give another controller"
+        )
+
+
+def _check_critic(critic: Any, sizes: tuple[int, ...], path: Path) -> None:
+    expected = {}
+    for k, (width, out) in enumerate(pairwise(sizes)):
+        expected |= {f"mlp.{2 * k}.weight": (out, width), f"mlp.{2 * k}.bias": (out,)}
+    tensors = isinstance(critic, dict) and all(isinstance(value, torch.Tensor) for value in critic.values())
+    if not tensors or {key: tuple(value.shape) for key, value in critic.items()} != expected:
+        raise ValueError(
+            f"{path}: its critic (critic_state_dict) must have the actor's hidden layers {list(sizes[1:-1])}, "
+            f"{sizes[0]} inputs and one output, got another: leave it out of the file, and one is trained"
+        )
+    if not all(bool(value.isfinite().all()) for value in critic.values()):
+        raise ValueError(f"{path}: its critic (critic_state_dict) has weights that are not finite: leave it out")

@@ -1,91 +1,15 @@
-"""PPO settings as a fresh dict per call, and rsl_rl's PPO with its minibatch step captured as one CUDA graph."""
+"""rsl_rl's PPO with its minibatch step captured as one CUDA graph."""
 
-import math
-from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
 from torch import nn
 
-from sim.robots.robot import RobotCfg
-from sim.robots.training import PaceCfg
+from train.ppo.cfg import PpoCfg
 
 _FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on
 _EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels
-
-
-@dataclass(frozen=True, kw_only=True)
-class PpoCfg(PaceCfg):
-    """Settings of the learner; the defaults are legged_gym's but for the steps."""
-
-    hidden_dims: tuple[int, ...] = (512, 256, 128)
-    """Hidden layers (ELU) of actor and critic."""
-    steps_per_env: int = 16
-    """Control steps an iteration, per environment; legged_gym's 24 are for half as many environments."""
-    epochs: int = 5
-    """Passes over the data of an iteration."""
-    mini_batches: int = 4
-    """Minibatches a pass."""
-    learning_rate: float = 1e-3
-    """Learning rate at the start; adapted to the KL divergence from then on."""
-    gamma: float = 0.99
-    """Discount per control step."""
-    lam: float = 0.95
-    """Lambda of generalised advantage estimation."""
-    clip: float = 0.2
-    """Clip range of the probability ratio and of the value."""
-    captured: bool = True
-    """Update with :class:`CapturedPPO`; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
-
-    @classmethod
-    def of(cls, robot: RobotCfg) -> "PpoCfg":
-        """The settings that a robot's controller is learned with."""
-        return cls(**{setting.name: getattr(robot.learning, setting.name) for setting in fields(PaceCfg)})
-
-
-def check_ppo(cfg: PpoCfg, num_envs: int) -> None:
-    """Refuse settings that nothing can be learned with.
-
-    Args:
-        cfg: Settings of the learner.
-        num_envs: Environments of one process.
-
-    Raises:
-        ValueError: Naming all that are out of range.
-    """
-    ranges = {
-        "hidden_dims": (
-            bool(cfg.hidden_dims) and min(cfg.hidden_dims) >= 1,
-            "at least one layer, each at least 1 wide",
-        ),
-        "steps_per_env": (cfg.steps_per_env >= 1, "at least 1"),
-        "epochs": (cfg.epochs >= 1, "at least 1"),
-        "mini_batches": (
-            1 <= cfg.mini_batches <= max(num_envs * cfg.steps_per_env // 2, 1),
-            f"at least 1, and at most half of the {num_envs} x {cfg.steps_per_env} transitions of an iteration",
-        ),
-        "learning_rate": (0.0 < cfg.learning_rate < math.inf, "above 0"),
-        "desired_kl": (0.0 < cfg.desired_kl < math.inf, "above 0"),
-        "gamma": (0.0 <= cfg.gamma <= 1.0, "in 0..1"),
-        "lam": (0.0 <= cfg.lam <= 1.0, "in 0..1"),
-        "clip": (0.0 < cfg.clip < math.inf, "above 0"),
-        "entropy": (0.0 <= cfg.entropy < math.inf, "at least 0"),
-        "init_noise_std": (0.0 < cfg.init_noise_std < math.inf, "above 0"),
-        "final_share": (0.0 <= cfg.final_share <= 1.0, "in 0..1"),
-        "final_kl": (
-            0.0 < cfg.final_kl < math.inf and (cfg.final_share == 0.0 or cfg.final_kl <= cfg.desired_kl),
-            f"above 0, and with a ppo.final_share at most ppo.desired_kl, {cfg.desired_kl}",
-        ),
-        "final_entropy": (0.0 <= cfg.final_entropy < math.inf, "at least 0"),
-    }
-    wrong = [
-        f"ppo.{name} must be {range_}, got {getattr(cfg, name)}" for name, (ok, range_) in ranges.items() if not ok
-    ]
-    if num_envs * cfg.steps_per_env == 1:
-        wrong.append("an iteration must have at least 2 transitions, got 1: more num_envs or ppo.steps_per_env")
-    if wrong:
-        raise ValueError("; ".join(wrong))
 
 
 def runner_settings(cfg: PpoCfg) -> dict[str, Any]:

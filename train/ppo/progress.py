@@ -4,9 +4,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+from torch.utils.tensorboard import FileWriter
+from torch.utils.tensorboard.summary import scalar
+
 from kernels.rewards import REWARDS
+from sim.files.atomic import unwritable
 from train.ppo.learner import Iteration, Learner
-from train.ppo.scalars import ScalarFile
 
 _ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out")
 STATE = {"settings": (dict,), "curve": (list,), "pieces": (list,), "env_steps": (int,), "wall_s": (float, int)}
@@ -63,7 +66,8 @@ class Progress:
         self._wall_s = float(saved["wall_s"]) if saved else 0.0
         self._pieces.append({**about, "from_iteration": learner.iteration})
         self._about = about
-        self._scalars = ScalarFile(run_dir)
+        self._run_dir = run_dir
+        self._scalars = FileWriter(str(run_dir))
         self._window: list[Iteration] = []
         self._piece_began = time.monotonic()
         self.warm = False
@@ -78,9 +82,10 @@ class Progress:
             self._finish_row()
 
     def close(self) -> None:
-        """Finish the last row."""
+        """Finish the last row and TensorBoard's file."""
         if self._window:
             self._finish_row()
+        self._scalars.close()
         self._wall_s += time.monotonic() - self._piece_began
         self._piece_began = time.monotonic()
 
@@ -159,13 +164,17 @@ class Progress:
             print(f"  {row['ends']['invalid']} invalid states reset, {row['overflows']} steps with a solver overflow")
 
     def _write_scalars(self, row: dict[str, Any]) -> None:
-        scalars = {}
+        """Adds the row to TensorBoard's file and waits until it is there: a killed run keeps it."""
+        summary = scalar("train/iteration", row["iteration"])
         for group, value in row.items():
-            entries = value if isinstance(value, dict) else {"": value}
-            for name, number in entries.items():
+            for name, number in (value if isinstance(value, dict) else {"": value}).items():
                 if number is not None and group != "iteration":
-                    scalars[f"{group}/{name}" if name else f"train/{group}"] = number
-        self._scalars.write(row["iteration"], scalars)
+                    summary.MergeFrom(scalar(f"{group}/{name}" if name else f"train/{group}", number))
+        try:
+            self._scalars.add_summary(summary, row["iteration"])
+            self._scalars.flush()
+        except OSError as error:
+            raise unwritable(self._run_dir, error) from error
 
 
 def _rounded(value: Any) -> Any:

@@ -1,25 +1,36 @@
-"""What all trainings share: a run directory, iterating until told to stop, checkpoints, the controller at the end."""
+"""What all trainings share: a job, iterating until told to stop, checkpoints, the controller at the end."""
 
 import io
 import signal
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
-from train.evaluate.held_out import TRAINED_ON
-from train.ppo.learner import Learner, check_entries, read_checkpoint
+from sim.files.command import command_line
+from sim.files.provenance import provenance
+from sim.files.settings import built, problems
+from sim.robots.robot import RobotCfg
+from sim.simulation import resolve_device
+from train.evaluate.sets import TRAINED_ON
+from train.ppo.cfg import PpoCfg, TrainingFlags, ppo_problems
+from train.ppo.learner import Learner, Ranks, check_entries, read_checkpoint
 from train.ppo.progress import STATE, Progress
+from train.task.cfg import TaskCfg, task_problems
+from train.task.curriculum import Tiles
+from train.task.task import CommandTask
+from train.task.vec_env import CommandVecEnv
 
 CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.pt"
 CONFIG = "config.json"
-RESERVE_S = 10.0
-"""Kept back of a time limit for the last save [s]."""
+_RESERVE_S = 10.0  # of a time limit, for the last save
+_SEED_STEP = 1_000_003  # between the tasks of two processes
 
 
 class StopRequest:
@@ -42,45 +53,71 @@ class StopRequest:
         signal.signal(kind, signal.SIG_DFL)
 
 
-def check_least(**numbers: tuple[int | None, int]) -> None:
-    """Refuse numbers below the least that they may be, each ``name=(number, least)``; none is left to a default.
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A training that can begin: everything that a user may have got wrong has been checked."""
+
+    command: str
+    """The word that calls it: train or finetune."""
+    flags: TrainingFlags
+    robot: RobotCfg
+    device: str
+    """Warp device name."""
+    num_envs: int
+    iterations: int
+    task: TaskCfg
+    ppo: PpoCfg
+    settings: dict[str, Any]
+    """What makes the training what it is: plain values, as a checkpoint keeps them."""
+    saved: dict[str, Any] | None
+    """The checkpoint that it goes on from."""
+    run_dir: Path
+    began: float
+    """When the command began, on the clock of :func:`time.monotonic` [s]."""
+
+
+def device_of(flags: TrainingFlags) -> str:
+    """Warp device name of this process of a training.
 
     Raises:
-        ValueError: Naming the first such.
+        ValueError: If there is no such device, or torch has no CUDA for it.
     """
-    for name, (number, least) in numbers.items():
-        if number is not None and number < least:
-            raise ValueError(f"{name} must be at least {least}, got {number}")
+    device = Ranks.of_environment().device(resolve_device(flags.device))
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(
+            f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build "
+            "or use --device cpu"
+        )
+    return device
 
 
-def check_limits(*, rows: int, save_every_s: float, max_seconds: float | None) -> None:
-    """Refuse limits that mean nothing.
+def check_training(flags: TrainingFlags, task: TaskCfg, ppo: PpoCfg, *, robot: RobotCfg, num_envs: int) -> None:
+    """Refuses flags and settings that nothing can be learned with.
 
     Raises:
-        ValueError: If there is no row, or a time is negative or none.
+        ValueError: Naming all that are wrong.
     """
-    if rows < 1:
-        raise ValueError(f"rows must be at least 1, got {rows}")
-    if not save_every_s >= 0.0:
-        raise ValueError(f"save_every_s must be at least 0 s, got {save_every_s}")
-    if max_seconds is not None and not max_seconds > 0.0:
-        raise ValueError(f"max_seconds must be above 0 s, got {max_seconds}; leave it out for no limit")
+    own = [line for line in problems(flags) if not line.startswith(("task.", "ppo."))]
+    found = [*own, *task_problems(task, robot.control_dt), *ppo_problems(ppo, num_envs)]
+    if found:
+        raise ValueError("; ".join(found))
 
 
-def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) -> Path:
+def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
     """The run directory, made and fit to be written to.
 
     Args:
-        run_dir: Where to write.
-        resume: Run to go on from; the only one that may be written over.
-        export: Where else the controller goes.
+        flags: Say where to write, which run to go on from, and where else the controller goes.
+        name: Of a new directory under runs/, before the date.
 
     Raises:
         ValueError: If it holds another run, one of the places cannot be written to, or the controller has another name.
     """
+    run_dir = flags.run_dir or flags.resume or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    export, resume = flags.export, flags.resume
     if export is not None and export.suffix != ".pt":
         raise ValueError(
-            f"export must be a file named *.pt, got {export}: python -m sim.policy.export makes ONNX files of it"
+            f"export must be a file named *.pt, got {export}: faultline export-policy makes an ONNX file of it"
         )
     if (run_dir / CHECKPOINT).exists() and (resume is None or run_dir.resolve() != resume.resolve()):
         raise ValueError(
@@ -89,13 +126,13 @@ def prepare_run_dir(run_dir: Path, *, resume: Path | None, export: Path | None) 
     config = run_dir / CONFIG
     if config.exists() and "settings" in read_json(config):
         raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
+    folders = {run_dir, export.parent if export else run_dir}
     try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        if export is not None:
-            export.parent.mkdir(parents=True, exist_ok=True)
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"cannot write to {error.filename}: {error.strerror}; name another place") from error
-    for folder in {run_dir, export.parent if export else run_dir}:
+    for folder in folders:
         check_writable(folder)
     return run_dir
 
@@ -109,25 +146,7 @@ def claimed(run_dir: Path) -> AbstractContextManager[None]:
     return locked(run_dir, f"another training works in {run_dir}: let it end, or name another --run-dir")
 
 
-def plain(value: Any) -> Any:
-    """Settings as they come back from a file: paths as text, tuples as lists."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
-def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
-    """What differs between two nested settings, one line each."""
-    found = []
-    for key in sorted(before.keys() | after.keys()):
-        old, new = before.get(key), after.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            found += changes(old, new, f"{prefix}{key}.")
-        elif old != new:
-            found.append(f"{prefix}{key} {old} -> {new}")
-    return found
+# Going on with a run ---------------------------------------------------------------------------------------------
 
 
 def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
@@ -143,40 +162,166 @@ def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
     """
     path = run / CHECKPOINT
     saved = read_checkpoint(path, robot)
-    check_entries(saved["extra"], STATE, path)
-    check_entries(saved["extra"]["settings"], {"seed": (int,)}, path)
-    _check_kind(run, saved["extra"], finetuning=finetuning)
-    if isinstance(saved["extra"]["settings"].get("task"), dict):
-        saved["extra"]["settings"]["task"].pop("max_speed", None)  # of older versions; it is the robot's now
+    extra = saved["extra"]
+    check_entries(extra, STATE, path)
+    found = "mix" in extra or "mix" in extra["settings"]
+    if found and not finetuning:
+        raise ValueError(f"{run} is a fine-tuning: go on with {command_line('finetune', robot=robot, resume=run)}")
+    if finetuning and not found:
+        raise ValueError(
+            f"{run} is the training of a base controller, not a fine-tuning: go on with "
+            f"{command_line('train', robot=robot, resume=run)}, or fine-tune what it made with --policy {path}"
+        )
+    if finetuning:
+        check_entries(extra, {"mix": (dict,)}, path)
     return saved
 
 
-def check_more(run: Path | None, saved: dict[str, Any] | None, iterations: int) -> None:
-    """Refuse fewer iterations in all than the resumed run, if any, has done.
+def settings_of(run: Path, saved: dict[str, Any], kinds: dict[str, type]) -> dict[str, Any]:
+    """The settings that a run was begun with.
+
+    Args:
+        run: Its directory.
+        saved: Its checkpoint.
+        kinds: Type of each setting asked for; settings classes are built.
 
     Raises:
-        ValueError: If there are fewer.
+        ValueError: If one is missing or damaged.
     """
-    if saved is not None and saved["iter"] > iterations:
-        raise ValueError(f"{run} has done {saved['iter']} iterations already: give at least as many in all")
+    settings, found = saved["extra"]["settings"], {}
+    for name, kind in kinds.items():
+        try:
+            if is_dataclass(kind):
+                found[name] = built(kind, settings[name], name)
+            elif type(settings[name]) is not kind:
+                raise ValueError(f"{name} must be of type {kind.__name__}, got {settings[name]!r}")
+            else:
+                found[name] = settings[name]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{run / CHECKPOINT} is damaged, or of another version: {error}; put a copy of it back, or begin a new "
+                "run"
+            ) from None
+    return found
 
 
-def _check_kind(run: Path, extra: dict[str, Any], *, finetuning: bool) -> None:
-    """Refuse to go on from a run of the other kind of training; with the command that does."""
-    found = "mix" in extra or "mix" in extra["settings"]
-    if found and not finetuning:
-        raise ValueError(
-            f"{run} is a fine-tuning: go on with make finetune RESUME={run} (python -m train.finetune --resume {run})"
+def check_resumed(flags: TrainingFlags, saved: dict[str, Any], settings: dict[str, Any]) -> list[str]:
+    """How the settings of a run that goes on differ from those it was begun with, one line each.
+
+    Args:
+        flags: Name the run.
+        saved: Its checkpoint.
+        settings: Those of now.
+
+    Raises:
+        ValueError: If it has done more iterations already than they ask for.
+    """
+    if saved["iter"] > settings["iterations"]:
+        raise ValueError(f"{flags.resume} has done {saved['iter']} iterations already: give at least as many in all")
+    return changes(saved["extra"]["settings"], settings)
+
+
+def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
+    """What differs between two nested settings, one line each."""
+    found = []
+    for key in sorted(before.keys() | after.keys()):
+        old, new = before.get(key), after.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += changes(old, new, f"{prefix}{key}.")
+        elif old != new:
+            found.append(f"{prefix}{key} {old} -> {new}")
+    return found
+
+
+# The training itself ---------------------------------------------------------------------------------------------
+
+
+class Training:
+    """A training at work: the task, what learns on it, and how far it is.
+
+    Attributes:
+        job: What was asked for.
+        task: The robots.
+        learner: PPO on them.
+        progress: Rows and record.
+    """
+
+    extra: dict[str, Any]
+    """What record and checkpoint say beside the progress; of a fine-tuning the elites it was trained on."""
+
+    def __init__(self, job: Job, *, tiles: Tiles | None = None, random_ages: bool = True) -> None:
+        """Begin, or go on from the checkpoint of the job.
+
+        Args:
+            job: What is asked for.
+            tiles: The terrains; those of the curriculum if left out.
+            random_ages: As :class:`train.ppo.learner.Learner` takes it.
+        """
+        self.job, self.extra = job, {}
+        seed, rank = job.flags.seed, Ranks.of_environment().rank
+        self.task = CommandTask(
+            job.robot, job.task, num_envs=job.num_envs, device=job.device, seed=seed + _SEED_STEP * rank, tiles=tiles
         )
-    if finetuning and not found:
-        raise ValueError(
-            f"{run} is the training of a base controller, not a fine-tuning: go on with make train RESUME={run} "
-            f"(python -m train.base --resume {run}), or fine-tune what it made with --policy {run / CHECKPOINT}"
+        self.learner = Learner(CommandVecEnv(self.task), job.ppo, seed=seed, random_ages=random_ages)
+        if job.saved is not None:
+            self.learner.resume(job.saved)
+        about = {**provenance(job.device, seed), "settings": job.settings}
+        before = job.saved and job.saved["extra"]
+        self.progress = Progress(
+            job.run_dir, self.learner, job.iterations, rows=job.flags.rows, about=about, saved=before
         )
+
+    def before_iteration(self) -> None:
+        """What a kind of training does before each iteration: nothing."""
+
+    def next_command(self) -> str | None:
+        """The command to look at the controller with, if there is one."""
+        return None
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the learner."""
+        return {**self.progress.state(), **self.extra}
+
+    def save(self) -> None:
+        """Writes a checkpoint."""
+        self.learner.save(self.job.run_dir / CHECKPOINT, self.state())
+
+    def iterate(self, stop: StopRequest) -> None:
+        """Iterates until all is done, a stop is requested, or another iteration might end past the time limit."""
+        learner, flags = self.learner, self.job.flags
+        deadline = self.job.began + flags.max_seconds - _RESERVE_S if flags.max_seconds else float("inf")
+        slowest, last_save = 0.0, time.monotonic()
+
+        def wanted() -> bool:
+            in_time = time.monotonic() + slowest < deadline
+            return learner.iteration < self.job.iterations and not stop.requested and in_time
+
+        while learner.ranks.all_want(wanted(), learner.env.device):
+            self.before_iteration()
+            learner.set_pace(self.job.iterations)
+            step = learner.iterate()
+            if self.progress.warm:  # the first iteration compiles and is no measure
+                slowest = max(slowest, step.collection_s + step.learning_s)
+            self.progress.add(step)
+            if time.monotonic() - last_save > flags.save_every_s:
+                self.save()
+                last_save = time.monotonic()
+
+    def finish(self) -> None:
+        """Writes the last checkpoint, and the controller with its record at every place asked for."""
+        learner = self.learner
+        learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
+        self.progress.close()
+        self.save()
+        record = {**self.progress.record(), **self.extra}
+        export = self.job.flags.export
+        for path in (self.job.run_dir / POLICY, *([export] if export else [])):
+            export_policy(path, learner, record)
+            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
 
 
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
-    """Write the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
+    """Writes the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it."""
     buffer = io.BytesIO()
     marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
     torch.save({"actor_state_dict": learner.actor_state(), "iter": learner.iteration, **marks}, buffer)
@@ -184,62 +329,42 @@ def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     write_atomically(path.with_suffix(".train.json"), to_json(record))
 
 
-def iterate(
-    learner: Learner,
-    progress: Progress,
-    *,
-    save: Callable[[], None],
-    save_every_s: float,
-    stop: StopRequest,
-    deadline: float,
-    before: Callable[[], None] = lambda: None,
-) -> None:
-    """Iterate until all is done, a stop is requested, or another iteration might end past the deadline.
+def run_training(job: Job, begin: Callable[[], Training]) -> int:
+    """Trains as a job says, and says how to go on; returns the exit status: 0, or 130 after Ctrl-C.
 
     Args:
-        learner: What learns.
-        progress: What is told of every iteration.
-        save: Saves everything.
-        save_every_s: How often [s].
-        stop: Whether to stop.
-        deadline: On the clock of :func:`time.monotonic` [s].
-        before: Called before each iteration.
+        job: What is asked for.
+        begin: Makes the training.
+
+    Raises:
+        ValueError: If the run is another training's, or its checkpoint does not fit.
+        FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
+        OSError: If a file cannot be written.
     """
-    slowest, last_save = 0.0, time.monotonic()
-
-    def wanted() -> bool:
-        return learner.iteration < progress.iterations and not stop.requested and time.monotonic() + slowest < deadline
-
-    while learner.ranks.all_want(wanted(), learner.env.device):
-        before()
-        learner.set_pace(progress.iterations)
-        step = learner.iterate()
-        if progress.warm:  # the first iteration compiles and is no measure
-            slowest = max(slowest, step.collection_s + step.learning_s)
-        progress.add(step)
-        if time.monotonic() - last_save > save_every_s:
-            save()
-            last_save = time.monotonic()
-
-
-def finish(
-    learner: Learner,
-    progress: Progress,
-    *,
-    save: Callable[[], None],
-    policies: list[Path],
-    about: dict[str, Any] | None = None,
-) -> None:
-    """The last checkpoint, and the controller with its record, ``about`` added, at every place asked for."""
-    learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
-    progress.close()
-    save()
-    record = {**progress.record(), **(about or {})}
-    for path in policies:
-        export_policy(path, learner, record)
-        print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+    run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
+    go_on = f"Go on with: {command_line(job.command, robot=job.robot.spec, resume=run_dir)}"
+    with StopRequest() as stop, claimed(run_dir):
+        training = begin()
+        flags = {key: value for key, value in asdict(job.flags).items() if value is not None}
+        write_atomically(run_dir / CONFIG, to_json({**_plain(flags), "device": job.device}))
+        try:
+            training.iterate(stop)
+            training.finish()
+        except OSError as error:
+            raise (OSError(f"{error}. {go_on}") if checkpoint.exists() else error) from error
+        except FloatingPointError as error:
+            kept = "the last checkpoint is kept" if checkpoint.exists() else "nothing was saved before"
+            raise FloatingPointError(f"{error}; {kept} in {run_dir}: lower --ppo.learning-rate") from error
+    done, following = training.learner.iteration, training.next_command()
+    if done < job.iterations:
+        print(f"Stopped after {done} of {job.iterations} iterations. {go_on}")
+    elif following is not None:
+        print(f"Next, see what it did:  {following}")
+    return 130 if stop.requested else 0
 
 
-def resumable(run_dir: Path, error: OSError) -> OSError:
-    """An error with how to go on, where that can be done."""
-    return OSError(f"{error}. Go on with: --resume {run_dir}") if (run_dir / CHECKPOINT).exists() else error
+def _plain(value: Any) -> Any:
+    """Settings as JSON has them: paths as text."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return str(value) if isinstance(value, Path) else value

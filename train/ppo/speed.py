@@ -1,51 +1,65 @@
-"""How fast training is: environment steps per second with learning, ``python -m train.ppo.speed --num-envs 4096 8192``."""
+"""How fast training is: environment steps per second with learning."""
 
-import json
 import statistics
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-import tyro
-
-from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.command import exit_code_of
-from sim.files.provenance import provenance
-from sim.robots.robot import RobotCfg, get_robot
-from sim.simulation import resolve_device
-from train.ppo.learner import Learner
-from train.ppo.ppo import PpoCfg
+from sim.files.command import OfRobot, OnDevice, publish, show_json
+from sim.files.settings import check, setting
+from train.ppo.cfg import PpoCfg
 from train.task.cfg import TaskCfg
-from train.task.task import CommandTask
-from train.task.vec_env import CommandVecEnv
+
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpeedCfg:
+class TrainSpeed(OfRobot, OnDevice):
     """Time training iterations, simulation and learning together."""
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
-    num_envs: tuple[int, ...] = (4096, 8192)
+    num_envs: tuple[int, ...] = setting((4096, 8192), least=1)
     """Numbers of robots to time."""
-    iterations: int = 40
+    iterations: int = setting(40, least=1)
     """Iterations timed, after 10 that are not."""
-    seed: int = 0
+    seed: int = setting(0, least=0)
     """Seed of everything drawn."""
     out: Path | None = None
     """Also write the numbers to this file."""
 
+    def execute(self) -> None:
+        """Times what is asked for, prints it and writes the file.
 
-def time_training(robot: RobotCfg, num_envs: int, *, iterations: int, device: str, seed: int) -> dict[str, Any]:
+        Raises:
+            ValueError: If something asked for cannot be had; raised before any long work.
+        """
+        from sim.files.provenance import provenance
+        from sim.robots.robot import get_robot
+        from sim.simulation import resolve_device
+
+        check(self)
+        robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device)
+
+        def measure() -> dict[str, Any]:
+            size = {"iterations": self.iterations, "device": device, "seed": self.seed}
+            runs = [time_training(robot, count, **size) for count in self.num_envs]
+            return {**provenance(device, self.seed), "robot": robot.name, "training": runs}
+
+        publish(self.out, measure, show_json)
+
+
+def time_training(robot: "RobotCfg", num_envs: int, *, iterations: int, device: str, seed: int) -> dict[str, Any]:
     """Median time of an iteration and what follows from it.
 
     The shipped controller, where there is one, walks the robots, so that contacts are those of the better part of a
     training; its weights go on being trained.
     """
+    import torch
+
+    from train.ppo.learner import Learner
+    from train.task.task import CommandTask
+    from train.task.vec_env import CommandVecEnv
+
     task = CommandTask(robot, TaskCfg.of(robot), num_envs=num_envs, device=device, seed=seed)
     learner = Learner(CommandVecEnv(task), PpoCfg(init_noise_std=0.5), seed=seed)
     if robot.policy_file.exists():
@@ -62,32 +76,3 @@ def time_training(robot: RobotCfg, num_envs: int, *, iterations: int, device: st
         "learning_s": statistics.median(step.learning_s for step in timed),
         "train_env_steps_per_s": learner.steps_per_iteration / seconds,
     }
-
-
-def measure(cfg: SpeedCfg) -> int:
-    """Time what is asked for, print it, write the file.
-
-    Raises:
-        ValueError: If something asked for cannot be had; raised before any long work.
-    """
-    robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
-    if cfg.out is not None:
-        prepare_output(cfg.out)
-    runs = [
-        time_training(robot, count, iterations=cfg.iterations, device=device, seed=cfg.seed) for count in cfg.num_envs
-    ]
-    report = {**provenance(device, cfg.seed), "robot": robot.name, "training": runs}
-    print(json.dumps(report, indent=2))
-    if cfg.out is not None:
-        write_atomically(cfg.out, to_json(report))
-    return 0
-
-
-def main() -> int:
-    """Command line; returns the exit status."""
-    cfg = tyro.cli(SpeedCfg, description=__doc__)
-    return exit_code_of(lambda: measure(cfg))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -31,11 +31,11 @@ class CurriculumCfg:
     columns of ``noise`` tiles are added beside them.
     """
 
-    num_columns: int = 20
+    num_columns: int = setting(20, least=0)
     """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
-    noise_columns: int = 2
+    noise_columns: int = setting(2, least=0)
     """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
-    max_first_level: int = 5
+    max_first_level: int = setting(5, least=0)
     """Robots begin on levels 0 to this, drawn uniformly."""
 
 
@@ -48,8 +48,8 @@ class TaskCfg(TrainingCfg):
     crosses: bool = False
     """Robots start at one side of a terrain and are told to go to the other, as in a search, instead of random
     velocities and headings from its middle."""
-    episode_s: float = setting(20.0, least=0)
-    command_interval_s: float = setting(10.0, least=0)
+    episode_s: float = setting(20.0, above=0)
+    command_interval_s: float = setting(10.0, above=0)
     """A new command every so often."""
     lin_vel_x: tuple[float, float] = setting((-1.0, 1.0), rising=True)
     """Range of the commanded forward velocity [m/s]."""
@@ -95,9 +95,8 @@ def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
         cfg: The settings.
         control_dt: Control step of the robot [s].
     """
-    times = {name: getattr(cfg, name) for name in ("episode_s", "command_interval_s")}
     return problems(cfg, "task.") + [
-        f"task.{name} must be at least {control_dt:g}, a control step, got {value:g}"
-        for name, value in times.items()
-        if 0 <= value < control_dt
+        f"task.{name} must be at least a control step, {control_dt:g} s, got {getattr(cfg, name):g}"
+        for name in ("episode_s", "command_interval_s")
+        if 0 < getattr(cfg, name) < control_dt
     ]

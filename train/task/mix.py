@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.bank import TerrainBank
+from sim.files.settings import check, setting
 from sim.terrain import (
     CROSSING_TYPES,
     NUM_COLS,
@@ -33,27 +34,21 @@ _LEAST_WEIGHT = 0.1  # of a terrain that is always crossed, beside 1 more for on
 class MixCfg:
     """The terrains of a fine-tuning."""
 
-    mix: str = "generated"
+    mix: str = setting("generated", one_of=MIXES)
     """generated (hand-crafted terrains and elites in equal shares), hard-random (likewise) or hand-crafted alone."""
-    terrains: int = 500
+    terrains: int = setting(500, least=1)
     """Terrains trained on at a time."""
-    swap_every: int = 400
+    swap_every: int = setting(400, least=1)
     """They are exchanged for others every so many iterations."""
-    draw: str = "uniform"
+    draw: str = setting("uniform", one_of=DRAWS)
     """How elites are drawn: uniform, or failing: the likelier, the less often they were crossed the last time."""
 
     def __post_init__(self) -> None:
-        if self.mix not in MIXES:
-            raise ValueError(f"mix must be one of {', '.join(MIXES)}, got '{self.mix}'")
-        if self.draw not in DRAWS:
-            raise ValueError(f"draw must be one of {', '.join(DRAWS)}, got '{self.draw}'")
+        check(self)
         if self.draw == "failing" and self.mix != "generated":
             raise ValueError(f"draw failing chooses among elites, of which mix {self.mix} has none: use mix generated")
-        if self.swap_every < 1:
-            raise ValueError(f"swap_every must be at least 1, got {self.swap_every}")
-        least = 1 if self.mix == "hand-crafted" else 2
-        if self.terrains < least:
-            raise ValueError(f"terrains must be at least {least} for mix {self.mix}, got {self.terrains}")
+        if self.terrains < 2 and self.mix != "hand-crafted":
+            raise ValueError(f"terrains must be at least 2 for mix {self.mix}, half of each kind, got {self.terrains}")
 
     @property
     def hand_crafted(self) -> int:

@@ -24,8 +24,7 @@ from qd.show.report.shown import Shown, counted
 from qd.show.report.table_sections import before_after_section, tables_section
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import write_atomically
-from sim.files.provenance import controller_hash
-from sim.policy.spec import spec_of
+from sim.policy.spec import controller_hash, spec_of
 
 MAX_BYTES = 15_000_000
 """Most that a page may weigh."""

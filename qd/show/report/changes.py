@@ -6,8 +6,7 @@ from typing import Any
 
 from qd.archive import Archive, read_archive
 from qd.show.report.tables import FAR, GENERATED
-from sim.files.provenance import controller_hash
-from sim.policy.spec import SHIPPED, ControllerSpec
+from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash
 from sim.robots.robot import RobotCfg
 
 _KINDS = ("mended", "newly_broken", "still_failing")

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from qd.run.progress import share_bar
 from qd.show.replay import REPLAY_STREAM
 from qd.workers.evaluator import episode_seeds
-from sim.files.provenance import code_fingerprint, controller_hash
+from sim.files.provenance import code_fingerprint
+from sim.policy.spec import controller_hash
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import Recording, record
 from sim.robots.own import robot_digest

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from sim.files.atomic import read_json
-from sim.policy.names import kind_of
+from sim.policy.spec import kind_of
 
 MEASURES = {"success": "success (no base collision)", "goal": "goal reached", "reward": "training reward"}
 """Measures shown, in words; the first two are fractions."""

@@ -78,7 +78,7 @@ def show_of(cfg: ViewCfg) -> Show:
         FileNotFoundError: If there is no archive.
         ValueError: If robot, archive, controllers or a number are not as they must be.
     """
-    from sim.policy.names import controllers_of
+    from sim.policy.spec import controllers_of
 
     found = archive_of_robot(cfg.robot, cfg.run)
     robot = found.robot

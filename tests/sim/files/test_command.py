@@ -43,7 +43,9 @@ def test_a_bug_keeps_its_traceback():
 def test_ctrl_c_ends_an_evaluation_in_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)  # where its runs/ would be
     monkeypatch.setattr(evaluate, "open_evaluator", lambda *_, **__: fail(KeyboardInterrupt()))
-    monkeypatch.setattr(sys, "argv", ["train.evaluate.evaluate", "--device", "cpu", "--terrains", "2", "--episodes", "1"])
+    monkeypatch.setattr(
+        sys, "argv", ["train.evaluate.evaluate", "--device", "cpu", "--terrains", "2", "--episodes", "1"]
+    )
     assert evaluate.main() == 130
     assert capsys.readouterr().err.endswith("\nStopped.\n")
 

@@ -2,6 +2,8 @@
 
 import json
 import re
+import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -56,3 +58,15 @@ def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):
     with_robot = code_fingerprint(["one"])
     monkeypatch.setattr("sim.files.provenance.versions", lambda: {"torch": "0"})
     assert len({before, with_robot, code_fingerprint(["one"])}) == 3
+
+
+def test_the_command_recorded_is_the_one_to_type(monkeypatch, tmp_path):
+    def recorded(name, *argv):
+        monkeypatch.setitem(sys.modules, "__main__", SimpleNamespace(__spec__=SimpleNamespace(name=name)))
+        monkeypatch.setattr(sys, "argv", ["x", *argv])
+        return provenance("cpu", 1)["command"]
+
+    assert recorded("tests.kills.__main__", "--seed", "1") == "python -m tests.kills --seed 1"
+    monkeypatch.chdir(tmp_path)
+    given = ("bench", "--out", str(tmp_path / "a" / "b.json"), "--run=/home/me/runs/x")
+    assert recorded("faultline", *given) == "faultline bench --out a/b.json --run=x"

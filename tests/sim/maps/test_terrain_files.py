@@ -12,8 +12,7 @@ from PIL import Image
 from sim.bank import heights_of
 from sim.bench import oracle
 from sim.maps.heightmap import as_terrain, read_heightmap
-from sim.maps.hfield import as_hfield
-from sim.maps.terrain_files import FORMATS, gray_scale, mjcf_of, png_of, stl_of, triangles_of, write_terrain
+from sim.maps.terrain_files import FORMATS, as_hfield, gray_scale, mjcf_of, png_of, stl_of, triangles_of, write_terrain
 from sim.mujoco_c.model import surface_heights
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING, hard_random_genes
 

@@ -1,15 +1,14 @@
 """Comparing two simulators: intervals by hand, agreement of known rates, and what the command refuses."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from sim.mujoco_c.agreement import Pair, summarise
-from sim.mujoco_c.crosscheck import Crosscheck, CrosscheckCfg, read_pool
+from sim.commands import Crosscheck
+from sim.files.command import run_command
+from sim.mujoco_c.crosscheck import Comparison, Pair, read_pool, summarise
 from sim.terrain import hard_random_genes
 
 
@@ -79,18 +78,18 @@ def test_a_pool_that_is_no_file_is_refused(tmp_path):
         {"episodes": 0},
         {"between": (0.9, 0.3)},
         {"between": (0.0, 1.5)},
-        {"processes": -1},
+        {"workers": -1},
         {"seed": -1},
     ],
 )
 def test_numbers_without_sense_are_refused(settings):
-    with pytest.raises(ValueError, match=r"positive|at least"):
-        Crosscheck(CrosscheckCfg(device="cpu", **settings))
+    with pytest.raises(ValueError, match=r"must (be|rise)"):
+        Comparison(Crosscheck(device="cpu", **settings))
 
 
 def test_a_pool_without_middling_terrains_says_how_many_it_has(tmp_path):
     np.savez(tmp_path / "flat.npz", genes=np.zeros((2, 64), np.float32))  # all bumps of height 0
-    check = Crosscheck(CrosscheckCfg(device="cpu", genes=tmp_path / "flat.npz", terrains=1, episodes=1))
+    check = Comparison(Crosscheck(device="cpu", genes=tmp_path / "flat.npz", terrains=1, episodes=1))
     with pytest.raises(ValueError, match="only 0 of 2 terrains"):
         check.choose()
 
@@ -99,33 +98,29 @@ def test_terrains_of_a_pool_can_be_named_whatever_their_rates(tmp_path):
     pool = tmp_path / "pool.npz"
     genes = np.arange(5, dtype=np.float32)[:, None].repeat(64, axis=1)
     np.savez(pool, genes=genes)
-    choice = Crosscheck(CrosscheckCfg(device="cpu", genes=pool, elite="4 1")).choose()
+    choice = Comparison(Crosscheck(device="cpu", genes=pool, elite="4 1")).choose()
     assert choice.index == [4, 1] and choice.first == [None, None]
     np.testing.assert_array_equal(choice.genes, genes[[4, 1]])
     with pytest.raises(ValueError, match=r"pool\.npz has no elite 5: expected all, or numbers of 0 to 4"):
-        Crosscheck(CrosscheckCfg(device="cpu", genes=pool, elite="5"))
-    with pytest.raises(ValueError, match="say which"):
-        Crosscheck(CrosscheckCfg(device="cpu", elite="all"))
+        Comparison(Crosscheck(device="cpu", genes=pool, elite="5"))
+    with pytest.raises(ValueError, match="give the pool"):
+        Comparison(Crosscheck(device="cpu", elite="all"))
 
 
 def test_named_terrains_are_crossed_in_both_simulators(tmp_path):
     genes = np.zeros((3, 64), np.float32)  # flat, but for the last
     genes[2] = hard_random_genes(1, np.random.default_rng(3))[0]
     np.savez(tmp_path / "pool.npz", genes=genes)
-    counts = {"episodes": 1, "plain_episodes": 1, "processes": 1}
-    report = Crosscheck(CrosscheckCfg(device="cpu", genes=tmp_path / "pool.npz", elite="2 0", **counts)).run()
+    counts = {"episodes": 1, "plain_episodes": 1, "workers": 1}
+    report = Comparison(Crosscheck(device="cpu", genes=tmp_path / "pool.npz", elite="2 0", **counts)).run()
     assert [row["index"] for row in report["terrains"]] == [2, 0] and report["left_out"] == []
     assert [row["episodes"] for row in report["terrains"]] == [[1, 1], [1, 1]]
     flat = report["terrains"][1]
     assert flat["first_success"] is None and flat["goal"]["ours"] == flat["goal"]["mujoco_c"] == 1.0
 
 
-def test_command_line_helps_and_refuses(tmp_path):
-    def call(*flags):
-        command = [sys.executable, "-m", "sim.mujoco_c.crosscheck", *flags]
-        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-    assert "--plain-episodes" in call("--help").stdout
-    refused = call("--device", "cpu", "--genes", str(tmp_path / "none.npz"))
-    assert refused.returncode == 2
-    assert "Traceback" not in refused.stderr and "none.npz" in refused.stderr
+def test_the_command_refuses_in_one_line(tmp_path, capsys):
+    missing = tmp_path / "none.npz"
+    assert run_command(Crosscheck, ["--device", "cpu", "--genes", str(missing)], name="crosscheck") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: --genes") and "none.npz" in error and error.count("\n") == 1

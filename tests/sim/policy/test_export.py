@@ -2,17 +2,18 @@
 
 import dataclasses
 import itertools
-import sys
 
 import numpy as np
 import onnx
 import pytest
 import torch
 
+from sim.commands import ExportPolicy
 from sim.crossing import CrossingCfg
-from sim.policy.export import export_onnx, main, to_onnx
+from sim.files.command import run_command
+from sim.policy import export as module
+from sim.policy.export import export_onnx, to_onnx
 from sim.policy.loaders import MlpPolicy, load_policy
-from sim.policy.loaders import export as module
 from sim.policy.onnx_file import OnnxPolicy, load_onnx
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
@@ -34,10 +35,9 @@ def actor(*sizes, normalised=False):
     return MlpPolicy(state)
 
 
-def tell(monkeypatch, capsys, *arguments):
+def tell(capsys, *arguments):
     """Exit status, output and error of the command."""
-    monkeypatch.setattr(sys, "argv", ["export", *map(str, arguments)])
-    code = main()
+    code = run_command(ExportPolicy, list(map(str, arguments)), name="export-policy")
     return code, *capsys.readouterr()
 
 
@@ -112,13 +112,13 @@ def test_the_name_must_say_what_it_is(tmp_path, name):
 
 def test_the_command(tmp_path, monkeypatch, capsys):
     path = tmp_path / "anymal.onnx"
-    code, out, _ = tell(monkeypatch, capsys, "--robot", "anymal", "--out", path)
+    code, out, _ = tell(capsys, "--robot", "anymal", "--out", path)
     assert code == 0
     assert "observation (batch, 235) -> action (batch, 12)" in out
     assert f"Try it: --policy {path}" in out
     assert isinstance(load_policy(path, ANYMAL, "cpu"), OnnxPolicy)
     # The file is a controller, but not one that can be written again.
-    code, _, error = tell(monkeypatch, capsys, "--policy", path, "--out", tmp_path / "again.onnx")
+    code, _, error = tell(capsys, "--policy", path, "--out", tmp_path / "again.onnx")
     assert code == 2
     assert "must be an rsl_rl checkpoint (.pt with actor_state_dict), got another kind of controller" in error
     assert not (tmp_path / "again.onnx").exists()
@@ -136,18 +136,10 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 def test_errors_of_the_command_are_one_line(tmp_path, monkeypatch, capsys, flags, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").write_text("a file")
-    code, _, error = tell(monkeypatch, capsys, *flags)
+    code, _, error = tell(capsys, *flags)
     assert code == 2
     assert message in error
     assert len(error.splitlines()) == 1
-
-
-def test_help_teaches(monkeypatch, capsys):
-    with pytest.raises(SystemExit) as caught:
-        tell(monkeypatch, capsys, "--help")
-    assert caught.value.code == 0
-    text = capsys.readouterr().out
-    assert all(word in text for word in ("--policy", "--robot", "--out", "(batch, observation_size)", "policy.pt"))
 
 
 def test_crossings_are_those_of_the_original(tmp_path):

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
-from sim.robots.hull import MAX_MESH_PROBES, MESH_TOLERANCE, SMALL_MESH_SHARE, hull_probes
 from sim.robots.model import build_robot
-from sim.robots.probes import shape_strips
+from sim.robots.probes import MAX_MESH_PROBES, MESH_TOLERANCE, SMALL_MESH_SHARE, hull_probes, shape_strips
 from sim.terrain import SPACING
 from tests.sim.scenes import Stepper, free_body, lying, positions, put, simulate, slope, velocities
 

@@ -57,7 +57,7 @@ CHANGES = [
     ("collision_bit=False,", "collision_bit=False," + GAINS, "has position actuators for FL_hip.*take one of them out"),
     ("collision_bit=False,", "collision_bit=False, effort_limit=(0.0,) * 8,", "effort_limit must be above 0"),
     ("collision_bit=False,", "collision_bit=False, effort_limit=(1.0,) * 4,", r"effort_limit needs 8 limits.*got 4"),
-    ("collision_bit=False,", "collision_bit=False, physics_dt=1.0,", "physics_dt must be above 0 and at most 0.05, got 1"),
+    ("collision_bit=False,", "collision_bit=False, physics_dt=1.0,", "physics_dt must be .* at most 0.05, got 1"),
     ("collision_bit=False,", "collision_bit=False, friction=-1.0,", "friction must be above 0"),
     (
         "collision_bit=False,", "collision_bit=False, contact_time_constant_s=0.004,",
@@ -158,7 +158,7 @@ def test_what_is_wrong_in_the_training_settings_is_named(tmp_path):
     file.write_text(head + file.read_text().replace("collision_bit", wrong))
     with pytest.raises(
         ValueError,
-        match=r"rewards.torques must be a fin.*soft_joint_limit.*added_base_mass must rise.*push_speed.*entropy.*num_envs must",
+        match=r"rewards.torques must be a fin.*soft_joint_limit.*added_base_mass must rise.*entropy.*num_envs",
     ):
         get_robot(str(file))
 

@@ -2,11 +2,11 @@
 
 import dataclasses
 import re
-import sys
 
 import pytest
 
-from sim.robots import stand as command
+from sim.commands import Stand
+from sim.files.command import run_command
 from sim.robots.robot import get_robot
 from sim.robots.stand import describe_model, describe_standing, stand
 from tests.sim.dogs import KINDS, LEGS, MASS, write_dog
@@ -72,18 +72,17 @@ def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
     assert "as a biped may" in text and "pelvis" in found.carried
 
 
-def run_main(monkeypatch, *argv):
-    monkeypatch.setattr(sys, "argv", ["stand", *argv, "--device", "cpu"])
-    return command.main()
+def run(*argv):
+    return run_command(Stand, [*argv, "--device", "cpu"], name="stand")
 
 
-def test_the_command(tmp_path, monkeypatch, capsys):
+def test_the_command(tmp_path, capsys):
     file = write_dog(tmp_path)
-    assert run_main(monkeypatch, "--robot", str(file), "--seconds", "1", "--drops", "2") == 0
+    assert run("--robot", str(file), "--seconds", "1", "--drops", "2") == 0
     assert capsys.readouterr().out.endswith("It stands.\n")
     file.write_text(file.read_text().replace("0.29", "0.2"))
-    assert run_main(monkeypatch, "--robot", str(file), "--seconds", "1", "--drops", "2") == 1
+    assert run("--robot", str(file), "--seconds", "1", "--drops", "2") == 1
     file.write_text(file.read_text().replace('"hip"', '"hop"'))
-    assert run_main(monkeypatch, "--robot", str(file)) == 2
+    assert run("--robot", str(file)) == 2
     assert "no joint named FL_hop, FR_hop, HL_hop, HR_hop in" in capsys.readouterr().err
-    assert run_main(monkeypatch, "--robot", "anymal", "--drops", "0") == 2
+    assert run("--robot", "anymal", "--drops", "0") == 2

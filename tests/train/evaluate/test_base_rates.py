@@ -10,7 +10,7 @@ from sim.files.intervals import bootstrap_interval
 from sim.robots.robot import get_robot
 from sim.rollout import CrossingCfg, Rollout
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-from train.evaluate.base_rates import evaluate_sets, summarise, velocity_error
+from train.evaluate.measures import base_rates, summarise, velocity_error
 
 
 def test_invalid_episodes_are_left_out_and_counted():
@@ -59,7 +59,7 @@ def test_three_sets_are_crossed():
     def evaluate(terrains, seeds, progress):
         return rollout.evaluate(terrains, seeds, progress=lambda done, most: progress(done / most))
 
-    report = evaluate_sets(evaluate, 3, seed=0)
+    report = base_rates(evaluate, 3, seed=0)
     assert report["hand_crafted"]["success_rate"] == 1.0 and report["hand_crafted"]["goal_rate"] == 0.0
     assert set(report["hand_crafted"]["by_type"]) == {"slope", "rough_slope", "stairs_up_down"}
     assert report["hard_random"]["episodes"] == 6 and report["hard_random"]["by_level"] is None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-from train.evaluate.differences import KINDS, difference, differences
 from train.evaluate.measures import measure
+from train.evaluate.tables import KINDS, difference, differences
 
 NUMBERS = np.array([10, 3, 7, 5, 8])
 

@@ -3,20 +3,21 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qd.archive import read_archive
 from sim.bank import heights_of
-from train.evaluate.distances import DistancesCfg, distances
+from train.evaluate.distances import Distances, distances
 from train.evaluate.sets import split_elites
 
-ARCHIVE = "results/cassie/archive"
+ARCHIVE = Path("results/cassie/archive")
 
 
 def test_the_nearest_is_found_among_all_elites_trained_on():
-    report = distances(DistancesCfg(robot="cassie", terrains=3))
+    report = distances(Distances(robot="cassie", terrains=3))
     archive = read_archive(ARCHIVE)
     split = split_elites(archive, "cassie")
     held, trained = (heights_of(archive.genes[rows]).astype(np.float64) for rows in (split.test[:3], split.train))
@@ -33,19 +34,19 @@ def test_the_nearest_is_found_among_all_elites_trained_on():
     ("settings", "message"),
     [
         ({"terrains": 0}, "terrains must be at least 1"),
-        ({"seed": -1}, "seed at least 0"),
-        ({"split_seed": -1}, "seed of the split"),
+        ({"seed": -1}, "seed must be at least 0"),
+        ({"split_seed": -1}, "split_seed must be at least 0"),
         ({"robot": "anymal", "archive": ARCHIVE}, "got one of 'cassie'"),
     ],
 )
 def test_what_makes_no_sense_is_refused(settings, message):
     with pytest.raises(ValueError, match=message):
-        distances(DistancesCfg(**{"robot": "cassie", **settings}))
+        distances(Distances(**{"robot": "cassie", **settings}))
 
 
 def test_the_command_writes_what_it_prints(tmp_path):
     def call(*flags):
-        command = [sys.executable, "-m", "train.evaluate.distances", *flags]
+        command = [sys.executable, "-m", "faultline", "distances", *flags]
         return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
     assert "--split-seed" in call("--help").stdout

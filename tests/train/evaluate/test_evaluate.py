@@ -1,7 +1,7 @@
 """The evaluation command: the paper's tables from end to end on short crossings, what goes on after a kill, errors."""
 
+import hashlib
 import json
-import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,18 +12,14 @@ import torch
 from qd.archive import write_archive
 from qd.workers.evaluator import EvaluatorCfg
 from sim.crossing import CrossingCfg
-from sim.files.command import split_words
-from sim.policy.names import controllers_of
+from sim.files.command import run_command, split_words
+from sim.policy.spec import controllers_of
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
-from train.evaluate.cfg import EvaluateCfg, size_of
-from train.evaluate.crossings import cross_all
-from train.evaluate.evaluate import evaluate_base, main
-from train.evaluate.evaluate import tables_job as tables
-from train.evaluate.kept import KeptCrossings
+from train.evaluate.crossings import KeptCrossings, cross_all
+from train.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, size_of
 from train.evaluate.sets import make_sets, split_elites
-from train.evaluate.tables_job import evaluate_tables
 
 PROTOTYPE = "tests.sim.policies:stretch"
 STANDER = "tests.sim.policies:stand"
@@ -67,7 +63,7 @@ def config(tmp_path, **changes):
         "policies": (f"base={STANDER}", f"C-G={PROTOTYPE}"), "device": "cpu", "terrains": 2, "episodes": 2,
         "run_dir": tmp_path / "tables",
     }  # fmt: skip
-    return EvaluateCfg(**values | changes)
+    return Evaluate(**values | changes)
 
 
 def test_the_tables_from_end_to_end(tmp_path, archive, capsys):
@@ -87,6 +83,7 @@ def test_the_tables_from_end_to_end(tmp_path, archive, capsys):
         "path": str(archive), "elites": 30, "iterations": 3, "train": 24, "test": 6, "split_seed": 0,
     }  # fmt: skip
     assert written["terrains"] == {"hand_crafted": 4, "hard_random": 4, "generated": 4, "generated_far": 2}
+    assert written["archive_sha256"] == hashlib.sha256((archive / "archive.npz").read_bytes()).hexdigest()
     assert written["controllers"]["C-G"]["policy"] == PROTOTYPE
     held_out = set(split_elites(make_archive(30), "anymal").test[:4].tolist())
     groups = written["traversable"]["generated"]
@@ -111,13 +108,13 @@ def test_rates_of_one_controller_go_under_runs(tmp_path, monkeypatch, capsys):
     # Never under results/, where the published ones stand.
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("train.evaluate.evaluate.open_evaluator", Crossings().open)
-    report = evaluate_base(EvaluateCfg(policy=STANDER, device="cpu", terrains=2, episodes=1))
+    report = evaluate_rates(Evaluate(policy=STANDER, device="cpu", terrains=2, episodes=1))
     # A controller other than the shipped one has a file of its own.
     written = "runs/anymal-tests.sim.policies-stand-rates.json"
     assert json.loads(Path(written).read_text()) == json.loads(json.dumps(report))
     assert set(report) >= {"hand_crafted", "hard_random", "flat", "command", "commit", "seed"}
     assert f"written to {written}" in capsys.readouterr().out
-    shipped = evaluate_base(EvaluateCfg(device="cpu", terrains=2, episodes=1))
+    shipped = evaluate_rates(Evaluate(device="cpu", terrains=2, episodes=1))
     assert json.loads(Path("runs/anymal-rates.json").read_text()) == json.loads(json.dumps(shipped))
 
 
@@ -187,7 +184,7 @@ def test_controllers_are_named():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the sizes of a machine without a GPU")
 def test_sizes(capsys):
     def size(**given):
-        chosen = size_of(EvaluateCfg(device="cpu", **given))
+        chosen = size_of(Evaluate(device="cpu", **given))
         return chosen.terrains, chosen.episodes
 
     assert size(sets=("hard_random",)) == (24, 4)
@@ -246,14 +243,13 @@ def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monke
     (tmp_path / "noise" / "archive.npz").write_bytes(b"noise")
     layers = {"mlp.0.weight": torch.zeros(12, 48), "mlp.0.bias": torch.zeros(12)}
     torch.save({"actor_state_dict": layers}, tmp_path / "small.pt")
-    for module in ("train.evaluate.evaluate", "train.evaluate.tables_job"):
-        monkeypatch.setattr(f"{module}.open_evaluator", None)  # crossing anything would fail with another error
-    monkeypatch.setattr(tables, "cross_all", None)
+    # Crossing anything would fail with another error.
+    monkeypatch.setattr("train.evaluate.evaluate.open_evaluator", None)
+    monkeypatch.setattr("train.evaluate.crossings.cross_all", None)
     flags = [flag.format(folder=tmp_path) for flag in flags]
     home = [] if "--run-dir" in flags else ["--run-dir", str(tmp_path / "tables")]
     device = [] if "--device" in flags else ["--device", "cpu"]
-    monkeypatch.setattr(sys, "argv", ["train.evaluate.evaluate", *flags, *home, *device])
-    assert main() == 2
+    assert run_command(Evaluate, [*flags, *home, *device], name="evaluate") == 2
     error = [line for line in capsys.readouterr().err.splitlines() if "Warp" not in line]
     assert len(error) == 1 and error[0].startswith("error: ")
     for part in message.format(folder=tmp_path).split(".*"):
@@ -271,6 +267,6 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("train.evaluate.evaluate.evaluate_tables", stop)
-    monkeypatch.setattr(sys, "argv", ["train.evaluate.evaluate", "--device", "cpu", "--sets", "hard_random"])
-    assert main() == 130
-    assert capsys.readouterr().err.endswith("\nStopped. What is crossed is kept: the same command goes on.\n")
+    assert run_command(Evaluate, ["--device", "cpu", "--sets", "hard_random"], name="evaluate") == 130
+    said = capsys.readouterr().err
+    assert "Stopped; what is crossed is kept" in said and "the same command" in said.lower()

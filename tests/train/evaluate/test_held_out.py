@@ -11,12 +11,10 @@ import torch
 from qd.archive import write_archive
 from tests.train.archives import make_archive
 from tests.train.test_finetune import PPO, write_actor
-from train.evaluate.cfg import EvaluateCfg
-from train.evaluate.held_out import TRAINED_ON, check_held_out, marks_of, recorded_marks
-from train.evaluate.sets import split_elites
-from train.evaluate.tables_job import evaluate_tables
-from train.finetune import finetune
-from train.finetune_job import FinetuneCfg, job_of
+from train.evaluate.evaluate import Evaluate, evaluate_tables
+from train.evaluate.sets import TRAINED_ON, check_held_out, marks_of, recorded_marks, split_elites
+from train.finetune import Finetune
+from train.tuning import job_of
 
 ARCHIVE = make_archive(20)
 
@@ -58,7 +56,7 @@ def test_elites_of_the_own_split_are_held_out_and_those_of_another_are_not(tmp_p
 def test_tables_refuse_a_controller_trained_on_what_they_hold_out(sets, tmp_path):
     write_archive(tmp_path / "archive.npz", ARCHIVE)
     policy = write_trained(tmp_path, ARCHIVE.genes)
-    cfg = EvaluateCfg(
+    cfg = Evaluate(
         policies=(f"C-G={policy}",), archive=tmp_path / "archive.npz", sets=sets, device="cpu", run_dir=tmp_path / "run"
     )
     with pytest.raises(ValueError, match=r"C-G was trained on . of the . elites"):
@@ -93,21 +91,21 @@ def test_a_file_of_another_kind_has_no_marks(tmp_path):
 @pytest.mark.parametrize("name", ["checkpoint.pt", "policy.pt"])
 def test_what_a_fine_tuning_leaves_says_what_it_was_trained_on(name, tmp_path):
     write_archive(tmp_path / "archive.npz", ARCHIVE)
-    cfg = FinetuneCfg(
+    cfg = replace(Finetune.defaults([]),
         policy=write_actor(tmp_path / "start.pt"), archive=tmp_path / "archive.npz", device="cpu", ppo=PPO,
         run_dir=tmp_path / "run", num_envs=6, terrains=4, swap_every=2, iterations=1,
     )  # fmt: skip
-    assert finetune(cfg) == 0
+    assert cfg.execute() == 0
     left = (tmp_path / "run" / name).rename(tmp_path / name)  # away from the record
     trained = marks_of(ARCHIVE.genes[split_elites(ARCHIVE, "anymal").train])
     assert recorded_marks(str(left)) == set(trained)
-    tables = EvaluateCfg(
+    tables = Evaluate(
         policies=(f"C-G={left}",), archive=tmp_path / "archive.npz", split_seed=1, device="cpu", run_dir=tmp_path / "t"
     )
     with pytest.raises(ValueError, match=r"C-G was trained on . of the 4 elites that split seed 1 holds out"):
         evaluate_tables(tables, open_evaluator=None)  # pyright: ignore[reportArgumentType] - nothing is crossed
     write_archive(tmp_path / "other.npz", make_archive(10, seed=2))
-    later = job_of(replace(cfg, policy=left, archive=tmp_path / "other.npz", run_dir=tmp_path / "later"))
+    later = job_of(replace(cfg, policy=left, archive=tmp_path / "other.npz", run_dir=tmp_path / "later"), 0.0)
     assert later.settings["trained_before"] == sorted(trained)
     assert set(trained) < set(later.trained_on)
 
@@ -116,9 +114,15 @@ def test_a_fine_tuning_records_what_it_and_those_before_it_were_trained_on(tmp_p
     first, second = make_archive(10, seed=1), make_archive(10, seed=2)
     write_archive(tmp_path / "second.npz", second)
     policy = write_trained(tmp_path, first.genes)
-    cfg = FinetuneCfg(
-        policy=policy, archive=tmp_path / "second.npz", device="cpu", run_dir=tmp_path / "run", num_envs=12, terrains=4
+    cfg = replace(
+        Finetune.defaults([]),
+        policy=policy,
+        archive=tmp_path / "second.npz",
+        device="cpu",
+        run_dir=tmp_path / "run",
+        num_envs=12,
+        terrains=4,
     )
     expected = {*marks_of(first.genes), *marks_of(second.genes[split_elites(second, "anymal").train])}
-    assert job_of(cfg).trained_on == sorted(expected)
+    assert job_of(cfg, 0.0).trained_on == sorted(expected)
     assert not expected & set(marks_of(second.genes[split_elites(second, "anymal").test]))

@@ -6,8 +6,9 @@ import os
 import numpy as np
 import pytest
 
+from sim.policy.spec import controller_hash
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-from train.evaluate.kept import KeptCrossings, controller_hash, take_terrains
+from train.evaluate.crossings import KeptCrossings, take_terrains
 from train.evaluate.sets import plain_set
 
 TERRAINS = plain_set("hard_random", 3, 0)
@@ -56,7 +57,7 @@ def test_whatever_changes_the_numbers_is_looked_at(tmp_path, policy, monkeypatch
     assert keeper(tmp_path).read(policy, fresh_seeds) is None
     assert keeper(tmp_path).read(policy, other_terrains) is None
     with monkeypatch.context() as patch:
-        patch.setattr("train.evaluate.kept.code_fingerprint", lambda rooms: "other code")
+        patch.setattr("train.evaluate.crossings.code_fingerprint", lambda rooms: "other code")
         assert keeper(tmp_path).read(policy, TERRAINS) is None
     with open(policy, "wb") as file:
         file.write(b"other weights")

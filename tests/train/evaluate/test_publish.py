@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from train.evaluate.publish import BEGIN, END, PublishCfg, numbers_of, publish
+from train.evaluate.publish import BEGIN, END, PAGE, Tables, numbers_of
 
 ROOT = Path(__file__).parents[3]
 
@@ -76,26 +76,26 @@ def test_a_kind_whose_controllers_all_have_a_seed_in_their_name_is_there(results
 
 
 def test_it_is_written_between_the_marks_and_checked(results, capsys):
-    readme = results / "README.md"
-    readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    cfg = PublishCfg(results=results, readme=readme)
+    page = results / "README.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    cfg = Tables(results=results, page=page)
     with pytest.raises(ValueError, match="says something else than"):
-        publish(PublishCfg(results=results, readme=readme, check=True))
-    assert publish(cfg) == 0
-    text = readme.read_text()
+        Tables(results=results, page=page, check=True).execute()
+    cfg.execute()
+    text = page.read_text()
     assert (
         text.startswith(f"before\n{BEGIN}\n**ANYmal C**") and text.endswith(f"|\n{END}\nafter\n") and "old" not in text
     )
-    assert publish(PublishCfg(results=results, readme=readme, check=True)) == 0
-    publish(cfg)
-    assert readme.read_text() == text
+    Tables(results=results, page=page, check=True).execute()
+    cfg.execute()
+    assert page.read_text() == text
 
 
 def test_what_is_not_there_is_named(results, tmp_path):
-    readme = results / "README.md"
-    readme.write_text("nothing\n")
+    page = results / "README.md"
+    page.write_text("nothing\n")
     with pytest.raises(ValueError, match="must hold the lines"):
-        publish(PublishCfg(results=results, readme=readme))
+        Tables(results=results, page=page).execute()
     with pytest.raises(ValueError, match="no results of a robot under"):
         numbers_of(tmp_path / "nowhere")
     (results / "anymal" / "tables.json").write_text(json.dumps({**TABLES, "goal": {}}))
@@ -103,5 +103,5 @@ def test_what_is_not_there_is_named(results, tmp_path):
         numbers_of(results)
 
 
-def test_the_readme_says_what_the_results_say():
-    assert publish(PublishCfg(results=ROOT / "results", readme=ROOT / "README.md", check=True)) == 0
+def test_the_published_page_says_what_the_results_say():
+    Tables(results=ROOT / "results", page=ROOT / PAGE, check=True).execute()

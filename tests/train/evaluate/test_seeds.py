@@ -2,7 +2,8 @@
 
 import pytest
 
-from train.evaluate.seeds import check_seeds, firsts, over_seeds, print_over_seeds
+from sim.policy.spec import firsts
+from train.evaluate.tables import check_seeds, over_seeds
 
 TABLES = {
     "success": {"near": {"base": 0.5, "C-G": 0.8, "C-G@1": 0.9, "C-G@2": 1.0, "C-HC@7": 0.4}},
@@ -46,10 +47,3 @@ def test_a_name_is_a_kind_and_at_most_one_seed(name):
 def test_more_than_an_interval_is_known_for():
     row = {f"C-G@{k}": 0.5 for k in range(11)}
     assert over_seeds({"goal": {"near": row}}, ["goal"])["goal"]["near"]["C-G"]["interval"] is None
-
-
-def test_it_is_printed_where_there_is_something(capsys):
-    print_over_seeds(over_seeds(TABLES, ["success", "goal"]))
-    assert "near, C-G: success 0.900 [0.652 1.000], goal -\n" in capsys.readouterr().out
-    print_over_seeds({})
-    assert capsys.readouterr().out == ""

@@ -75,7 +75,7 @@ def test_another_seed_or_archive_is_another_draw():
 @pytest.mark.parametrize(
     ("archive", "seed", "message"),
     [
-        (make_archive(60, robot="cassie"), 0, "must be of robot 'anymal', got one of 'cassie'.*make archive"),
+        (make_archive(60, robot="cassie"), 0, "must be of robot 'anymal', got one of 'cassie'.*archive --robot anymal"),
         (make_archive(0), 0, "at least 5 elites, got 0: let its search go on"),
         (make_archive(4), 0, "at least 5 elites, got 4"),
         (make_archive(60), -1, "must not be negative, got -1"),
@@ -141,7 +141,9 @@ def test_the_far_third_is_the_farthest():
 def test_distance_is_the_root_mean_square_over_all_nodes(monkeypatch):
     # Maps of 2 x 2 nodes; (0, 0, 0, 0) lies sqrt((1 + 1 + 1 + 1) / 4) = 1 from one and sqrt(.36 / 4) = .3 from another.
     maps = {0: [0, 0, 0, 0], 1: [1, -1, 1, -1], 2: [0, 0.6, 0, 0]}
-    monkeypatch.setattr("train.evaluate.sets._heights", lambda genes: np.array([maps[int(row[0])] for row in genes], float))
+    monkeypatch.setattr(
+        "train.evaluate.sets._heights", lambda genes: np.array([maps[int(row[0])] for row in genes], float)
+    )
     training = np.repeat([[1], [2]], 60, axis=0)  # more than are compared at once
     np.testing.assert_allclose(nearest_distance(np.array([[0], [1]]), training), [0.3, 0.0], atol=1e-9)
     np.testing.assert_allclose(nearest_distance(np.array([[0]]), training[:60]), [1.0])

@@ -8,10 +8,9 @@ import pytest
 
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 from train.evaluate.measures import measure
-from train.evaluate.paper import published
+from train.evaluate.publish import published
 from train.evaluate.sets import plain_set
-from train.evaluate.table_figure import draw_tables, write_figure
-from train.evaluate.table_print import print_tables
+from train.evaluate.show import draw_tables, print_tables, write_figure
 from train.evaluate.tables import make_tables, split_by_goal
 
 SEED = 0
@@ -92,7 +91,7 @@ def test_the_terminal_shows_everything(report, capsys):
     print_tables(report)
     said = capsys.readouterr().out
     row = next(line for line in said.splitlines() if line.startswith("C-G"))
-    assert "0.833 [" in row and row.endswith("0.980, 25.4")  # ours, and the paper's
+    assert "0.833 (" in row and row.endswith("0.980, 25.4")  # ours, and the paper's
     assert "generated: 2 terrains that some controller crossed" in said
     # C-G fails terrain 102, as base does; terrain 101 is not compared.
     assert "base -> C-G: 0 mended (0), 1 still failing, 0 newly broken (0) of 2; goal rate +0.000" in said

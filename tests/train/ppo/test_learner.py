@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from train.ppo.cfg import PpoCfg
 from train.ppo.learner import CHECKPOINT_FORMAT, Learner, read_checkpoint
-from train.ppo.ppo import PpoCfg
 from train.task.vec_env import CommandVecEnv
 
 CFG = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=2, mini_batches=2)

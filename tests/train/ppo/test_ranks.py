@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from train.ppo.ranks import Ranks
+from train.ppo.learner import Ranks
 
 ROOT = Path(__file__).parents[3]
 
@@ -25,14 +25,14 @@ def torchrun(*arguments: str) -> subprocess.CompletedProcess:
 def test_two_processes_train_one_controller_and_go_on(tmp_path):
     run = tmp_path / "run"
     size = ["--device", "cpu", "--num-envs", "4", "--ppo.hidden-dims", "16", "--ppo.steps-per-env", "8"]
-    first = torchrun("-m", "train.base", *size, "--iterations", "2", "--run-dir", str(run))
+    first = torchrun("-m", "faultline", "train", *size, "--iterations", "2", "--run-dir", str(run))
     assert first.returncode == 0, first.stderr
     assert first.stdout.count("Controller and training record written") == 1  # one of them speaks
     record = json.loads((run / "policy.train.json").read_text())
     assert record["env_steps"] == 2 * 2 * 4 * 8
     assert record["settings"]["processes"] == 2
     before = torch.load(run / "policy.pt", weights_only=True)["actor_state_dict"]
-    again = torchrun("-m", "train.base", *size, "--iterations", "3", "--resume", str(run))
+    again = torchrun("-m", "faultline", "train", *size, "--iterations", "3", "--resume", str(run))
     assert again.returncode == 0, again.stderr
     after = torch.load(run / "policy.pt", weights_only=True)
     assert after["iter"] == 3

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from qd.show.view.crossings import Crossings, Wanted
-from sim.files.provenance import controller_hash
+from sim.policy.spec import controller_hash
 from sim.recording.file import write_recording
 from tests.qd.show.view.made import make_recording
 

@@ -1,21 +1,22 @@
-"""The tables as a figure, with the paper's own numbers beside ours."""
+"""What evaluations show: rates and tables on the terminal, tables as a figure, the paper's numbers beside ours."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sim.files.atomic import write_atomically
-from sim.policy.names import kind_of
-from train.evaluate.seeds import firsts
-from train.evaluate.table_print import published_value
+from sim.files.intervals import value_words
+from sim.policy.spec import firsts, kind_of
+from train.evaluate.measures import invalid_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_FORMS = {"success": ".3f", "goal": ".3f", "fallen": ".3f", "reward": ".1f"}
 SET_LABELS = {
     "hand_crafted": "hand-crafted",
     "hard_random": "hard-random",
@@ -34,6 +35,125 @@ _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
 _CHANGES = {"mended": "#0072b2", "still_failing": "#bbbbbb", "newly_broken": "#d55e00"}
 _PAPER_LABEL = "of that name in the paper"
+
+
+def print_rates(report: dict[str, Any]) -> None:
+    """Prints the rates of one controller.
+
+    Args:
+        report: As ``base.json`` has it.
+    """
+    print(f"{'':<24}{'success':>24}{'goal':>24}{'fallen':>8}{'terrains':>10}")
+    for name in ("hand_crafted", "hard_random"):
+        rows = {name: report[name]}
+        for group in ("by_type", "by_level"):
+            prefix = "level " if group == "by_level" else ""
+            rows |= {f"  {prefix}{key}": value for key, value in (report[name][group] or {}).items()}
+        for label, row in rows.items():
+            success, goal = (value_words(row[f"{key}_rate"], row.get(f"{key}_interval")) for key in ("success", "goal"))
+            fallen = value_words(row["fallen_rate"], None)
+            print(f"{label:<24}{success:>24}{goal:>24}{fallen:>8}{row['terrains']:>10}")
+    print(f"flat ground: mean |v_x - command| {value_words(report['flat']['vx_error_mean'], None)} m/s")
+    for line in invalid_lines({name: report[name]["outcomes"] for name in ("hand_crafted", "hard_random")}):
+        print(line)
+
+
+def published_value(report: dict[str, Any], measure: str, name: str, who: str) -> float | None:
+    """The paper's number of a measure, a set and a controller's name; None where it has none."""
+    return ((report["paper"] or {}).get(measure, {}).get(name) or {}).get(who)
+
+
+def print_tables(report: dict[str, Any]) -> None:
+    """Print every set with every controller, what became of terrains between controllers, and what nobody crossed.
+
+    Args:
+        report: As ``tables.json`` has it.
+    """
+    wide = 2 + max(12, *(len(who) for row in report["success"].values() for who in row))
+    for name in report["success"]:
+        _print_set(report, name, wide)
+    if report["paper"] is not None:
+        print("paper: its success rate and reward, where it has a controller of that name")
+    _print_over_seeds(report["over_seeds"])
+    _print_penalties(report, wide)
+    _print_differences(report)
+    for name, groups in report["traversable"].items():
+        _print_traversable(name, groups, wide)
+    ended = {f"{who} on {name}": counts for name, row in report["outcomes"].items() for who, counts in row.items()}
+    for line in invalid_lines(ended):
+        print(line)
+
+
+def _print_set(report: dict[str, Any], name: str, wide: int) -> None:
+    print(f"\n{name}: {report['terrains'][name]} terrains x {report['episodes']} episodes")
+    print(_row("", (*_FORMS, "paper"), wide, 24))
+    for who in report["success"][name]:
+        cells = [
+            value_words(report[measure][name][who], report["intervals"][measure][name][who], form)
+            for measure, form in _FORMS.items()
+        ]
+        paper = [published_value(report, measure, name, who) for measure in ("success", "reward")]
+        cells.append("" if None in paper else "{:.3f}, {:.1f}".format(*paper))
+        print(_row(who, cells, wide, 24))
+
+
+def _row(label: str, cells: Iterable[str], wide: int, each: int) -> str:
+    return f"{label:<{wide}}" + "".join(f"{cell:>{each}}" for cell in cells)
+
+
+def _print_penalties(report: dict[str, Any], wide: int) -> None:
+    rows = report["penalties"]
+    names = list(next(iter(next(iter(rows.values())).values())))
+    print("\nscaled penalties: 1 is what a common one comes to with the shipped controller on hard-random terrain")
+    for name, row in rows.items():
+        print(_row(name, names, wide, 15))
+        for who, values in row.items():
+            cells = (value_words(values[key], None, ".2f") for key in names)
+            print(_row(f"  {who}", cells, wide, 15))
+
+
+def _print_differences(report: dict[str, Any]) -> None:
+    if not any(report["differences"].values()):
+        return
+    print(
+        "\nTerrains on which under half of the episodes reach the goal: with the first controller and not the second\n"
+        "(mended), with both (still failing), with the second alone (newly broken); in brackets those beyond chance."
+    )
+    for name, pairs in report["differences"].items():
+        print(name)
+        for pair, found in pairs.items():
+            mended, broken = found["mended"], found["newly_broken"]
+            gain = value_words(found["gain"]["goal"]["mean"], found["gain"]["goal"]["interval"], "+.3f")
+            print(
+                f"  {pair}: {mended['count']} mended ({mended['clear']}), {found['still_failing']['count']} still "
+                f"failing, {broken['count']} newly broken ({broken['clear']}) of {found['compared']}; goal rate {gain}"
+            )
+
+
+def _print_traversable(name: str, groups: dict[str, Any], wide: int) -> None:
+    for key, label in (("crossed", "that some controller crossed"), ("never_crossed", "that none ever crossed")):
+        group = groups[key]
+        print(f"\n{name}: {group['count']} terrains {label}")
+        if group["count"]:
+            print(_row("", _FORMS, wide, 12))
+            for who in group["success"]:
+                cells = (value_words(group[measure][who], None, form) for measure, form in _FORMS.items())
+                print(_row(who, cells, wide, 12))
+
+
+def _print_over_seeds(found: dict[str, Any]) -> None:
+    """Means over the controllers of a kind; nothing where no kind has several."""
+    if not found:
+        return
+    print("\nmean over the controllers of a kind, and its 95 % t interval over them")
+    for name in next(iter(found.values())):
+        for kind in found[next(iter(found))][name]:
+            cells = (f"{measure} {_mean_words(rows[name][kind])}" for measure, rows in found.items())
+            print(f"  {name}, {kind}: " + ", ".join(cells))
+
+
+def _mean_words(summary: dict[str, Any]) -> str:
+    return value_words(summary["mean"], summary["interval"])
 
 
 def write_figure(path: Path, report: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim.bench.bare import measure_bare_physics
+from sim.bench.physics import measure_bare_physics
 from sim.crossing import CrossingCfg
 from sim.rollout import Rollout
 from sim.terrain import hard_random_genes

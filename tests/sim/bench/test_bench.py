@@ -1,23 +1,21 @@
 """The benchmark: kernels and torch counterparts against the oracle on walking robots, and what is refused."""
 
 import json
-import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
-from sim.bench.__main__ import main
 from sim.bench.cases import make_cases
 from sim.bench.checks import OutputError, Truth, require_close
-from sim.bench.measure import measure_case
+from sim.bench.report import measure_case
 from sim.bench.scene import SceneCfg, build_scene
 from sim.bench.timing import TimingCfg
-from sim.files.provenance import provenance
-from tests.sim.test_bench_report import make_ceiling
+from sim.commands import Bench
+from sim.files.command import run_command
+from tests.sim.bench.test_report import make_ceiling
 
 CASES = ("rasterise", "contact", "scan", "observation", "penalties", "contact_forces")
 QUICK = TimingCfg(rounds=1, replay_s=1e-6)
@@ -154,6 +152,10 @@ def test_a_wrong_kernel_stops_the_measurement(cases, device):
 TINY = ["--num-envs", "3", "--num-terrains", "2", "--walk-s", "1", "--duration-s", "1", "--rounds", "1", "--no-compile"]
 
 
+def main(argv):
+    return run_command(Bench, argv, name="bench")
+
+
 def test_command_line(tmp_path, device, capsys):
     out = tmp_path / "new" / "bench.json"
     assert main([*TINY, "--device", device, "--out", str(out)]) == 0
@@ -188,7 +190,7 @@ def test_nothing_is_written_where_an_output_is_wrong(tmp_path, device, capsys, m
         (["--device", "abacus"], "abacus"),
         (["--num-envs", "2", "--num-terrains", "3"], "3 terrains for 2 envs"),
         (["--walk-s", "30"], "walk_s"),
-        (["--rounds", "0"], "rounds"),
+        (["--rounds", "0", "--seed", "-1"], "rounds must be at least 1, got 0; seed must"),
         (["--robot", "horse"], "horse"),
     ],
 )
@@ -202,17 +204,3 @@ def test_what_cannot_be_had_is_one_line(tmp_path, capsys, arguments, reason):
 def test_an_output_that_cannot_be_written_is_known_at_once(tmp_path, capsys):
     assert main(["--device", "cpu", "--out", str(tmp_path)]) == 2
     assert str(tmp_path) in capsys.readouterr().err
-
-
-def test_help(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["--help"])
-    assert end.value.code == 0
-    assert "--heightfield" in capsys.readouterr().out
-
-
-def test_the_command_recorded_is_the_one_to_type(monkeypatch):
-    spec = SimpleNamespace(name="sim.bench.__main__")
-    monkeypatch.setitem(sys.modules, "__main__", SimpleNamespace(__spec__=spec))
-    monkeypatch.setattr(sys, "argv", ["x", "--seed", "1"])
-    assert provenance("cpu", 1)["command"] == "python -m sim.bench --seed 1"

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from sim.bench.ceiling_kernels import FLOPS_PER_STEP, SPECIALS_PER_STEP, do_nothing, exponentials, multiply_add
+from sim.bench.ceiling import FLOPS_PER_STEP, SPECIALS_PER_STEP, do_nothing, exponentials, multiply_add
 
 
 def test_multiply_adds_are_all_done(device):

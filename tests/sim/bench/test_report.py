@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from sim.bench.cases import Work
 from sim.bench.ceiling import Ceiling
-from sim.bench.report import add_shares, file_of, preset, table
+from sim.bench.report import add_shares, file_of, sizes_of, table
 from sim.bench.timing import MAX_LAUNCHES, TimingCfg, Variant, fit_launches, time_in_turns
-from sim.bench.work import Work
+from sim.commands import Bench
 
 
 def make_ceiling():
@@ -96,10 +97,10 @@ def test_variants_take_turns_after_a_warm_up():
 
 
 def test_sizes_are_those_of_the_paper_on_cuda():
-    assert preset("cuda:1", seed=3).scene.num_envs == 4096
-    assert preset("cuda:1", seed=3).scene.num_terrains == 200
-    assert preset("cpu", seed=3).scene.num_envs == 16
-    assert preset("cpu", seed=3).scene.seed == 3
+    scene, timing = sizes_of(Bench(), "cuda:1")
+    assert (scene.num_envs, scene.num_terrains, timing.rounds) == (4096, 200, 20)
+    scene, timing = sizes_of(Bench(num_envs=9, rounds=1, seed=3), "cpu")
+    assert (scene.num_envs, scene.num_terrains, scene.seed, timing.rounds) == (9, 8, 3, 1)
 
 
 def test_numbers_are_named_after_the_device_and_leave_the_published_ones_alone():

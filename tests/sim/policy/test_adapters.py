@@ -11,8 +11,8 @@ import warp as wp
 from sim.bench import oracle
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import surface_heights
+from sim.policy.adapters import read_row
 from sim.policy.loaders import load_policy
-from sim.policy.sensed import read_row
 from sim.policy.spec import ControllerSpec
 from sim.rollout import Rollout
 from sim.terrain import hard_random_genes
@@ -26,7 +26,7 @@ THEIR_ORDER = [9, 10, 11, 6, 7, 8, 3, 4, 5, 0, 1, 2]
 """Their k-th joint is our joint THEIR_ORDER[k]."""
 ADAPTER = """
 import torch
-from sim.policy.sensed import read_row
+from sim.policy.adapters import read_row
 
 ORDER = [9, 10, 11, 6, 7, 8, 3, 4, 5, 0, 1, 2]
 BACK = [ORDER.index(joint) for joint in range(12)]

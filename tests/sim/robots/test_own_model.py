@@ -17,8 +17,8 @@ from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from tests.sim.dogs import GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, urdf, with_mesh, write_dog
+from tests.sim.robots.test_drops import above_ground, measure_gaps, mixed_ground
 from tests.sim.scenes import Stepper, put, velocities
-from tests.sim.test_drops import above_ground, measure_gaps, mixed_ground
 
 FLAT = np.zeros((1, 161, 321), np.float32)
 

@@ -1,6 +1,6 @@
 """Robots dropped in any orientation onto every kind of ground.
 
-On a GPU: ``FAULTLINE_DEVICE=cuda:0 FAULTLINE_DROPS=4096 pytest tests/sim/test_drops.py -s``.
+On a GPU: ``FAULTLINE_DEVICE=cuda:0 FAULTLINE_DROPS=4096 pytest tests/sim/robots/test_drops.py -s``.
 """
 
 import dataclasses

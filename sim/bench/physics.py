@@ -1,0 +1,312 @@
+"""The whole control step, the bare physics in it, and the same physics with the solver's own heightfield collision.
+
+Bare physics is terrain contact and solver alone, on the motion of recorded crossings: the yardstick of everything else.
+"""
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from kernels.episode import PARKING_HEIGHT
+from sim.bank import TerrainBank
+from sim.bench.scene import Scene
+from sim.rollout import Rollout
+from sim.simulation import CAPACITY_OVERFLOWS, GROUND_FRICTION, Simulation
+from sim.terrain import SPACING
+
+_SEGMENT_STEPS = 10
+_SEGMENT_EVERY = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class BareRates:
+    """Physics steps a second over all environments, of the captured graph of terrain contacts and solver alone."""
+
+    walking: float
+    """In the motion of the crossings themselves: states and joint targets recorded from a rollout, physics replayed."""
+    standing: float
+    """Holding the default pose at the start of the crossings; cheaper, since hardly any contact changes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """A stretch of the robots' motion to replay: where it begins, and what the controller wanted from there on."""
+
+    joint_q: Any
+    """Joint coordinates at its begin, on the device, shape (num_envs, 7 + num_joints)."""
+    joint_qd: Any
+    """Joint velocities, shape (num_envs, 6 + num_joints)."""
+    targets: list[Any]
+    """Joint targets of each control step, shape (num_envs, 7 + num_joints)."""
+
+
+def measure_bare_physics(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray, *, steps: int = 1000) -> BareRates:
+    """Bare physics rates on a rollout's own terrains, environments and solver.
+
+    The walking rate replays short segments, each from a recorded state: over 0.2 s a replayed robot still moves as the
+    recorded one did, which over a whole crossing without its controller it would not.
+
+    Args:
+        rollout: Built for the terrains.
+        terrains: Genes or heights, as :meth:`Rollout.evaluate` takes them.
+        seeds: One a terrain, uint32.
+        steps: Physics steps timed at least.
+    """
+    sim = rollout.sim
+
+    def control_step() -> None:
+        for _ in range(rollout.robot.decimation):
+            sim.physics_step()
+
+    segments = record_segments(rollout, terrains, seeds)
+    with wp.ScopedDevice(sim.device):
+        graph = sim.capture(control_step)
+        replay_segments(sim, graph, segments[:2])
+        rounds = -(-steps // (len(segments) * _SEGMENT_STEPS * rollout.robot.decimation))
+        wp.synchronize_device(sim.device)
+        began = time.perf_counter()
+        for _ in range(rounds):
+            replay_segments(sim, graph, segments)
+        wp.synchronize_device(sim.device)
+        replayed = rounds * sum(len(segment.targets) for segment in segments) * rollout.robot.decimation
+        walking = sim.num_envs * replayed / (time.perf_counter() - began)
+        return BareRates(walking=walking, standing=_time_standing(rollout, graph, terrains, seeds, steps))
+
+
+def record_segments(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -> list[Segment]:
+    """State and targets of the first 10 of every 20 control steps of the crossings."""
+    sim, segments = rollout.sim, []
+    most = round(rollout.cfg.max_duration_s / rollout.robot.control_dt)
+    rollout.begin(terrains, seeds)
+    for step in range(most):
+        if step % _SEGMENT_EVERY == 0:
+            segments.append(Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
+        rollout.control_step()
+        if step % _SEGMENT_EVERY < _SEGMENT_STEPS:
+            segments[-1].targets.append(wp.clone(sim.targets))
+    return segments
+
+
+def replay_segments(sim: Simulation, graph: Any, segments: list[Segment]) -> None:
+    """Play segments back: ``graph`` is launched once a control step."""
+    everyone = wp.ones(sim.num_envs, dtype=int, device=sim.device)
+    for segment in segments:
+        wp.copy(sim.joint_q, segment.joint_q)
+        wp.copy(sim.joint_qd, segment.joint_qd)
+        sim.clear_solver(everyone)
+        sim.refresh()
+        for targets in segment.targets:
+            wp.copy(sim.targets, targets)
+            wp.capture_launch(graph)
+
+
+def _time_standing(rollout: Rollout, graph: Any, terrains: np.ndarray, seeds: np.ndarray, steps: int) -> float:
+    sim, robot = rollout.sim, rollout.robot
+    rollout.begin(terrains, seeds)
+    sim.joint_qd.zero_()
+    targets = np.zeros(sim.targets.shape, dtype=np.float32)
+    targets[:, 7:] = robot.default_joint_pos
+    sim.targets.assign(targets)
+    launches = -(-steps // robot.decimation)
+    for _ in range(100):  # 2 s, in which they settle
+        wp.capture_launch(graph)
+    wp.synchronize_device(sim.device)
+    began = time.perf_counter()
+    for _ in range(launches):
+        wp.capture_launch(graph)
+    wp.synchronize_device(sim.device)
+    return sim.num_envs * launches * robot.decimation / (time.perf_counter() - began)
+
+
+_LOST_M = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollisionRates:
+    """Physics steps a second over all environments, contact and solver alone, in the same recorded motion."""
+
+    ours: float
+    """Sphere probes against the height grids (:mod:`kernels.contact`): the bare physics rate."""
+    solver: float | None = None
+    """The solver's own collision of the robot's shapes with a heightfield of all terrains; None: not measured."""
+    height_difference_m: float | None = None
+    """Mean difference of the bases' heights after the 0.2 s replayed from the middle of the crossings, over the robots
+    still at it: the two stand on the same ground. None: all were lost."""
+    solver_invalid_envs: int | None = None
+    """Environments that the solver's collision lost in it: not finite, or thrown over a metre away."""
+    solver_overflows: int | None = None
+    """Environments in which its buffers, as large as ours, were too small in the last step."""
+
+
+class HeightfieldSimulation(Simulation):
+    """Robots on one mosaic of all terrains; an environment's coordinates are shifted by ``offset`` to its tile.
+
+    Attributes:
+        offset: Where each environment's tile begins [m], shape (num_envs, 2).
+    """
+
+    solver_collides = True
+
+    def __init__(self, sim: Simulation) -> None:
+        """The robots, terrains and step of another simulation, whose bank holds its terrains already."""
+        self._terrain_of_env = sim.terrain_of_env.numpy()
+        self._tiles = sim.bank.heights.numpy()[: self._terrain_of_env.max() + 1]
+        flat = TerrainBank(sim.bank.num_terrains, device=sim.device, nrow=2, ncol=2)  # only its number is asked for
+        super().__init__(sim.robot, flat, self._terrain_of_env)
+
+    def _build_model(self, builder: newton.ModelBuilder) -> None:
+        tiles = self._tiles
+        num_rows, num_cols = tiles.shape[1] - 1, tiles.shape[2] - 1  # cells: neighbours share their edge nodes
+        across = int(np.ceil(np.sqrt(len(tiles) * num_rows / num_cols)))
+        up = -(-len(tiles) // across)
+        mosaic = np.zeros((up * num_rows + 1, across * num_cols + 1), np.float32)
+        for t, tile in enumerate(tiles):
+            row, col = t // across * num_rows, t % across * num_cols
+            mosaic[row : row + num_rows + 1, col : col + num_cols + 1] = tile
+        row, col = np.divmod(self._terrain_of_env, across)
+        self.offset = np.stack([col * num_cols, row * num_rows], axis=1) * SPACING
+        half_x, half_y = 0.5 * SPACING * across * num_cols, 0.5 * SPACING * up * num_rows
+        scene = newton.ModelBuilder()
+        newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
+        scene.rigid_gap = 0.0
+        scene.default_shape_cfg.mu = GROUND_FRICTION
+        # No explicit bounds: Newton rescales the data by its own minimum and maximum in any case.
+        ground = newton.Heightfield(data=mosaic, nrow=mosaic.shape[0], ncol=mosaic.shape[1], hx=half_x, hy=half_y)
+        middle: Any = wp.vec3(half_x, half_y, 0.0)
+        scene.add_shape_heightfield(
+            heightfield=ground,
+            xform=wp.transform(middle, wp.quat_identity()),
+            custom_attributes={"mujoco:geom_solmix": 0.0},  # as the ground of the simulation it is compared with
+        )
+        scene.replicate(builder, self.num_envs)
+        self.model = scene.finalize()
+
+    def _build_contact(self, builder: newton.ModelBuilder) -> None:
+        """Nothing: the solver collides, and no contact force is read."""
+
+    def shift(self, segment: Segment) -> Segment:
+        """A recorded segment in this simulation's coordinates."""
+        joint_q = segment.joint_q.numpy().copy()
+        joint_q[:, :2] += self.offset
+        moved = wp.array(joint_q, dtype=float, device=self.device)
+        return Segment(joint_q=moved, joint_qd=segment.joint_qd, targets=segment.targets)
+
+    def physics_step(self) -> None:
+        """One solver step, its collision included."""
+        self.solver.step(self._state, self._state, self._control, None, self.robot.physics_dt)
+
+
+def _time_replay(sim: Simulation, graph: Any, segments: list[Segment]) -> float:
+    with wp.ScopedDevice(sim.device):
+        wp.synchronize_device(sim.device)
+        began = time.perf_counter()
+        replay_segments(sim, graph, segments)
+        wp.synchronize_device(sim.device)
+        return time.perf_counter() - began
+
+
+def _capture_physics(sim: Simulation) -> Any:
+    def control_step() -> None:
+        for _ in range(sim.robot.decimation):
+            sim.physics_step()
+
+    return sim.capture(control_step)
+
+
+def measure_collision(
+    sim: Simulation, other: HeightfieldSimulation | None, segments: list[Segment], *, rounds: int
+) -> CollisionRates:
+    """Physics rates of two simulations on the same motion, in turns.
+
+    Args:
+        sim: The simulation the segments were recorded from.
+        other: The same robots on the solver's heightfield, or None.
+        segments: The motion.
+        rounds: How often all of it is replayed in each; the median counts.
+    """
+    sims: list[tuple[Simulation, Any, list[Segment]]] = [(sim, _capture_physics(sim), segments)]
+    if other is not None:
+        sims.append((other, _capture_physics(other), [other.shift(segment) for segment in segments]))
+    for replayed in sims:
+        _time_replay(replayed[0], replayed[1], replayed[2][:2])
+    seconds = np.median([[_time_replay(*replayed) for replayed in sims] for _ in range(rounds)], axis=0)
+    steps = sim.num_envs * sim.robot.decimation * sum(len(segment.targets) for segment in segments)
+    if other is None:
+        return CollisionRates(ours=steps / float(seconds[0]))
+    middle = len(segments) // 2
+    for simulated, graph, own in sims:
+        _time_replay(simulated, graph, own[middle : middle + 1])
+    heights = [simulated.joint_q.numpy()[:, 2] for simulated in (sim, other)]
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(heights[0] - heights[1])
+    apart = apart[segments[middle].joint_q.numpy()[:, 2] < 0.5 * PARKING_HEIGHT]  # parked robots tell nothing
+    valid = apart < _LOST_M
+    return CollisionRates(
+        ours=steps / float(seconds[0]),
+        solver=steps / float(seconds[1]),
+        height_difference_m=float(apart[valid].mean()) if valid.any() else None,
+        solver_invalid_envs=int((~valid).sum()),
+        solver_overflows=int(((other.overflow.numpy() & CAPACITY_OVERFLOWS) != 0).sum()),
+    )
+
+
+def time_control_step(scene: Scene) -> float:
+    """Seconds a control step over whole crossings: policy, four physics steps, penalties, ends, observation."""
+    rollout, device = scene.rollout, scene.rollout.sim.device
+    steps = round(scene.cfg.duration_s / scene.robot.control_dt)
+    rollout.begin(scene.genes, scene.seeds)
+    wp.synchronize_device(device)
+    began = time.perf_counter()
+    for _ in range(steps):
+        rollout.control_step()
+    wp.synchronize_device(device)
+    return (time.perf_counter() - began) / steps
+
+
+def _build_heightfield(sim: Simulation) -> tuple[HeightfieldSimulation | None, str | None]:
+    """The comparison, or why there is none: the failure of another library's collision takes nothing from ours."""
+    try:
+        return HeightfieldSimulation(sim), None
+    except Exception as error:
+        return None, f"{type(error).__name__}: {error}"[:300]
+
+
+def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The row of the whole step, and the physics rates with either collision.
+
+    Bare physics is contact and solver alone in the motion of the same crossings (:mod:`sim.bench.physics`).
+
+    Args:
+        scene: Robots and terrains; its state is that of another moment afterwards.
+        rounds: Repetitions, of which the median counts.
+        heightfield: Whether to measure the solver's own collision too.
+    """
+    sim = scene.rollout.sim
+    seconds = sorted(time_control_step(scene) for _ in range(3))[1]
+    segments = record_segments(scene.rollout, scene.genes, scene.seeds)
+    other, failure = _build_heightfield(sim) if heightfield else (None, "not asked for")
+    rates = measure_collision(sim, other, segments, rounds=rounds)
+    bare_s = sim.num_envs * scene.robot.decimation / rates.ours
+    row = {
+        "kernel": "whole_step",
+        "ours_ms": seconds * 1e3,
+        "torch_ms": None,
+        "torch_compile_ms": None,
+        "speedup": None,
+        "speedup_compile": None,
+        "ceiling_share": bare_s / seconds,
+        "bound_by": "bare physics",
+        "bare_ms": bare_s * 1e3,
+    }
+    collision = {
+        "physics_steps_per_s": rates.ours,
+        "physics_steps_per_s_solver_collision": rates.solver,
+        "speedup": None if rates.solver is None else rates.ours / rates.solver,
+        **{name: value for name, value in asdict(rates).items() if name not in ("ours", "solver")},
+        "solver_failure": failure,
+    }
+    return row, collision

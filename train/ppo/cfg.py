@@ -1,0 +1,107 @@
+"""Settings of the learner, and the flags that both trainings have."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.files.command import OnDevice
+from sim.files.settings import problems, setting
+from sim.robots.training import PaceCfg
+
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
+
+_ROBOT = "anymal"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoCfg(PaceCfg):
+    """Settings of the learner; the defaults are legged_gym's but for the steps."""
+
+    hidden_dims: tuple[int, ...] = setting((512, 256, 128), least=1)
+    """Hidden layers (ELU) of actor and critic."""
+    steps_per_env: int = setting(16, least=1)
+    """Control steps an iteration, per environment; legged_gym's 24 are for half as many environments."""
+    epochs: int = setting(5, least=1)
+    """Passes over the data of an iteration."""
+    mini_batches: int = setting(4, least=1)
+    """Minibatches a pass."""
+    learning_rate: float = setting(1e-3, above=0.0)
+    """Learning rate at the start; adapted to the KL divergence from then on."""
+    gamma: float = setting(0.99, least=0.0, most=1.0)
+    """Discount per control step."""
+    lam: float = setting(0.95, least=0.0, most=1.0)
+    """Lambda of generalised advantage estimation."""
+    clip: float = setting(0.2, above=0.0)
+    """Clip range of the probability ratio and of the value."""
+    captured: bool = True
+    """Update with one captured graph a minibatch; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
+
+    @classmethod
+    def of(cls, robot: "RobotCfg") -> "PpoCfg":
+        """The settings that a robot's controller is learned with."""
+        return cls(**{own.name: getattr(robot.learning, own.name) for own in fields(PaceCfg)})
+
+
+def ppo_problems(cfg: PpoCfg, num_envs: int) -> list[str]:
+    """What is wrong with the settings of the learner, one line each.
+
+    Args:
+        cfg: The settings.
+        num_envs: Environments of one process.
+    """
+    found = problems(cfg, "ppo.")
+    if found:
+        return found
+    transitions = num_envs * cfg.steps_per_env
+    if not cfg.hidden_dims:
+        found.append("ppo.hidden_dims must name at least one layer, got none")
+    if transitions == 1:
+        found.append("an iteration must have at least 2 transitions, got 1: more num_envs or ppo.steps_per_env")
+    elif cfg.mini_batches > transitions // 2:
+        found.append(
+            f"ppo.mini_batches must be at most half of the {num_envs} x {cfg.steps_per_env} transitions of an "
+            f"iteration, got {cfg.mini_batches}"
+        )
+    if cfg.final_share > 0.0 and cfg.final_kl > cfg.desired_kl:
+        found.append(f"ppo.final_kl must be at most ppo.desired_kl, {cfg.desired_kl}, got {cfg.final_kl}")
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingFlags(OnDevice):
+    """The flags of every training; a run that is resumed has its own settings as defaults."""
+
+    robot: str = _ROBOT
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
+    num_envs: int | None = setting(None, least=1)
+    """Robots trained at once, per process; left out, as many as suit robot and device."""
+    iterations: int | None = setting(None, least=1)
+    """Iterations in all, those before a resume included; left out, as many as suit robot and device."""
+    max_seconds: float | None = setting(None, above=0.0)
+    """Save and stop in time to be done this many seconds after the start."""
+    run_dir: Path | None = None
+    """Where to write; a new directory under runs/, or the resumed run."""
+    resume: Path | None = None
+    """Run directory to go on from."""
+    export: Path | None = None
+    """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
+    <name>.pt beside the settings file of another robot makes it that robot's own."""
+    seed: int = setting(0, least=0)
+    """Seed of everything drawn."""
+    save_every_s: float = setting(60.0, least=0.0)
+    """A checkpoint every so often [s]."""
+    rows: int = setting(100, least=1)
+    """Progress rows over the whole training."""
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+
+
+def named_robot_and_run(flags: Sequence[str]) -> tuple[str, Path | None]:
+    """The robot and the run to resume that a command line names: the defaults of all other flags follow from them."""
+    named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    named.add_argument("--robot", default=_ROBOT)
+    named.add_argument("--resume", type=Path)
+    known = named.parse_known_args(flags)[0]
+    return known.robot, known.resume

@@ -1,0 +1,215 @@
+"""A fine-tuning: what it begins with, checked, and how it exchanges terrains under the learner."""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qd.archive import read_archive
+from sim.files.command import command_line
+from sim.policy.loaders import MlpPolicy, load_policy
+from sim.robots.own import own_hash
+from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.training import RewardCfg
+from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, split_elites
+from train.finetune import Finetune
+from train.ppo.learner import Start, read_start
+from train.ppo.ppo import CapturedPPO
+from train.ppo.run import (
+    POLICY,
+    Job,
+    Training,
+    check_resumed,
+    check_training,
+    device_of,
+    prepare_run_dir,
+    read_saved,
+)
+from train.task.cfg import TaskCfg
+from train.task.mix import Mix, MixCfg
+
+_PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
+_PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}  # the paper's ANYmal
+_SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain: episodes end
+_CRITIC_ITERATIONS = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuningJob(Job):
+    """A fine-tuning that can begin."""
+
+    start: Start | None
+    """Networks it begins with; none where it goes on from a checkpoint."""
+    mix: Mix
+    critic_iterations: int
+    """Iterations at first in which the critic learns alone."""
+
+    @property
+    def trained_on(self) -> list[str]:
+        """Marks of all elites that the controller has been trained on in the end (:func:`marks_of`)."""
+        return sorted({*marks_of(self.mix.genes), *self.settings.get("trained_before", [])})
+
+
+class FineTuning(Training):
+    """A fine-tuning at work: the terrains are exchanged under the learner."""
+
+    def __init__(self, job: TuningJob) -> None:
+        """Begin, or go on from the checkpoint of the job."""
+        self.mix, self._alone = job.mix, job.critic_iterations
+        tiles = self.mix.restore(job.saved["extra"]["mix"]) if job.saved else self.mix.next()
+        # Every episode is whole, at the beginning as after an exchange: who crossed which terrain is counted.
+        super().__init__(job, tiles=tiles, random_ages=False)
+        self.extra = {TRAINED_ON: job.trained_on}
+        if job.start is not None:
+            self.learner.start_from(job.start.actor, job.start.critic)
+
+    def before_iteration(self) -> None:
+        """Exchanges the terrains where that is due, and lets the actor learn once its critic has had its time."""
+        iteration = self.learner.iteration
+        if iteration // self.mix.cfg.swap_every > self.mix.swap:
+            self.task.exchange(self.mix.next(self.task.counts()))
+            self.learner.begin_again()
+        alg = self.learner.alg
+        assert isinstance(alg, CapturedPPO)
+        alg.let_actor_learn(iteration >= self._alone)
+        if iteration == self._alone:
+            alg.begin_actor()
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps beside the learner, the terrains among it."""
+        return {**super().state(), "mix": self.mix.state(self.task.counts())}
+
+    def finish(self) -> None:
+        """Writes the controller as ONNX too, where the packages for it are."""
+        super().finish()
+        path = self.job.run_dir / POLICY
+        try:
+            from sim.policy.export import export_onnx
+        except ImportError as error:
+            command = command_line("export-policy", robot=self.job.robot.spec, policy=path)
+            print(f"No ONNX file was written ({error}); where onnx is installed:  {command}")
+            return
+        policy = load_policy(path, self.job.robot, "cpu")
+        assert isinstance(policy, MlpPolicy)
+        export_onnx(policy, path.with_suffix(".onnx"))
+        print(f"The same as ONNX: {path.with_suffix('.onnx')}")
+
+    def next_command(self) -> str:
+        """The command that holds the controller against the shipped one, on elites held out of its training too."""
+        archive = self.job.settings["archive"]
+        return command_line(
+            "evaluate",
+            robot=self.job.robot.spec,
+            policies=["base=shipped", f"tuned={self.job.run_dir / POLICY}"],
+            archive=archive and archive["path"],
+            split_seed=(self.job.settings["split_seed"] or None) if archive else None,
+        )
+
+
+def job_of(flags: Finetune, began: float) -> TuningJob:
+    """What a command line asks for, checked.
+
+    Args:
+        flags: The command line.
+        began: When the command began, on the clock of :func:`time.monotonic` [s].
+
+    Raises:
+        ValueError: If controller, archive, mix, a size or the directory is not as it must be.
+    """
+    robot, device = get_robot(flags.robot), device_of(flags)
+    saved = read_saved(flags.resume, robot.name, finetuning=True) if flags.resume else None
+    size = sizes_of(flags, robot.name, on_gpu=device.startswith("cuda"))
+    if saved is None:
+        path = flags.policy or robot.policy_file
+        start, before = read_start(path, robot), sorted(recorded_marks(str(path)))
+        ppo = replace(flags.ppo, hidden_dims=start.hidden_dims)
+        size["critic_iterations"] = 0 if start.critic is not None else size["critic_iterations"]
+    else:  # all of it is in the checkpoint: the file it began with may be gone
+        start, ppo, before = None, flags.ppo, saved["extra"]["settings"].get("trained_before", [])
+    num_envs, iterations = size["num_envs"], size["iterations"]
+    crosses = flags.task == "crossing"
+    task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards)
+    check_training(flags, task, ppo, robot=robot, num_envs=num_envs)
+    if not ppo.captured:
+        raise ValueError("rsl_rl's own PPO cannot let the critic learn alone at first: leave --ppo.captured on")
+    mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
+    if num_envs < mix_cfg.terrains:
+        raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {num_envs}")
+    genes, archive = _elites(flags, robot)
+    settings = {
+        "seed": flags.seed,
+        "num_envs": num_envs,
+        "iterations": iterations,
+        "policy": str(flags.policy or "shipped"),
+        "mix": asdict(mix_cfg),
+        "archive": archive,
+        "split_seed": flags.split_seed,
+        "critic_iterations": size["critic_iterations"],
+        "task": asdict(task),
+        "ppo": asdict(ppo),
+        **own_hash(robot),
+        **({"trained_before": before} if before else {}),
+    }
+    if saved is not None:
+        _refuse_changes(flags, saved, settings)
+    return TuningJob(
+        command="finetune", flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations,
+        task=task, ppo=ppo, settings=settings, saved=saved, began=began,
+        run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
+        start=start, critic_iterations=size["critic_iterations"],
+        mix=Mix(cfg=mix_cfg, genes=genes, crosses=crosses, seed=flags.seed, device=device),
+    )  # fmt: skip
+
+
+def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
+    """Which reward terms weigh otherwise than the robot's own, in words."""
+    usual = asdict(own)
+    other = {name: weight for name, weight in asdict(rewards).items() if weight != usual[name]}
+    if not other:
+        return "Rewards: the robot's own"
+    given = ", ".join(f"{name}={weight:g}" for name, weight in other.items())
+    return f"Rewards: {given} (the robot's own: {', '.join(f'{usual[name]:g}' for name in other)})"
+
+
+def sizes_of(flags: Finetune, robot: str, *, on_gpu: bool) -> dict[str, int]:
+    """Sizes of the training, with those left out as the device can do."""
+    sizes = _PAPER.get(robot, _PAPER_OTHERS) if on_gpu else _SMALL
+    if not on_gpu and flags.num_envs is None and flags.iterations is None:
+        print(
+            f"No GPU: a small fine-tuning of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough "
+            "to see that it runs. The paper's takes minutes on one GPU."
+        )
+    given = {name: getattr(flags, name) for name in (*sizes, "critic_iterations")}
+    found = {**sizes, **{name: value for name, value in given.items() if value is not None}}
+    return {"critic_iterations": min(_CRITIC_ITERATIONS, found["iterations"] // 2), **found}
+
+
+def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, dict[str, Any] | None]:
+    """Genes of the elites to train on, shape (E, 64), and where they are from."""
+    if flags.mix != "generated":
+        if flags.archive is not None:
+            raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
+        return np.zeros((0, 64), np.float32), None
+    path = flags.archive or Path("results") / robot.name / "archive"
+    try:
+        archive = read_archive(path)
+    except FileNotFoundError as error:
+        make = command_line("archive", robot=robot.spec)
+        raise ValueError(f"{error}; make one ({make}) and name it with --archive") from error
+    rows = split_elites(archive, robot.name, flags.split_seed).train
+    return archive.genes[rows], {
+        "path": str(path), "archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows),
+        "elites_sha256": elites_sha256(archive),
+    }  # fmt: skip
+
+
+def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, Any]) -> None:
+    """Nothing but the iterations may change, and where the archive lies: its hash says whether it is the same."""
+    free = ("iterations ", "archive.path ")
+    different = [line for line in check_resumed(flags, saved, settings) if not line.startswith(free)]
+    if different:
+        raise ValueError(
+            f"{flags.resume} was begun with other settings ({'; '.join(different)}): leave out what is given "
+            "otherwise, put an archive that has changed back, or begin a new run"
+        )
