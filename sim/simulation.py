@@ -25,7 +25,7 @@ CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 
 @dataclass(frozen=True, kw_only=True)
 class SolverCfg:
-    """Options of the physics solver, chosen by measurement (``python -m sim.bench.options``).
+    """Options of the physics solver, chosen by measurement (``faultline solver-options``).
 
     The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that a physics step
     of 0.005 s allows; at MuJoCo's default of 0.02 s feet that land hard sink in by more than their radius. Friction

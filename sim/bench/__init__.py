@@ -1,1 +1,1 @@
-"""Microbenchmarks: every kernel against torch and against what the device can do at best; ``python -m sim.bench``."""
+"""Microbenchmarks: every kernel against torch and against what the device can do at best."""

@@ -5,6 +5,9 @@ fastest copy of at least as many bytes as it must move: as near to the processor
 launch, which would hold back a small copy as it does a small kernel.
 """
 
+# Kernels are compiled by Warp, whose types these are.
+# pyright: reportIndexIssue=false, reportArgumentType=false
+
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -101,7 +104,7 @@ def exponentials(steps: int, out: Any) -> None:
 BOUND_SHARE = 0.25
 """A kernel that reaches this share of a ceiling is bound by it."""
 LAUNCH_SHARE = 0.5
-"""One that reaches none, but of whose time an empty launch takes this share, is bound by launching."""
+"""A kernel that reaches none is bound by launching if an empty launch takes this share of its time."""
 
 BOUND_BY_RULE = (
     f"the ceiling with the largest share, if that is at least {BOUND_SHARE}; else launch, if an empty launch takes at "

@@ -1,4 +1,4 @@
-"""Outputs held against the float64 oracle before anything is timed; where it is slow, on a random part of them."""
+"""Comparison of outputs with the float64 oracle before anything is timed; on a random part where the oracle is slow."""
 
 from functools import cached_property
 from typing import Any
@@ -43,7 +43,7 @@ def _exact(values: Any) -> NDArray:
 
 
 class Truth:
-    """What the oracle says of a scene: computed when first asked for, and held against every variant's output.
+    """The oracle's outputs of a scene, computed on first use and compared with every variant's output.
 
     Args of the checks: ``who`` names the variant in errors; the outputs are NumPy arrays.
     """
@@ -53,7 +53,7 @@ class Truth:
 
         Args:
             scene: Whose kernels are checked.
-            num_checked: Environments looked at where the oracle is slow.
+            num_checked: Environments checked where the oracle is slow.
         """
         sim: Any = scene.rollout.sim
         rng = np.random.default_rng(scene.cfg.seed)
@@ -149,7 +149,7 @@ class Truth:
 
     @cached_property
     def _distances(self) -> dict[tuple[int, int], NDArray]:
-        """Signed distance of each probe of the strips of the environments looked at; infinite where out of reach."""
+        """Signed distance of each probe of the strips of the checked environments; infinite where out of reach."""
         return {
             (int(env), strip): np.array(
                 [

@@ -4,8 +4,11 @@ The tests and :mod:`sim.bench` hold the kernels against it; nothing here is shar
 Vectors are world-local unless a name ends in ``_b``.
 """
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+
+Array = Any  # an array, or a sequence of numbers: checked by what is computed
 
 TABLE_I = {  # the paper's minimum and maximum of each parameter, in gene order
     "mu_x": (6, 10),
@@ -19,7 +22,7 @@ TABLE_I = {  # the paper's minimum and maximum of each parameter, in gene order
 }
 
 
-def mixture_height(genes: ArrayLike, x: ArrayLike, y: ArrayLike) -> NDArray:
+def mixture_height(genes: Array, x: Array, y: Array) -> Array:
     """The paper's equation 1 for one terrain: genes (8 * num_bumps,), heights of the shape of x and y."""
     height = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
     for bump in np.clip(np.float64(genes), -1, 1).reshape(-1, 8):
@@ -34,7 +37,7 @@ def mixture_height(genes: ArrayLike, x: ArrayLike, y: ArrayLike) -> NDArray:
     return height
 
 
-def triangles(grid: NDArray, spacing: float, x: float, y: float, reach: float) -> NDArray:
+def triangles(grid: Array, spacing: float, x: float, y: float, reach: float) -> Array:
     """Corners (num, 3, 3) of every surface triangle within ``reach`` of (x, y); edge heights continue outside.
 
     Each cell is cut from its (low x, high y) to its (high x, low y) corner; corners run counter-clockwise from above.
@@ -43,7 +46,7 @@ def triangles(grid: NDArray, spacing: float, x: float, y: float, reach: float) -
     rows = np.arange(np.floor((y - reach) / spacing) - 1, np.floor((y + reach) / spacing) + 2).astype(int)
     row, col = (index.ravel() for index in np.meshgrid(rows, cols, indexing="ij"))
 
-    def node(i: NDArray, j: NDArray) -> NDArray:
+    def node(i: Array, j: Array) -> Array:
         inside = np.clip(i, 0, grid.shape[0] - 1), np.clip(j, 0, grid.shape[1] - 1)
         return np.stack([j * spacing, i * spacing, np.float64(grid[inside])], axis=-1)
 
@@ -52,11 +55,11 @@ def triangles(grid: NDArray, spacing: float, x: float, y: float, reach: float) -
     return np.concatenate([low, high])
 
 
-def _area(u: NDArray, v: NDArray) -> NDArray:
+def _area(u: Array, v: Array) -> Array:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def _under(corners: NDArray, point: ArrayLike) -> NDArray:
+def _under(corners: Array, point: Array) -> Array:
     """Barycentric weights (num, 3) of the vertical through ``point`` in each triangle."""
     a, b, c = corners[:, 0, :2], corners[:, 1, :2], corners[:, 2, :2]
     q = np.float64(point)
@@ -64,7 +67,7 @@ def _under(corners: NDArray, point: ArrayLike) -> NDArray:
     return weights / _area(b - a, c - a)[:, None]
 
 
-def surface_height(grid: NDArray, spacing: float, x: float, y: float) -> float:
+def surface_height(grid: Array, spacing: float, x: float, y: float) -> float:
     """Height of the triangulated surface at one (x, y)."""
     corners = triangles(grid, spacing, x, y, 0.0)
     weights = _under(corners, (x, y))
@@ -72,7 +75,7 @@ def surface_height(grid: NDArray, spacing: float, x: float, y: float) -> float:
     return float(weights[k] @ corners[k, :, 2])
 
 
-def surface_normal(grid: NDArray, spacing: float, x: float, y: float) -> NDArray:
+def surface_normal(grid: Array, spacing: float, x: float, y: float) -> Array:
     """Upward unit normal of the triangle at one (x, y)."""
     corners = triangles(grid, spacing, x, y, 0.0)
     a, b, c = corners[np.argmax(_under(corners, (x, y)).min(axis=1))]
@@ -80,13 +83,13 @@ def surface_normal(grid: NDArray, spacing: float, x: float, y: float) -> NDArray
     return normal / np.linalg.norm(normal)
 
 
-def _nearest_on_segments(p: NDArray, start: NDArray, end: NDArray) -> NDArray:
+def _nearest_on_segments(p: Array, start: Array, end: Array) -> Array:
     along = end - start
     share = np.clip(((p - start) * along).sum(1) / (along * along).sum(1), 0, 1)
     return start + share[:, None] * along
 
 
-def nearest_on_surface(grid: NDArray, spacing: float, p: ArrayLike, reach: float) -> tuple[float, NDArray | None]:
+def nearest_on_surface(grid: Array, spacing: float, p: Array, reach: float) -> tuple[float, Array | None]:
     """Signed distance of ``p`` to the surface and the nearest point; (inf, None) if nothing is within ``reach``.
 
     Brute force: on every triangle near, the foot of the perpendicular where it falls inside, and the best of all edges.
@@ -110,14 +113,14 @@ def nearest_on_surface(grid: NDArray, spacing: float, p: ArrayLike, reach: float
     return (-distances[best] if below else distances[best]), candidates[best]
 
 
-def rotation_matrix(quaternion_xyzw: ArrayLike) -> NDArray:
+def rotation_matrix(quaternion_xyzw: Array) -> Array:
     """Matrix that turns base-frame vectors into the world frame."""
     x, y, z, w = np.float64(quaternion_xyzw) / np.linalg.norm(np.float64(quaternion_xyzw))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
-def base_velocities(q: NDArray, qd: NDArray, base_com: ArrayLike) -> tuple[NDArray, NDArray]:
+def base_velocities(q: Array, qd: Array, base_com: Array) -> tuple[Array, Array]:
     """Base-frame velocity of the base link's origin, and base-frame angular velocity."""
     to_base = rotation_matrix(q[3:7]).T
     ang_vel_b = to_base @ np.float64(qd[3:6])
@@ -125,9 +128,9 @@ def base_velocities(q: NDArray, qd: NDArray, base_com: ArrayLike) -> tuple[NDArr
 
 
 def geom_forces(
-    world: NDArray, column: NDArray, frame: NDArray, efc_address: NDArray, efc_force: NDArray,
+    world: Array, column: Array, frame: Array, efc_address: Array, efc_force: Array,
     shape: tuple[int, int],
-) -> NDArray:  # fmt: skip
+) -> Array:  # fmt: skip
     """Sum of contact forces on each geom, (num_envs, num_geoms, 3), each along its frame's normal and two tangents.
 
     ``column`` is the geom's column in the result, -1 for none; an ``efc_address`` below 0 is a contact without force.
@@ -139,9 +142,9 @@ def geom_forces(
 
 
 def penalties(
-    q: NDArray, qd: NDArray, base_com: ArrayLike, command: NDArray, forces: ArrayLike, feet: list[int],
+    q: Array, qd: Array, base_com: Array, command: Array, forces: Array, feet: list[int],
     base_and_limbs: list[int], force_limit: float,
-) -> NDArray:  # fmt: skip
+) -> Array:  # fmt: skip
     """The six raw penalties of one physics step, before times dt (definitions: raw penalties)."""
     lin_vel_b, ang_vel_b = base_velocities(q, qd, base_com)
     forces = np.float64(forces)
@@ -159,16 +162,16 @@ def penalties(
     )
 
 
-def yaw_of(quaternion_xyzw: ArrayLike) -> float:
+def yaw_of(quaternion_xyzw: Array) -> float:
     """Heading of the base's x axis."""
     forward = rotation_matrix(quaternion_xyzw)[:, 0]
     return np.arctan2(forward[1], forward[0])
 
 
 def observation(
-    q: ArrayLike, qd: ArrayLike, command: ArrayLike, last_action: ArrayLike, grid: NDArray, spacing: float,
-    default_joint_pos: ArrayLike, scan: ArrayLike, base_com: ArrayLike,
-) -> NDArray:  # fmt: skip
+    q: Array, qd: Array, command: Array, last_action: Array, grid: Array, spacing: float,
+    default_joint_pos: Array, scan: Array, base_com: Array,
+) -> Array:  # fmt: skip
     """One observation row; ``scan`` (num_scan_points, 2) in the yaw frame."""
     num_joints = len(default_joint_pos)
     q, qd = np.float64(q), np.float64(qd)
@@ -192,8 +195,8 @@ def observation(
 
 
 def goal_command(
-    position: ArrayLike, yaw: float, goal: ArrayLike, speed: float = 0.75, gain: float = 0.5, limit: float = 1.0
-) -> NDArray:
+    position: Array, yaw: float, goal: Array, speed: float = 0.75, gain: float = 0.5, limit: float = 1.0
+) -> Array:
     """Velocity toward the goal in the yaw frame, and the yaw rate that turns the robot to it."""
     to_goal = np.float64(goal) - position
     error = (np.arctan2(to_goal[1], to_goal[0]) - yaw + np.pi) % (2 * np.pi) - np.pi
@@ -201,7 +204,7 @@ def goal_command(
 
 
 def outcome(
-    q: NDArray, qd: NDArray, base_force: float, overflow: int, steps: int, max_steps: int,
+    q: Array, qd: Array, base_force: float, overflow: int, steps: int, max_steps: int,
     goal: tuple[float, float] = (14.0, 4.0),
 ) -> str:  # fmt: skip
     """Name of how an episode stands after a step (definitions: a crossing)."""

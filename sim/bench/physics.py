@@ -4,7 +4,8 @@ Bare physics is terrain contact and solver alone, on the motion of recorded cros
 """
 
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import newton
@@ -20,6 +21,7 @@ from sim.terrain import SPACING
 
 _SEGMENT_STEPS = 10
 _SEGMENT_EVERY = 20
+_LOST_M = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +36,7 @@ class BareRates:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """A stretch of the robots' motion to replay: where it begins, and what the controller wanted from there on."""
+    """A stretch of recorded motion: the state at its start and the joint targets from there on."""
 
     joint_q: Any
     """Joint coordinates at its begin, on the device, shape (num_envs, 7 + num_joints)."""
@@ -57,24 +59,36 @@ def measure_bare_physics(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarr
         steps: Physics steps timed at least.
     """
     sim = rollout.sim
+    segments = record_segments(rollout, terrains, seeds)
+    graph = _capture_physics(sim)
+    _time(lambda: replay_segments(sim, graph, segments[:2]), sim.device)  # so that kernels are loaded
+    rounds = -(-steps // (len(segments) * _SEGMENT_STEPS * rollout.robot.decimation))
+    seconds = _time(lambda: [replay_segments(sim, graph, segments) for _ in range(rounds)], sim.device)
+    replayed = rounds * sum(len(segment.targets) for segment in segments) * rollout.robot.decimation
+    return BareRates(
+        walking=sim.num_envs * replayed / seconds, standing=_time_standing(rollout, graph, terrains, seeds, steps)
+    )
+
+
+def _capture_physics(sim: Simulation) -> Any:
+    """The graph of the physics steps of one control step."""
 
     def control_step() -> None:
-        for _ in range(rollout.robot.decimation):
+        for _ in range(sim.robot.decimation):
             sim.physics_step()
 
-    segments = record_segments(rollout, terrains, seeds)
     with wp.ScopedDevice(sim.device):
-        graph = sim.capture(control_step)
-        replay_segments(sim, graph, segments[:2])
-        rounds = -(-steps // (len(segments) * _SEGMENT_STEPS * rollout.robot.decimation))
-        wp.synchronize_device(sim.device)
+        return sim.capture(control_step)
+
+
+def _time(work: Callable[[], object], device: str) -> float:
+    """Seconds from when the device is idle to when it has done the work."""
+    with wp.ScopedDevice(device):
+        wp.synchronize_device(device)
         began = time.perf_counter()
-        for _ in range(rounds):
-            replay_segments(sim, graph, segments)
-        wp.synchronize_device(sim.device)
-        replayed = rounds * sum(len(segment.targets) for segment in segments) * rollout.robot.decimation
-        walking = sim.num_envs * replayed / (time.perf_counter() - began)
-        return BareRates(walking=walking, standing=_time_standing(rollout, graph, terrains, seeds, steps))
+        work()
+        wp.synchronize_device(device)
+        return time.perf_counter() - began
 
 
 def record_segments(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -> list[Segment]:
@@ -112,34 +126,11 @@ def _time_standing(rollout: Rollout, graph: Any, terrains: np.ndarray, seeds: np
     targets[:, 7:] = robot.default_joint_pos
     sim.targets.assign(targets)
     launches = -(-steps // robot.decimation)
-    for _ in range(100):  # 2 s, in which they settle
-        wp.capture_launch(graph)
-    wp.synchronize_device(sim.device)
-    began = time.perf_counter()
-    for _ in range(launches):
-        wp.capture_launch(graph)
-    wp.synchronize_device(sim.device)
-    return sim.num_envs * launches * robot.decimation / (time.perf_counter() - began)
-
-
-_LOST_M = 1.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class CollisionRates:
-    """Physics steps a second over all environments, contact and solver alone, in the same recorded motion."""
-
-    ours: float
-    """Sphere probes against the height grids (:mod:`kernels.contact`): the bare physics rate."""
-    solver: float | None = None
-    """The solver's own collision of the robot's shapes with a heightfield of all terrains; None: not measured."""
-    height_difference_m: float | None = None
-    """Mean difference of the bases' heights after the 0.2 s replayed from the middle of the crossings, over the robots
-    still at it: the two stand on the same ground. None: all were lost."""
-    solver_invalid_envs: int | None = None
-    """Environments that the solver's collision lost in it: not finite, or thrown over a metre away."""
-    solver_overflows: int | None = None
-    """Environments in which its buffers, as large as ours, were too small in the last step."""
+    with wp.ScopedDevice(sim.device):
+        for _ in range(100):  # 2 s, in which they settle
+            wp.capture_launch(graph)
+    seconds = _time(lambda: [wp.capture_launch(graph) for _ in range(launches)], sim.device)
+    return sim.num_envs * launches * robot.decimation / seconds
 
 
 class HeightfieldSimulation(Simulation):
@@ -200,75 +191,67 @@ class HeightfieldSimulation(Simulation):
         self.solver.step(self._state, self._state, self._control, None, self.robot.physics_dt)
 
 
-def _time_replay(sim: Simulation, graph: Any, segments: list[Segment]) -> float:
-    with wp.ScopedDevice(sim.device):
-        wp.synchronize_device(sim.device)
-        began = time.perf_counter()
-        replay_segments(sim, graph, segments)
-        wp.synchronize_device(sim.device)
-        return time.perf_counter() - began
-
-
-def _capture_physics(sim: Simulation) -> Any:
-    def control_step() -> None:
-        for _ in range(sim.robot.decimation):
-            sim.physics_step()
-
-    return sim.capture(control_step)
-
-
 def measure_collision(
     sim: Simulation, other: HeightfieldSimulation | None, segments: list[Segment], *, rounds: int
-) -> CollisionRates:
+) -> dict[str, Any]:
     """Physics rates of two simulations on the same motion, in turns.
 
     Args:
-        sim: The simulation the segments were recorded from.
+        sim: The simulation that the segments were recorded from.
         other: The same robots on the solver's heightfield, or None.
         segments: The motion.
         rounds: How often all of it is replayed in each; the median counts.
+
+    Returns:
+        ``physics_steps_per_s`` over all environments, by our contact and, ``_solver_collision``, by the solver's, and
+        their ratio ``speedup``. Of the 0.2 s in the middle of the crossings: ``height_difference_m``, the mean
+        difference of the bases' heights, ``solver_invalid_envs`` that the solver's collision lost (not finite, or
+        thrown over a metre away), and ``solver_overflows`` of its buffers, which are as large as ours. What is not
+        measured is None.
     """
     sims: list[tuple[Simulation, Any, list[Segment]]] = [(sim, _capture_physics(sim), segments)]
     if other is not None:
         sims.append((other, _capture_physics(other), [other.shift(segment) for segment in segments]))
-    for replayed in sims:
-        _time_replay(replayed[0], replayed[1], replayed[2][:2])
-    seconds = np.median([[_time_replay(*replayed) for replayed in sims] for _ in range(rounds)], axis=0)
-    steps = sim.num_envs * sim.robot.decimation * sum(len(segment.targets) for segment in segments)
+
+    def replay(which: tuple[Simulation, Any, list[Segment]], part: slice = slice(None)) -> float:
+        return _time(lambda: replay_segments(which[0], which[1], which[2][part]), sim.device)
+
+    for which in sims:
+        replay(which, slice(2))
+    seconds = np.median([[replay(which) for which in sims] for _ in range(rounds)], axis=0)
+    rates = sim.num_envs * sim.robot.decimation * sum(len(segment.targets) for segment in segments) / seconds
+    found: dict[str, Any] = {"physics_steps_per_s": float(rates[0])}
+    names = ("speedup", "height_difference_m", "solver_invalid_envs", "solver_overflows")
+    found |= dict.fromkeys(("physics_steps_per_s_solver_collision", *names))
     if other is None:
-        return CollisionRates(ours=steps / float(seconds[0]))
+        return found
     middle = len(segments) // 2
-    for simulated, graph, own in sims:
-        _time_replay(simulated, graph, own[middle : middle + 1])
+    for which in sims:
+        replay(which, slice(middle, middle + 1))
     heights = [simulated.joint_q.numpy()[:, 2] for simulated in (sim, other)]
     with np.errstate(invalid="ignore"):
         apart = np.abs(heights[0] - heights[1])
     apart = apart[segments[middle].joint_q.numpy()[:, 2] < 0.5 * PARKING_HEIGHT]  # parked robots tell nothing
     valid = apart < _LOST_M
-    return CollisionRates(
-        ours=steps / float(seconds[0]),
-        solver=steps / float(seconds[1]),
-        height_difference_m=float(apart[valid].mean()) if valid.any() else None,
-        solver_invalid_envs=int((~valid).sum()),
-        solver_overflows=int(((other.overflow.numpy() & CAPACITY_OVERFLOWS) != 0).sum()),
-    )
+    return found | {
+        "physics_steps_per_s_solver_collision": float(rates[1]),
+        "speedup": float(rates[0] / rates[1]),
+        "height_difference_m": float(apart[valid].mean()) if valid.any() else None,
+        "solver_invalid_envs": int((~valid).sum()),
+        "solver_overflows": int(((other.overflow.numpy() & CAPACITY_OVERFLOWS) != 0).sum()),
+    }
 
 
 def time_control_step(scene: Scene) -> float:
     """Seconds a control step over whole crossings: policy, four physics steps, penalties, ends, observation."""
-    rollout, device = scene.rollout, scene.rollout.sim.device
+    rollout = scene.rollout
     steps = round(scene.cfg.duration_s / scene.robot.control_dt)
     rollout.begin(scene.genes, scene.seeds)
-    wp.synchronize_device(device)
-    began = time.perf_counter()
-    for _ in range(steps):
-        rollout.control_step()
-    wp.synchronize_device(device)
-    return (time.perf_counter() - began) / steps
+    return _time(lambda: [rollout.control_step() for _ in range(steps)], rollout.sim.device) / steps
 
 
 def _build_heightfield(sim: Simulation) -> tuple[HeightfieldSimulation | None, str | None]:
-    """The comparison, or why there is none: the failure of another library's collision takes nothing from ours."""
+    """The simulation to compare with, or why there is none; a failure of the solver's collision stops nothing."""
     try:
         return HeightfieldSimulation(sim), None
     except Exception as error:
@@ -278,10 +261,8 @@ def _build_heightfield(sim: Simulation) -> tuple[HeightfieldSimulation | None, s
 def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of the whole step, and the physics rates with either collision.
 
-    Bare physics is contact and solver alone in the motion of the same crossings (:mod:`sim.bench.physics`).
-
     Args:
-        scene: Robots and terrains; its state is that of another moment afterwards.
+        scene: Robots and terrains; its state changes.
         rounds: Repetitions, of which the median counts.
         heightfield: Whether to measure the solver's own collision too.
     """
@@ -289,24 +270,14 @@ def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[
     seconds = sorted(time_control_step(scene) for _ in range(3))[1]
     segments = record_segments(scene.rollout, scene.genes, scene.seeds)
     other, failure = _build_heightfield(sim) if heightfield else (None, "not asked for")
-    rates = measure_collision(sim, other, segments, rounds=rounds)
-    bare_s = sim.num_envs * scene.robot.decimation / rates.ours
+    collision = measure_collision(sim, other, segments, rounds=rounds)
+    bare_s = sim.num_envs * scene.robot.decimation / collision["physics_steps_per_s"]
     row = {
         "kernel": "whole_step",
         "ours_ms": seconds * 1e3,
-        "torch_ms": None,
-        "torch_compile_ms": None,
-        "speedup": None,
-        "speedup_compile": None,
+        **dict.fromkeys(("torch_ms", "torch_compile_ms", "speedup", "speedup_compile")),
         "ceiling_share": bare_s / seconds,
         "bound_by": "bare physics",
         "bare_ms": bare_s * 1e3,
     }
-    collision = {
-        "physics_steps_per_s": rates.ours,
-        "physics_steps_per_s_solver_collision": rates.solver,
-        "speedup": None if rates.solver is None else rates.ours / rates.solver,
-        **{name: value for name, value in asdict(rates).items() if name not in ("ours", "solver")},
-        "solver_failure": failure,
-    }
-    return row, collision
+    return row, collision | {"solver_failure": failure}

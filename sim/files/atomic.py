@@ -52,7 +52,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> OSError:
-    """The error of a write that failed, with what it was to write and what to do; a bare one names neither."""
+    """The error of a failed write that names the file and the remedy; a bare one names neither."""
     return OSError(
         f"{path} cannot be written: {error.strerror or error}: make room there or give another place; "
         "what was saved before is whole"
@@ -65,7 +65,7 @@ def is_leftover(path: Path) -> bool:
 
 
 def check_writable(folder: Path) -> None:
-    """Finds out whether files can be made in a folder, before the work whose result goes there.
+    """Checks that files can be made in a folder, before long work whose result goes there.
 
     Raises:
         ValueError: If they cannot.
@@ -79,7 +79,7 @@ def check_writable(folder: Path) -> None:
 
 
 def prepare_output(file: Path) -> None:
-    """Makes the folder of a file to be written after long work, and finds out whether the file can be.
+    """Makes the folder of a file and checks that the file can be written, before long work.
 
     Raises:
         ValueError: If it cannot.

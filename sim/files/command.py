@@ -63,7 +63,7 @@ class Which:
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
-    """Number of the elite, 0 the worst; where a command takes several, numbers apart by spaces, or all."""
+    """Number of the elite, 0 the worst; where a command takes several: numbers separated by spaces, or all."""
 
 
 class UserError(Exception):
@@ -87,7 +87,7 @@ class _HasDefaults(Protocol):
 
 @contextmanager
 def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None]:
-    """Ends work that stops or fails half way with what there is and how to go on.
+    """Adds what is saved and how to go on to the error of work that stops or fails half way.
 
     Args:
         state: What is saved, after ``Stopped;``.
@@ -168,7 +168,7 @@ def _program() -> str:
 
 
 def split_words(values: Sequence[str]) -> list[str]:
-    """Words of arguments that may hold several each, apart by spaces or commas."""
+    """The words of arguments; one argument may hold several, separated by spaces or commas."""
     return " ".join(values).replace(",", " ").split()
 
 
@@ -176,9 +176,9 @@ def chosen_elites(text: str, count: int, whose: object) -> list[int]:
     """Numbers of elites, as a command line names them.
 
     Args:
-        text: Numbers apart by spaces or commas, or ``all``.
+        text: Numbers separated by spaces or commas, or ``all``.
         count: How many elites there are.
-        whose: What they are of, for the message.
+        whose: Their run or pool, for the message.
 
     Raises:
         ValueError: If it is something else, or there is no such elite.

@@ -28,7 +28,7 @@ def read_arrays(path: Path, names: Sequence[str], *, max_bytes: float = float("i
     Args:
         path: The file.
         names: Which.
-        max_bytes: Most that one of them may hold; a file of zeros is small whatever it holds.
+        max_bytes: Largest size of one of them; a packed file of zeros is small at any size.
 
     Raises:
         Exception: Anything, if it is damaged, another file, or lacks one: zip, zlib and npy headers fail with a dozen

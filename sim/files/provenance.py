@@ -54,7 +54,7 @@ def code_fingerprint(rooms: Sequence[str]) -> str:
 
 
 def _command() -> str:
-    """The command that runs, as one types it; of a path outside the working folder only the name is told."""
+    """The running command as a user types it; a path outside the working folder is cut to its name."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     module = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
     program = ["faultline"] if module == "faultline" else ["python", "-m", module]

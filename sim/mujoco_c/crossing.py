@@ -55,7 +55,7 @@ class Starts:
 
 @dataclass(frozen=True, kw_only=True)
 class PlainCrossings:
-    """What came of crossings of one terrain, one row an episode."""
+    """Results of crossings of one terrain, one row an episode."""
 
     outcome: NDArray[np.uint8]
     """:class:`kernels.episode.Outcome`, shape (num_episodes,)."""
@@ -130,7 +130,7 @@ def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[A
 
 
 class _Episodes:
-    """States of the running episodes of one terrain, stepped one by one, looked at together."""
+    """States of the running episodes of one terrain, stepped one by one."""
 
     def __init__(self, robot: RobotCfg, model: Any, starts: Starts) -> None:
         self._model, self._robot = model, robot

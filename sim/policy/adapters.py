@@ -1,4 +1,4 @@
-"""The observation row taken apart: what a robot senses, in physical units, for controllers that expect another row."""
+"""The observation row split into physical quantities, for controllers that expect another row."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -39,7 +39,7 @@ def _on_device(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
 
 
 def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
-    """Takes observation rows apart.
+    """Splits observation rows into physical quantities.
 
     Args:
         row: Observation rows, shape (num_envs, robot.observation_size).

@@ -56,7 +56,7 @@ def to_onnx(policy: MlpPolicy) -> bytes:
 
 
 def export_onnx(policy: MlpPolicy, path: Path) -> float:
-    """Write a policy as one self-contained ONNX file, held against the original before and after it is written.
+    """Writes a policy as one self-contained ONNX file and compares it with the original, before and after writing.
 
     Args:
         policy: The actor, on any device.

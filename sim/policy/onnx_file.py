@@ -12,7 +12,7 @@ import torch
 PRODUCER = "faultline"
 """Who wrote a file, as the file says; ours carry a checksum."""
 _CHECKSUM = "faultline_sha256"
-_EXPORT = "write it from its rsl_rl checkpoint by `python -m sim.policy.export`"
+_EXPORT = "write it from its rsl_rl checkpoint by `faultline export-policy`"
 _CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 
 
@@ -107,7 +107,7 @@ def _libraries(name: str) -> tuple[Any, Any]:
 
 
 def seal(model: Any) -> bytes:
-    """An ``onnx.ModelProto`` as the bytes of a file whose every byte is under a checksum.
+    """An ``onnx.ModelProto`` as the bytes of a file, with a checksum over all of them.
 
     Serialised messages add up: the checksum is one more piece of metadata, and ends the file.
     """
@@ -123,7 +123,7 @@ def _closing(kind: Any, checksum: str) -> bytes:
 
 
 def _check_file(data: bytes, name: str) -> None:
-    """Refuses what is no ONNX model, is damaged, or points outside itself."""
+    """Raises ValueError for a file that is no ONNX model, is damaged, or keeps weights in another file."""
     onnx, _ = _libraries(name)
     try:
         model = onnx.ModelProto.FromString(data)

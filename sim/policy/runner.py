@@ -52,7 +52,7 @@ class PolicyRunner:
         forget(self._policy)
 
     def _call(self) -> None:
-        """On a row of its own, which the controller may keep or change; what it returns is looked at."""
+        """Calls the controller with a copy of the rows, which it may keep or change, and checks its actions."""
         try:
             action = self._policy(self._observation.clone())
         except (Exception, SystemExit) as error:  # a controller can fail with anything
@@ -60,7 +60,9 @@ class PolicyRunner:
         shape = tuple(self._action.shape)
         problem = action_problem(action, shape)
         if problem is not None:
-            raise ValueError(f"the controller must return actions of shape {shape}, {problem} in a crossing's middle")
+            raise ValueError(
+                f"the controller must return actions of shape {shape}, {problem}, during a crossing"
+            )
         self._action.copy_(action)
 
     @torch.inference_mode()

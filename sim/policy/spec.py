@@ -36,7 +36,7 @@ class ControllerSpec:
 
     @classmethod
     def parse(cls, spec: str | Path) -> "ControllerSpec":
-        """Takes a name apart; anything that is there as a file is a file."""
+        """Splits a name into its parts; the name of an existing file is that file."""
         match = _NAMED.fullmatch(str(spec))
         if match is None or Path(spec).exists():
             return cls(file=str(spec))
@@ -178,8 +178,8 @@ def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]
     """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
 
     Args:
-        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; several may stand in one, apart by
-            spaces, as make hands them over.
+        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; one text may hold several, separated
+            by spaces.
         robot: The robot, whose controller is the shipped one.
 
     Raises:
@@ -201,7 +201,7 @@ def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]
 
 
 def controller_suffix(policy: str, usual: str) -> str:
-    """What the name of a file about a controller ends with: nothing for the usual one, else such as -C-G."""
+    """The ending of the names of files about a controller: empty for the usual one, else for example ``-C-G``."""
     if is_same(policy, usual):
         return ""
     label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")

@@ -1,1 +1,1 @@
-"""Robots: settings, model, controller, penalty scales, training; those shipped and those of one's own."""
+"""Robots: settings, model, controller, penalty scales, training; the shipped ones and a user's own."""

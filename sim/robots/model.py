@@ -50,7 +50,7 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
         _add_model(builder, robot, files)
     except Exception as error:  # an importer can fail with anything
         raise ValueError(f"robot '{robot.name}': {' '.join(str(error).split()) or type(error).__name__}") from error
-    # The rest is only told of a tree of single joints, where joints and their columns are one.
+    # The other checks need a tree of single joints, where joints and their columns are the same.
     problems = _structure_problems(builder)
     if not problems:
         bodies = [leaf_name(label) for label in builder.body_label]
@@ -192,7 +192,7 @@ def _unknown(kind: str, wanted: Sequence[str], present: list[str], robot: RobotC
 
 
 def _set_drives(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
-    """Takes gains, limits and armature from the settings where they are given; returns what is wrong with the gains."""
+    """Takes gains, limits and armature from the settings where they are given; returns the problems of the gains."""
     joints = robot.joint_names
     driven = [name for name, gain in zip(joints, builder.joint_target_ke[6:], strict=True) if gain > 0.0]
     if robot.stiffness is not None and driven:

@@ -61,7 +61,7 @@ def _parse(file: Path) -> ET.Element:
 
 
 def _take_urdf_mesh(mesh: ET.Element, model_file: Path) -> Path:
-    """The file of a URDF's mesh, whose name is made absolute."""
+    """Makes the file name of a URDF's mesh absolute, and returns it."""
     name = mesh.get("filename", "").removeprefix("file://")
     path = model_file.parent / name
     if name.startswith(_PACKAGE):
@@ -81,7 +81,7 @@ def _take_urdf_mesh(mesh: ET.Element, model_file: Path) -> Path:
 
 
 def _mjcf_files(root: ET.Element, within: tuple[Path, ...], main_folder: Path) -> list[Path]:
-    """Files that an MJCF names: what it includes, with what that names, and meshes.
+    """Files that an MJCF names: meshes and included files, with the files that those name.
 
     Args:
         root: Of the XML.

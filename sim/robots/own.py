@@ -1,4 +1,4 @@
-"""Robots of one's own: load and check their settings file, hash them, pack them for another machine."""
+"""Robots of a user: load and check their settings file, hash them, pack them for another machine."""
 
 import hashlib
 import itertools
@@ -90,7 +90,7 @@ def _name_problems(robot: RobotCfg) -> list[str]:
 
 
 def robot_digest(robot: RobotCfg) -> str | None:
-    """SHA-256 of what a robot of one's own is: settings but for its training, model and meshes; None of a shipped one.
+    """SHA-256 of a user's robot: settings without training, model and meshes; None for a shipped robot.
 
     Raises:
         ValueError: If a file is missing.
@@ -105,14 +105,14 @@ def robot_digest(robot: RobotCfg) -> str | None:
 
 
 def own_hash(robot: RobotCfg) -> dict[str, str]:
-    """For the settings that a training remembers: the hash of a robot of one's own, nothing of a shipped one."""
+    """The key ``robot_sha256`` for the settings of a training; empty for a shipped robot."""
     digest = robot_digest(robot)
     return {} if digest is None else {"robot_sha256": digest}
 
 
 @dataclass(frozen=True, kw_only=True)
 class PackedRobot:
-    """A robot of one's own on its way to a machine that need not have its files."""
+    """A user's robot with its files, for a machine that may lack them."""
 
     robot: RobotCfg
     model: str

@@ -179,7 +179,7 @@ def _probes_of(content: bytes) -> HullProbes:
 
 
 def hull_probes(vertices: _Array) -> HullProbes:
-    """Probes of a mesh's convex hull, which is what it collides as, whatever is hollow in it.
+    """Probes of a mesh's convex hull; a mesh collides as its hull, so hollows are filled.
 
     Args:
         vertices: Shape (num_vertices, 3) [m].

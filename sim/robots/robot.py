@@ -1,6 +1,5 @@
-"""Robots: what the simulation and the search need to know of them; the shipped ones, and those of one's own."""
+"""Settings of robots: the shipped ones, and how a user's own are found."""
 
-import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.files.atomic import read_json
+from sim.files.command import command_line
 from sim.files.settings import setting
 from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg
 
@@ -79,7 +79,7 @@ class RobotCfg:
     learning: LearningCfg = field(default_factory=LearningCfg)
     """How that training goes on a GPU."""
     settings_file: Path | None = None
-    """The Python file of a robot of one's own, set by :func:`get_robot`; None of a shipped one."""
+    """The Python file of a user's robot, set by :func:`get_robot`; None for a shipped robot."""
 
     @property
     def spec(self) -> str:
@@ -115,7 +115,7 @@ class RobotCfg:
 
     @property
     def home(self) -> Path:
-        """Folder of its controller, training record and penalty scales: beside the settings of a robot of one's own."""
+        """Folder of its controller, training record and penalty scales; a user's robot has them beside its settings."""
         return _ROBOTS_DIR if self.settings_file is None else self.settings_file.parent
 
     @property
@@ -125,7 +125,7 @@ class RobotCfg:
 
     @property
     def scales_file(self) -> Path:
-        """The penalty scales measured with that controller (``make calibrate``)."""
+        """The penalty scales measured with that controller (``faultline calibrate``)."""
         return self.home / f"{self.name}.scales.json"
 
     def role_of(self, geom: str) -> int:
@@ -145,7 +145,7 @@ class RobotCfg:
         Raises:
             ValueError: If they were never measured, or not for these penalties.
         """
-        remedy = f"run `make calibrate ROBOT={shlex.quote(self.spec)}`"
+        remedy = f"run `{command_line('calibrate', robot=self.spec)}`"
         if not self.scales_file.exists():
             raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
         scales = read_json(self.scales_file).get("scales")
@@ -261,10 +261,10 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
 
 
 def robot_of(name: str, given: "str | RobotCfg | None", file: Path) -> RobotCfg:
-    """The robot that a file says it is of, such as a run.
+    """The robot that a file names, for example a run's.
 
-    A shipped one is known by that name. Another one only if the command line names it too: what a file names is never
-    run.
+    A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
+    file names.
 
     Args:
         name: What the file says.

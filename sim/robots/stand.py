@@ -23,7 +23,7 @@ _SUNK = 0.005  # deeper than this in the ground at the start is a mistake [m]
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """What came of a robot on its default pose, and of those that were dropped."""
+    """How a robot stood in its default pose, and how the dropped ones lay."""
 
     gap: float
     """Height of its lowest foot over the ground at the start [m]; below 0 it starts in the ground."""
@@ -184,7 +184,7 @@ def describe_model(robot: RobotCfg) -> str:
 
 
 def describe_standing(robot: RobotCfg, found: Standing) -> tuple[str, bool]:
-    """What came of it, in words, and whether nothing has to be mended."""
+    """The findings in words, and whether nothing has to be mended."""
     carried = ", ".join(f"{name} {share:.0%}" for name, share in found.carried.items()) or "nothing"
     first, last = found.height
     lines = [
@@ -201,11 +201,11 @@ def describe_standing(robot: RobotCfg, found: Standing) -> tuple[str, bool]:
     if not found.finite:
         wrong.append("states became not finite: gains too high for physics_dt, or too little armature?")
     if found.overflowed:
-        wrong.append("a buffer of the solver was too small: raise nconmax and njmax above what is said here")
+        wrong.append("a buffer of the solver was too small: raise nconmax and njmax above the numbers above")
     lines += [f"To mend: {text}" for text in wrong]
     lines.append(
         "It stands."
         if found.stands
-        else "It does not stand by itself, as a biped may; of another robot look at gains, effort and the default pose."
+        else "It does not stand by itself. A biped may fall; of others check gains, effort and default pose."
     )
     return "\n".join(lines), not wrong

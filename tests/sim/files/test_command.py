@@ -1,84 +1,118 @@
-"""How the commands end: exit codes, one line for what a user can mend, and files tried before the work."""
+"""How commands start, fail and end, and the command lines that are printed."""
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from qd.run.cli import run_command
-from qd.studies import speed as search_speed
-from sim.files.command import chosen_elites, exit_code_of
-from train.evaluate.evaluate import evaluate
-from train.ppo.ppo import speed
+from sim.files.command import (
+    Interrupted,
+    UserError,
+    Where,
+    Which,
+    Who,
+    chosen_elites,
+    command_line,
+    naming_what_is_next,
+    publish,
+    run_command,
+)
+
+ERRORS = {"value": ValueError("two\nlines"), "user": UserError("a worker is lost"), "bug": ZeroDivisionError()}
+ERRORS |= {"file": OSError("a/b cannot be written"), "number": FloatingPointError("not finite")}
+ERRORS |= {"stop": KeyboardInterrupt(), "resumable": Interrupted("Stopped; 3 saved. Resume with x")}
 
 
-@pytest.fixture
-def shipped_search() -> Path:
-    return Path(__file__).parents[3] / "results" / "anymal" / "archive"
+@dataclass(frozen=True, kw_only=True)
+class Toy(Who, Where, Which):
+    """Fail as told."""
+
+    how: str = ""
+    """What to raise."""
+    status: int | None = None
+    """What to return."""
+
+    def execute(self) -> int | None:
+        if self.how:
+            raise ERRORS[self.how]
+        return self.status
 
 
-def fail(error: BaseException) -> int:
-    raise error
+def run(*argv):
+    return run_command(Toy, argv, name="toy")
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "message"),
+    ("how", "status", "message"),
     [
-        (ValueError("two\nlines"), 2, "error: two lines\n"),
-        (OSError("a/b cannot be written"), 2, "error: a/b cannot be written\n"),
-        (FloatingPointError("not finite"), 2, "error: not finite\n"),
-        (KeyboardInterrupt(), 130, "\nStopped.\n"),
+        ("value", 2, "error: two lines\n"),
+        ("user", 2, "error: a worker is lost\n"),
+        ("file", 2, "error: a/b cannot be written\n"),
+        ("number", 2, "error: not finite\n"),
+        ("stop", 130, "\nStopped.\n"),
+        ("resumable", 130, "\nStopped; 3 saved. Resume with x\n"),
     ],
 )
-def test_errors_become_one_line_and_an_exit_code(capsys, error, code, message):
-    assert exit_code_of(lambda: fail(error)) == code
+def test_errors_become_one_line_and_an_exit_status(capsys, how, status, message):
+    assert run("--how", how) == status
     assert capsys.readouterr().err == message
 
 
-def test_a_bug_keeps_its_traceback():
+def test_a_command_returns_its_status():
+    assert (run(), run("--status", "1")) == (0, 1)
+
+
+def test_a_bug_keeps_its_traceback_and_so_does_every_error_for_debugging(monkeypatch):
     with pytest.raises(ZeroDivisionError):
-        exit_code_of(lambda: fail(ZeroDivisionError()))
+        run("--how", "bug")
+    monkeypatch.setenv("FAULTLINE_DEBUG", "1")
+    with pytest.raises(ValueError, match="two"):
+        run("--how", "value")
 
 
-def test_ctrl_c_ends_an_evaluation_in_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)  # where its runs/ would be
-    monkeypatch.setattr(evaluate, "open_evaluator", lambda *_, **__: fail(KeyboardInterrupt()))
-    monkeypatch.setattr(
-        sys, "argv", ["train.evaluate.evaluate", "--device", "cpu", "--terrains", "2", "--episodes", "1"]
-    )
-    assert evaluate.main() == 130
-    assert capsys.readouterr().err.endswith("\nStopped.\n")
+def test_the_option_groups_are_flags(capsys):
+    with pytest.raises(SystemExit) as end:
+        run("--help")
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    assert "usage: faultline toy" in text and "Fail as told." in text
+    assert [flag for flag in ("robot", "policy", "device", "workers", "run", "elite") if f"--{flag}" not in text] == []
 
 
-@pytest.mark.parametrize("out", ["/proc/nowhere/speed.json", "{folder}"])
-def test_where_to_write_is_tried_before_the_timing(tmp_path, monkeypatch, capsys, out):
-    out = out.format(folder=tmp_path)
-    monkeypatch.setattr(speed, "time_training", lambda *_, **__: fail(ZeroDivisionError()))
-    monkeypatch.setattr(sys, "argv", ["train.ppo.speed", "--device", "cpu", "--out", out])
-    assert speed.main() == 2
-    monkeypatch.setattr(search_speed, "measure", lambda *_: fail(ZeroDivisionError()))
-    with pytest.raises(SystemExit) as exit:
-        run_command(search_speed.Arguments, search_speed.main, ["--device", "cpu", "--out", out])
-    assert exit.value.code == 2
-    for line in [line for line in capsys.readouterr().err.splitlines() if "Warp" not in line]:
-        assert line.startswith("error: ") and ("cannot write to" in line or "is a directory" in line)
+def test_work_that_stops_says_what_comes_next():
+    saved = naming_what_is_next("3 are saved", lambda: "Go on with x")
+    with pytest.raises(Interrupted, match=r"^Stopped; 3 are saved\. Go on with x$"), saved:
+        raise KeyboardInterrupt
+    for error in (UserError("lost"), OSError("disk full")):
+        saved = naming_what_is_next("3 are saved", lambda: "Go on with x")
+        with pytest.raises(type(error), match=r"^(lost|disk full)\. Go on with x$"), saved:
+            raise error
+    with pytest.raises(ZeroDivisionError), naming_what_is_next("", lambda: "x"):
+        raise ZeroDivisionError
 
 
-@pytest.mark.parametrize(
-    "flags", [["--iterations", "0"], ["--steps", "0"], ["--curve", "1000"], ["--curve", "0"]], ids=" ".join
-)
-def test_numbers_that_make_no_sense_are_refused_before_the_timing(capsys, flags):
-    with pytest.raises(SystemExit) as exit:
-        run_command(search_speed.Arguments, search_speed.main, ["--device", "cpu", *flags])
-    assert exit.value.code == 2
-    assert "must be positive and --curve multiples of 16" in capsys.readouterr().err
+def test_a_command_line_can_be_typed(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/opt/bin/faultline"])
+    flags = {"run": Path("runs/a b"), "elite": [0, 1], "reward": True, "device": None, "no_colour": False}
+    assert command_line("replay", **flags) == "/opt/bin/faultline replay --run 'runs/a b' --elite 0 1 --reward"
+    monkeypatch.setattr("sim.files.command.shutil.which", lambda name: "/opt/bin/faultline")
+    assert command_line("view", workers="ray:4") == "faultline view --workers ray:4"
 
 
-def test_a_run_of_another_device_is_not_timed_against_this_one(shipped_search):
-    with pytest.raises(ValueError, match="was made on NVIDIA H200, the bare rate would be that of NVIDIA H100"):
-        search_speed.read_iterations(shipped_search, 20, "NVIDIA H100")
-    cfg, metrics, terrains = search_speed.read_iterations(shipped_search, 20, "NVIDIA H200")
-    assert (cfg.robot, len(metrics), terrains.shape) == ("anymal", 20, (200, 64))
+def test_a_report_is_shown_and_written(tmp_path, capsys):
+    file = tmp_path / "new" / "a.json"
+    assert publish(file, lambda: {"a": 1}, lambda report: print("shown", report["a"])) == {"a": 1}
+    assert capsys.readouterr().out == f"shown 1\nwritten to {file}\n"
+    assert file.read_text() == '{\n  "a": 1\n}\n'
+    publish(None, lambda: {}, lambda report: None)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("out", ["/proc/nowhere/a.json", "{folder}"])
+def test_where_to_write_is_tried_before_the_work(tmp_path, out):
+    with pytest.raises(ValueError, match=r"cannot write to|is a directory"):
+        publish(Path(out.format(folder=tmp_path)), lambda: pytest.fail("worked"), print)
 
 
 def test_elites_are_named_by_numbers_or_all():

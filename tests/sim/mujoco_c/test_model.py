@@ -11,9 +11,8 @@ from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.bench import oracle
 from sim.crossing import CrossingCfg
-from sim.mujoco_c.crossing import _Episodes, cross, draw_starts, join, to_mujoco
+from sim.mujoco_c.crossing import _Episodes, cross, draw_starts, join, run_plain, to_mujoco
 from sim.mujoco_c.model import crossing_model, goal_commands, observations, step_penalties, surface_heights
-from sim.mujoco_c.processes import run_plain
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.simulation import GROUND_FRICTION, SolverCfg

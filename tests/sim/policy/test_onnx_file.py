@@ -143,7 +143,7 @@ def not_a_number():
     [
         (linear(48), "maps 48 observations to 12 actions.*235 observations and 12 joints"),
         (linear(235, 10), "maps 235 observations to 10 actions.*use a controller of this robot"),
-        (linear(batch=1, out_batch=1), r"fixed batch size of 1 \(input 'obs' of shape \[1, 235\]\).*train\.export"),
+        (linear(batch=1, out_batch=1), r"fixed batch size of 1 \(input 'obs' of shape \[1, 235\]\).*export-policy"),
         (linear(batch=4, out_batch=4), "fixed batch size of 4"),
         (typed(DOUBLE), r"input of shape.*float32, got 'obs'.*tensor\(double\)"),
         (typed(INT64), r"got 'obs'.*tensor\(int64\)"),

@@ -25,7 +25,7 @@ def test_a_file_is_a_robot(tmp_path, monkeypatch):
     assert (dog.settings_file, dog.spec, dog.model_file) == (file, str(file), tmp_path / "mine" / "dog.xml")
     assert dog.policy_file == tmp_path / "mine" / "dog.pt"
     assert dog.scales_file == tmp_path / "mine" / "dog.scales.json"
-    with pytest.raises(ValueError, match=rf"make calibrate ROBOT={re.escape(str(file))}"):
+    with pytest.raises(ValueError, match=rf"calibrate --robot {re.escape(str(file))}`"):
         dog.read_penalty_scales()
     assert get_robot(dog) is dog
     assert pickle.loads(pickle.dumps(dog)) == dog

@@ -220,14 +220,14 @@ def test_a_missing_file_is_named(anymal, tmp_path):
 
 def test_a_robot_without_scales_says_how_to_measure_them(cassie, monkeypatch, tmp_path):
     monkeypatch.setattr(type(cassie), "scales_file", tmp_path / "none.json")
-    with pytest.raises(ValueError, match=r"no penalty scales of robot 'cassie'.*`make calibrate ROBOT=cassie`"):
+    with pytest.raises(ValueError, match=r"no penalty scales of robot 'cassie'.*faultline calibrate --robot cassie`"):
         cassie.read_penalty_scales()
 
 
 def test_penalty_scales_are_read(anymal, monkeypatch, tmp_path):
     file = tmp_path / "scales.json"
     monkeypatch.setattr(type(anymal), "scales_file", file)
-    with pytest.raises(ValueError, match="make calibrate ROBOT=anymal"):
+    with pytest.raises(ValueError, match="calibrate --robot anymal"):
         anymal.read_penalty_scales()
     scales = {name: 0.5 + k for k, name in enumerate(anymal.penalties)}
     file.write_text(json.dumps({"scales": scales}))

@@ -258,7 +258,7 @@ def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monke
 
 def test_a_robot_without_scales_is_told_how_to_get_them(tmp_path, monkeypatch):
     monkeypatch.setattr("sim.robots.robot._ROBOTS_DIR", Path(tmp_path))
-    with pytest.raises(ValueError, match=r"no penalty scales of robot 'anymal'.*make calibrate"):
+    with pytest.raises(ValueError, match=r"no penalty scales of robot 'anymal'.*calibrate --robot anymal"):
         evaluate_tables(config(tmp_path), open_evaluator=Crossings().open)
 
 

@@ -1,0 +1,69 @@
+"""The command: its words, how it fails, and that help loads nothing that takes seconds."""
+
+import dataclasses
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import faultline
+
+ROOT = Path(__file__).resolve().parents[1]
+WORDS = {name: command for group in faultline.COMMANDS.values() for name, command in group.items()}
+HEAVY = ("torch", "warp", "newton", "mujoco", "ribs", "rsl_rl", "matplotlib", "scipy", "viser", "ray")
+
+
+def loaded_by(*argv: str) -> tuple[str, set[str]]:
+    """What a command line prints, and the heavy packages that it loads, in a process of its own."""
+    script = (
+        "import sys, faultline\n"
+        "try:\n    faultline.main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
+        f"print('LOADED', *[name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    command = [sys.executable, "-c", script, *argv]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    text, _, loaded = done.stdout.rpartition("LOADED")
+    return text, set(loaded.split())
+
+
+def test_help_names_every_command_and_loads_nothing():
+    text, loaded = loaded_by("--help")
+    assert [name for name in WORDS if f"  {name} " not in text] == []
+    assert loaded == set()
+
+
+@pytest.mark.parametrize("name", WORDS)
+def test_help_of_a_command_is_quick(name):
+    text, loaded = loaded_by(name, "--help")
+    assert f"usage: faultline {name}" in text
+    assert loaded == set()
+
+
+@pytest.mark.parametrize("name", WORDS)
+def test_a_command_is_a_frozen_dataclass_whose_help_teaches(name):
+    module, _, cls = WORDS[name].where.partition(":")
+    command = getattr(importlib.import_module(module), cls)
+    assert dataclasses.is_dataclass(command) and command.__dataclass_params__.frozen
+    assert callable(command.execute)
+    assert command.__doc__ and not command.__doc__.startswith(f"{cls}(")  # what dataclass makes up where there is none
+
+
+def test_no_command_shows_what_there_is(capsys):
+    assert faultline.main([]) == 0
+    assert "usage: faultline COMMAND" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("given", "meant"), [("achive", "did you mean archive?"), ("xyz", "--help lists them")])
+def test_an_unknown_word_gets_a_suggestion(capsys, given, meant):
+    assert faultline.main([given]) == 2
+    error = capsys.readouterr().err
+    assert f"'{given}'" in error and meant in error
+
+
+def test_a_flag_that_is_none_is_refused(capsys):
+    with pytest.raises(SystemExit) as end:
+        faultline.main(["stand", "--robots", "anymal"])
+    assert end.value.code == 2
+    assert "--robots" in capsys.readouterr().err
