@@ -1,8 +1,8 @@
 """Terrain contact: strips of sphere probes against height grids, written as contact records for the physics solver.
 
-A strip is a row of equal spheres on one collision shape (:mod:`sim.robots.probes` makes them), straight but for meshes. Of the
-probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its two ends
-and on the highest point between, and a robot on its back cannot flood the solver.
+A strip is a row of equal spheres on one collision shape, straight but for meshes (:mod:`sim.robots.probes` makes them).
+Of the probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its
+two ends and on the highest point between, and a robot on its back cannot flood the solver.
 """
 
 from typing import Any
@@ -164,10 +164,11 @@ def collide_strips(
             f"body_q must hold {num_envs} x {layout.bodies_per_env} poses, got {body_q.shape[0]}: "
             "one robot per entry of terrain_of_env"
         )
+    inputs = [body_q, terrain_of_env, terrain, probes, layout]
     wp.launch(
         _collide_strips_kernel,
-        dim=(probes.strip_radius.shape[0], num_envs),
-        inputs=[body_q, terrain_of_env, terrain, probes, layout],
+        (probes.strip_radius.shape[0], num_envs),
+        inputs,
         outputs=[contacts_out],
         device=body_q.device,
     )

@@ -1,19 +1,16 @@
-"""A crossing on the device: randomised start, goal command, and the latch that ends an episode once and for all."""
+"""An episode on the device, of a crossing and of training alike: its task, its command, and the latch that ends it."""
 
 from enum import IntEnum
 from typing import Any
 
 import warp as wp
 
-from kernels.goal import Task, goal_command, is_at_goal, is_out
-from kernels.heightfield import Terrain
 from kernels.penalties import max_base_force
-from kernels.start import StartRanges, place_robot
-from kernels.state import base_position, base_yaw, state_is_invalid
+from kernels.state import base_position, base_rotation, base_yaw, projected_gravity, state_is_invalid, wrap_angle
 
 
 class Outcome(IntEnum):
-    """How an episode ended."""
+    """How an episode ended; tilt ends those of training alone."""
 
     RUNNING = 0
     GOAL = 1
@@ -21,6 +18,7 @@ class Outcome(IntEnum):
     TIME_OUT = 3
     OUT = 4
     INVALID = 5
+    TILT = 6
 
 
 _RUNNING = wp.constant(int(Outcome.RUNNING))
@@ -29,78 +27,113 @@ _BASE_COLLISION = wp.constant(int(Outcome.BASE_COLLISION))
 _TIME_OUT = wp.constant(int(Outcome.TIME_OUT))
 _OUT = wp.constant(int(Outcome.OUT))
 _INVALID = wp.constant(int(Outcome.INVALID))
+_TILT = wp.constant(int(Outcome.TILT))
 
 PARKING_HEIGHT = wp.constant(50.0)
 """Height at which robots whose episodes have ended are kept [m]."""
 
 
 @wp.struct
-class EpisodeState:
-    """Progress of each environment's episode, shape (num_envs,) each."""
+class Task:
+    """Goal, command and limits of an episode; steps are those it is judged after."""
+
+    goal: wp.vec2
+    goal_radius: float
+    """Within this of the goal the episode ends [m]; 0 where it never does."""
+    speed: float
+    """Commanded speed toward the goal [m/s]."""
+    yaw_gain: float
+    """Commanded yaw rate per heading error [1/s]."""
+    max_yaw_rate: float
+    """Largest commanded yaw rate [rad/s]."""
+    lower: wp.vec2
+    """World-local corner of the allowed area [m]; leaving it ends the episode as OUT."""
+    upper: wp.vec2
+    max_steps: int
+    """Steps of the longest episode."""
+    first_counted_step: int
+    """Penalties count from this step on."""
+    base_force: float
+    """Contact force on the base that counts as a collision [N]."""
+    max_gravity_z: float
+    """Tilt ends an episode where the projected gravity's z exceeds this (-1: upright); 2 where it never does."""
+    max_speed: float
+    """Any velocity beyond is invalid [m/s or rad/s]."""
+    overflow_mask: int
+    """Solver overflow bits that make an episode invalid."""
+
+
+@wp.struct
+class Episodes:
+    """Progress of each environment's episode, shape (num_envs,) unless said otherwise."""
 
     outcome: wp.array[int]
+    """:class:`Outcome`, 0 while it runs."""
     steps: wp.array[int]
-    """Physics steps made up to the end."""
+    """Steps made up to the end."""
     counted: wp.array[int]
     """1 if the step just made counts for the penalties."""
+    base_force: wp.array[float]
+    """Largest contact force on the base noted since the episode was last judged [N]."""
+    start: wp.array[wp.vec2]
+    """Where the episode began, world-local [m]."""
     final_pose: wp.array[wp.transform]
     """Base pose at the end, world-local frame."""
+    rng: wp.array[wp.uint32]
+    """State of the random numbers that the next start is drawn from."""
     num_running: wp.array[int]
     """Episodes not yet ended, shape (1,)."""
 
 
-@wp.kernel
-def _start_episodes_kernel(
-    seed_of_terrain: wp.array[wp.uint32],
-    terrain_of_env: wp.array[int],
-    num_replicas: int,
-    terrain: Terrain,
-    ranges: StartRanges,
-    base_com: wp.vec3,
-    default_joint_pos: wp.array[float],
-    joint_q_out: wp.array2d[float],
-    joint_qd_out: wp.array2d[float],
-    episode_out: EpisodeState,
-):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    t = terrain_of_env[env]
-    # The stream depends on the terrain's seed and the replica alone: sharding terrains changes no episode.
-    rng = wp.rand_init(int(seed_of_terrain[t]), env % num_replicas)
-    place_robot(rng, terrain, t, ranges, base_com, default_joint_pos, env, joint_q_out, joint_qd_out)
-    episode_out.outcome[env] = _RUNNING
-    episode_out.steps[env] = 0
-    episode_out.counted[env] = 0
-    episode_out.final_pose[env] = wp.transform_identity()
-    wp.atomic_add(episode_out.num_running, 0, 1)
+def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
+    """Allocate episodes that have not begun."""
+    episodes = Episodes()
+    for name in ("outcome", "steps", "counted"):
+        setattr(episodes, name, wp.zeros(num_envs, dtype=int, device=device))
+    episodes.base_force = wp.zeros(num_envs, dtype=float, device=device)
+    episodes.start = wp.zeros(num_envs, dtype=wp.vec2, device=device)
+    episodes.final_pose = wp.zeros(num_envs, dtype=wp.transform, device=device)
+    episodes.rng = wp.zeros(num_envs, dtype=wp.uint32, device=device)
+    episodes.num_running = wp.zeros(1, dtype=int, device=device)
+    return episodes
 
 
-def start_episodes(
-    seed_of_terrain: Any, terrain_of_env: Any, num_replicas: int, terrain: Terrain, ranges: StartRanges,
-    base_com: wp.vec3, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, episode_out: EpisodeState,
-) -> None:  # fmt: skip
-    """Put every robot at its randomised start; replica r of terrain t draws from the stream (seed of t, r).
+def begin_all(episodes_out: Episodes) -> None:
+    """Set every episode running, with no step made; moves no robot."""
+    episodes_out.outcome.zero_()
+    episodes_out.steps.zero_()
+    episodes_out.num_running.fill_(episodes_out.outcome.shape[0])
 
-    Args:
-        seed_of_terrain: uint32 seeds, shape (num_terrains,).
-        terrain_of_env: Terrain of each environment, shape (num_envs,).
-        num_replicas: Episodes a terrain; the replica of an environment is ``env % num_replicas``.
-        terrain: Height grids.
-        ranges: Nominal start and ranges.
-        base_com: Mass centre of the base in its frame [m].
-        default_joint_pos: Default pose [rad], shape (num_joints,).
-        joint_q_out: Shape (num_envs, 7 + num_joints).
-        joint_qd_out: Shape (num_envs, 6 + num_joints).
-        episode_out: Set to running, zero steps.
-    """
-    episode_out.num_running.zero_()
-    wp.launch(
-        _start_episodes_kernel,
-        dim=terrain_of_env.shape[0],
-        inputs=[seed_of_terrain, terrain_of_env, num_replicas, terrain, ranges, base_com, default_joint_pos],
-        outputs=[joint_q_out, joint_qd_out, episode_out],
-        device=joint_q_out.device,
+
+def end_all(episodes_out: Episodes) -> None:
+    """End every episode, so that all of them restart."""
+    episodes_out.outcome.fill_(int(Outcome.TIME_OUT))
+    episodes_out.num_running.zero_()
+
+
+@wp.func
+def goal_command(position: wp.vec2, yaw: float, task: Task) -> wp.vec3:
+    """Velocity toward the goal in the yaw frame [m/s] and the yaw rate that turns the robot to it [rad/s]."""
+    to_goal = task.goal - position
+    error = wrap_angle(wp.atan2(to_goal[1], to_goal[0]) - yaw)
+    return wp.vec3(
+        task.speed * wp.cos(error),
+        task.speed * wp.sin(error),
+        wp.clamp(task.yaw_gain * error, -task.max_yaw_rate, task.max_yaw_rate),
     )
+
+
+@wp.func
+def is_at_goal(position: wp.vec3, task: Task) -> bool:
+    """Whether a base there, world-local [m], has reached the goal."""
+    return wp.length(task.goal - wp.vec2(position[0], position[1])) < task.goal_radius
+
+
+@wp.func
+def is_out(position: wp.vec3, task: Task) -> bool:
+    """Whether a base there, world-local [m], has left the world."""
+    beside = position[1] < task.lower[1] or position[1] > task.upper[1]
+    return beside or position[0] < task.lower[0] or position[0] > task.upper[0]
 
 
 @wp.kernel
@@ -118,25 +151,22 @@ def _command_goal_kernel(
 
 def command_goal(joint_q: Any, outcome: Any, task: Task, command_out: Any) -> None:
     """Write each environment's command, zero once its episode has ended; shape (num_envs, 3)."""
-    wp.launch(
-        _command_goal_kernel,
-        dim=outcome.shape[0],
-        inputs=[joint_q, outcome, task],
-        outputs=[command_out],
-        device=joint_q.device,
-    )
+    inputs = [joint_q, outcome, task]
+    wp.launch(_command_goal_kernel, outcome.shape[0], inputs, outputs=[command_out], device=joint_q.device)
 
 
 @wp.func
-def judge_step(
+def judge_state(
     joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_force: float, overflow: int, steps: int,
     task: Task, env: int,
 ) -> int:  # fmt: skip
-    """Outcome of an episode after its ``steps``-th physics step; the gravest of several wins."""
+    """Outcome of an episode after its ``steps``-th step; the gravest of several wins."""
     if (overflow & task.overflow_mask) != 0 or state_is_invalid(joint_q, joint_qd, env, task.max_speed):
         return _INVALID
     if base_force > task.base_force:
         return _BASE_COLLISION
+    if projected_gravity(joint_q, env)[2] > task.max_gravity_z:
+        return _TILT
     position = base_position(joint_q, env)
     if is_at_goal(position, task):
         return _GOAL
@@ -145,6 +175,79 @@ def judge_step(
     if steps >= task.max_steps:
         return _TIME_OUT
     return _RUNNING
+
+
+@wp.kernel
+def _note_base_forces_kernel(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], episodes_out: Episodes):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    episodes_out.base_force[env] = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
+
+
+def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) -> None:
+    """Note how hard the bases are touched in a physics step after which the episodes are not judged.
+
+    Args:
+        geom_force: Contact forces of the physics step, world frame [N], shape (num_envs, num_geoms).
+        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
+        episodes_out: Raises ``base_force``.
+    """
+    inputs, device = [geom_force, geom_role], geom_force.device
+    wp.launch(_note_base_forces_kernel, geom_force.shape[0], inputs, outputs=[episodes_out], device=device)
+
+
+@wp.kernel
+def _latch_outcomes_kernel(
+    joint_q: wp.array2d[float],
+    joint_qd: wp.array2d[float],
+    geom_force: wp.array2d[wp.vec3],
+    geom_role: wp.array[int],
+    overflow: wp.array[int],
+    contact_count: wp.array[int],
+    contact_capacity: int,
+    task: Task,
+    episodes_out: Episodes,
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    episodes_out.counted[env] = 0
+    if episodes_out.outcome[env] != _RUNNING:
+        return
+    steps = episodes_out.steps[env] + 1
+    bits = overflow[env]
+    if contact_count[0] > contact_capacity:
+        bits = task.overflow_mask  # whose contacts were dropped is not known, so no episode is trusted
+    force = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
+    outcome = judge_state(joint_q, joint_qd, force, bits, steps, task, env)
+    episodes_out.base_force[env] = 0.0
+    episodes_out.steps[env] = steps
+    if outcome != _INVALID and steps >= task.first_counted_step:
+        episodes_out.counted[env] = 1
+    if outcome != _RUNNING:
+        episodes_out.outcome[env] = outcome
+        episodes_out.final_pose[env] = wp.transform(base_position(joint_q, env), base_rotation(joint_q, env))
+        wp.atomic_sub(episodes_out.num_running, 0, 1)
+
+
+def latch_outcomes(
+    joint_q: Any, joint_qd: Any, geom_force: Any, geom_role: Any, overflow: Any, contact_count: Any,
+    contact_capacity: int, task: Task, episodes_out: Episodes,
+) -> None:  # fmt: skip
+    """Judge every running episode after a step and latch its end.
+
+    Args:
+        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
+        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
+        geom_force: Contact forces, world frame [N], shape (num_envs, num_geoms).
+        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
+        overflow: Solver overflow bits of the step, shape (num_envs,).
+        contact_count: Terrain contacts found in the step, shape (1,).
+        contact_capacity: Contacts that fit.
+        task: Goal and limits.
+        episodes_out: Updated in place; forgets what forces were noted.
+    """
+    inputs = [joint_q, joint_qd, geom_force, geom_role, overflow, contact_count, contact_capacity, task]
+    wp.launch(_latch_outcomes_kernel, overflow.shape[0], inputs, outputs=[episodes_out], device=joint_q.device)
 
 
 @wp.kernel
@@ -169,7 +272,7 @@ def _park_ended_kernel(
     for j in range(default_joint_pos.shape[0]):
         joint_q_out[env, 7 + j] = default_joint_pos[j]
         targets_out[env, 7 + j] = default_joint_pos[j]
-    for b in range(body_q_out.shape[1]):  # or the next contacts would be those of where it was
+    for b in range(body_q_out.shape[1]):  # or the next contacts would be found where it was
         body_q_out[env, b] = wp.transform(wp.vec3(0.0, 0.0, PARKING_HEIGHT), wp.quat_identity())
 
 
@@ -178,8 +281,8 @@ def park_ended(
 ) -> None:
     """Hold the robots whose episodes have ended at rest, high above the ground, where they touch nothing.
 
-    Left to walk on they would cost as much as the others, and robots on their backs more than that. To be called every
-    control step: in between they fall by millimetres.
+    They would otherwise cost as much as the others, and more on their backs. Call it every control step: in between,
+    they fall by millimetres.
 
     Args:
         outcome: Shape (num_envs,).
@@ -189,69 +292,11 @@ def park_ended(
         targets_out: Joint targets in columns 7 and up, shape (num_envs, 7 + num_joints).
         body_q_out: Body poses, shape (num_envs, num_bodies).
     """
+    inputs = [outcome, default_joint_pos]
     wp.launch(
         _park_ended_kernel,
-        dim=outcome.shape[0],
-        inputs=[outcome, default_joint_pos],
+        outcome.shape[0],
+        inputs,
         outputs=[joint_q_out, joint_qd_out, targets_out, body_q_out],
         device=outcome.device,
-    )
-
-
-@wp.kernel
-def _latch_outcomes_kernel(
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    geom_force: wp.array2d[wp.vec3],
-    geom_role: wp.array[int],
-    overflow: wp.array[int],
-    contact_count: wp.array[int],
-    contact_capacity: int,
-    task: Task,
-    episode_out: EpisodeState,
-):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    episode_out.counted[env] = 0
-    if episode_out.outcome[env] != _RUNNING:
-        return
-    steps = episode_out.steps[env] + 1
-    bits = overflow[env]
-    if contact_count[0] > contact_capacity:
-        bits = task.overflow_mask  # nobody knows whose contacts were dropped, so nobody's episode is trusted
-    outcome = judge_step(joint_q, joint_qd, max_base_force(geom_force, geom_role, env), bits, steps, task, env)
-    episode_out.steps[env] = steps
-    if outcome != _INVALID and steps >= task.first_counted_step:
-        episode_out.counted[env] = 1
-    if outcome != _RUNNING:
-        episode_out.outcome[env] = outcome
-        episode_out.final_pose[env] = wp.transform(
-            base_position(joint_q, env), wp.quat(joint_q[env, 3], joint_q[env, 4], joint_q[env, 5], joint_q[env, 6])
-        )
-        wp.atomic_sub(episode_out.num_running, 0, 1)
-
-
-def latch_outcomes(
-    joint_q: Any, joint_qd: Any, geom_force: Any, geom_role: Any, overflow: Any, contact_count: Any,
-    contact_capacity: int, task: Task, episode_out: EpisodeState,
-) -> None:  # fmt: skip
-    """Judge every running episode after a physics step and latch its end.
-
-    Args:
-        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
-        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
-        geom_force: Contact forces, world frame [N], shape (num_envs, num_geoms).
-        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
-        overflow: Solver overflow bits of the step, shape (num_envs,).
-        contact_count: Terrain contacts found in the step, shape (1,).
-        contact_capacity: Contacts that fit.
-        task: Goal and limits.
-        episode_out: Updated in place.
-    """
-    wp.launch(
-        _latch_outcomes_kernel,
-        dim=overflow.shape[0],
-        inputs=[joint_q, joint_qd, geom_force, geom_role, overflow, contact_count, contact_capacity, task],
-        outputs=[episode_out],
-        device=joint_q.device,
     )

@@ -151,15 +151,8 @@ def write_observation(
     expected = (num_envs, NUM_BASE_COLUMNS + 3 * num_joints + sensors.scan_x.shape[0])
     if tuple(observation_out.shape) != expected:
         raise ValueError(f"observation_out must have shape {expected}, got {tuple(observation_out.shape)}")
-    wp.launch(
-        _write_observation_kernel,
-        dim=expected,
-        inputs=[
-            joint_q, joint_qd, command, last_action, terrain_of_env, terrain, sensors, noise, noise_seed,
-        ],
-        outputs=[observation_out],
-        device=joint_q.device,
-    )  # fmt: skip
+    inputs = [joint_q, joint_qd, command, last_action, terrain_of_env, terrain, sensors, noise, noise_seed]
+    wp.launch(_write_observation_kernel, expected, inputs, outputs=[observation_out], device=joint_q.device)
 
 
 @wp.kernel
@@ -191,13 +184,8 @@ def write_scan(joint_q: Any, terrain_of_env: Any, terrain: Terrain, sensors: Sen
     expected = (joint_q.shape[0], sensors.scan_x.shape[0])
     if tuple(scan_out.shape) != expected:
         raise ValueError(f"scan_out must have shape {expected}, got {tuple(scan_out.shape)}")
-    wp.launch(
-        _write_scan_kernel,
-        dim=expected,
-        inputs=[joint_q, terrain_of_env, terrain, sensors],
-        outputs=[scan_out],
-        device=joint_q.device,
-    )
+    inputs = [joint_q, terrain_of_env, terrain, sensors]
+    wp.launch(_write_scan_kernel, expected, inputs, outputs=[scan_out], device=joint_q.device)
 
 
 @wp.kernel
@@ -227,10 +215,5 @@ def apply_action(action: Any, sensors: Sensors, scale: float, last_action_out: A
     """
     if tuple(action.shape) != tuple(last_action_out.shape):
         raise ValueError(f"action must have shape {tuple(last_action_out.shape)}, got {tuple(action.shape)}")
-    wp.launch(
-        _apply_action_kernel,
-        dim=action.shape,
-        inputs=[action, sensors.default_joint_pos, scale],
-        outputs=[last_action_out, targets_out],
-        device=action.device,
-    )
+    inputs = [action, sensors.default_joint_pos, scale]
+    wp.launch(_apply_action_kernel, action.shape, inputs, outputs=[last_action_out, targets_out], device=action.device)

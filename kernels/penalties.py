@@ -73,12 +73,9 @@ def sum_geom_forces(contacts: SolverContacts, column_of_geom: Any, geom_force_ou
         geom_force_out: Vectors, shape (num_envs, num_geoms); overwritten.
     """
     geom_force_out.zero_()
+    inputs = [contacts, column_of_geom]
     wp.launch(
-        _sum_geom_forces_kernel,
-        dim=contacts.capacity,
-        inputs=[contacts, column_of_geom],
-        outputs=[geom_force_out],
-        device=geom_force_out.device,
+        _sum_geom_forces_kernel, contacts.capacity, inputs, outputs=[geom_force_out], device=geom_force_out.device
     )
 
 
@@ -189,12 +186,5 @@ def add_penalties(
             f"sums_out must have shape ({counted.shape[0]}, {len(PENALTIES)}), got {tuple(sums_out.shape)}: "
             f"one column for each of {', '.join(PENALTIES)}"
         )
-    wp.launch(
-        _add_penalties_kernel,
-        dim=counted.shape[0],
-        inputs=[
-            joint_q, joint_qd, base_com, command, geom_force, geom_role, force_limit, dt, counted,
-        ],
-        outputs=[sums_out],
-        device=sums_out.device,
-    )  # fmt: skip
+    inputs = [joint_q, joint_qd, base_com, command, geom_force, geom_role, force_limit, dt, counted]
+    wp.launch(_add_penalties_kernel, counted.shape[0], inputs, outputs=[sums_out], device=sums_out.device)

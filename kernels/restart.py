@@ -1,81 +1,99 @@
-"""What follows the end of a training episode (curriculum, masked restart), and commands and pushes.
-
-Random numbers come from the counter of :class:`kernels.training.Episodes` and the environment's number alone, so that a
-run is repeatable on the CPU and nothing is drawn on the host.
-"""
+"""The restart of an episode, of a crossing and of training alike: a randomised start, with nothing remembered."""
 
 from typing import Any
 
 import warp as wp
 
-from kernels.goal import goal_command
-from kernels.heightfield import Terrain
-from kernels.rewards import Feet
-from kernels.start import StartRanges, place_robot
-from kernels.state import base_yaw, wrap_angle
-from kernels.training import End, Episodes, Rules
+from kernels.episode import Episodes, Outcome
+from kernels.heightfield import Terrain, node_height
+from kernels.observation import Sensors
+from kernels.rewards import Rewards
 
-_RUNNING = wp.constant(int(End.RUNNING))
-_INVALID = wp.constant(int(End.INVALID))
+_RUNNING = wp.constant(int(Outcome.RUNNING))
 
-_STREAM_LEVEL = wp.constant(0)
-_STREAM_START = wp.constant(1)
-_STREAM_COMMAND = wp.constant(2)
-_STREAM_PUSH = wp.constant(3)
-_PUSH_STAGGER = wp.constant(7919)  # a prime: pushes meet the environments one after the other
+
+@wp.struct
+class StartRanges:
+    """Randomised start of an episode: half widths round the nominal start, uniform."""
+
+    position: wp.vec2
+    """Nominal start, world-local x, y [m]."""
+    position_range: float
+    yaw_range: float
+    joint_scale_range: float
+    """Joint angles are the default pose times 1 +- this."""
+    velocity_range: float
+    """Each component of the base's linear [m/s] and angular [rad/s] velocity, world frame."""
+    base_height: float
+    """Base height over the highest ground under the robot [m]."""
+    footprint: wp.vec2
+    """Half length and half width of the ground looked at [m]."""
 
 
 @wp.func
-def _random_stream(counter: int, stream: int, num_envs: int, env: int) -> wp.uint32:
-    # Observation noise takes the offsets from 0 up (kernels.observation); these lie below.
-    return wp.rand_init(counter, -1 - (stream * num_envs + env))
+def highest_ground(terrain: Terrain, t: int, centre: wp.vec2, half: wp.vec2) -> float:
+    """Highest node [m] of the world-local rectangle ``centre`` +- ``half`` [m]."""
+    col0 = int(wp.floor((centre[0] - half[0]) / terrain.spacing))
+    col1 = int(wp.ceil((centre[0] + half[0]) / terrain.spacing))
+    row0 = int(wp.floor((centre[1] - half[1]) / terrain.spacing))
+    row1 = int(wp.ceil((centre[1] + half[1]) / terrain.spacing))
+    highest = node_height(terrain, t, row0, col0)
+    for row in range(row0, row1 + 1):
+        for col in range(col0, col1 + 1):
+            highest = wp.max(highest, node_height(terrain, t, row, col))
+    return highest
 
 
 @wp.func
-def next_level(level: int, walked: float, commanded_speed: float, drawn: int, rules: Rules) -> int:
-    """Terrain level after an episode: up if it walked far, down if it lagged behind; past the last, the drawn one."""
-    if walked > rules.promotion_distance:
-        return wp.where(level + 1 < rules.num_levels, level + 1, drawn)
-    if walked < commanded_speed * rules.demotion_time_s:
-        return wp.max(level - 1, 0)
-    return level
+def _place_robot(
+    rng: wp.uint32, terrain: Terrain, t: int, ranges: StartRanges, sensors: Sensors, env: int,
+    joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float],
+):  # fmt: skip
+    """Write the joint coordinates and velocities of a start drawn from ``rng`` (base velocity: at the link origin)."""
+    x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
+    rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))
+    joint_q_out[env, 0] = x
+    joint_q_out[env, 1] = y
+    joint_q_out[env, 2] = ranges.base_height + highest_ground(terrain, t, wp.vec2(x, y), ranges.footprint)
+    for k in range(4):
+        joint_q_out[env, 3 + k] = rotation[k]
+    for j in range(sensors.default_joint_pos.shape[0]):
+        scale = 1.0 + ranges.joint_scale_range * wp.randf(rng, -1.0, 1.0)
+        joint_q_out[env, 7 + j] = sensors.default_joint_pos[j] * scale
+        joint_qd_out[env, 6 + j] = 0.0
+    v = ranges.velocity_range
+    lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    of_com = lin_vel + wp.cross(ang_vel, wp.quat_rotate(rotation, sensors.base_com))
+    for k in range(3):
+        joint_qd_out[env, k] = of_com[k]
+        joint_qd_out[env, 3 + k] = ang_vel[k]
 
 
 @wp.kernel
-def _promote_episodes_kernel(
-    joint_q: wp.array2d[float], rules: Rules, terrain_of_env_out: wp.array[int], episodes_out: Episodes
+def _seed_starts_kernel(
+    seed_of_terrain: wp.array[wp.uint32], terrain_of_env: wp.array[int], num_replicas: int, episodes_out: Episodes
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
-    end = episodes_out.end[env]
-    if end == _RUNNING:
-        return
-    level = episodes_out.level[env]
-    if end != _INVALID:
-        rng = _random_stream(episodes_out.counter[0], _STREAM_LEVEL, episodes_out.end.shape[0], env)
-        drawn = wp.randi(rng, 0, rules.num_levels)
-        walked = wp.length(wp.vec2(joint_q[env, 0], joint_q[env, 1]) - episodes_out.start[env])
-        speed = wp.length(wp.vec2(episodes_out.command[env, 0], episodes_out.command[env, 1]))
-        level = next_level(level, walked, speed, drawn, rules)
-    episodes_out.level[env] = level
-    terrain_of_env_out[env] = level * rules.num_columns + episodes_out.column[env]
+    # The stream depends on the terrain's seed and the replica alone: sharding terrains changes no episode.
+    episodes_out.rng[env] = wp.rand_init(int(seed_of_terrain[terrain_of_env[env]]), env % num_replicas)
 
 
-def promote_episodes(joint_q: Any, rules: Rules, terrain_of_env_out: Any, episodes_out: Episodes) -> None:
-    """Move the ended episodes up or down the terrain levels by how far they came; an invalid one stays.
+def seed_starts(seed_of_terrain: Any, terrain_of_env: Any, num_replicas: int, episodes_out: Episodes) -> None:
+    """Let the next start of replica r on terrain t be drawn from the stream (seed of t, r).
 
     Args:
-        joint_q: Joint coordinates at the end, shape (num_envs, 7 + num_joints).
-        rules: Levels, columns and the distances that decide.
-        terrain_of_env_out: Tile of each environment, shape (num_envs,).
-        episodes_out: Updates ``level``.
+        seed_of_terrain: uint32 seeds, shape (num_terrains,).
+        terrain_of_env: Terrain of each environment, shape (num_envs,).
+        num_replicas: Episodes a terrain; the replica of an environment is ``env % num_replicas``.
+        episodes_out: Writes ``rng``.
     """
+    inputs = [seed_of_terrain, terrain_of_env, num_replicas]
     wp.launch(
-        _promote_episodes_kernel,
-        dim=joint_q.shape[0],
-        inputs=[joint_q, rules],
-        outputs=[terrain_of_env_out, episodes_out],
-        device=joint_q.device,
+        _seed_starts_kernel, terrain_of_env.shape[0], inputs, outputs=[episodes_out], device=terrain_of_env.device
     )
 
 
@@ -84,33 +102,38 @@ def _restart_episodes_kernel(
     terrain_of_env: wp.array[int],
     terrain: Terrain,
     ranges: StartRanges,
-    base_com: wp.vec3,
-    default_joint_pos: wp.array[float],
+    sensors: Sensors,
     joint_q_out: wp.array2d[float],
     joint_qd_out: wp.array2d[float],
-    feet_out: Feet,
+    last_action_out: wp.array2d[float],
     episodes_out: Episodes,
+    rewards_out: Rewards,
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
-    if episodes_out.end[env] == _RUNNING:
+    if episodes_out.outcome[env] == _RUNNING:
         return
-    rng = _random_stream(episodes_out.counter[0], _STREAM_START, terrain_of_env.shape[0], env)
-    t = terrain_of_env[env]
-    place_robot(rng, terrain, t, ranges, base_com, default_joint_pos, env, joint_q_out, joint_qd_out)
+    _place_robot(episodes_out.rng[env], terrain, terrain_of_env[env], ranges, sensors, env, joint_q_out, joint_qd_out)
     episodes_out.start[env] = wp.vec2(joint_q_out[env, 0], joint_q_out[env, 1])
+    episodes_out.outcome[env] = _RUNNING
     episodes_out.steps[env] = 0
-    episodes_out.total_reward[env] = 0.0
-    for j in range(default_joint_pos.shape[0]):
-        episodes_out.last_action[env, j] = 0.0
-    for g in range(feet_out.air_time.shape[1]):
-        feet_out.air_time[env, g] = 0.0
-        feet_out.touched[env, g] = 0
+    episodes_out.counted[env] = 0
+    episodes_out.final_pose[env] = wp.transform_identity()
+    wp.atomic_add(episodes_out.num_running, 0, 1)
+    for j in range(last_action_out.shape[1]):
+        last_action_out[env, j] = 0.0
+    if rewards_out.total.shape[0] == 0:
+        return
+    rewards_out.running[env] = 1
+    rewards_out.total[env] = 0.0
+    for g in range(rewards_out.air_time.shape[1]):
+        rewards_out.air_time[env, g] = 0.0
+        rewards_out.touched[env, g] = 0
 
 
 def restart_episodes(
-    terrain_of_env: Any, terrain: Terrain, ranges: StartRanges, base_com: wp.vec3, default_joint_pos: Any,
-    joint_q_out: Any, joint_qd_out: Any, feet_out: Feet, episodes_out: Episodes,
+    terrain_of_env: Any, terrain: Terrain, ranges: StartRanges, sensors: Sensors, joint_q_out: Any, joint_qd_out: Any,
+    last_action_out: Any, episodes_out: Episodes, rewards_out: Rewards,
 ) -> None:  # fmt: skip
     """Put the robots whose episodes ended at a new randomised start, with nothing remembered of the episode before.
 
@@ -118,94 +141,37 @@ def restart_episodes(
         terrain_of_env: Terrain of each environment, shape (num_envs,).
         terrain: Height grids.
         ranges: Nominal start and ranges.
-        base_com: Mass centre of the base in its frame [m].
-        default_joint_pos: Default pose [rad], shape (num_joints,).
+        sensors: Holds the default pose and the mass centre of the base.
         joint_q_out: Joint coordinates, shape (num_envs, 7 + num_joints).
         joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints).
-        feet_out: Contact memory.
-        episodes_out: Reads ``end``; restarts ``start``, ``steps``, ``total_reward`` and ``last_action``.
+        last_action_out: Action of the step before, shape (num_envs, num_joints).
+        episodes_out: Set running, zero steps; starts are drawn from ``rng``.
+        rewards_out: Nothing summed; empty where nothing is rewarded.
     """
+    inputs = [terrain_of_env, terrain, ranges, sensors]
     wp.launch(
         _restart_episodes_kernel,
-        dim=terrain_of_env.shape[0],
-        inputs=[terrain_of_env, terrain, ranges, base_com, default_joint_pos],
-        outputs=[joint_q_out, joint_qd_out, feet_out, episodes_out],
+        terrain_of_env.shape[0],
+        inputs,
+        outputs=[joint_q_out, joint_qd_out, last_action_out, episodes_out, rewards_out],
         device=joint_q_out.device,
     )
 
 
-@wp.func
-def _draw_command(rng: wp.uint32, rules: Rules, env: int, episodes_out: Episodes):
-    vx = wp.randf(rng, rules.lin_vel_x[0], rules.lin_vel_x[1])
-    vy = wp.randf(rng, rules.lin_vel_y[0], rules.lin_vel_y[1])
-    episodes_out.heading[env] = wp.randf(rng, -wp.pi, wp.pi)
-    moving = wp.where(wp.length(wp.vec2(vx, vy)) > rules.min_speed, 1.0, 0.0)
-    episodes_out.command[env, 0] = moving * vx
-    episodes_out.command[env, 1] = moving * vy
-
-
 @wp.kernel
-def _command_episodes_kernel(
-    rules: Rules, joint_q: wp.array2d[float], joint_qd_out: wp.array2d[float], episodes_out: Episodes
-):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    counter = episodes_out.counter[0]
-    num_envs = joint_q.shape[0]
-    if rules.crosses == 1:
-        command = goal_command(wp.vec2(joint_q[env, 0], joint_q[env, 1]), base_yaw(joint_q, env), rules.crossing)
-        for k in range(3):
-            episodes_out.command[env, k] = command[k]
-    else:
-        if episodes_out.steps[env] % rules.command_steps == 0:
-            _draw_command(_random_stream(counter, _STREAM_COMMAND, num_envs, env), rules, env, episodes_out)
-        error = wrap_angle(episodes_out.heading[env] - base_yaw(joint_q, env))
-        episodes_out.command[env, 2] = wp.clamp(rules.yaw_gain * error, -rules.max_yaw_rate, rules.max_yaw_rate)
-    if rules.push_steps == 0:
-        return
-    if (counter + env * _PUSH_STAGGER) % rules.push_steps == 0:
-        rng = _random_stream(counter, _STREAM_PUSH, num_envs, env)
-        joint_qd_out[env, 0] = wp.randf(rng, -rules.push_speed, rules.push_speed)
-        joint_qd_out[env, 1] = wp.randf(rng, -rules.push_speed, rules.push_speed)
+def _clear_rows_kernel(mask: wp.array[int], rows_out: wp.array2d[float]):
+    """Grid (num_envs, num_columns)."""
+    env, k = wp.tid()
+    if mask[env] != 0:
+        rows_out[env, k] = 0.0
 
 
-def command_episodes(rules: Rules, joint_q: Any, joint_qd_out: Any, episodes_out: Episodes) -> None:
-    """Tell every robot what to do next, and push where that is due.
+def clear_rows(mask: Any, rows_out: Any) -> None:
+    """Set the rows of ``rows_out`` (num_envs, num_columns) to zero where the int ``mask`` (num_envs,) is not 0.
 
-    Where robots cross, the command is to go to the goal; else a new one is drawn where it is due (at the start too),
-    and headings become yaw rates.
-
-    Args:
-        rules: Ranges and intervals.
-        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
-        joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints); a push overwrites vx and vy.
-        episodes_out: Updates ``heading`` and ``command``.
+    Raises:
+        ValueError: If the mask has not one entry a row.
     """
-    wp.launch(
-        _command_episodes_kernel,
-        dim=joint_q.shape[0],
-        inputs=[rules, joint_q],
-        outputs=[joint_qd_out, episodes_out],
-        device=joint_q.device,
-    )
-
-
-@wp.kernel
-def _remember_steps_kernel(joint_qd: wp.array2d[float], episodes_out: Episodes):
-    """Grid (num_envs, num_joints)."""
-    env, j = wp.tid()
-    episodes_out.previous_action[env, j] = episodes_out.last_action[env, j]
-    episodes_out.previous_joint_vel[env, j] = joint_qd[env, 6 + j]
-    if env == 0 and j == 0:
-        episodes_out.counter[0] = episodes_out.counter[0] + 1
-
-
-def remember_steps(joint_qd: Any, episodes_out: Episodes) -> None:
-    """Keep action and joint rates for the next step's rewards, and advance the counter; the last launch of a step."""
-    wp.launch(
-        _remember_steps_kernel,
-        dim=episodes_out.last_action.shape,
-        inputs=[joint_qd],
-        outputs=[episodes_out],
-        device=joint_qd.device,
-    )
+    if mask.shape[0] != rows_out.shape[0]:
+        raise ValueError(f"mask must have shape ({rows_out.shape[0]},), got {tuple(mask.shape)}")
+    wp.launch(_clear_rows_kernel, dim=rows_out.shape, inputs=[mask], outputs=[rows_out], device=rows_out.device)

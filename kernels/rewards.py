@@ -1,160 +1,361 @@
-"""Rewards of the command-following task: the terms of :mod:`kernels.reward_terms`, weighed and added.
+"""Rewards of a control step: legged_gym's terms under its names where it has them, weighed, added, and summed.
 
-A term is added by its function there, and here by a field of :class:`RewardWeights`, its name in :data:`REWARDS` and
-its line in :func:`_weighted_terms`.
+A term is one ``@_term`` function here, and its weight is the field of that name in
+:class:`sim.robots.training.RewardCfg`. It gives the unweighted rate of reward in one control step. Terms are added in
+the order in which they stand here.
 """
 
+from collections.abc import Callable, Collection
 from typing import Any
 
 import warp as wp
 
-from kernels.penalties import excess_contact_force, is_stumbling
-from kernels.reward_terms import (
-    Feet,
-    Motion,
-    action_rate,
-    ang_vel_xy,
-    collision,
-    dof_acc,
-    dof_pos_limits,
-    feet_air_time,
-    joint_deviation,
-    lin_vel_z,
-    no_fly,
-    orientation,
-    termination,
-    torques,
-    tracking_ang_vel,
-    tracking_lin_vel,
-)
-from kernels.state import base_ang_vel_b, base_lin_vel_b
+from kernels.episode import Outcome
+from kernels.penalties import COLLISION_FORCE, FOOT, LIMB, excess_contact_force, is_stumbling
+from kernels.state import base_ang_vel_b, base_lin_vel_b, projected_gravity
 
-REWARDS = (
-    "tracking_lin_vel", "tracking_ang_vel", "lin_vel_z", "ang_vel_xy", "torques", "dof_acc",
-    "feet_air_time", "collision", "action_rate", "stumble", "feet_contact_forces",
-    "dof_pos_limits", "no_fly", "orientation", "joint_deviation", "termination",
-)  # fmt: skip
-"""Terms in the order of the columns of ``terms_out``."""
+TRACKING_VARIANCE = wp.constant(0.25)
+TOUCH_FORCE = wp.constant(1.0)
+MIN_COMMANDED_SPEED = wp.constant(0.1)
 
-_NUM_TERMS = wp.constant(len(REWARDS))
-_TERMINATION = wp.constant(REWARDS.index("termination"))
-_Terms = wp.types.vector(len(REWARDS), float)
+_RUNNING = wp.constant(int(Outcome.RUNNING))
+_INVALID = wp.constant(int(Outcome.INVALID))
+
+
+@wp.struct
+class Motion:
+    """What a control step ended in; one row an environment."""
+
+    joint_q: wp.array2d[float]
+    """Joint coordinates (:mod:`kernels.state`)."""
+    joint_qd: wp.array2d[float]
+    joint_torque: wp.array2d[float]
+    """Actuator torques [N m] in columns 6 and up."""
+    geom_force: wp.array2d[wp.vec3]
+    """Contact force on each geom, world frame [N]."""
+    geom_role: wp.array[int]
+    """Role bits of :mod:`kernels.penalties`, one a geom."""
+    command: wp.array2d[float]
+    """Command the action answered: vx, vy [m/s], yaw rate [rad/s]."""
+    action: wp.array2d[float]
+    """Clipped action of the step, shape (num_envs, num_joints)."""
+    base_com: wp.vec3
+    """Mass centre of the base in its frame [m]."""
+    force_limit: float
+    """Foot contact force beyond which it is penalised [N]."""
+    dt: float
+    """Control step [s]."""
+    min_air_time_s: float
+    """A foot in the air for longer earns a reward when it lands, for less long it costs one [s]."""
+    joint_lower: wp.array[float]
+    """Soft lower limit of each joint [rad], shape (num_joints,)."""
+    joint_upper: wp.array[float]
+    """Soft upper limit of each joint [rad], shape (num_joints,)."""
+    default_joint_pos: wp.array[float]
+    """Default pose [rad], shape (num_joints,)."""
+    joint_is_steady: wp.array[int]
+    """1 for a joint that is to keep near its default angle, shape (num_joints,)."""
+
+
+@wp.struct
+class Rewards:
+    """Rewards of the episodes so far, and what the next step's are compared with; shape (num_envs,) unless said."""
+
+    running: wp.array[int]
+    """1 if the episode had not ended when the control step began."""
+    step: wp.array[float]
+    """Reward of the step just made."""
+    total: wp.array[float]
+    """Reward of the episode so far."""
+    terms: wp.array2d[float]
+    """Sums of the weighted terms since they were last cleared, shape (num_envs, len(REWARDS))."""
+    previous_action: wp.array2d[float]
+    """Clipped action of the step before, shape (num_envs, num_joints)."""
+    previous_joint_vel: wp.array2d[float]
+    """Joint rates at the end of the step before [rad/s], shape (num_envs, num_joints)."""
+    air_time: wp.array2d[float]
+    """Time since the foot last touched the ground [s], shape (num_envs, num_geoms); 0 for other geoms."""
+    touched: wp.array2d[int]
+    """1 if the foot touched the ground at the end of the step before, shape (num_envs, num_geoms)."""
+
+
+_TERMS: dict[str, Any] = {}
+
+
+def _term(function: Callable[..., Any]) -> Any:
+    """Make a Warp function of a reward term, and its name a column of the rewards."""
+    _TERMS[function.__name__] = wp.func(function)
+    return _TERMS[function.__name__]
+
+
+@wp.func
+def _lin_vel(motion: Motion, env: int) -> wp.vec3:
+    return base_lin_vel_b(motion.joint_q, motion.joint_qd, motion.base_com, env)
+
+
+@wp.func
+def _ang_vel(motion: Motion, env: int) -> wp.vec3:
+    return base_ang_vel_b(motion.joint_q, motion.joint_qd, env)
+
+
+@wp.func
+def _is_told_to_stand(motion: Motion, env: int) -> bool:
+    """Whether the commanded velocity is none, up to 0.1 m/s."""
+    return wp.length(wp.vec2(motion.command[env, 0], motion.command[env, 1])) <= MIN_COMMANDED_SPEED
+
+
+@_term
+def tracking_lin_vel(motion: Motion, rewards: Rewards, env: int) -> float:
+    """``exp(-|v_xy - v_xy,cmd|^2 / 0.25)``, base frame."""
+    velocity = _lin_vel(motion, env)
+    error = wp.vec2(motion.command[env, 0] - velocity[0], motion.command[env, 1] - velocity[1])
+    return wp.exp(-wp.length_sq(error) / TRACKING_VARIANCE)
+
+
+@_term
+def tracking_ang_vel(motion: Motion, rewards: Rewards, env: int) -> float:
+    """``exp(-(w_z - w_z,cmd)^2 / 0.25)``, base frame."""
+    error = motion.command[env, 2] - _ang_vel(motion, env)[2]
+    return wp.exp(-error * error / TRACKING_VARIANCE)
+
+
+@_term
+def lin_vel_z(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Square of the base's velocity along its own z axis [m^2/s^2]."""
+    velocity = _lin_vel(motion, env)
+    return velocity[2] * velocity[2]
+
+
+@_term
+def ang_vel_xy(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Square of the base's roll and pitch rates [rad^2/s^2]."""
+    rate = _ang_vel(motion, env)
+    return rate[0] * rate[0] + rate[1] * rate[1]
+
+
+@_term
+def torques(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Sum over the joints of the squared torque [N^2 m^2]."""
+    total = float(0.0)
+    for j in range(motion.action.shape[1]):
+        total += motion.joint_torque[env, 6 + j] * motion.joint_torque[env, 6 + j]
+    return total
+
+
+@_term
+def dof_acc(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Sum over the joints of the squared mean acceleration over the control step [rad^2/s^4]."""
+    total = float(0.0)
+    for j in range(motion.action.shape[1]):
+        acceleration = (motion.joint_qd[env, 6 + j] - rewards.previous_joint_vel[env, j]) / motion.dt
+        total += acceleration * acceleration
+    return total
+
+
+@_term
+def feet_air_time(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Sum over the feet that land of their time in the air less the least; 0 when told to stand. Updates ``rewards``.
+
+    A foot is on the ground if it touches now or did in the step before: one missed step is no take-off.
+    """
+    total = float(0.0)
+    for g in range(motion.geom_role.shape[0]):
+        if (motion.geom_role[g] & FOOT) != 0:
+            touching = int(0)
+            if motion.geom_force[env, g][2] > TOUCH_FORCE:
+                touching = 1
+            air_time = rewards.air_time[env, g]
+            if touching == 1 or rewards.touched[env, g] == 1:
+                if air_time > 0.0:
+                    total += air_time + motion.dt - motion.min_air_time_s
+                rewards.air_time[env, g] = 0.0
+            else:
+                rewards.air_time[env, g] = air_time + motion.dt
+            rewards.touched[env, g] = touching
+    if _is_told_to_stand(motion, env):
+        total = 0.0
+    return total
+
+
+@_term
+def collision(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Number of limb geoms touched with more than 0.1 N."""
+    count = float(0.0)
+    for g in range(motion.geom_role.shape[0]):
+        if (motion.geom_role[g] & LIMB) != 0 and wp.length(motion.geom_force[env, g]) > COLLISION_FORCE:
+            count += 1.0
+    return count
+
+
+@_term
+def action_rate(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Sum over the joints of the squared change of the action."""
+    total = float(0.0)
+    for j in range(motion.action.shape[1]):
+        change = motion.action[env, j] - rewards.previous_action[env, j]
+        total += change * change
+    return total
+
+
+@_term
+def stumble(motion: Motion, rewards: Rewards, env: int) -> float:
+    """1 if any foot hits a vertical surface (:func:`kernels.penalties.is_stumbling`), else 0."""
+    return is_stumbling(motion.geom_force, motion.geom_role, env)
+
+
+@_term
+def feet_contact_forces(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Sum over the feet of the contact force beyond the limit [N]."""
+    return excess_contact_force(motion.geom_force, motion.geom_role, motion.force_limit, env)
+
+
+@_term
+def dof_pos_limits(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Sum over the joints of how far they are beyond their soft limits [rad]."""
+    total = float(0.0)
+    for j in range(motion.joint_lower.shape[0]):
+        angle = motion.joint_q[env, 7 + j]
+        total += wp.max(motion.joint_lower[j] - angle, 0.0) + wp.max(angle - motion.joint_upper[j], 0.0)
+    return total
+
+
+@_term
+def no_fly(motion: Motion, rewards: Rewards, env: int) -> float:
+    """1 if exactly one foot is pushed up, by more than 0.1 N; 0 when told to stand, where legged_gym pays it too."""
+    count = int(0)
+    for g in range(motion.geom_role.shape[0]):
+        if (motion.geom_role[g] & FOOT) != 0 and motion.geom_force[env, g][2] > COLLISION_FORCE:
+            count += 1
+    return wp.where(count == 1 and not _is_told_to_stand(motion, env), 1.0, 0.0)
+
+
+@_term
+def orientation(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Square of the sine of the base's tilt."""
+    gravity = projected_gravity(motion.joint_q, env)
+    return gravity[0] * gravity[0] + gravity[1] * gravity[1]
+
+
+@_term
+def joint_deviation(motion: Motion, rewards: Rewards, env: int) -> float:
+    """Sum over the steady joints of how far they are from their default angle [rad] (Isaac Lab's, for its Cassie)."""
+    total = float(0.0)
+    for j in range(motion.joint_is_steady.shape[0]):
+        if motion.joint_is_steady[j] != 0:
+            total += wp.abs(motion.joint_q[env, 7 + j] - motion.default_joint_pos[j])
+    return total
+
+
+_FUNCTIONS = tuple(_TERMS.values())
+REWARDS = (*_TERMS, "termination")
+"""Columns of the sums of terms, in their order; the last is the price of a fall."""
+
+_NUM_TERMS = wp.constant(len(_TERMS))
+_TermWeights = wp.types.vector(len(_TERMS), float)
+wp.set_module_options({"max_unroll": len(_TERMS)})  # the loop over the terms calls another function each time
 
 
 @wp.struct
 class RewardWeights:
-    """Weight of each term per second, fields named as in :data:`REWARDS`."""
+    """What a step pays; made by :func:`make_weights`."""
 
-    tracking_lin_vel: float
-    tracking_ang_vel: float
-    lin_vel_z: float
-    ang_vel_xy: float
-    torques: float
-    dof_acc: float
-    feet_air_time: float
-    collision: float
-    action_rate: float
-    stumble: float
-    feet_contact_forces: float
-    dof_pos_limits: float
-    no_fly: float
-    orientation: float
-    joint_deviation: float
+    terms: _TermWeights
+    """Weight of each term per second, in the order of :data:`REWARDS`."""
     termination: float
+    """Weight of a fall per second."""
+    falls: int
+    """Outcomes that are a fall, bits ``1 << Outcome``."""
+    only_positive: int
+    """1: the sum of the terms is clipped at 0, so that ending early never pays."""
 
 
-@wp.func
-def _weighted_terms(motion: Motion, weights: RewardWeights, feet: Feet, env: int) -> _Terms:
-    command = wp.vec3(motion.command[env, 0], motion.command[env, 1], motion.command[env, 2])
-    lin_vel = base_lin_vel_b(motion.joint_q, motion.joint_qd, motion.base_com, env)
-    ang_vel = base_ang_vel_b(motion.joint_q, motion.joint_qd, env)
-    terms = _Terms()
-    terms[0] = weights.tracking_lin_vel * tracking_lin_vel(lin_vel, command)
-    terms[1] = weights.tracking_ang_vel * tracking_ang_vel(ang_vel, command)
-    terms[2] = weights.lin_vel_z * lin_vel_z(lin_vel)
-    terms[3] = weights.ang_vel_xy * ang_vel_xy(ang_vel)
-    terms[4] = weights.torques * torques(motion, env)
-    terms[5] = weights.dof_acc * dof_acc(motion, env)
-    terms[6] = weights.feet_air_time * feet_air_time(motion, feet, env)
-    terms[7] = weights.collision * collision(motion, env)
-    terms[8] = weights.action_rate * action_rate(motion, env)
-    terms[9] = weights.stumble * is_stumbling(motion.geom_force, motion.geom_role, env)
-    terms[10] = weights.feet_contact_forces * excess_contact_force(
-        motion.geom_force, motion.geom_role, motion.force_limit, env
-    )
-    terms[11] = weights.dof_pos_limits * dof_pos_limits(motion, env)
-    terms[12] = weights.no_fly * no_fly(motion, env)
-    terms[13] = weights.orientation * orientation(motion, env)
-    terms[14] = weights.joint_deviation * joint_deviation(motion, env)
-    terms[15] = weights.termination * termination(motion, env)
-    return terms
+def make_weights(weights: dict[str, float], *, only_positive: bool, falls: Collection[Outcome]) -> RewardWeights:
+    """Weights as a kernel argument.
+
+    Args:
+        weights: Weight of each of :data:`REWARDS` per second.
+        only_positive: Clip the sum of the terms at 0; a fall is not clipped.
+        falls: Outcomes that cost ``termination``.
+    """
+    packed = RewardWeights()
+    packed.terms = _TermWeights(*(weights[name] for name in _TERMS))
+    packed.termination = weights["termination"]
+    packed.falls = sum(1 << outcome for outcome in falls)
+    packed.only_positive = int(only_positive)
+    return packed
+
+
+def make_rewards(num_envs: int, num_joints: int, num_geoms: int, device: str | None = None) -> Rewards:
+    """Allocate the rewards of episodes that have not begun."""
+    rewards = Rewards()
+    rewards.running = wp.ones(num_envs, dtype=int, device=device)
+    rewards.step = wp.zeros(num_envs, dtype=float, device=device)
+    rewards.total = wp.zeros(num_envs, dtype=float, device=device)
+    rewards.touched = wp.zeros((num_envs, num_geoms), dtype=int, device=device)
+    widths = {"terms": len(REWARDS), "air_time": num_geoms, "previous_action": num_joints}
+    for name, width in {**widths, "previous_joint_vel": num_joints}.items():
+        setattr(rewards, name, wp.zeros((num_envs, width), dtype=float, device=device))
+    return rewards
 
 
 @wp.kernel
-def _reward_steps_kernel(
-    motion: Motion,
-    weights: RewardWeights,
-    only_positive: int,
-    valid: wp.array[int],
-    feet_out: Feet,
-    reward_out: wp.array[float],
-    terms_out: wp.array2d[float],
-):
+def _reward_steps_kernel(motion: Motion, weights: RewardWeights, outcome: wp.array[int], rewards_out: Rewards):
     """Grid (num_envs,)."""
     env = wp.tid()
-    if valid[env] == 0:
-        fall = weights.termination * termination(motion, env)
-        reward_out[env] = motion.dt * fall
-        terms_out[env, _TERMINATION] += motion.dt * fall
-        return
-    terms = _weighted_terms(motion, weights, feet_out, env)
+    ended = outcome[env]
+    running = rewards_out.running[env]
+    rewards_out.running[env] = wp.where(ended == _RUNNING, 1, 0)
     reward = float(0.0)
-    for k in range(_NUM_TERMS):
-        if k != _TERMINATION:
-            reward += terms[k]
-        terms_out[env, k] += motion.dt * terms[k]
-    if only_positive != 0:
-        reward = wp.max(reward, 0.0)
-    reward_out[env] = motion.dt * (reward + terms[_TERMINATION])  # a fall is not clipped
+    if running == 1 and ended != _INVALID:
+        for k in range(_NUM_TERMS):
+            weighted = weights.terms[k] * wp.static(_FUNCTIONS[k])(motion, rewards_out, env)
+            reward += weighted
+            rewards_out.terms[env, k] += motion.dt * weighted
+        if weights.only_positive != 0:
+            reward = wp.max(reward, 0.0)
+    if running == 1 and (weights.falls & (1 << ended)) != 0:
+        reward += weights.termination
+        rewards_out.terms[env, _NUM_TERMS] += motion.dt * weights.termination
+    rewards_out.step[env] = motion.dt * reward
+    rewards_out.total[env] += motion.dt * reward
 
 
-def reward_steps(
-    motion: Motion, weights: RewardWeights, *, only_positive: bool, valid: Any, feet_out: Feet, reward_out: Any,
-    terms_out: Any,
-) -> None:  # fmt: skip
-    """Reward one control step: the weighted sum of all terms times the control step, where ``valid`` is not 0.
+def reward_steps(motion: Motion, weights: RewardWeights, outcome: Any, rewards_out: Rewards) -> None:
+    """Reward one control step: the weighted sum of all terms times the control step.
+
+    A step is paid if its episode had not ended before. A step that ends in an invalid state pays no term; one that ends
+    in a fall pays its price too.
 
     Args:
         motion: What the step ended in.
-        weights: Weight of each term per second.
-        only_positive: Clip the sum of all terms but ``termination`` at 0, so that ending early never pays.
-        valid: 0 where the state is not to be trusted: nothing but ``termination`` counts; shape (num_envs,).
-        feet_out: Contact memory of the feet; updated.
-        reward_out: Reward of the step, shape (num_envs,).
-        terms_out: Each weighted term is added to it, columns :data:`REWARDS`; shape (num_envs, len(REWARDS)).
-
-    Raises:
-        ValueError: If ``terms_out`` has not one column a term.
+        weights: What it pays.
+        outcome: :class:`kernels.episode.Outcome` after the step, shape (num_envs,).
+        rewards_out: Updated, but for what :func:`remember_steps` writes.
     """
-    expected = (valid.shape[0], len(REWARDS))
-    if tuple(terms_out.shape) != expected:
-        raise ValueError(
-            f"terms_out must have shape {expected}, got {tuple(terms_out.shape)}: one column for each of "
-            f"{', '.join(REWARDS)}"
-        )
-    wp.launch(
-        _reward_steps_kernel,
-        dim=valid.shape[0],
-        inputs=[motion, weights, int(only_positive), valid],
-        outputs=[feet_out, reward_out, terms_out],
-        device=reward_out.device,
-    )
+    inputs = [motion, weights, outcome]
+    wp.launch(_reward_steps_kernel, outcome.shape[0], inputs, outputs=[rewards_out], device=outcome.device)
 
 
-def make_feet(num_envs: int, num_geoms: int, device: str, *, min_air_time_s: float = 0.5) -> Feet:
-    """Contact memory of robots that were just put down."""
-    feet = Feet()
-    feet.min_air_time_s = min_air_time_s
-    feet.air_time = wp.zeros((num_envs, num_geoms), dtype=float, device=device)
-    feet.touched = wp.zeros((num_envs, num_geoms), dtype=int, device=device)
-    return feet
+@wp.kernel
+def _remember_steps_kernel(
+    action: wp.array2d[float], joint_qd: wp.array2d[float], rewards_out: Rewards, counter_out: wp.array[int]
+):
+    """Grid (num_envs, num_joints)."""
+    env, j = wp.tid()
+    rewards_out.previous_action[env, j] = action[env, j]
+    rewards_out.previous_joint_vel[env, j] = joint_qd[env, 6 + j]
+    if env == 0 and j == 0:
+        counter_out[0] = counter_out[0] + 1
+
+
+def remember_steps(action: Any, joint_qd: Any, rewards_out: Rewards, counter_out: Any) -> None:
+    """Keep what the next step's rewards are compared with, and count the step; its last launch.
+
+    Args:
+        action: Clipped action, shape (num_envs, num_joints).
+        joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
+        rewards_out: Writes ``previous_action`` and ``previous_joint_vel``.
+        counter_out: Control steps so far, shape (1,).
+    """
+    inputs = [action, joint_qd]
+    wp.launch(_remember_steps_kernel, action.shape, inputs, outputs=[rewards_out, counter_out], device=action.device)

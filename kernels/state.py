@@ -49,9 +49,7 @@ def base_ang_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], env:
 
 
 @wp.func
-def base_lin_vel_b(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_com: wp.vec3, env: int
-) -> wp.vec3:
+def base_lin_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_com: wp.vec3, env: int) -> wp.vec3:
     """Velocity of the base link's origin in the base frame [m/s]; ``base_com`` is the mass centre in that frame [m]."""
     of_com = wp.quat_rotate_inv(
         base_rotation(joint_q, env), wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])

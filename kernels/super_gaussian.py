@@ -104,17 +104,7 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
         )
     num_bumps = genes.shape[1] // GENES_PER_BUMP
     bumps = wp.empty((genes.shape[0], num_bumps), dtype=Bump, device=genes.device)
-    wp.launch(
-        _decode_genes_kernel,
-        dim=bumps.shape,
-        inputs=[genes, _genes(*LOWER), _genes(*UPPER)],
-        outputs=[bumps],
-        device=genes.device,
-    )
-    wp.launch(
-        _rasterise_bumps_kernel,
-        dim=heights_out.shape,
-        inputs=[bumps, spacing],
-        outputs=[heights_out],
-        device=genes.device,
-    )
+    inputs = [genes, _genes(*LOWER), _genes(*UPPER)]
+    wp.launch(_decode_genes_kernel, bumps.shape, inputs, outputs=[bumps], device=genes.device)
+    inputs = [bumps, spacing]
+    wp.launch(_rasterise_bumps_kernel, heights_out.shape, inputs, outputs=[heights_out], device=genes.device)

@@ -1,67 +1,48 @@
-"""Episodes of the command-following task on the device: their state, their ends, and the statistics of training.
+"""What training adds to an episode: levels of terrain, random commands, pushes, and the statistics of its progress.
 
-What follows an end (curriculum, restart, commands, pushes) is in :mod:`kernels.restart`.
+Random numbers come from the counter of :class:`Training` and the environment's number alone, so that a run is
+repeatable on the CPU and nothing is drawn on the host.
 """
 
-from enum import IntEnum
 from typing import Any
 
 import warp as wp
 
-from kernels.goal import Task, is_at_goal, is_out
-from kernels.penalties import max_base_force
-from kernels.rewards import REWARDS
-from kernels.state import base_ang_vel_b, base_lin_vel_b, base_position, projected_gravity, state_is_invalid
-
-
-class End(IntEnum):
-    """How a training episode ended in the step just made."""
-
-    RUNNING = 0
-    TIME_OUT = 1
-    BASE_COLLISION = 2
-    TILT = 3
-    INVALID = 4
-    GOAL = 5
-    OUT = 6
-
+from kernels.episode import Episodes, Outcome, Task, goal_command
+from kernels.rewards import Rewards
+from kernels.state import base_ang_vel_b, base_lin_vel_b, base_yaw, wrap_angle
 
 STATISTICS = (
-    "steps", "episodes", "time_out", "base_collision", "tilt", "invalid", "goal", "out", "overflow",
+    "steps", "episodes", *(outcome.name.lower() for outcome in Outcome if outcome != Outcome.RUNNING), "overflow",
     "episode_steps", "episode_reward", "lin_vel_error", "yaw_rate_error",
 )  # fmt: skip
-"""Columns of the sums that training progress is read from; the six ends count episodes."""
+"""Columns of the sums that training progress is read from; the outcomes count episodes."""
 
-_RUNNING = wp.constant(int(End.RUNNING))
-_TIME_OUT = wp.constant(int(End.TIME_OUT))
-_BASE_COLLISION = wp.constant(int(End.BASE_COLLISION))
-_TILT = wp.constant(int(End.TILT))
-_INVALID = wp.constant(int(End.INVALID))
-_GOAL = wp.constant(int(End.GOAL))
-_OUT = wp.constant(int(End.OUT))
+_RUNNING = wp.constant(int(Outcome.RUNNING))
+_INVALID = wp.constant(int(Outcome.INVALID))
 # Columns of STATISTICS as a kernel needs them.
 _STEPS = wp.constant(STATISTICS.index("steps"))
 _EPISODES = wp.constant(STATISTICS.index("episodes"))
-_ENDS = wp.constant(STATISTICS.index("time_out") - int(End.TIME_OUT))
+_OUTCOMES = wp.constant(STATISTICS.index("goal") - int(Outcome.GOAL))
 _OVERFLOW = wp.constant(STATISTICS.index("overflow"))
 _EPISODE_STEPS = wp.constant(STATISTICS.index("episode_steps"))
 _EPISODE_REWARD = wp.constant(STATISTICS.index("episode_reward"))
 _LIN_VEL_ERROR = wp.constant(STATISTICS.index("lin_vel_error"))
 _YAW_RATE_ERROR = wp.constant(STATISTICS.index("yaw_rate_error"))
 
+_STREAM_LEVEL = wp.constant(0)
+_STREAM_START = wp.constant(1)
+_STREAM_COMMAND = wp.constant(2)
+_STREAM_PUSH = wp.constant(3)
+_PUSH_STAGGER = wp.constant(7919)  # a prime: pushes meet the environments one after the other
+
 
 @wp.struct
 class Rules:
-    """Limits, ranges and intervals of the task; steps are control steps."""
+    """What is commanded, when robots are pushed and where they restart; steps are control steps."""
 
-    max_steps: int
-    """Longest episode."""
-    base_force: float
-    """Contact force on the base that ends an episode [N]."""
-    max_gravity_z: float
-    """Tilt ends an episode where the projected gravity's z exceeds this (-1: upright)."""
-    max_speed: float
-    """Any velocity beyond is invalid [m/s or rad/s]."""
+    crosses: int
+    """1: robots are told to go to the goal of the task; 0: they are told random velocities and headings."""
     overflow_mask: int
     """Solver overflow bits that are counted."""
     num_levels: int
@@ -78,64 +59,40 @@ class Rules:
     lin_vel_y: wp.vec2
     min_speed: float
     """Slower commands become 0 [m/s]."""
-    yaw_gain: float
-    max_yaw_rate: float
     push_steps: int
     """A push every so often; 0 for none."""
     push_speed: float
     """A push sets vx and vy of the mass centre to +- this, world frame [m/s]."""
-    crosses: int
-    """1: robots are told to go to a goal, where their episode ends; 0: they are told random velocities and headings."""
-    crossing: Task
-    """The goal and what is told on the way to it; of its ends, the goal and the borders of the world count."""
 
 
 @wp.struct
-class Episodes:
-    """Progress of each environment's episode, shape (num_envs,) unless said otherwise."""
+class Training:
+    """What training keeps beside the episodes, shape (num_envs,) unless said otherwise."""
 
     counter: wp.array[int]
     """Control steps so far, counted from a seed: what all random numbers come from; shape (1,)."""
-    end: wp.array[int]
-    """How the episode ended in the step just made (:class:`End`)."""
-    valid: wp.array[int]
-    """0 where the step ended in a state not to be trusted."""
-    fallen: wp.array[int]
-    """1 where the step ended the episode by a base collision, by tilt or in an invalid state."""
-    base_force: wp.array[float]
-    """Largest contact force on the base noted since the last control step was judged [N]."""
-    steps: wp.array[int]
-    """Control steps of the episode."""
+    ended: wp.array[int]
+    """:class:`kernels.episode.Outcome` of the step just made: the episode itself has restarted since."""
     level: wp.array[int]
     column: wp.array[int]
-    start: wp.array[wp.vec2]
-    """Where the episode began, world-local [m]."""
     heading: wp.array[float]
     """Commanded heading [rad]."""
     command: wp.array2d[float]
     """vx, vy [m/s], yaw rate [rad/s]; shape (num_envs, 3)."""
-    last_action: wp.array2d[float]
-    """Clipped action of the step, shape (num_envs, num_joints)."""
-    previous_action: wp.array2d[float]
-    previous_joint_vel: wp.array2d[float]
     action: wp.array2d[float]
     """What the policy put out, shape (num_envs, num_joints)."""
+    last_action: wp.array2d[float]
+    """Clipped action of the step, shape (num_envs, num_joints)."""
     observation: wp.array2d[float]
     """What the policy sees next, shape (num_envs, observation_size)."""
-    reward: wp.array[float]
-    """Reward of the step just made."""
-    reward_terms: wp.array2d[float]
-    """Sums of the weighted terms since they were last cleared, shape (num_envs, len(REWARDS))."""
-    total_reward: wp.array[float]
-    """Reward of the episode so far."""
     statistics: wp.array2d[float]
     """Sums since they were last cleared, columns :data:`STATISTICS`; shape (num_envs, len(STATISTICS))."""
 
 
-def make_episodes(
+def make_training(
     columns: Any, levels: Any, *, num_joints: int, observation_size: int, first_count: int, device: str
-) -> Episodes:
-    """Allocate the state of the episodes, all zero but for what is given.
+) -> Training:
+    """Allocate what training keeps, all zero but for what is given.
 
     Args:
         columns: Terrain column of each environment, integers of shape (num_envs,).
@@ -146,99 +103,16 @@ def make_episodes(
         device: Warp device name.
     """
     num_envs = len(columns)
-    episodes = Episodes()
-    episodes.counter = wp.array([first_count], dtype=int, device=device)
-    episodes.column = wp.array(columns, dtype=int, device=device)
-    episodes.level = wp.array(levels, dtype=int, device=device)
-    episodes.start = wp.zeros(num_envs, dtype=wp.vec2, device=device)
-    for name in ("end", "valid", "fallen", "steps"):
-        setattr(episodes, name, wp.zeros(num_envs, dtype=int, device=device))
-    for name in ("heading", "reward", "total_reward", "base_force"):
-        setattr(episodes, name, wp.zeros(num_envs, dtype=float, device=device))
-    widths = {"command": 3, "observation": observation_size}
-    widths |= {"statistics": len(STATISTICS), "reward_terms": len(REWARDS)}
-    widths |= dict.fromkeys(("action", "last_action", "previous_action", "previous_joint_vel"), num_joints)
-    for name, width in widths.items():
-        setattr(episodes, name, wp.zeros((num_envs, width), dtype=float, device=device))
-    return episodes
-
-
-@wp.func
-def judge_state(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_force: float, steps: int, rules: Rules, env: int
-) -> int:
-    """:class:`End` of an episode after its ``steps``-th control step; the gravest of several wins."""
-    if state_is_invalid(joint_q, joint_qd, env, rules.max_speed):
-        return _INVALID
-    if base_force > rules.base_force:
-        return _BASE_COLLISION
-    if projected_gravity(joint_q, env)[2] > rules.max_gravity_z:
-        return _TILT
-    if rules.crosses == 1:
-        if is_at_goal(base_position(joint_q, env), rules.crossing):
-            return _GOAL
-        if is_out(base_position(joint_q, env), rules.crossing):
-            return _OUT
-    if steps >= rules.max_steps:
-        return _TIME_OUT
-    return _RUNNING
-
-
-@wp.kernel
-def _note_base_forces_kernel(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], episodes_out: Episodes):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    episodes_out.base_force[env] = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
-
-
-def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) -> None:
-    """Note how hard the bases are touched, for :func:`judge_steps`, after each physics step in which a touch counts.
-
-    Args:
-        geom_force: Contact forces of the physics step, world frame [N], shape (num_envs, num_geoms).
-        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
-        episodes_out: Raises ``base_force``.
-    """
-    inputs, device = [geom_force, geom_role], geom_force.device
-    wp.launch(_note_base_forces_kernel, geom_force.shape[0], inputs, outputs=[episodes_out], device=device)
-
-
-@wp.kernel
-def _judge_steps_kernel(
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    rules: Rules,
-    episodes_out: Episodes,
-):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    steps = episodes_out.steps[env] + 1
-    end = judge_state(joint_q, joint_qd, episodes_out.base_force[env], steps, rules, env)
-    episodes_out.base_force[env] = 0.0
-    episodes_out.steps[env] = steps
-    episodes_out.end[env] = end
-    episodes_out.valid[env] = wp.where(end == _INVALID, 0, 1)
-    # An invalid state costs what a fall does: were it free, falling robots would learn to whip their legs too fast.
-    stands = end != _TILT and end != _BASE_COLLISION and end != _INVALID
-    episodes_out.fallen[env] = wp.where(stands, 0, 1)
-
-
-def judge_steps(joint_q: Any, joint_qd: Any, rules: Rules, episodes_out: Episodes) -> None:
-    """Count a control step and judge which episodes end with it.
-
-    Args:
-        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
-        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
-        rules: Limits.
-        episodes_out: Writes ``steps``, ``end``, ``valid`` and ``fallen``; forgets what forces were noted.
-    """
-    wp.launch(
-        _judge_steps_kernel,
-        dim=joint_q.shape[0],
-        inputs=[joint_q, joint_qd, rules],
-        outputs=[episodes_out],
-        device=joint_q.device,
-    )
+    training = Training()
+    training.counter = wp.array([first_count], dtype=int, device=device)
+    training.column = wp.array(columns, dtype=int, device=device)
+    training.level = wp.array(levels, dtype=int, device=device)
+    training.ended = wp.zeros(num_envs, dtype=int, device=device)
+    training.heading = wp.zeros(num_envs, dtype=float, device=device)
+    widths = {"command": 3, "observation": observation_size, "statistics": len(STATISTICS)}
+    for name, width in {**widths, "action": num_joints, "last_action": num_joints}.items():
+        setattr(training, name, wp.zeros((num_envs, width), dtype=float, device=device))
+    return training
 
 
 @wp.kernel
@@ -248,32 +122,35 @@ def _record_steps_kernel(
     base_com: wp.vec3,
     overflow: wp.array[int],
     rules: Rules,
-    episodes_out: Episodes,
+    episodes: Episodes,
+    rewards: Rewards,
+    training_out: Training,
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
-    end = episodes_out.end[env]
-    episodes_out.total_reward[env] += episodes_out.reward[env]
-    episodes_out.statistics[env, _STEPS] += 1.0
-    if end != _RUNNING:
-        episodes_out.statistics[env, _EPISODES] += 1.0
-        episodes_out.statistics[env, _ENDS + end] += 1.0
-        episodes_out.statistics[env, _EPISODE_STEPS] += float(episodes_out.steps[env])
-        episodes_out.statistics[env, _EPISODE_REWARD] += episodes_out.total_reward[env]
+    outcome = episodes.outcome[env]
+    training_out.ended[env] = outcome
+    training_out.statistics[env, _STEPS] += 1.0
+    if outcome != _RUNNING:
+        training_out.statistics[env, _EPISODES] += 1.0
+        training_out.statistics[env, _OUTCOMES + outcome] += 1.0
+        training_out.statistics[env, _EPISODE_STEPS] += float(episodes.steps[env])
+        training_out.statistics[env, _EPISODE_REWARD] += rewards.total[env]
     if (overflow[env] & rules.overflow_mask) != 0:
-        episodes_out.statistics[env, _OVERFLOW] += 1.0
-    if end != _INVALID:
+        training_out.statistics[env, _OVERFLOW] += 1.0
+    if outcome != _INVALID:
         lin_vel = base_lin_vel_b(joint_q, joint_qd, base_com, env)
         ang_vel = base_ang_vel_b(joint_q, joint_qd, env)
-        error = wp.vec2(lin_vel[0] - episodes_out.command[env, 0], lin_vel[1] - episodes_out.command[env, 1])
-        episodes_out.statistics[env, _LIN_VEL_ERROR] += wp.length(error)
-        episodes_out.statistics[env, _YAW_RATE_ERROR] += wp.abs(ang_vel[2] - episodes_out.command[env, 2])
+        error = wp.vec2(lin_vel[0] - training_out.command[env, 0], lin_vel[1] - training_out.command[env, 1])
+        training_out.statistics[env, _LIN_VEL_ERROR] += wp.length(error)
+        training_out.statistics[env, _YAW_RATE_ERROR] += wp.abs(ang_vel[2] - training_out.command[env, 2])
 
 
 def record_steps(
-    joint_q: Any, joint_qd: Any, base_com: wp.vec3, overflow: Any, rules: Rules, episodes_out: Episodes
-) -> None:
-    """Add a judged and rewarded step to ``episodes_out.statistics`` and ``total_reward``.
+    joint_q: Any, joint_qd: Any, base_com: wp.vec3, overflow: Any, rules: Rules, episodes: Episodes, rewards: Rewards,
+    training_out: Training,
+) -> None:  # fmt: skip
+    """Note how a judged and rewarded step ended, and add it to the statistics.
 
     Args:
         joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
@@ -281,12 +158,140 @@ def record_steps(
         base_com: Mass centre of the base in its frame [m].
         overflow: Solver overflow bits of the last physics step, shape (num_envs,).
         rules: Which bits count.
-        episodes_out: Updated.
+        episodes: Outcomes and steps.
+        rewards: Totals.
+        training_out: Writes ``ended``; adds to ``statistics``.
     """
+    inputs = [joint_q, joint_qd, base_com, overflow, rules, episodes, rewards]
+    wp.launch(_record_steps_kernel, joint_q.shape[0], inputs, outputs=[training_out], device=joint_q.device)
+
+
+@wp.func
+def _random_stream(counter: int, stream: int, num_envs: int, env: int) -> wp.uint32:
+    # Observation noise takes the offsets from 0 up (kernels.observation); these lie below.
+    return wp.rand_init(counter, -1 - (stream * num_envs + env))
+
+
+@wp.func
+def next_level(level: int, walked: float, commanded_speed: float, drawn: int, rules: Rules) -> int:
+    """Terrain level after an episode: up if it walked far, down if it lagged behind; past the last, the drawn one."""
+    if walked > rules.promotion_distance:
+        return wp.where(level + 1 < rules.num_levels, level + 1, drawn)
+    if walked < commanded_speed * rules.demotion_time_s:
+        return wp.max(level - 1, 0)
+    return level
+
+
+@wp.kernel
+def _promote_episodes_kernel(
+    joint_q: wp.array2d[float], episodes: Episodes, rules: Rules, terrain_of_env_out: wp.array[int],
+    training_out: Training,
+):  # fmt: skip
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    outcome = episodes.outcome[env]
+    if outcome == _RUNNING:
+        return
+    level = training_out.level[env]
+    if outcome != _INVALID:
+        rng = _random_stream(training_out.counter[0], _STREAM_LEVEL, joint_q.shape[0], env)
+        drawn = wp.randi(rng, 0, rules.num_levels)
+        walked = wp.length(wp.vec2(joint_q[env, 0], joint_q[env, 1]) - episodes.start[env])
+        speed = wp.length(wp.vec2(training_out.command[env, 0], training_out.command[env, 1]))
+        level = next_level(level, walked, speed, drawn, rules)
+    training_out.level[env] = level
+    terrain_of_env_out[env] = level * rules.num_columns + training_out.column[env]
+
+
+def promote_episodes(
+    joint_q: Any, episodes: Episodes, rules: Rules, terrain_of_env_out: Any, training_out: Training
+) -> None:
+    """Move the ended episodes up or down the terrain levels by how far they came; an invalid one stays.
+
+    Args:
+        joint_q: Joint coordinates at the end, shape (num_envs, 7 + num_joints).
+        episodes: Outcomes and starts.
+        rules: Levels, columns and the distances that decide.
+        terrain_of_env_out: Tile of each environment, shape (num_envs,).
+        training_out: Updates ``level``.
+    """
+    inputs = [joint_q, episodes, rules]
     wp.launch(
-        _record_steps_kernel,
-        dim=joint_q.shape[0],
-        inputs=[joint_q, joint_qd, base_com, overflow, rules],
-        outputs=[episodes_out],
+        _promote_episodes_kernel,
+        joint_q.shape[0],
+        inputs,
+        outputs=[terrain_of_env_out, training_out],
         device=joint_q.device,
+    )
+
+
+@wp.kernel
+def _seed_restarts_kernel(training: Training, episodes_out: Episodes):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    num_envs = episodes_out.rng.shape[0]
+    episodes_out.rng[env] = _random_stream(training.counter[0], _STREAM_START, num_envs, env)
+
+
+def seed_restarts(training: Training, episodes_out: Episodes) -> None:
+    """Let the starts of this control step be drawn from its counter; writes ``rng``."""
+    rng = episodes_out.rng
+    wp.launch(_seed_restarts_kernel, rng.shape[0], inputs=[training], outputs=[episodes_out], device=rng.device)
+
+
+@wp.func
+def _draw_command(rng: wp.uint32, rules: Rules, env: int, training_out: Training):
+    vx = wp.randf(rng, rules.lin_vel_x[0], rules.lin_vel_x[1])
+    vy = wp.randf(rng, rules.lin_vel_y[0], rules.lin_vel_y[1])
+    training_out.heading[env] = wp.randf(rng, -wp.pi, wp.pi)
+    moving = wp.where(wp.length(wp.vec2(vx, vy)) > rules.min_speed, 1.0, 0.0)
+    training_out.command[env, 0] = moving * vx
+    training_out.command[env, 1] = moving * vy
+
+
+@wp.kernel
+def _command_episodes_kernel(
+    joint_q: wp.array2d[float], episodes: Episodes, rules: Rules, task: Task, joint_qd_out: wp.array2d[float],
+    training_out: Training,
+):  # fmt: skip
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    counter = training_out.counter[0]
+    num_envs = joint_q.shape[0]
+    if rules.crosses == 1:
+        command = goal_command(wp.vec2(joint_q[env, 0], joint_q[env, 1]), base_yaw(joint_q, env), task)
+        for k in range(3):
+            training_out.command[env, k] = command[k]
+    else:
+        if episodes.steps[env] % rules.command_steps == 0:
+            _draw_command(_random_stream(counter, _STREAM_COMMAND, num_envs, env), rules, env, training_out)
+        error = wrap_angle(training_out.heading[env] - base_yaw(joint_q, env))
+        training_out.command[env, 2] = wp.clamp(task.yaw_gain * error, -task.max_yaw_rate, task.max_yaw_rate)
+    if rules.push_steps == 0:
+        return
+    if (counter + env * _PUSH_STAGGER) % rules.push_steps == 0:
+        rng = _random_stream(counter, _STREAM_PUSH, num_envs, env)
+        joint_qd_out[env, 0] = wp.randf(rng, -rules.push_speed, rules.push_speed)
+        joint_qd_out[env, 1] = wp.randf(rng, -rules.push_speed, rules.push_speed)
+
+
+def command_episodes(
+    joint_q: Any, episodes: Episodes, rules: Rules, task: Task, joint_qd_out: Any, training_out: Training
+) -> None:
+    """Tell every robot what to do next, and push where that is due.
+
+    Where robots cross, the command is to go to the goal; else a new one is drawn where it is due (at the start too),
+    and headings become yaw rates.
+
+    Args:
+        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
+        episodes: Steps.
+        rules: Ranges and intervals.
+        task: Goal, and how headings become yaw rates.
+        joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints); a push overwrites vx and vy.
+        training_out: Updates ``heading`` and ``command``.
+    """
+    inputs = [joint_q, episodes, rules, task]
+    wp.launch(
+        _command_episodes_kernel, joint_q.shape[0], inputs, outputs=[joint_qd_out, training_out], device=joint_q.device
     )

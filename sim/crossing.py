@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from kernels.episode import EpisodeState
-from kernels.goal import Task
-from kernels.start import StartRanges
+from kernels.episode import Task
+from kernels.restart import StartRanges
 from sim.robots.robot import RobotCfg
 
 
@@ -35,26 +34,22 @@ class CrossingCfg:
     poll_every_s: float = 1.0
     """How often the host asks whether any episode still runs, in simulated time."""
     reward: bool = False
-    """Sum the robot's training reward too. For its sake alone a robot that reached the goal is told to stand and goes
-    on until the time is over or it ends otherwise; else robots stop at the goal."""
+    """Sum the robot's training reward too. A robot that reached the goal is then told to stand, and goes on until its
+    time is over or it ends otherwise; without it, robots stop at the goal."""
 
 
-def make_task(cfg: CrossingCfg, robot: RobotCfg) -> Task:
-    """The goal, command and ends of a crossing as a kernel argument."""
-    from sim.simulation import CAPACITY_OVERFLOWS  # which imports Newton: who only shows a crossing waits for nothing
+def make_task(cfg: CrossingCfg, robot: RobotCfg, *, to_goal: bool = True) -> Task:
+    """The goal, command and ends of a crossing as a kernel argument; without ``to_goal`` the goal ends none."""
+    from sim.simulation import CAPACITY_OVERFLOWS  # imports Newton, which the settings alone do not need
 
     task = Task()
-    task.goal = wp.vec2(*cfg.goal)
-    task.goal_radius = cfg.goal_radius
-    task.speed = cfg.speed
-    task.yaw_gain = cfg.yaw_gain
-    task.max_yaw_rate = cfg.max_yaw_rate
-    task.lower = wp.vec2(*cfg.lower)
-    task.upper = wp.vec2(*cfg.upper)
+    for name in ("goal", "speed", "yaw_gain", "max_yaw_rate", "lower", "upper", "base_force"):
+        setattr(task, name, getattr(cfg, name))
+    task.goal_radius = cfg.goal_radius if to_goal else 0.0  # nobody is nearer than that
     task.max_steps = round(cfg.max_duration_s / robot.physics_dt)
     task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
-    task.base_force = cfg.base_force
     task.max_speed = robot.max_speed
+    task.max_gravity_z = 2.0  # above that of any robot: tilt ends no crossing
     task.overflow_mask = CAPACITY_OVERFLOWS
     return task
 
@@ -70,13 +65,3 @@ def make_start_ranges(cfg: CrossingCfg, robot: RobotCfg) -> StartRanges:
     ranges.base_height = robot.default_base_height
     ranges.footprint = wp.vec2(*robot.footprint)
     return ranges
-
-
-def make_episode_state(num_envs: int) -> EpisodeState:
-    """Episodes on the current device that have not begun."""
-    episode = EpisodeState()
-    for field in ("outcome", "steps", "counted"):
-        setattr(episode, field, wp.zeros(num_envs, dtype=int))
-    episode.final_pose = wp.zeros(num_envs, dtype=wp.transform)
-    episode.num_running = wp.zeros(1, dtype=int)
-    return episode

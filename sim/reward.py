@@ -1,96 +1,101 @@
-"""The reward of a crossing: that of the robot's training, summed over the whole time, whatever the crossing came to."""
+"""The reward of a robot's training: what a simulation's control steps pay, in training and in a crossing alike."""
 
+from collections.abc import Collection
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from kernels.episode import EpisodeState, latch_outcomes
-from kernels.goal import Task
-from kernels.paid_steps import add_paid, make_paid_steps, mark_paid, start_paying
-from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
-from sim.crossing import make_episode_state
-from sim.motion import make_motion
+from kernels.episode import Outcome
+from kernels.rewards import Motion, make_rewards, make_weights, reward_steps
+from sim.robots.training import TrainingCfg
 from sim.simulation import Simulation
 
 
-class RewardSum:
-    """Sums the training reward of every robot from its start to the end of its time.
+def soft_joint_limits(sim: Simulation, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper soft limits of the joints [rad], float32, shape (num_joints,) each.
 
-    Beside the crossing it keeps a second set of episodes, the same but without a goal: base collision, leaving the
-    world, an invalid state or the time end them. A base collision is a fall; tilt, which ends an episode of the
-    training, ends none here.
+    Args:
+        sim: The robots.
+        share: Part of each joint's range that they span, about its middle; where there is none, they are far away.
+    """
+    joints = slice(6, 6 + sim.robot.num_joints)
+    lower, upper = (
+        np.asarray(limits.numpy(), dtype=np.float64)[joints]
+        for limits in (sim.model.joint_limit_lower, sim.model.joint_limit_upper)
+    )
+    middle, half = 0.5 * (lower + upper), 0.5 * share * (upper - lower)
+    return (middle - half).astype(np.float32), (middle + half).astype(np.float32)
+
+
+def make_motion(sim: Simulation, cfg: TrainingCfg, *, command: Any, action: Any) -> Motion:
+    """What rewards are computed from, as a kernel argument on the simulation's device.
+
+    Args:
+        sim: The robots; their state is referred to, not copied.
+        cfg: Which joints are to keep still, how soft their limits are, and how long feet are to be in the air.
+        command: Command the action answers, shape (num_envs, 3).
+        action: Clipped action of the step, shape (num_envs, num_joints).
+
+    Raises:
+        ValueError: If a steady joint is none of the robot's.
+    """
+    robot = sim.robot
+    unknown = [name for name in cfg.steady_joints if name not in robot.joint_names]
+    if unknown:
+        raise ValueError(
+            f"steady_joints: robot '{robot.name}' has no joint named {', '.join(unknown)}: expected some of "
+            f"{', '.join(robot.joint_names)}"
+        )
+    motion = Motion()
+    for name in ("joint_q", "joint_qd", "joint_torque", "geom_force", "geom_role"):
+        setattr(motion, name, getattr(sim, name))
+    motion.command, motion.action = command, action
+    motion.base_com = sim.sensors.base_com
+    motion.default_joint_pos = sim.sensors.default_joint_pos
+    motion.force_limit = robot.contact_force_limit
+    motion.dt = robot.control_dt
+    motion.min_air_time_s = cfg.min_air_time_s
+    lower, upper = soft_joint_limits(sim, cfg.soft_joint_limit)
+    motion.joint_lower = wp.array(lower, dtype=float, device=sim.device)
+    motion.joint_upper = wp.array(upper, dtype=float, device=sim.device)
+    steady = [int(name in cfg.steady_joints) for name in robot.joint_names]
+    motion.joint_is_steady = wp.array(steady, dtype=int, device=sim.device)
+    return motion
+
+
+class Reward:
+    """Pays every control step of every robot.
 
     Attributes:
-        episode: The episodes without a goal; while one runs, its robot must be stepped.
+        state: Rewards so far (:class:`kernels.rewards.Rewards`).
     """
 
-    def __init__(self, sim: Simulation, task: Task, *, command: Any, action: Any) -> None:
-        """Allocate on the current device.
+    def __init__(
+        self, sim: Simulation, cfg: TrainingCfg, *, command: Any, action: Any, falls: Collection[Outcome]
+    ) -> None:
+        """Allocate on the simulation's device.
 
         Args:
             sim: The robots.
-            task: Limits of the crossing; its goal is taken out.
+            cfg: What is paid.
             command: Command the action answers, shape (num_envs, 3).
             action: Clipped action of the step, shape (num_envs, num_joints).
+            falls: Outcomes that cost what a fall does.
 
         Raises:
-            ValueError: If the robot's training settings do not fit it.
+            ValueError: If the settings do not fit the robot.
         """
-        robot, training = sim.robot, sim.robot.training
-        self.episode: EpisodeState = make_episode_state(sim.num_envs)
-        self._only_positive, self._sim, self._action = training.only_positive, sim, action
-        self._task = task
-        self._task.goal_radius = 0.0  # nobody is nearer than that
-        self._weights = RewardWeights()
-        for name, weight in asdict(training.rewards).items():
-            setattr(self._weights, name, weight)
-        geoms = len(robot.geom_names)
-        self._feet = make_feet(sim.num_envs, geoms, sim.device, min_air_time_s=training.min_air_time_s)
-        self._paid = make_paid_steps(sim.num_envs, robot.num_joints)
-        self._terms = wp.zeros((sim.num_envs, len(REWARDS)), dtype=float)
-        self._motion = make_motion(
-            sim,
-            training,
-            command=command,
-            action=action,
-            previous_action=self._paid.previous_action,
-            previous_joint_vel=self._paid.previous_joint_vel,
-            fallen=self._paid.fallen,
-        )
+        robot = sim.robot
+        self._motion = make_motion(sim, cfg, command=command, action=action)
+        self._weights = make_weights(asdict(cfg.rewards), only_positive=cfg.only_positive, falls=falls)
+        self.state = make_rewards(sim.num_envs, robot.num_joints, len(robot.geom_names), sim.device)
 
-    def start(self) -> None:
-        """Begin again, with robots that were just put down."""
-        self.episode.outcome.zero_()
-        self.episode.steps.zero_()
-        self.episode.num_running.fill_(self._sim.num_envs)
-        self._feet.air_time.zero_()
-        self._feet.touched.zero_()
-        start_paying(self._sim.joint_qd, self._paid)
+    def pay(self, outcome: Any) -> None:
+        """Reward the control step just made, before the next command is written.
 
-    def latch(self) -> None:
-        """Judge the episodes after a physics step."""
-        sim = self._sim
-        latch_outcomes(
-            sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, sim.overflow, sim.contact_count,
-            sim.contact_capacity, self._task, self.episode,
-        )  # fmt: skip
-
-    def add(self) -> None:
-        """Reward the control step just made, before the next command is written."""
-        mark_paid(self.episode.outcome, self._paid)
-        reward_steps(
-            self._motion,
-            self._weights,
-            only_positive=self._only_positive,
-            valid=self._paid.valid,
-            feet_out=self._feet,
-            reward_out=self._paid.reward,
-            terms_out=self._terms,
-        )
-        add_paid(self._action, self._sim.joint_qd, self._paid)
-
-    def total(self) -> np.ndarray:
-        """Reward of each episode so far, float64, shape (num_envs,)."""
-        return self._paid.total.numpy().astype(np.float64)
+        Args:
+            outcome: :class:`kernels.episode.Outcome` after it, shape (num_envs,).
+        """
+        reward_steps(self._motion, self._weights, outcome, self.state)

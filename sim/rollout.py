@@ -2,27 +2,86 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from kernels.episode import Outcome, command_goal, latch_outcomes, park_ended, start_episodes
+from kernels.episode import Outcome, begin_all, command_goal, end_all, latch_outcomes, make_episodes, park_ended
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
+from kernels.restart import restart_episodes, seed_starts
+from kernels.rewards import Rewards, remember_steps
 from sim.bank import TerrainBank
-from sim.crossing import CrossingCfg, make_episode_state, make_start_ranges, make_task
+from sim.crossing import CrossingCfg, make_start_ranges, make_task
 from sim.policy.loaders import PolicySpec, load_policy, prepare_torch
 from sim.policy.runner import PolicyRunner
-from sim.reward import RewardSum
+from sim.reward import Reward
 from sim.robots.robot import RobotCfg
-from sim.rollout_result import RolloutResult, RolloutState
 from sim.simulation import Simulation, SolverCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
 
-__all__ = ["Rollout", "RolloutResult", "evaluate"]
-
 _FALLEN_TILT_DEG = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutResult:
+    """What came of every episode; arrays lead with (num_terrains, num_replicas)."""
+
+    penalties: np.ndarray
+    """Raw penalty sums times the physics step, unscaled; (T, R, P) float64, NaN where invalid."""
+    penalty_names: tuple[str, ...]
+    outcome: np.ndarray
+    """:class:`kernels.episode.Outcome` of each episode, uint8."""
+    fallen: np.ndarray
+    """Tilt above 60 degrees at the end, bool."""
+    duration_s: np.ndarray
+    """Simulated time up to the end [s], float32."""
+    final_position: np.ndarray
+    """Base position at the end, world-local [m], (T, R, 3) float32."""
+    physics_steps: int
+    """Physics steps run until the last episode ended."""
+    wall_s: float
+    paths: np.ndarray | None = None
+    """Base position at every control step [m], NaN after the end; (T, R, steps, 3) float32, or None."""
+    reward: np.ndarray | None = None
+    """Training reward summed to the end of the time, (T, R) float64, NaN where invalid; None unless asked for."""
+
+    @property
+    def base_collision(self) -> np.ndarray:
+        """Ended by base collision, bool."""
+        return self.outcome == Outcome.BASE_COLLISION
+
+    @property
+    def reached_goal(self) -> np.ndarray:
+        """Ended at the goal, bool."""
+        return self.outcome == Outcome.GOAL
+
+    @property
+    def invalid(self) -> np.ndarray:
+        """Non-finite, too fast or overflowed, bool."""
+        return self.outcome == Outcome.INVALID
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutState:
+    """Device arrays (Warp) of a rollout between two control steps, not copied; one row an environment."""
+
+    joint_q: Any
+    """Joint coordinates, shape (num_envs, 7 + num_joints)."""
+    geom_force: Any
+    """Contact force on each geom of ``robot.geom_names`` in the last physics step, world frame [N], vectors of shape
+    (num_envs, num_geoms)."""
+    penalty_sums: Any
+    """Columns :data:`kernels.penalties.PENALTIES`, times the physics step, shape (num_envs, 6)."""
+    command: Any
+    """Command of the coming control step, zero once an episode has ended, shape (num_envs, 3)."""
+    outcome: Any
+    """:class:`kernels.episode.Outcome`, shape (num_envs,)."""
+    steps: Any
+    """Physics steps up to the end, shape (num_envs,)."""
 
 
 class Rollout:
@@ -75,44 +134,54 @@ class Rollout:
 
     def _allocate(self) -> None:
         num_envs, robot = self.sim.num_envs, self.robot
-        self._task = make_task(self.cfg, robot)
         self._ranges = make_start_ranges(self.cfg, robot)
         self._command = wp.zeros((num_envs, 3), dtype=float)
         self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
         self._last_action = wp.zeros_like(self._action)
         self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
-        self._noise_seed = wp.zeros(1, dtype=int)
+        self._counter = wp.zeros(1, dtype=int)
         self._sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
         self._everyone = wp.ones(num_envs, dtype=int)
         self._seeds = wp.zeros(self.num_terrains, dtype=wp.uint32)
-        self._episode = self._stepped = make_episode_state(num_envs)
-        self._reward: RewardSum | None = None
+        self._task = make_task(self.cfg, robot)
+        self._episode = self._stepped = make_episodes(num_envs)
+        self._latches = [(self._task, self._episode)]
+        self._reward: Reward | None = None
         if self.cfg.reward:
-            task = make_task(self.cfg, robot)
-            self._reward = RewardSum(self.sim, task, command=self._command, action=self._last_action)
-            self._stepped = self._reward.episode  # goes on when a crossing has ended at the goal
+            # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them runs,
+            # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
+            io = {"command": self._command, "action": self._last_action}
+            self._reward = Reward(self.sim, robot.training, falls=(Outcome.BASE_COLLISION,), **io)
+            self._stepped = make_episodes(num_envs)
+            self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
+        self._rewards = Rewards() if self._reward is None else self._reward.state
 
     def _start(self, seeds: np.ndarray) -> None:
+        sim = self.sim
         self._seeds.assign(seeds)
-        start_episodes(
-            self._seeds, self.sim.terrain_of_env, self.num_replicas, self.sim.bank.terrain, self._ranges,
-            self.sim.sensors.base_com, self.sim.sensors.default_joint_pos, self.sim.joint_q, self.sim.joint_qd,
-            self._episode,
+        begin_all(self._stepped)
+        end_all(self._episode)
+        seed_starts(self._seeds, sim.terrain_of_env, self.num_replicas, self._episode)
+        restart_episodes(
+            sim.terrain_of_env, sim.bank.terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,
+            self._last_action, self._episode, self._rewards,
         )  # fmt: skip
-        self.sim.clear_solver(self._everyone)
+        self._remember()
+        sim.clear_solver(self._everyone)
         self._sums.zero_()
-        self._last_action.zero_()
-        if self._reward is not None:
-            self._reward.start()
-        self.sim.refresh()
+        sim.refresh()
         self._observe()
 
     def _observe(self) -> None:
         command_goal(self.sim.joint_q, self._episode.outcome, self._task, self._command)
         write_observation(
             self.sim.joint_q, self.sim.joint_qd, self._command, self._last_action, self.sim.terrain_of_env,
-            self.sim.bank.terrain, self.sim.sensors, Noise(), self._noise_seed, self._observation,
+            self.sim.bank.terrain, self.sim.sensors, Noise(), self._counter, self._observation,
         )  # fmt: skip
+
+    def _remember(self) -> None:
+        if self._reward is not None:
+            remember_steps(self._last_action, self.sim.joint_qd, self._rewards, self._counter)
 
     def _launch_control_step(self) -> None:
         sim, robot = self.sim, self.robot
@@ -124,18 +193,18 @@ class Rollout:
         for _ in range(robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()
-            latch_outcomes(
-                sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, sim.overflow, sim.contact_count,
-                sim.contact_capacity, self._task, self._episode,
-            )  # fmt: skip
-            if self._reward is not None:
-                self._reward.latch()
+            for task, episode in self._latches:
+                latch_outcomes(
+                    sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, sim.overflow, sim.contact_count,
+                    sim.contact_capacity, task, episode,
+                )  # fmt: skip
             add_penalties(
                 sim.joint_q, sim.joint_qd, sim.sensors.base_com, self._command, sim.geom_force, sim.geom_role,
                 robot.contact_force_limit, robot.physics_dt, self._episode.counted, self._sums,
             )  # fmt: skip
         if self._reward is not None:
-            self._reward.add()
+            self._reward.pay(self._stepped.outcome)
+        self._remember()
         self._observe()
 
     def evaluate(
@@ -177,15 +246,12 @@ class Rollout:
 
     @property
     def state(self) -> RolloutState:
-        """What the rollout stands at, on the device."""
+        """The rollout's present state, on the device."""
+        sim, episode = self.sim, self._episode
         return RolloutState(
-            joint_q=self.sim.joint_q,
-            geom_force=self.sim.geom_force,
-            penalty_sums=self._sums,
-            command=self._command,
-            outcome=self._episode.outcome,
-            steps=self._episode.steps,
-        )
+            joint_q=sim.joint_q, geom_force=sim.geom_force, penalty_sums=self._sums, command=self._command,
+            outcome=episode.outcome, steps=episode.steps,
+        )  # fmt: skip
 
     def begin(self, terrains: np.ndarray, seeds: np.ndarray) -> None:
         """Set the terrains and put every robot at its start; arguments and errors as of :meth:`evaluate`."""
@@ -225,8 +291,9 @@ class Rollout:
         columns = [PENALTIES.index(name) for name in self.robot.penalties]
         penalties = self._sums.numpy().astype(np.float64)[:, columns].reshape(*shape, len(columns))
         penalties[outcome == Outcome.INVALID] = np.nan
-        reward = None if self._reward is None else self._reward.total().reshape(shape)
-        if reward is not None:
+        reward = None
+        if self._reward is not None:
+            reward = self._rewards.total.numpy().astype(np.float64).reshape(shape)
             reward[outcome == Outcome.INVALID] = np.nan
         with np.errstate(invalid="ignore"):
             upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)

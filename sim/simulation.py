@@ -11,7 +11,7 @@ import warp as wp
 from kernels.contact import ContactBuffer, Layout, collide_strips
 from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
-from kernels.reset import clear_rows
+from kernels.restart import clear_rows
 from sim.bank import TerrainBank
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import make_probes
@@ -20,7 +20,7 @@ from sim.robots.robot import RobotCfg
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
 CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
-"""mujoco_warp's overflow bits but those of its two iteration caps, reaching which is no fault."""
+"""mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +219,7 @@ class Simulation:
         self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
 
     def refresh(self) -> None:
-        """Recompute body poses from the joint coordinates; due after anyone but the solver wrote them."""
+        """Recompute body poses from the joint coordinates; call it after anything but the solver wrote them."""
         state: Any = self._state
         newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
 
@@ -242,8 +242,8 @@ class Simulation:
     def clear_solver(self, mask: Any) -> None:
         """Forget the solver's memory in the environments where ``mask`` (num_envs,) is not 0: warm start and Jacobian.
 
-        The solver multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that once was not
-        finite would stay so for ever, whatever state it is reset to.
+        The solver multiplies whole tiles of the constraint Jacobian, unused rows by zero. A world that was once not
+        finite would stay so, whatever state it is reset to.
         """
         data = self.solver.mjw_data
         clear_rows(mask, data.qacc_warmstart)

@@ -137,7 +137,7 @@ def numbers_of(result: "RolloutResult") -> dict[str, Any]:
         "episodes": len(valid),
         "invalid_episodes": int((~valid).sum()),
         "rates": {name: _rate(int((hit & valid).sum()), int(valid.sum())) for name, hit in flags.items()},
-        "outcomes": {o.name.lower(): int((result.outcome[0] == o).sum()) for o in Outcome if o != Outcome.RUNNING},
+        "outcomes": {o.name.lower(): int((result.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT},
         "duration_s": float(result.duration_s[0, valid].mean()) if valid.any() else None,
         "penalties": {
             name: {"mean": float(column.mean()), "std": float(column.std()), "unit": PENALTY_UNITS.get(name, "")}

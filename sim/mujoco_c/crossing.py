@@ -18,9 +18,11 @@ import warp as wp
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from kernels.episode import EpisodeState, Outcome, start_episodes
-from kernels.observation import ACTION_LIMIT
+from kernels.episode import Outcome, end_all, make_episodes
+from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import BASE, PENALTIES
+from kernels.restart import restart_episodes, seed_starts
+from kernels.rewards import Rewards
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
 from sim.mujoco_c.model import Array, crossing_model, goal_commands, observations, step_penalties
@@ -96,16 +98,14 @@ def draw_starts(
     with wp.ScopedDevice(device):
         joint_q = wp.zeros((count, 7 + robot.num_joints), dtype=float)
         joint_qd = wp.zeros((count, 6 + robot.num_joints), dtype=float)
-        episode = EpisodeState()
-        for field in ("outcome", "steps", "counted"):
-            setattr(episode, field, wp.zeros(count, dtype=int))
-        episode.final_pose = wp.zeros(count, dtype=wp.transform)
-        episode.num_running = wp.zeros(1, dtype=int)
-        base_com = wp.vec3(*builder.body_com[0])
-        start_episodes(
-            wp.array([seed], dtype=wp.uint32), wp.zeros(count, dtype=int), count, bank.terrain,
-            make_start_ranges(cfg or CrossingCfg(), robot), base_com,
-            wp.array(robot.default_joint_pos, dtype=float), joint_q, joint_qd, episode,
+        episodes, terrain_of_env, sensors = make_episodes(count), wp.zeros(count, dtype=int), Sensors()
+        sensors.base_com = base_com = wp.vec3(*builder.body_com[0])
+        sensors.default_joint_pos = wp.array(robot.default_joint_pos, dtype=float)
+        end_all(episodes)
+        seed_starts(wp.array([seed], dtype=wp.uint32), terrain_of_env, count, episodes)
+        restart_episodes(
+            terrain_of_env, bank.terrain, make_start_ranges(cfg or CrossingCfg(), robot), sensors, joint_q, joint_qd,
+            wp.zeros((count, robot.num_joints), dtype=float), episodes, Rewards(),
         )  # fmt: skip
     return to_mujoco(joint_q.numpy(), joint_qd.numpy(), np.array(base_com))
 

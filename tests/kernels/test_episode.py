@@ -1,47 +1,46 @@
-"""A crossing's start, goal command and latch: oracle, properties, hand-computed numbers."""
+"""An episode's command and the latch that ends it: oracle, properties, hand-computed numbers."""
 
 import numpy as np
-import pytest
 import warp as wp
 
 from kernels.episode import (
     PARKING_HEIGHT,
-    EpisodeState,
     Outcome,
+    begin_all,
     command_goal,
     latch_outcomes,
+    make_episodes,
+    note_base_forces,
     park_ended,
-    start_episodes,
 )
 from kernels.penalties import BASE, FOOT, LIMB
 from sim.bench import oracle
-from sim.crossing import CrossingCfg, make_start_ranges, make_task
+from sim.crossing import CrossingCfg, make_task
 from tests.kernels.states import random_states, upright
-from tests.kernels.test_heightfield import make_terrain, rough
 
 ROLES = [LIMB, BASE, FOOT, BASE]
-BASE_COM = (-0.02, 0.01, 0.03)
 MAX_STEPS = 4000
 GOAL = (14.0, 4.0)
 
 
 def make_state(num_envs, device, outcome=0, steps=0):
-    state = EpisodeState()
-    state.outcome = wp.array(np.broadcast_to(outcome, num_envs), dtype=int, device=device)
-    state.steps = wp.array(np.broadcast_to(steps, num_envs), dtype=int, device=device)
-    state.counted = wp.full(num_envs, 9, dtype=int, device=device)
-    state.final_pose = wp.zeros(num_envs, dtype=wp.transform, device=device)
-    running = np.count_nonzero(np.broadcast_to(outcome, num_envs) == Outcome.RUNNING)
-    state.num_running = wp.array([running], dtype=int, device=device)
+    state = make_episodes(num_envs, device)
+    state.outcome.assign(np.broadcast_to(np.int32(outcome), num_envs))
+    state.steps.assign(np.broadcast_to(np.int32(steps), num_envs))
+    state.counted.fill_(9)
+    state.num_running.fill_(int(np.count_nonzero(np.broadcast_to(outcome, num_envs) == Outcome.RUNNING)))
     return state
 
 
-def latch(states, device, anymal, state, *, force=0.0, overflow=0, contacts=(0, 10), cfg=None):
+def latch(states, device, anymal, state, *, force=0.0, overflow=0, contacts=(0, 10), cfg=None, **limits):
     """One judged step; ``force`` [N] acts on the second base geom of every environment."""
     num_envs = len(states[0])
     forces = np.zeros((num_envs, len(ROLES), 3))
     forces[:, 0] = forces[:, 2] = 500.0  # limbs and feet may touch as they like
     forces[:, 3, 1] = force
+    task = make_task(cfg or CrossingCfg(), anymal)
+    for name, value in limits.items():
+        setattr(task, name, value)
     latch_outcomes(
         *(wp.array(np.float32(array), device=device) for array in states),
         wp.array(np.float32(forces), dtype=wp.vec3, device=device),
@@ -49,7 +48,7 @@ def latch(states, device, anymal, state, *, force=0.0, overflow=0, contacts=(0, 
         wp.array(np.broadcast_to(overflow, num_envs), dtype=int, device=device),
         wp.array([contacts[0]], dtype=int, device=device),
         contacts[1],
-        make_task(cfg or CrossingCfg(), anymal),
+        task,
         state,
     )
     return [Outcome(k) for k in state.outcome.numpy()]
@@ -68,7 +67,7 @@ def test_latch_parity_with_the_oracle(device, anymal):
     got = latch((q, qd), device, anymal, make_state(num_envs, device, steps=steps), force=force, overflow=overflow)
     expected = [oracle.outcome(*row, MAX_STEPS) for row in zip(q, qd, force, overflow, steps + 1, strict=True)]
     assert [outcome.name for outcome in got] == expected
-    assert {outcome.name for outcome in got} == {outcome.name for outcome in Outcome}
+    assert {outcome.name for outcome in got} == {outcome.name for outcome in Outcome if outcome != Outcome.TILT}
 
 
 def test_an_ended_episode_stays_ended(device, anymal):
@@ -135,6 +134,59 @@ def test_penalties_may_count_from_a_later_step(device, anymal):
     assert counted == [0, 0, 0, 0, 1, 1]
 
 
+def tilted(*degrees):
+    q, qd = upright(len(degrees), 3)
+    half = np.deg2rad(degrees) / 2
+    q[:, 3], q[:, 6] = np.sin(half), np.cos(half)
+    return q, qd
+
+
+def test_tilt_ends_an_episode_where_it_is_told_to(device, anymal):
+    # The projected gravity's z is -cos(tilt): -0.1 at 84.3 degrees.
+    states = tilted(84.0, 84.6, 180.0)
+    found = latch(states, device, anymal, make_state(3, device), max_gravity_z=-0.1)
+    assert found == [Outcome.RUNNING, Outcome.TILT, Outcome.TILT]
+    assert latch(states, device, anymal, make_state(3, device)) == [Outcome.RUNNING] * 3  # no crossing does
+
+
+def test_the_gravest_end_wins(device, anymal):
+    def found(**changes):
+        q, qd = tilted(180.0)
+        q[0, 0] = 14.0
+        state = make_state(1, device, steps=MAX_STEPS - 1)
+        return latch((q, qd), device, anymal, state, **{"max_gravity_z": -0.1, **changes})
+
+    assert found() == [Outcome.TILT]
+    assert found(max_gravity_z=2.0) == [Outcome.GOAL]
+    assert found(force=5.0) == [Outcome.BASE_COLLISION]
+    assert found(force=5.0, overflow=4) == [Outcome.INVALID]
+
+
+def test_without_a_goal_and_borders_neither_ends_an_episode(device, anymal):
+    endless = {"goal_radius": 0.0, "lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
+    q, qd = upright(3, 3)
+    q[:, 0] = 14.0, -1e6, 1e6
+    q[0, 1] = 4.0
+    assert latch((q, qd), device, anymal, make_state(3, device), **endless) == [Outcome.RUNNING] * 3
+    ended = [Outcome.GOAL, Outcome.OUT, Outcome.OUT]
+    assert latch((q, qd), device, anymal, make_state(3, device)) == ended
+
+
+def test_a_touch_noted_between_ends_the_episode_and_is_then_forgotten(device, anymal):
+    state, roles = make_state(2, device), wp.array(ROLES, dtype=int, device=device)
+    still, touched = np.zeros((2, 4, 3), np.float32), np.zeros((2, 4, 3), np.float32)
+    touched[1, 1, 2] = 40.0  # on the base
+    touched[0, 2, 2] = 500.0  # on a foot
+    for force in (touched, still):
+        note_base_forces(wp.array(force, dtype=wp.vec3, device=device), roles, state)
+    assert state.base_force.numpy().tolist() == [0.0, 40.0]
+    assert latch(upright(2, 3), device, anymal, state) == [Outcome.RUNNING, Outcome.BASE_COLLISION]
+    assert state.base_force.numpy().tolist() == [0.0, 0.0]
+    begin_all(state)
+    assert latch(upright(2, 3), device, anymal, state) == [Outcome.RUNNING] * 2
+    assert state.steps.numpy().tolist() == [1, 1] and state.num_running.numpy()[0] == 2
+
+
 def command(states, device, anymal, outcome=0):
     num_envs = len(states[0])
     out = wp.zeros((num_envs, 3), dtype=float, device=device)
@@ -159,89 +211,3 @@ def test_command_by_hand(device, anymal):
     got = command((q, qd), device, anymal, outcome=[0, 0, 0, Outcome.TIME_OUT])
     np.testing.assert_allclose(got[[0, 1, 3]], [[0.75, 0, 0], [0, 0.75, 0.785398], [0, 0, 0]], atol=1e-5)
     np.testing.assert_allclose([got[2, 0], abs(got[2, 2])], [-0.75, 1], atol=1e-5)
-
-
-def start(seeds, replicas, grids, device, anymal, terrain_of_env=None):
-    num_envs = len(seeds) * replicas
-    joints = np.float32(anymal.default_joint_pos)
-    q = wp.zeros((num_envs, 19), dtype=float, device=device)
-    qd = wp.zeros((num_envs, 18), dtype=float, device=device)
-    state = make_state(num_envs, device, outcome=Outcome.GOAL, steps=77)
-    if terrain_of_env is None:
-        terrain_of_env = np.repeat(np.arange(len(seeds)), replicas)
-    start_episodes(
-        wp.array(np.uint32(seeds), device=device),
-        wp.array(terrain_of_env, dtype=int, device=device),
-        replicas,
-        make_terrain(grids, device),
-        make_start_ranges(CrossingCfg(), anymal),
-        wp.vec3(*BASE_COM),
-        wp.array(joints, device=device),
-        q,
-        qd,
-        state,
-    )
-    return q.numpy(), qd.numpy(), state
-
-
-def test_starts_fill_their_ranges(device, anymal):
-    q, qd, state = start(range(40), 20, np.zeros((40, 161, 321)), device, anymal)
-    default = np.array(anymal.default_joint_pos)
-    moving = default != 0
-    com_arm = np.array([oracle.rotation_matrix(row[3:7]) @ BASE_COM for row in q])
-    origin_velocity = qd[:, :3] - np.cross(qd[:, 3:6], com_arm)
-    columns = {  # drawn quantity, middle, half width (definitions: a crossing)
-        "x": (q[:, :1], 2, 0.1),
-        "y": (q[:, 1:2], 4, 0.1),
-        "yaw": (np.array([[oracle.yaw_of(row[3:7])] for row in q]), 0, 0.2),
-        "joints": (q[:, 7:][:, moving] / default[moving], 1, 0.2),
-        "velocity": (origin_velocity, 0, 0.2),
-        "angular velocity": (qd[:, 3:6], 0, 0.2),
-    }
-    for name, (drawn, middle, half) in columns.items():
-        off = (drawn - middle) / half
-        assert np.abs(off).max() < 1 + 1e-4, name
-        assert off.max(axis=0).min() > 0.97, name  # 800 draws all below 0.97: chance 5e-6
-        assert off.min(axis=0).max() < -0.97, name
-        # The mean of 800 uniform draws is 0 +- 0.02; the draws of one column tell nothing of the next.
-        assert np.abs(off.mean(axis=0)).max() < 0.1, name
-    drawn = np.column_stack([values for values, _, _ in columns.values()])
-    assert np.abs(np.corrcoef(drawn.T) - np.eye(drawn.shape[1])).max() < 0.2
-    assert not q[:, 7:][:, ~moving].any()
-    assert not qd[:, 6:].any()
-    np.testing.assert_allclose(np.linalg.norm(q[:, 3:7], axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(q[:, 2], anymal.default_base_height, atol=1e-6)
-    assert (state.outcome.numpy() == Outcome.RUNNING).all()
-    assert not state.steps.numpy().any()
-    assert state.num_running.numpy()[0] == 800
-
-
-def test_the_start_stands_on_the_highest_ground_under_the_robot(device, anymal):
-    grids = np.stack([rough(161, 321, 0.3, seed=k) for k in range(2)])
-    q, _, _ = start([1, 2], 8, grids, device, anymal)
-    for env, row in enumerate(np.float64(q)):
-        half = np.array(anymal.footprint)
-        low, high = np.floor((row[:2] - half) / 0.05).astype(int), np.ceil((row[:2] + half) / 0.05).astype(int)
-        ground = grids[env // 8, low[1] : high[1] + 1, low[0] : high[0] + 1].max()
-        assert row[2] == pytest.approx(ground + anymal.default_base_height, abs=1e-6)
-
-
-def test_a_start_depends_on_its_seed_and_replica_alone(device, anymal):
-    grids = np.stack([rough(161, 321, 0.3, seed=k) for k in range(4)])
-    seeds, order = np.array([5, 2**32 - 1, 5, 0]), [3, 1, 0, 2]
-    q, qd, _ = start(seeds, 3, grids, device, anymal)
-    by_terrain = q.reshape(4, 3, 19)
-    again, _, _ = start(seeds[order], 3, grids[order], device, anymal)
-    np.testing.assert_array_equal(again.reshape(4, 3, 19), by_terrain[order])
-    alone, _, _ = start(seeds[1:2], 3, grids[1:2], device, anymal)
-    np.testing.assert_array_equal(alone, by_terrain[1])
-    # Seed 5 twice: the same draws on other ground. Seeds and replicas differ from each other.
-    np.testing.assert_array_equal(by_terrain[0, :, 7:], by_terrain[2, :, 7:])
-    assert len(np.unique(qd[:, 0])) == 9
-
-
-def test_cpu_is_deterministic(anymal):
-    grids = rough(161, 321)[None]
-    one, other = start([3], 10, grids, "cpu", anymal), start([3], 10, grids, "cpu", anymal)
-    np.testing.assert_array_equal(one[0], other[0])
-    np.testing.assert_array_equal(one[1], other[1])

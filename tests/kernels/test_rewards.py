@@ -1,12 +1,15 @@
 """Reward terms against a float64 oracle and hand-computed numbers."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import warp as wp
 
+from kernels.episode import Outcome
 from kernels.penalties import BASE, FOOT, LIMB
-from kernels.reward_terms import Feet, Motion
-from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
+from kernels.rewards import REWARDS, Motion, make_rewards, make_weights, remember_steps, reward_steps
+from sim.robots.training import RewardCfg
 
 NUM_JOINTS = 3
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
@@ -16,6 +19,7 @@ BASE_COM = (0.05, -0.02, 0.1)
 LOWER, UPPER = (-0.5, -1e10, 0.2), (0.5, 1e10, 0.8)
 DEFAULT_POSE = (0.1, -0.2, 0.3)
 STEADY = (1, 0, 1)
+FALLS = (Outcome.BASE_COLLISION, Outcome.INVALID)
 STANDING = (0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -38,41 +42,28 @@ class Step:
             assert self.arrays[name].shape == np.shape(value)
             self.arrays[name] = np.float32(value)
         self.num_envs = num_envs
-        self.feet = make_feet(num_envs, geoms, "cpu")
-        self.base_com = BASE_COM
-        self.valid = np.ones(num_envs, np.int32)
-        self.fallen = np.zeros(num_envs, np.int32)
+        self.min_air_time_s = 0.5
+        self.outcome = np.zeros(num_envs, np.int32)
+        self.rewards = make_rewards(num_envs, NUM_JOINTS, geoms, "cpu")
 
     def reward(self, *, only_positive: bool = False, **weights: float) -> tuple[np.ndarray, np.ndarray]:
         """Reward (num_envs,) and the terms per second (num_envs, len(REWARDS))."""
         motion = Motion()
         for name, value in self.arrays.items():
-            setattr(motion, name, wp.array(value, dtype=wp.vec3 if name == "geom_force" else float))
+            owner = self.rewards if name.startswith("previous") else motion
+            setattr(owner, name, wp.array(value, dtype=wp.vec3 if name == "geom_force" else float))
         motion.geom_role = wp.array(ROLES, dtype=int)
-        motion.base_com = self.base_com
-        motion.force_limit = FORCE_LIMIT
-        motion.dt = DT
+        motion.base_com = BASE_COM
+        motion.force_limit, motion.dt, motion.min_air_time_s = FORCE_LIMIT, DT, self.min_air_time_s
         motion.joint_lower, motion.joint_upper, motion.default_joint_pos = (
             wp.array(row, dtype=float) for row in (LOWER, UPPER, DEFAULT_POSE)
         )
         motion.joint_is_steady = wp.array(STEADY, dtype=int)
-        motion.fallen = wp.array(self.fallen, dtype=int)
-        packed = RewardWeights()
-        for name, value in weights.items():
-            setattr(packed, name, value)
-        reward = wp.full(self.num_envs, -7.0, dtype=float)
-        terms = wp.zeros((self.num_envs, len(REWARDS)), dtype=float)
-        valid = wp.array(self.valid, dtype=int)
-        reward_steps(
-            motion,
-            packed,
-            only_positive=only_positive,
-            valid=valid,
-            feet_out=self.feet,
-            reward_out=reward,
-            terms_out=terms,
-        )
-        return reward.numpy(), terms.numpy() / DT
+        weights = make_weights(dict.fromkeys(REWARDS, 0.0) | weights, only_positive=only_positive, falls=FALLS)
+        self.rewards.running.fill_(1)
+        self.rewards.terms.zero_()
+        reward_steps(motion, weights, wp.array(self.outcome, dtype=int), self.rewards)
+        return self.rewards.step.numpy().copy(), self.rewards.terms.numpy() / DT
 
     def term(self, name: str) -> float:
         """One unweighted term of the first environment."""
@@ -113,7 +104,7 @@ def oracle(step: Step) -> dict[str, np.ndarray]:
         "no_fly": ((foot_force[..., 2] > 0.1).sum(1) == 1) & commanded,
         "orientation": (gravity[:, :2] ** 2).sum(1),
         "joint_deviation": (np.abs(angle - DEFAULT_POSE) * STEADY).sum(1),
-        "termination": step.fallen,
+        "termination": step.outcome == Outcome.BASE_COLLISION,
     }
 
 
@@ -134,7 +125,7 @@ def random_step(num_envs: int) -> Step:
         previous_action=rng.normal(size=(num_envs, NUM_JOINTS)),
         previous_joint_vel=rng.normal(size=(num_envs, NUM_JOINTS)),
     )
-    step.fallen = rng.integers(2, size=num_envs).astype(np.int32)
+    step.outcome = rng.choice([Outcome.RUNNING, Outcome.BASE_COLLISION, Outcome.TIME_OUT], num_envs).astype(np.int32)
     return step
 
 
@@ -168,7 +159,7 @@ def test_clipping_at_zero():
 def test_a_fall_is_paid_for_even_where_rewards_are_clipped():
     # As in legged_gym: max(0, -1 * 2^2) * .02 - 200 * .02 = -4; without a fall 0.
     step = Step(2, joint_qd=np.tile(np.float32([0, 0, 2, 0, 0, 0, 0, 0, 0]), (2, 1)))
-    step.fallen = np.array([1, 0], np.int32)
+    step.outcome = np.array([Outcome.BASE_COLLISION, Outcome.TIME_OUT], np.int32)
     reward, terms = step.reward(only_positive=True, lin_vel_z=-1.0, termination=-200.0)
     np.testing.assert_allclose(reward, [-4.0, 0.0], rtol=1e-6)
     np.testing.assert_allclose(terms[:, REWARDS.index("termination")], [-200.0, 0.0], rtol=1e-6)
@@ -247,10 +238,12 @@ def test_one_foot_alone_on_the_ground(up, command, expected):
     assert Step(geom_force=loaded, command=[command]).term("no_fly") == expected
 
 
-def air_times(pattern: list[bool], command: tuple[float, float, float] = (1.0, 0.0, 0.0), **feet: float) -> list[float]:
+def air_times(
+    pattern: list[bool], command: tuple[float, float, float] = (1.0, 0.0, 0.0), least: float = 0.5
+) -> list[float]:
     """The air-time term of each step of one foot that touches as told."""
     step = Step(command=[command])
-    step.feet = make_feet(1, len(ROLES), "cpu", **feet)
+    step.min_air_time_s = least
     found = []
     for touching in pattern:
         step.arrays["geom_force"] = forces(g3=(0, 0, 100.0 if touching else 0.0))
@@ -268,7 +261,7 @@ def test_air_time_counts_from_take_off_to_landing():
 
 def test_the_air_time_that_pays_is_a_setting():
     # Landing after 31 * .02 = .62 s as above, of which .3 are asked for.
-    found = air_times([True] * 3 + [False] * 31 + [True], min_air_time_s=0.3)
+    found = air_times([True] * 3 + [False] * 31 + [True], least=0.3)
     assert found[-1] == pytest.approx(0.32, abs=1e-5)
 
 
@@ -281,19 +274,48 @@ def test_air_time_does_not_count_when_told_to_stand():
 
 
 def test_of_an_invalid_state_nothing_but_the_fall_counts():
-    step = Step(3, joint_qd=np.full((3, 9), np.nan))
-    step.valid = np.array([0, 0, 1], np.int32)
-    step.fallen = np.array([0, 1, 0], np.int32)
+    step = Step(2, joint_qd=np.full((2, 9), np.nan))
+    step.outcome = np.array([Outcome.INVALID, Outcome.RUNNING], np.int32)
     reward, terms = step.reward(tracking_lin_vel=1.0, termination=-200.0)
-    assert reward[0] == 0.0 and (terms[0] == 0.0).all()
-    assert reward[1] == pytest.approx(-4.0)
-    assert terms[1].tolist() == [0.0] * REWARDS.index("termination") + [pytest.approx(-200.0)]
-    assert np.isnan(reward[2])
+    assert reward[0] == pytest.approx(-4.0)
+    assert terms[0].tolist() == [0.0] * REWARDS.index("termination") + [pytest.approx(-200.0)]
+    assert np.isnan(reward[1])
+    assert step.rewards.total.numpy()[0] == reward[0]
 
 
-def test_wrong_shape_is_refused():
-    with pytest.raises(ValueError, match="one column for each of tracking_lin_vel"):
-        reward_steps(
-            Motion(), RewardWeights(), only_positive=True, valid=wp.zeros(2, dtype=int), feet_out=Feet(),
-            reward_out=wp.zeros(2, dtype=float), terms_out=wp.zeros((2, 3), dtype=float),
-        )  # fmt: skip
+def test_an_outcome_that_is_no_fall_costs_nothing():
+    step = Step(2)
+    step.outcome = np.array([Outcome.TILT, Outcome.GOAL], np.int32)
+    assert step.reward(termination=-200.0)[0].tolist() == [0.0, 0.0]
+
+
+def test_a_step_is_paid_if_its_episode_had_not_ended_before():
+    # At rest and told so, a step pays .02 * 1: the step that ends the first's episode is paid, those after it are not.
+    rewards, outcome = make_rewards(2, NUM_JOINTS, len(ROLES), "cpu"), wp.array([Outcome.OUT, 0], dtype=int)
+    step = Step(2)
+    step.rewards = rewards
+    weights = make_weights(dict.fromkeys(REWARDS, 0.0) | {"tracking_lin_vel": 1.0}, only_positive=True, falls=())
+    motion = Motion()
+    for name in ("joint_q", "joint_qd", "joint_torque", "geom_force", "command", "action"):
+        setattr(motion, name, wp.array(step.arrays[name], dtype=wp.vec3 if name == "geom_force" else float))
+    motion.dt = DT
+    for _ in range(3):
+        reward_steps(motion, weights, outcome, rewards)
+    np.testing.assert_allclose(rewards.total.numpy(), [DT, 3 * DT], rtol=1e-6)
+    np.testing.assert_allclose(rewards.step.numpy(), [0.0, DT], rtol=1e-6)
+
+
+def test_every_term_has_a_weight():
+    with pytest.raises(KeyError, match="no_fly"):
+        make_weights({name: 1.0 for name in REWARDS if name != "no_fly"}, only_positive=False, falls=())
+    assert {setting.name for setting in fields(RewardCfg)} == set(REWARDS)
+
+
+def test_remembering_a_step():
+    rewards, counter = make_rewards(2, 2, 1, "cpu"), wp.array([41], dtype=int)
+    action = wp.array(np.float32([[1, 2], [3, 4]]), dtype=float)
+    joint_qd = wp.array(np.arange(16, dtype=np.float32).reshape(2, 8), dtype=float)
+    remember_steps(action, joint_qd, rewards, counter)
+    assert rewards.previous_action.numpy().tolist() == [[1, 2], [3, 4]]
+    assert rewards.previous_joint_vel.numpy().tolist() == [[6, 7], [14, 15]]
+    assert counter.numpy().tolist() == [42]

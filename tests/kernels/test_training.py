@@ -1,137 +1,199 @@
-"""Ends of training episodes and the statistics of training, against hand-made states."""
+"""What training adds to episodes: levels, commands and pushes, the seeds of starts, and statistics."""
 
 import numpy as np
+import pytest
 import warp as wp
 
-from kernels.penalties import BASE, FOOT
-from kernels.training import STATISTICS, End, Rules, judge_steps, make_episodes, note_base_forces, record_steps
+from kernels.episode import Outcome, Task, make_episodes
+from kernels.rewards import make_rewards
+from kernels.training import (
+    STATISTICS,
+    Rules,
+    command_episodes,
+    make_training,
+    promote_episodes,
+    record_steps,
+    seed_restarts,
+)
+from sim.crossing import CrossingCfg, make_task
+from sim.robots.robot import get_robot
 
-ROLES = [BASE, FOOT]
+NUM_JOINTS = 2
+NUM_LEVELS, NUM_COLUMNS = 4, 3
 UPRIGHT = (0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 1.0, 0.1)
 
 
-def make_rules(*, crosses=0):
+def make_rules(**changes):
     rules = Rules()
-    rules.crosses = crosses
-    rules.crossing.goal = (14.0, 4.0)
-    rules.crossing.goal_radius = 0.5
-    rules.crossing.lower = (-2.0, -2.0)
-    rules.crossing.upper = (18.0, 10.0)
-    rules.max_steps = 1000
-    rules.base_force = 1.0
-    rules.max_gravity_z = -0.1
-    rules.max_speed = 100.0
-    rules.overflow_mask = ~(512 | 1024)
+    values = {
+        "num_levels": NUM_LEVELS, "num_columns": NUM_COLUMNS, "promotion_distance": 4.0, "demotion_time_s": 10.0,
+        "command_steps": 500, "lin_vel_x": (-1.0, 1.0), "lin_vel_y": (-0.5, 0.5), "min_speed": 0.2, "push_steps": 0,
+        "push_speed": 1.0, "overflow_mask": ~(512 | 1024),
+    }  # fmt: skip
+    for name, value in {**values, **changes}.items():
+        setattr(rules, name, value)
     return rules
 
 
-def episodes_of(num_envs):
-    return make_episodes(
-        np.zeros(num_envs, np.int32), np.zeros(num_envs, np.int32), num_joints=1, observation_size=4, first_count=0,
-        device="cpu",
-    )  # fmt: skip
+def make_batch(num_envs, *, outcome=Outcome.TIME_OUT, level=0, column=0, count=0):
+    """Episodes and what training keeps beside them."""
+    full = np.full(num_envs, 1, np.int32)
+    training = make_training(
+        full * column, full * level, num_joints=NUM_JOINTS, observation_size=4, first_count=count, device="cpu"
+    )
+    episodes = make_episodes(num_envs, "cpu")
+    episodes.outcome.assign(np.broadcast_to(np.int32(outcome), num_envs))
+    return episodes, training
 
 
-def tilted(angle):
-    return (0.0, 0.0, 0.6, np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2), 0.1)
+def promoted(walked, speed, *, level=1, outcome=Outcome.TIME_OUT, count=0):
+    """Level and terrain of one environment after an episode."""
+    num_envs = len(np.atleast_1d(walked))
+    episodes, training = make_batch(num_envs, outcome=outcome, level=level, column=2, count=count)
+    episodes.start.assign(np.full((num_envs, 2), 5.0, np.float32))
+    joint_q = np.full((num_envs, 7 + NUM_JOINTS), 5.0, np.float32)
+    joint_q[:, 1] += walked
+    command = np.zeros((num_envs, 3), np.float32)
+    command[:, 0] = speed
+    training.command.assign(command)
+    terrain = wp.full(num_envs, 99, dtype=int)
+    promote_episodes(wp.array(joint_q, dtype=float), episodes, make_rules(), terrain, training)
+    return training.level.numpy(), terrain.numpy()
 
 
-def judge(rows, *, velocity=0.0, base_force=0.0, steps=0, crosses=0):
-    """End of each environment; arguments are one for all or one for each."""
-    num_envs = len(rows)
-    episodes = episodes_of(num_envs)
+def test_level_goes_up_down_or_stays():
+    # Commanded .3 m/s: 3 m are due.
+    levels, terrain = promoted([4.1, 3.9, 3.1, 2.9, 0.0], 0.3)
+    assert levels.tolist() == [2, 1, 1, 0, 0]
+    assert terrain.tolist() == [level * NUM_COLUMNS + 2 for level in levels]
+    assert promoted(0.0, 0.0)[0] == [1]  # told to stand
+
+
+def test_walking_far_counts_before_lagging_behind():
+    assert promoted(4.1, 1.0)[0] == [2]
+
+
+def test_level_zero_is_the_lowest():
+    assert promoted(0.0, 1.0, level=0)[0] == [0]
+
+
+def test_past_the_last_level_any_level_follows():
+    levels = promoted(np.full(400, 5.0), 1.0, level=NUM_LEVELS - 1)[0]
+    counts = np.bincount(levels, minlength=NUM_LEVELS)
+    assert counts.shape == (NUM_LEVELS,) and (counts > 60).all()  # 100 expected, standard deviation 8.7
+
+
+def test_running_and_invalid_episodes_keep_their_level():
+    levels, terrain = promoted([9.0, 9.0], 0.3, outcome=[Outcome.RUNNING, Outcome.INVALID])
+    assert levels.tolist() == [1, 1]
+    assert terrain.tolist() == [99, NUM_COLUMNS + 2]
+
+
+def test_starts_are_drawn_from_counter_and_environment_alone():
+    def seeds(num_envs, count):
+        episodes, training = make_batch(num_envs, count=count)
+        seed_restarts(training, episodes)
+        return episodes.rng.numpy().tolist()
+
+    assert seeds(4, 7) == seeds(4, 7)
+    assert len({*seeds(4, 7), *seeds(4, 8)}) == 8
+
+
+def command(
+    num_envs=1, *, steps=0, yaw=0.0, heading=None, before=(0.0, 0.0, 0.0), count=0, place=(0.0, 0.0), task=None, **rules
+):
+    """Commands, joint velocities and headings after the launch."""
+    if task is None:
+        task = Task()
+        task.yaw_gain, task.max_yaw_rate = 0.5, 1.0
+    episodes, training = make_batch(num_envs, outcome=Outcome.RUNNING, count=count)
     episodes.steps.assign(np.broadcast_to(np.int32(steps), num_envs))
-    joint_qd = np.zeros((num_envs, 7), np.float32)
-    joint_qd[:, 3] = velocity
-    force = np.zeros((num_envs, 2, 3), np.float32)
-    force[:, 0, 1] = base_force
-    force[:, 1, 2] = 500.0  # the foot's force ends nothing
-    note_base_forces(wp.array(force, dtype=wp.vec3), wp.array(ROLES, dtype=int), episodes)
-    joint_q = wp.array(np.float32(rows), dtype=float)
-    judge_steps(joint_q, wp.array(joint_qd, dtype=float), make_rules(crosses=crosses), episodes)
-    return episodes
+    training.command.assign(np.tile(np.float32(before), (num_envs, 1)))
+    if heading is not None:
+        training.heading.fill_(heading)
+    joint_q = np.zeros((num_envs, 7 + NUM_JOINTS), np.float32)
+    joint_q[:, :2] = place
+    joint_q[:, 5], joint_q[:, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
+    joint_qd = wp.full((num_envs, 6 + NUM_JOINTS), 9.0, dtype=float)
+    command_episodes(wp.array(joint_q, dtype=float), episodes, make_rules(**rules), task, joint_qd, training)
+    return training.command.numpy(), joint_qd.numpy(), training.heading.numpy()
 
 
-def ends(*args, **kwargs):
-    return [End(end) for end in judge(*args, **kwargs).end.numpy()]
+def test_commands_fill_their_ranges_and_slow_ones_are_zero():
+    commands, _, headings = command(4000)
+    speed = np.linalg.norm(commands[:, :2], axis=1)
+    assert (speed[speed > 0] > 0.2).all()
+    # A disc of radius .2 in the rectangle of 2 x 1: pi * .04 / 2 = 6.3 %, standard deviation .4 %.
+    assert abs((speed == 0).mean() - 0.0628) < 0.015
+    for values, bound in ((commands[:, 0], 1.0), (commands[:, 1], 0.5), (headings, np.pi)):
+        assert -bound <= values.min() < -0.99 * bound and 0.99 * bound < values.max() <= bound
 
 
-def test_ends_at_their_thresholds():
-    assert ends([UPRIGHT] * 2, base_force=[0.99, 1.01]) == [End.RUNNING, End.BASE_COLLISION]
-    # The projected gravity's z is -cos(tilt): -0.1 at 84.3 degrees.
-    assert ends([tilted(np.deg2rad(84.0)), tilted(np.deg2rad(84.6))]) == [End.RUNNING, End.TILT]
-    assert ends([UPRIGHT] * 2, steps=[998, 999]) == [End.RUNNING, End.TIME_OUT]
-    assert ends([UPRIGHT] * 2, velocity=[-99.9, -100.1]) == [End.RUNNING, End.INVALID]
+@pytest.mark.parametrize(("steps", "drawn"), [(0, True), (499, False), (500, True), (501, False), (1000, True)])
+def test_commands_are_drawn_when_due(steps, drawn):
+    commands, _, _ = command(steps=steps, before=(0.123, 0.0, 0.0))
+    assert (commands[0, 0] != np.float32(0.123)) == drawn
 
 
-def test_non_finite_states_are_invalid():
-    broken = [(*UPRIGHT[:7], value) for value in (np.nan, np.inf, -np.inf)]
-    assert ends(broken) == [End.INVALID] * 3
-    assert ends([UPRIGHT], velocity=np.nan) == [End.INVALID]
+@pytest.mark.parametrize(
+    ("heading", "yaw", "rate"),
+    [(0.6, 0.2, 0.2), (0.2, 0.6, -0.2), (3.0, -3.0, -0.14159), (2.5, 0.0, 1.0), (-2.5, 0.0, -1.0)],
+)
+def test_heading_becomes_a_yaw_rate_the_short_way_round(heading, yaw, rate):
+    commands, _, _ = command(steps=1, heading=heading, yaw=yaw)
+    assert commands[0, 2] == pytest.approx(rate, abs=1e-4)
 
 
-def test_a_crossing_ends_at_the_goal_and_beyond_the_borders():
-    places = [(13.4, 4.0), (13.6, 4.0), (14.0, 4.6), (-2.1, 4.0), (18.1, 4.0), (5.0, -2.1), (5.0, 10.1), (5.0, 9.9)]
-    rows = [(*place, *UPRIGHT[2:]) for place in places]
-    out = [End.OUT] * 4
-    assert ends(rows, crosses=1) == [End.RUNNING, End.GOAL, End.RUNNING, *out, End.RUNNING]
-    assert ends(rows) == [End.RUNNING] * 8
-    assert ends([rows[1]], crosses=1, steps=999) == [End.GOAL]
-    assert ends([rows[1]], crosses=1, base_force=5.0) == [End.BASE_COLLISION]
+@pytest.mark.parametrize(
+    ("place", "yaw", "expected"),
+    [
+        ((2.0, 4.0), 0.0, (0.75, 0.0, 0.0)),
+        # The goal lies to the left of a robot that looks along x: turn left, at most 1 rad/s.
+        ((14.0, 0.0), 0.0, (0.0, 0.75, 0.5 * np.pi / 2)),
+        ((14.0, 8.0), np.pi / 2, (-0.75, 0.0, -1.0)),
+    ],
+)
+def test_a_crossing_robot_is_told_to_go_to_its_goal(place, yaw, expected):
+    task = make_task(CrossingCfg(), get_robot("anymal"))
+    commands, _, headings = command(steps=0, heading=0.3, yaw=yaw, place=place, crosses=1, task=task)
+    if abs(expected[2]) == 1.0:  # straight behind: either way round is the short one
+        commands[0, 2] = -abs(commands[0, 2])
+    np.testing.assert_allclose(commands[0], expected, atol=1e-6)
+    assert headings.tolist() == [np.float32(0.3)]  # nothing is drawn
 
 
-def test_the_gravest_end_wins():
-    assert ends([tilted(np.pi)], base_force=5.0, steps=999) == [End.BASE_COLLISION]
-    assert ends([tilted(np.pi)], steps=999) == [End.TILT]
-    assert ends([tilted(np.pi)], base_force=5.0, velocity=200.0, steps=999) == [End.INVALID]
+def test_each_environment_is_pushed_once_an_interval():
+    interval, num_envs = 20, 30
+    pushed = np.zeros((interval, num_envs), bool)
+    for count in range(interval):
+        _, joint_qd, _ = command(num_envs, steps=1, count=count, push_steps=interval)
+        pushed[count] = (joint_qd[:, :2] != 9.0).all(axis=1)
+        assert (np.abs(joint_qd[pushed[count], :2]) <= 1.0).all()
+        assert (joint_qd[:, 2:] == 9.0).all() and (joint_qd[~pushed[count]] == 9.0).all()
+    assert (pushed.sum(axis=0) == 1).all()
+    assert pushed.sum(axis=1).max() < num_envs / 2  # not all at once
 
 
-def test_steps_are_counted_and_validity_is_marked():
-    episodes = judge([UPRIGHT, UPRIGHT], velocity=[0.0, np.nan], steps=[3, 4])
-    assert episodes.steps.numpy().tolist() == [4, 5]
-    assert episodes.valid.numpy().tolist() == [1, 0]
-
-
-def test_a_touch_noted_within_a_step_ends_it_and_not_the_next():
-    episodes = episodes_of(2)
-    rows, roles = wp.array(np.float32([UPRIGHT] * 2), dtype=float), wp.array(ROLES, dtype=int)
-    still, touched = np.zeros((2, 2, 3), np.float32), np.zeros((2, 2, 3), np.float32)
-    touched[1, 0, 2] = 40.0  # on the base
-    touched[0, 1, 2] = 500.0  # on a foot
-    for force in (touched, still):
-        note_base_forces(wp.array(force, dtype=wp.vec3), roles, episodes)
-    assert episodes.base_force.numpy().tolist() == [0.0, 40.0]
-    seen = []
-    for _ in range(2):
-        judge_steps(rows, wp.zeros((2, 7), dtype=float), make_rules(), episodes)
-        seen.append([End(end) for end in episodes.end.numpy()])
-    assert seen == [[End.RUNNING, End.BASE_COLLISION], [End.RUNNING] * 2]
-
-
-def test_a_fall_is_a_collision_of_the_base_a_tilt_or_an_invalid_state():
-    rows = [UPRIGHT, UPRIGHT, tilted(np.pi), UPRIGHT, (*UPRIGHT[:7], np.nan)]
-    episodes = judge(rows, base_force=[0.0, 2.0, 0.0, 0.0, 2.0], steps=[3, 3, 3, 999, 3])
-    assert [End(end) for end in episodes.end.numpy()] == [
-        End.RUNNING, End.BASE_COLLISION, End.TILT, End.TIME_OUT, End.INVALID,
-    ]  # fmt: skip
-    assert episodes.fallen.numpy().tolist() == [0, 1, 1, 0, 1]
+def test_no_pushes_when_told_so():
+    assert (command(5, steps=1, push_steps=0)[1] == 9.0).all()
 
 
 def test_statistics_add_up():
-    episodes = episodes_of(4)
-    episodes.end.assign(np.array([End.RUNNING, End.TIME_OUT, End.TILT, End.INVALID], np.int32))
+    outcome = [Outcome.RUNNING, Outcome.TIME_OUT, Outcome.TILT, Outcome.INVALID]
+    episodes, training = make_batch(4, outcome=outcome)
+    rewards = make_rewards(4, NUM_JOINTS, 1, "cpu")
     episodes.steps.assign(np.array([5, 1000, 20, 30], np.int32))
-    episodes.reward.assign(np.float32([1, 2, 3, 4]))
-    episodes.total_reward.assign(np.float32([10, 20, 30, 40]))
-    episodes.command.assign(np.float32([[0.3, 0.4, 0.2]] * 4))
+    rewards.total.assign(np.float32([11, 22, 33, 44]))
+    training.command.assign(np.float32([[0.3, 0.4, 0.2]] * 4))
     joint_q = wp.array(np.float32([UPRIGHT] * 3 + [(*UPRIGHT[:7], np.nan)]), dtype=float)
     joint_qd = wp.zeros((4, 7), dtype=float)
     overflow = wp.array([1, 512 | 1024, 0, 2 | 512], dtype=int)
-    record_steps(joint_q, joint_qd, wp.vec3(0.0), overflow, make_rules(), episodes)
-    sums = dict(zip(STATISTICS, episodes.statistics.numpy().sum(0), strict=True))
-    assert episodes.total_reward.numpy().tolist() == [11, 22, 33, 44]
+    record_steps(joint_q, joint_qd, wp.vec3(0.0), overflow, make_rules(), episodes, rewards, training)
+    assert training.ended.numpy().tolist() == outcome
+    sums = dict(zip(STATISTICS, training.statistics.numpy().sum(0), strict=True))
     expected = {
-        "steps": 4, "episodes": 3, "time_out": 1, "base_collision": 0, "tilt": 1, "invalid": 1, "overflow": 2,
+        "steps": 4, "episodes": 3, "time_out": 1, "base_collision": 0, "tilt": 1, "invalid": 1, "goal": 0,
+        "out": 0, "overflow": 2,
         "episode_steps": 1050, "episode_reward": 99,
         "lin_vel_error": 3 * 0.5,  # hypot(.3, .4), of the three that are valid
         "yaw_rate_error": 3 * 0.2,

@@ -1,4 +1,4 @@
-"""The reward of a crossing: what is paid for, until when, and that nothing else changes by asking for it."""
+"""The training reward: what it is computed from, what a crossing is paid and until when."""
 
 import math
 from dataclasses import fields, replace
@@ -6,14 +6,17 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from kernels.episode import Outcome
+from kernels.rewards import REWARDS
 from sim.crossing import CrossingCfg
 from sim.policy.loaders import load_policy
+from sim.reward import Reward, make_motion, soft_joint_limits
 from sim.robots.training import RewardCfg, TrainingCfg
 from sim.rollout import Rollout
 from tests.sim.policies import stand
-from tests.sim.scenes import positions, put
+from tests.sim.scenes import ONLY_ANYMAL, ONLY_CASSIE, positions, put
 
 FLAT = np.zeros((161, 321), np.float32)
 NOTHING = {field.name: 0.0 for field in fields(RewardCfg)}
@@ -185,3 +188,54 @@ def test_the_policy_is_told_to_stand_after_the_goal(anymal, device):
     crossing(anymal, device, watch, start=(14.3, 4.0), max_duration_s=0.1).evaluate(FLAT[None], np.array([1]))
     commands = torch.stack(seen)[-5:].cpu()  # before these, the policy was tried
     assert commands[0, :2].norm() > 1.0 and (commands[1:] == 0.0).all()
+
+
+@ONLY_CASSIE
+def test_soft_limits_by_hand(eight):
+    # Abduction spans -.2618 to .3927: .06545 +- .95 * .32725. The toe -2.4435 to -.5236: -1.48355 +- .95 * .95995.
+    lower, upper = soft_joint_limits(eight, 0.95)
+    np.testing.assert_allclose([lower[0], upper[0]], [-0.2454375, 0.3763375], atol=1e-6)
+    np.testing.assert_allclose([lower[5], upper[5]], [-2.3955025, -0.5715975], atol=1e-6)
+    np.testing.assert_allclose([lower[6], upper[6]], [-0.3763375, 0.2454375], atol=1e-6)  # mirrored
+    assert lower.shape == upper.shape == (12,)
+
+
+@ONLY_ANYMAL
+def test_joints_that_turn_freely_have_far_limits(eight):
+    lower, upper = soft_joint_limits(eight, 0.9)
+    np.testing.assert_allclose([lower[0], upper[0]], [-0.115 - 0.9 * 0.605, -0.115 + 0.9 * 0.605], atol=1e-6)
+    assert (lower[1:3] < -1e9).all() and (upper[1:3] > 1e9).all()
+    assert np.isfinite(lower).all() and np.isfinite(upper).all()
+
+
+def test_a_robots_own_settings_reach_the_kernels(eight, robot):
+    motion = make_motion(eight, robot.training, command=None, action=None)
+    steady = {name for name, flag in zip(robot.joint_names, motion.joint_is_steady.numpy(), strict=True) if flag}
+    hips = {f"hip_{joint}_{side}" for joint in ("abduction", "rotation") for side in ("left", "right")}
+    assert steady == (hips if robot.name == "cassie" else set())
+    assert motion.force_limit == robot.contact_force_limit and motion.dt == pytest.approx(0.02)
+    lower, upper = soft_joint_limits(eight, robot.training.soft_joint_limit)
+    np.testing.assert_array_equal(motion.joint_lower.numpy(), lower)
+    np.testing.assert_array_equal(motion.joint_upper.numpy(), upper)
+    np.testing.assert_allclose(motion.default_joint_pos.numpy(), robot.default_joint_pos, rtol=1e-6)
+
+
+@ONLY_CASSIE
+def test_a_joint_that_is_not_there_is_named(eight, robot):
+    cfg = replace(robot.training, steady_joints=("hip_rotation_left", "knee"))
+    with pytest.raises(ValueError, match="robot 'cassie' has no joint named knee: expected some of hip_abduction_left"):
+        make_motion(eight, cfg, command=None, action=None)
+    assert TrainingCfg().steady_joints == ()
+
+
+@ONLY_ANYMAL
+def test_what_torques_cost_by_hand(eight, robot):
+    # 12 joints at 10 N m, -1e-5 per (N m)^2 and second: 12 * 100 * -1e-5 * .02 s = -2.4e-4.
+    with wp.ScopedDevice(eight.device):
+        command, action = wp.zeros((8, 3), dtype=float), wp.zeros((8, 12), dtype=float)
+        reward = Reward(eight, robot.training, command=command, action=action, falls=())
+        before = eight.joint_torque.numpy().copy()
+        eight.joint_torque.fill_(10.0)
+        reward.pay(wp.zeros(8, dtype=int))
+        eight.joint_torque.assign(before)
+    np.testing.assert_allclose(reward.state.terms.numpy()[:, REWARDS.index("torques")], -2.4e-4, rtol=1e-5)

@@ -86,11 +86,25 @@ def test_a_base_on_a_spike_collides(robot, device):
     assert result.physics_steps < 400
 
 
-def test_a_robot_beside_the_goal_reaches_it(robot, device):
-    # From (13.45, 4) +- 0.1 m the goal's 0.5 m circle round (14, 4) is entered with 0.75 m/s at most 0.2 m later.
-    result = crossing(robot, device, start=(13.8, 4.0)).evaluate(FLAT[None], np.array([1]))
+@pytest.mark.parametrize(("x", "outcome"), [(13.45, Outcome.TIME_OUT), (13.55, Outcome.GOAL), (14.45, Outcome.GOAL)])
+def test_the_goal_is_half_a_metre_wide_each_way(robot, device, x, outcome):
+    still = {"start_position_range": 0.0, "start_velocity_range": 0.0, "max_duration_s": 0.1}
+    result = crossing(robot, device, start=(x, 4.0), **still).evaluate(FLAT[None], np.array([1]))
+    assert (result.outcome == outcome).all()
+    # At the goal already, the episode ends with the first physics step.
+    steps = 1 if outcome == Outcome.GOAL else 20
+    np.testing.assert_allclose(result.duration_s, steps * robot.physics_dt, atol=1e-6)
+
+
+def test_a_robot_that_walks_to_the_goal_stops_at_its_edge(robot, device):
+    # From (13, 4) +- 0.1 m, half a metre to go at .75 m/s; a physics step of .005 s takes it in by 1 cm at most.
+    walker = load_policy(robot.policy_file, robot, device)
+    rollout = crossing(robot, device, walker, start=(13.0, 4.0), max_duration_s=3.0)
+    result = rollout.evaluate(FLAT[None], np.array([1]))
     assert result.reached_goal.all()
-    np.testing.assert_allclose(result.duration_s, robot.physics_dt, atol=1e-6)
+    distance = np.linalg.norm(result.final_position[..., :2] - [14.0, 4.0], axis=-1)
+    assert ((distance > 0.49) & (distance < 0.5)).all()
+    assert (result.duration_s > 0.3).all()
 
 
 @pytest.mark.parametrize("start", [(18.3, 4.0), (-2.3, 4.0), (9.0, 10.3), (9.0, -2.3)])
@@ -99,18 +113,19 @@ def test_a_robot_out_of_bounds_is_out(robot, device, start):
     assert (result.outcome == Outcome.OUT).all()
 
 
-def test_a_robot_on_its_back_has_fallen(anymal, device):
-    stander = crossing(anymal, device, max_duration_s=0.1, poll_every_s=0.02, base_force=1e9)
+def test_a_robot_has_fallen_that_tilts_by_more_than_60_degrees(anymal, device):
+    # High above the ground, turned at every control step: in the last one it turns by less than a degree more.
+    flyer = crossing(anymal, device, max_duration_s=0.1, poll_every_s=0.02)
+    tilt = np.deg2rad([0.0, 58.0, 62.0, 180.0])
 
     def turn(share):
-        q = np.array(stander.sim.joint_q.numpy())
-        q[1:, 3:7] = [1, 0, 0, 0]
-        q[1:, 2] = 0.6
-        stander.sim.joint_q.assign(q)
-        stander.sim.refresh()
+        q = positions(flyer.sim)
+        q[:, 2], q[:, 3:7] = 5.0, 0.0
+        q[:, 3], q[:, 6] = np.sin(tilt / 2), np.cos(tilt / 2)
+        put(flyer.sim, q)
 
-    result = stander.evaluate(FLAT[None], np.array([1]), progress=turn)
-    assert result.fallen.tolist() == [[False, True, True, True]]
+    result = flyer.evaluate(FLAT[None], np.array([1]), progress=turn)
+    assert result.fallen.tolist() == [[False, False, True, True]]
     assert (result.outcome == Outcome.TIME_OUT).all()  # tilt alone ends nothing
 
 

@@ -44,10 +44,10 @@ def test_a_crossing_is_paid_as_training_pays_it(anymal):
     task.restart_all(torch.zeros(NUM_ENVS))
     task.sim.joint_q.assign(start[0])
     task.sim.joint_qd.assign(start[1])
-    task._episodes.previous_joint_vel.assign(start[1][:, 6:])
+    task._reward.state.previous_joint_vel.assign(start[1][:, 6:])
     total = np.zeros(NUM_ENVS)
     for command, action in zip(commands, actions, strict=True):
-        task._episodes.command.assign(command.numpy())
+        task._training.command.assign(command.numpy())
         task.step(action)
         total += task.reward.numpy()
     assert (task.episode_steps == 100).all()  # nobody fell

@@ -95,7 +95,9 @@ def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
 
 def count_outcomes(result: RolloutResult) -> dict[str, int]:
     """Episodes by how they ended."""
-    return {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in Outcome}
+    return {
+        outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in Outcome if outcome != Outcome.TILT
+    }
 
 
 def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:

@@ -1,18 +1,14 @@
-"""Settings of the command-following task, and what the kernels take of them."""
+"""Settings of the command-following task. Nothing here loads Warp or Newton: the help of a command shows them."""
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from sim.files.settings import problems, setting
 from sim.robots.training import TrainingCfg
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
-
-_TILE_SIDE = 8.0
-_TILE_CENTRE = (8.0, 4.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,13 +67,13 @@ class TaskCfg(TrainingCfg):
     """Range of the robots' friction coefficients."""
     start_position_range: float = setting(1.0, least=0)
     """Starts lie within this of the tile's centre along x and y [m]."""
-    start_yaw_range: float = setting(np.pi, least=0)
+    start_yaw_range: float = setting(math.pi, least=0)
     """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
     start_velocity_range: float = setting(0.5, least=0)
     """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
     base_force: float = setting(1.0, least=0)
     """Contact force on the base that ends an episode [N]."""
-    max_gravity_z: float = -0.1
+    max_gravity_z: float = setting(-0.1)
     """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
 
     @classmethod
@@ -88,7 +84,7 @@ class TaskCfg(TrainingCfg):
             robot: Robot settings.
             changes: Fields to set otherwise.
         """
-        own = {setting.name: getattr(robot.training, setting.name) for setting in fields(TrainingCfg)}
+        own = {own.name: getattr(robot.training, own.name) for own in fields(TrainingCfg)}
         return cls(**{**own, **changes})
 
 
@@ -102,62 +98,5 @@ def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
     return problems(cfg, "task.") + [
         f"task.{name} must be at least a control step, {control_dt:g} s, got {getattr(cfg, name):g}"
         for name in ("episode_s", "command_interval_s")
-        if getattr(cfg, name) < control_dt
+        if 0 < getattr(cfg, name) < control_dt
     ]
-
-
-def fill(struct: Any, **values: Any) -> Any:
-    """Set the fields of a kernel argument; returns it."""
-    for name, value in values.items():
-        setattr(struct, name, value)
-    return struct
-
-
-def make_rules(cfg: TaskCfg, robot: "RobotCfg", num_levels: int, num_columns: int) -> Any:
-    """Limits, ranges and intervals of the task as a kernel argument."""
-    from kernels.training import Rules
-    from sim import crossing
-    from sim.simulation import CAPACITY_OVERFLOWS
-
-    control_dt = robot.control_dt
-    return fill(
-        Rules(),
-        max_steps=round(cfg.episode_s / control_dt),
-        base_force=cfg.base_force,
-        max_gravity_z=cfg.max_gravity_z,
-        max_speed=robot.max_speed,
-        overflow_mask=CAPACITY_OVERFLOWS,
-        num_levels=num_levels,
-        num_columns=num_columns,
-        promotion_distance=0.5 * _TILE_SIDE,
-        demotion_time_s=0.5 * cfg.episode_s,
-        command_steps=round(cfg.command_interval_s / control_dt),
-        lin_vel_x=cfg.lin_vel_x,
-        lin_vel_y=cfg.lin_vel_y,
-        min_speed=cfg.min_speed,
-        yaw_gain=cfg.yaw_gain,
-        max_yaw_rate=cfg.max_yaw_rate,
-        push_steps=round(cfg.push_interval_s / control_dt),
-        push_speed=cfg.push_speed,
-        crosses=int(cfg.crosses),
-        crossing=crossing.make_task(crossing.CrossingCfg(), robot),
-    )
-
-
-def make_start_ranges(cfg: TaskCfg, robot: "RobotCfg") -> Any:
-    """The randomised start of an episode as a kernel argument."""
-    from kernels.start import StartRanges
-    from sim import crossing
-
-    if cfg.crosses:
-        return crossing.make_start_ranges(crossing.CrossingCfg(), robot)
-    return fill(
-        StartRanges(),
-        position=_TILE_CENTRE,
-        position_range=cfg.start_position_range,
-        yaw_range=cfg.start_yaw_range,
-        joint_scale_range=cfg.start_joint_range,
-        velocity_range=cfg.start_velocity_range,
-        base_height=robot.default_base_height,
-        footprint=(max(robot.footprint), max(robot.footprint)),  # whatever the heading
-    )

@@ -5,21 +5,37 @@ pushes, observation. The host copies actions in and results out, and draws no ra
 """
 
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import torch
 
+from kernels.episode import Outcome, end_all, latch_outcomes, make_episodes, note_base_forces
 from kernels.observation import Noise, apply_action, write_observation
-from kernels.restart import command_episodes, promote_episodes, remember_steps, restart_episodes
-from kernels.rewards import REWARDS, RewardWeights, make_feet, reward_steps
-from kernels.training import STATISTICS, End, judge_steps, make_episodes, note_base_forces, record_steps
+from kernels.restart import StartRanges, restart_episodes
+from kernels.rewards import REWARDS, remember_steps
+from kernels.training import (
+    STATISTICS,
+    Rules,
+    command_episodes,
+    make_training,
+    promote_episodes,
+    record_steps,
+    seed_restarts,
+)
+from sim import crossing
 from sim.bank import TerrainBank
-from sim.motion import make_motion
 from sim.policy.loaders import prepare_torch
+from sim.reward import Reward
 from sim.robots.robot import RobotCfg
-from sim.simulation import Simulation
-from train.task.cfg import TaskCfg, fill, make_rules, make_start_ranges, task_problems
+from sim.simulation import CAPACITY_OVERFLOWS, Simulation
+from train.task.cfg import TaskCfg, task_problems
 from train.task.curriculum import Tiles, first_levels, make_tiles
+
+_FALLS = (Outcome.BASE_COLLISION, Outcome.TILT, Outcome.INVALID)
+"""An invalid state costs what a fall does: were it free, falling robots would learn to whip their legs too fast."""
+_TILE_SIDE = 8.0
+_TILE_CENTRE = (8.0, 4.0)
 
 
 class CommandTask:
@@ -30,7 +46,7 @@ class CommandTask:
     Attributes:
         observation: Observation row of each environment, shape (num_envs, observation_size).
         reward: Reward of the step just made, shape (num_envs,).
-        end: How the episode ended with it (:class:`kernels.training.End`), int32, shape (num_envs,).
+        end: How the episode ended with it (:class:`kernels.episode.Outcome`), int32, shape (num_envs,).
         episode_steps: Control steps of the episode so far, int32, shape (num_envs,).
         levels: Terrain level, int32, shape (num_envs,).
         counter: Control steps since the seed's first number: the state of all random numbers, int32, shape (1,).
@@ -66,9 +82,13 @@ class CommandTask:
         columns = self.tiles.columns_of(num_envs)
         levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(level_seed)) % self.tiles.num_levels
         self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
-        self._rules = make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
-        self.max_episode_steps: int = self._rules.max_steps
-        self._episodes = make_episodes(
+        self._task = _make_task(cfg, robot)
+        self._rules = _make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
+        self._ranges = _make_start_ranges(cfg, robot)
+        self._noise = _fill(Noise(), **asdict(cfg.noise))
+        self.max_episode_steps: int = self._task.max_steps
+        self._episodes = make_episodes(num_envs, device)
+        self._training = training = make_training(
             columns,
             levels,
             num_joints=robot.num_joints,
@@ -76,7 +96,7 @@ class CommandTask:
             first_count=first_count,
             device=device,
         )
-        self._make_structs()
+        self._reward = Reward(self.sim, cfg, command=training.command, action=training.last_action, falls=_FALLS)
         self._make_views()
         self._graph = self.sim.capture(self._control_step)  # makes one step, which is undone here
         self.counter.fill_(first_count)
@@ -93,37 +113,20 @@ class CommandTask:
             added_base_mass=rng.uniform(*self.cfg.added_base_mass, self.num_envs).astype(np.float32),
         )
 
-    def _make_structs(self) -> None:
-        sim, robot, cfg = self.sim, self.robot, self.cfg
-        self._noise = fill(Noise(), **asdict(cfg.noise))
-        self._weights = fill(RewardWeights(), **asdict(cfg.rewards))
-        geoms, episodes = len(robot.geom_names), self._episodes
-        self._feet = make_feet(self.num_envs, geoms, self.device, min_air_time_s=cfg.min_air_time_s)
-        self._ranges = make_start_ranges(cfg, robot)
-        self._motion = make_motion(
-            sim,
-            cfg,
-            command=episodes.command,
-            action=episodes.last_action,
-            previous_action=episodes.previous_action,
-            previous_joint_vel=episodes.previous_joint_vel,
-            fallen=episodes.fallen,
-        )
-
     def _make_views(self) -> None:
-        episodes = self._episodes
-        self._action = torch.from_dlpack(episodes.action)
-        self.observation = torch.from_dlpack(episodes.observation)
-        self.reward = torch.from_dlpack(episodes.reward)
-        self.end = torch.from_dlpack(episodes.end)
-        self.episode_steps = torch.from_dlpack(episodes.steps)
-        self.levels = torch.from_dlpack(episodes.level)
-        self.counter = torch.from_dlpack(episodes.counter)
-        self._column = torch.from_dlpack(episodes.column)
+        training, rewards = self._training, self._reward.state
+        self._action = torch.from_dlpack(training.action)
+        self.observation = torch.from_dlpack(training.observation)
+        self.reward = torch.from_dlpack(rewards.step)
+        self.end = torch.from_dlpack(training.ended)
+        self.episode_steps = torch.from_dlpack(self._episodes.steps)
+        self.levels = torch.from_dlpack(training.level)
+        self.counter = torch.from_dlpack(training.counter)
+        self._column = torch.from_dlpack(training.column)
         self._terrain_of_env = torch.from_dlpack(self.sim.terrain_of_env)
-        self._statistics = torch.from_dlpack(episodes.statistics)
+        self._statistics = torch.from_dlpack(training.statistics)
         self._counted = torch.zeros_like(self._statistics)
-        self._reward_terms = torch.from_dlpack(episodes.reward_terms)
+        self._reward_terms = torch.from_dlpack(rewards.terms)
 
     def step(self, action: torch.Tensor) -> None:
         """Make one control step; an episode that ends restarts within it.
@@ -159,7 +162,8 @@ class CommandTask:
     def _restart_on(self, levels: torch.Tensor) -> None:
         self.levels.copy_(levels)
         self._terrain_of_env.copy_(self.levels * self.tiles.num_columns + self._column)
-        self.end.fill_(int(End.TIME_OUT))
+        self.end.fill_(int(Outcome.TIME_OUT))
+        end_all(self._episodes)
         self._begin_episodes()
 
     def counts(self) -> dict[str, np.ndarray]:
@@ -187,40 +191,97 @@ class CommandTask:
         return {str(name): float(levels[types == name].mean()) for name in dict.fromkeys(types)}
 
     def _control_step(self) -> None:
-        sim, episodes = self.sim, self._episodes
-        apply_action(episodes.action, sim.sensors, self.robot.action_scale, episodes.last_action, sim.targets)
+        sim, episodes, training = self.sim, self._episodes, self._training
+        apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
         sim.refresh()
-        for step in range(self.robot.decimation):
+        for step in range(1, self.robot.decimation + 1):
             sim.physics_step()
             # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.
-            if self.cfg.crosses or step == self.robot.decimation - 1:
+            if self.cfg.crosses and step < self.robot.decimation:
                 sim.read_geom_forces()
                 note_base_forces(sim.geom_force, sim.geom_role, episodes)
-        judge_steps(sim.joint_q, sim.joint_qd, self._rules, episodes)
-        reward_steps(
-            self._motion,
-            self._weights,
-            only_positive=self.cfg.only_positive,
-            valid=episodes.valid,
-            feet_out=self._feet,
-            reward_out=episodes.reward,
-            terms_out=episodes.reward_terms,
-        )
-        record_steps(sim.joint_q, sim.joint_qd, sim.sensors.base_com, sim.overflow, self._rules, episodes)
-        promote_episodes(sim.joint_q, self._rules, sim.terrain_of_env, episodes)
+        sim.read_geom_forces()
+        latch_outcomes(
+            sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, sim.overflow, sim.contact_count,
+            sim.contact_capacity, self._task, episodes,
+        )  # fmt: skip
+        self._reward.pay(episodes.outcome)
+        record_steps(
+            sim.joint_q, sim.joint_qd, sim.sensors.base_com, sim.overflow, self._rules, episodes, self._reward.state,
+            training,
+        )  # fmt: skip
+        promote_episodes(sim.joint_q, episodes, self._rules, sim.terrain_of_env, training)
         self._begin_episodes()
 
     def _begin_episodes(self) -> None:
-        sim, episodes, terrain = self.sim, self._episodes, self.sim.bank.terrain
-        base_com, default_pose = sim.sensors.base_com, sim.sensors.default_joint_pos
+        sim, episodes, training, terrain = self.sim, self._episodes, self._training, self.sim.bank.terrain
+        seed_restarts(training, episodes)
         restart_episodes(
-            sim.terrain_of_env, terrain, self._ranges, base_com, default_pose,
-            sim.joint_q, sim.joint_qd, self._feet, episodes,
+            sim.terrain_of_env, terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd, training.last_action,
+            episodes, self._reward.state,
         )  # fmt: skip
-        sim.clear_solver(episodes.end)
-        command_episodes(self._rules, sim.joint_q, sim.joint_qd, episodes)
+        sim.clear_solver(training.ended)
+        command_episodes(sim.joint_q, episodes, self._rules, self._task, sim.joint_qd, training)
         write_observation(
-            sim.joint_q, sim.joint_qd, episodes.command, episodes.last_action, sim.terrain_of_env, terrain,
-            sim.sensors, self._noise, episodes.counter, episodes.observation,
+            sim.joint_q, sim.joint_qd, training.command, training.last_action, sim.terrain_of_env, terrain,
+            sim.sensors, self._noise, training.counter, training.observation,
         )  # fmt: skip
-        remember_steps(sim.joint_qd, episodes)
+        remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
+
+
+def _fill(struct: Any, **values: Any) -> Any:
+    """Set the fields of a kernel argument; returns it."""
+    for name, value in values.items():
+        setattr(struct, name, value)
+    return struct
+
+
+def _make_task(cfg: TaskCfg, robot: RobotCfg) -> Any:
+    """Goal, command and limits of an episode as a kernel argument; its steps are control steps."""
+    task = crossing.make_task(crossing.CrossingCfg(), robot, to_goal=cfg.crosses)
+    if not cfg.crosses:
+        endless = {"lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
+        _fill(task, yaw_gain=cfg.yaw_gain, max_yaw_rate=cfg.max_yaw_rate, **endless)
+    return _fill(
+        task,
+        max_steps=round(cfg.episode_s / robot.control_dt),
+        base_force=cfg.base_force,
+        max_gravity_z=cfg.max_gravity_z,
+        overflow_mask=0,  # counted, and no reason to end an episode
+    )
+
+
+def _make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
+    """Commands, pushes and levels of the task as a kernel argument."""
+    control_dt = robot.control_dt
+    return _fill(
+        Rules(),
+        crosses=int(cfg.crosses),
+        overflow_mask=CAPACITY_OVERFLOWS,
+        num_levels=num_levels,
+        num_columns=num_columns,
+        promotion_distance=0.5 * _TILE_SIDE,
+        demotion_time_s=0.5 * cfg.episode_s,
+        command_steps=round(cfg.command_interval_s / control_dt),
+        lin_vel_x=cfg.lin_vel_x,
+        lin_vel_y=cfg.lin_vel_y,
+        min_speed=cfg.min_speed,
+        push_steps=round(cfg.push_interval_s / control_dt),
+        push_speed=cfg.push_speed,
+    )
+
+
+def _make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
+    """The randomised start of an episode as a kernel argument."""
+    if cfg.crosses:
+        return crossing.make_start_ranges(crossing.CrossingCfg(), robot)
+    return _fill(
+        StartRanges(),
+        position=_TILE_CENTRE,
+        position_range=cfg.start_position_range,
+        yaw_range=cfg.start_yaw_range,
+        joint_scale_range=cfg.start_joint_range,
+        velocity_range=cfg.start_velocity_range,
+        base_height=robot.default_base_height,
+        footprint=(max(robot.footprint), max(robot.footprint)),  # whatever the heading
+    )

@@ -7,7 +7,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from kernels.training import End
+from kernels.episode import Outcome
 from train.task.task import CommandTask
 
 
@@ -50,5 +50,5 @@ class CommandVecEnv(VecEnv):
         self.task.step(actions)
         end = self.task.end
         # A robot at its goal or out of the world did not fail: as with the clock, its value goes on.
-        cut = (end == int(End.TIME_OUT)) | (end == int(End.GOAL)) | (end == int(End.OUT))
+        cut = (end == int(Outcome.TIME_OUT)) | (end == int(Outcome.GOAL)) | (end == int(Outcome.OUT))
         return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": cut}

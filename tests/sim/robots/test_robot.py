@@ -90,6 +90,14 @@ def test_gains_and_limits_are_the_same_in_newton_and_mujoco(robot, c_model, buil
 
 
 @ONLY_ANYMAL
+def test_anymals_joints_carry_the_inertia_of_their_drives(c_model, eight):
+    # Robot-side inertia of an ANYdrive's rotor, 0.06 kg m^2; the solver has it too.
+    np.testing.assert_allclose(c_model.dof_armature[6:], 0.06)
+    armature = eight.solver.mjw_model.dof_armature.numpy().reshape(-1, 18)
+    np.testing.assert_allclose(armature[:, 6:], 0.06, rtol=1e-6)
+
+
+@ONLY_ANYMAL
 def test_anymals_hips_are_limited(robot, c_model, builder):
     abduction = np.array([name.endswith("HAA") for name in robot.joint_names])
     # Legs turn in by 0.72 rad and out by 0.49 rad: mirrored on the right.
