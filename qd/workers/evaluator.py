@@ -88,6 +88,8 @@ class EvaluatorCfg:
     """Penalties are summed from this time of an episode on [s]."""
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
+    space: str = "super_gaussian"
+    """Terrain space of the genes."""
 
     @property
     def num_workers(self) -> int:
@@ -212,6 +214,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
     from sim.robots.robot import get_robot
     from sim.rollout import CrossingCfg, Rollout
+    from sim.space import get_space
 
     return Rollout(
         get_robot(cfg.robot),
@@ -220,6 +223,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
         num_replicas=cfg.num_replicas,
         device=cfg.device,
         cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
+        space=get_space(cfg.space),
     )
 
 
@@ -282,8 +286,7 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
 
 def _in_process(crosser: Crosser) -> Evaluate:
     def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
-        report = None if progress is None else lambda done, most: progress(done / most)
-        return crosser.evaluate(terrains, seeds, progress=report)
+        return crosser.evaluate(terrains, seeds, progress=progress)
 
     return evaluate
 

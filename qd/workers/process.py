@@ -25,7 +25,7 @@ class Crosser(Protocol):
     """What evaluates a fixed number of terrains, such as :class:`sim.rollout.Rollout`."""
 
     def evaluate(
-        self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[int, int], None] | None = None
+        self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None
     ) -> "RolloutResult":
         """Cross each terrain."""
         ...
@@ -100,7 +100,7 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
         connection.send(("ready", None))
         while True:
             terrains, seeds = connection.recv()
-            report = lambda done, most: connection.send(("progress", done / most))  # noqa: E731
+            report = lambda share: connection.send(("progress", share))  # noqa: E731
             connection.send(("result", crosser.evaluate(terrains, seeds, progress=report)))
     except (EOFError, ConnectionError):  # the other end is gone: closed, or killed with unread messages
         sys.exit(0)

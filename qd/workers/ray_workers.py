@@ -135,8 +135,8 @@ class RayWorker:
         """Share of the present terrains that is done."""
         return self._share
 
-    def _note(self, done: int, most: int) -> None:
-        self._share = done / most
+    def _note(self, share: float) -> None:
+        self._share = share
 
 
 @dataclass

@@ -19,8 +19,8 @@ class Crosser:
     def evaluate(self, terrains, seeds, *, progress=None):
         assert len(terrains) == len(seeds) == self.num_terrains
         if progress is not None:
-            progress(1, 2)
-            progress(2, 2)
+            progress(0.5)
+            progress(1.0)
         return stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
 
 
