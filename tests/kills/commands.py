@@ -3,8 +3,9 @@
 import dataclasses
 import os
 import resource
+import sys
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from kernels.episode import Outcome
-from qd import reevaluate
+from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.cli import run_command
 from qd.show import replay
 from qd.studies import calibrate
 from sim import rollout
+from sim.files import command
 from sim.files.command import exit_code_of
 from tests.kills import searches, trainings
 from tests.qd import stand_in
@@ -33,8 +35,15 @@ def resume_search(path: Path) -> None:
 def reevaluate_search(path: Path) -> None:
     """All elites again."""
     searches.without_figures()
-    main = partial(reevaluate.reevaluate_run, open_evaluator=stand_in.open_stand_in)
-    run_command(reevaluate.ReevaluateCfg, main, ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY])
+    argv = ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY]
+    if status := command.run_command(_StandInReevaluate, argv, name="reevaluate"):
+        sys.exit(status)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _StandInReevaluate(Reevaluate):
+    def execute(self) -> None:
+        reevaluate_run(self, open_evaluator=stand_in.open_stand_in)
 
 
 def replay_elite(path: Path) -> None:
