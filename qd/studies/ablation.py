@@ -67,9 +67,13 @@ class Ablation(Who, Where):
         from qd.studies.study import Study, publish_with_figure, run_study
         from qd.workers.evaluator import open_evaluator as opened
         from qd.workers.evaluator import resolve_device
-        from sim.robots.robot import get_robot
+        from sim.robots.robot import get_robot, robot_of
 
-        robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device, self.workers)
+        device = resolve_device(self.device, self.workers)
+        if self.run is None:
+            robot = get_robot(self.robot or "anymal")
+        else:
+            robot = robot_of(RunDirectory(self.run).read_cfg().robot, self.robot, self.run)
         path = self.run_dir or RUNS / f"{robot.name}-ablation"
         base = self._begun(robot, device) if self.run is None else self._of_run(self.run, robot)
         if base.iterations < base.reevaluate_every:
@@ -79,7 +83,8 @@ class Ablation(Who, Where):
             )
         names = _ALPHAS if self.run is None else ("alpha_0",)
         runs = {name: changed(base, {"alpha": _ALPHAS[name]}) for name in names}
-        study = Study.of(path, runs, robot, policy=self.policy, device=device, workers=self.workers, sampled=True)
+        moved = None if self.run is None else moved_policy(base, self.policy)
+        study = Study.of(path, runs, robot, device=device, workers=self.workers, sampled=True, moved=moved)
 
         def measure() -> dict[str, Any]:
             metrics = run_study(study, open_evaluator or opened)
@@ -110,7 +115,6 @@ class Ablation(Who, Where):
         wrong = [
             f"{name} {there}, got {wanted}"
             for name, there, wanted in (
-                ("robot", cfg.robot, robot.name),
                 ("preset", cfg.preset, self.preset or cfg.preset),
                 ("seed", cfg.seed, cfg.seed if self.seed is None else self.seed),
                 ("policy", cfg.policy, cfg.policy if moved else self.policy or cfg.policy),
