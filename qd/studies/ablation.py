@@ -140,8 +140,8 @@ def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
         iterations: Up to which they are compared.
 
     Returns:
-        ``iterations`` at which elites of all crossed fresh episodes, the ``mean_std`` and their ``intervals`` (95 %, bootstrap
-        over elites) by name, the ``elites`` and ``mean_fitness`` there, and ``below_by_more_than_intervals``: whether,
+        ``iterations`` at which elites of all crossed fresh episodes; by name the ``mean_std``, their ``intervals``
+        (95 %, bootstrap over elites), the ``elites`` and ``mean_fitness`` there, and ``below_by_more_than_intervals``: whether,
         of each, the interval with alpha 1 ends before that with alpha 0 begins.
 
     Raises:

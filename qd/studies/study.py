@@ -48,7 +48,7 @@ class Study:
     origin: dict[str, Any]
     """Provenance."""
     sampled: bool
-    """Whether up to 200 drawn elites cross fresh episodes every so many iterations, or all elites, and at the end too."""
+    """Whether up to 200 drawn elites cross fresh episodes every so many iterations; else all do, and at the end too."""
 
     @classmethod
     def of(
@@ -164,9 +164,7 @@ def _lock_step(searches: Sequence[_Search], evaluate: Evaluate, *, sampled: bool
             _iterate([one for one in searches if one.done == done], evaluate, done + 1, bar, sampled=sampled)
 
 
-def _iterate(
-    active: Sequence[_Search], evaluate: Evaluate, iteration: int, bar: ProgressBar, *, sampled: bool
-) -> None:
+def _iterate(active: Sequence[_Search], evaluate: Evaluate, iteration: int, bar: ProgressBar, *, sampled: bool) -> None:
     """One iteration of some searches, saved."""
     began, every = time.perf_counter(), active[0].cfg.reevaluate_every
     asked = [one.search.ask() for one in active]
@@ -187,9 +185,7 @@ def _iterate(
     best = max((one.metrics[-1] for one in active), key=lambda row: row["elites"])
     episodes = sum(row["episodes"] for row in rows)
     status = worker_status(evaluate)
-    bar.show(
-        {**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}, None if status is None else str(status)
-    )
+    bar.show({**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}, None if status is None else str(status))
 
 
 def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) -> list[dict[str, Any]]:

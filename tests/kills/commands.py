@@ -62,7 +62,6 @@ def resume_training(run_dir: Path) -> int:
 
 def calibrate_with(policy: Path) -> None:
     """Penalty scales with a controller."""
-    calibrate.open_evaluator = stand_in.open_stand_in
     out = str(policy.parent / "scales.json")
     argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
     run_command(calibrate.CalibrateCfg, calibrate.calibrate, argv)
