@@ -14,7 +14,6 @@ import numpy as np
 
 from kernels.episode import Outcome
 from qd.fresh import Reevaluate, reevaluate_run
-from qd.run.cli import run_command
 from qd.show import replay
 from qd.studies import calibrate
 from sim import rollout
@@ -50,7 +49,7 @@ def replay_elite(path: Path) -> None:
     """The worst elite again."""
     rollout.Rollout = _StandInRollout
     argv = ["--run", str(path), "--device", "cpu", "--replicas", "4", "--policy", searches.POLICY]
-    run_command(replay.ReplayCfg, replay.main, argv)
+    sys.exit(command.run_command(replay.ReplayElite, argv, name="replay"))
 
 
 def resume_training(run_dir: Path) -> int:
@@ -64,7 +63,7 @@ def calibrate_with(policy: Path) -> None:
     """Penalty scales with a controller."""
     out = str(policy.parent / "scales.json")
     argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
-    run_command(calibrate.CalibrateCfg, calibrate.calibrate, argv)
+    sys.exit(command.run_command(calibrate.Calibrate, argv, name="calibrate"))
 
 
 def evaluate_with(policy: Path) -> int:
