@@ -141,8 +141,8 @@ def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
 
     Returns:
         ``iterations`` at which elites of all crossed fresh episodes; by name the ``mean_std``, their ``intervals``
-        (95 %, bootstrap over elites), the ``elites`` and ``mean_fitness`` there, and ``below_by_more_than_intervals``: whether,
-        of each, the interval with alpha 1 ends before that with alpha 0 begins.
+        (95 %, bootstrap over elites), ``elites`` and ``mean_fitness`` there; and ``below_by_more_than_intervals``:
+        whether, of each, the interval with alpha 1 ends before that with alpha 0 begins.
 
     Raises:
         ValueError: If there is no such iteration.

@@ -100,7 +100,7 @@ def test_a_worker_that_died_is_started_again(tmp_path):
 
 
 def test_three_deaths_in_a_search_change_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("qd.search.write_figures", lambda folder, archive, metrics: [])
+    monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
     alone = run_search(make_job(tmp_path / "alone"), open_evaluator=stand_in.open_stand_in)
     job = make_job(tmp_path / "on-ray")
     deadly = dataclasses.replace(job.evaluator, workers="ray:2", policy=f"die:{tmp_path}:3")
