@@ -1,39 +1,44 @@
 """What the fitness gains by subtracting standard deviations: the paper's ablation, alpha 1 against alpha 0."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.fresh import FRESH_EPISODES, Open
-from qd.run.arguments import Arguments, job_of
-from qd.run.cli import naming_what_is_next, run_command
-from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, differences
-from qd.run.settings import SearchCfg, as_settings, refuse_unnamed_code
-from qd.search import run_search
-from qd.show.figures import new_figure, save_figure
-from qd.studies.beside import LOOKS, prepare_numbers
-from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
-from sim.files.atomic import to_json, write_atomically
+from qd.run.directory import RUNS, Metrics, RunDirectory
+from qd.run.settings import (
+    SearchCfg,
+    as_settings,
+    changed,
+    measured_now,
+    moved_policy,
+    preset,
+    refuse_changes,
+    refuse_unnamed_code,
+    resumed,
+)
+from sim.files.command import Where, Who
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_NAMES = {1.0: "alpha_1", 0.0: "alpha_0"}
-_DEFAULTS = {"paper": (150, 50), "small": (6, 2)}  # iterations, and how often elites are looked at
+    from qd.fresh import Open
+    from sim.robots.robot import RobotCfg
+
+_ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
+_DEFAULTS = {"paper": (150, 50), "small": (6, 2)}  # iterations, and how often elites cross fresh episodes
 
 
 @dataclass(frozen=True, kw_only=True)
-class AblationCfg:
+class Ablation(Who, Where):
     """Search with and without the standard deviations in the fitness, and see how repeatable the elites are.
 
-    Every so many iterations up to 200 elites of each search are drawn and crossed 40 times afresh; the mean of their
-    standard deviations is compared. Stopped, the same command goes on.
+    Every so many iterations up to 200 elites of each search are drawn and cross 40 fresh episodes; the mean of their
+    standard deviations is compared. Both searches are ordinary runs, alpha_1 and alpha_0 in the study's folder. State
+    is saved after every iteration, and the same command goes on.
     """
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     run: Path | None = None
     """A run with alpha 1 whose first iterations are taken; left out, one is made too."""
     preset: str | None = None
@@ -42,140 +47,89 @@ class AblationCfg:
     """Iterations to compare; 150 of preset paper, 6 of small."""
     seed: int | None = None
     """Seed of the searches; that of --run, or 0."""
-    policy: str | None = None
-    """Controller other than the shipped one."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
-    workers: int | Literal["auto"] | None = None
-    """Ray workers, a GPU or CPU core each; auto: all there are."""
     run_dir: Path | None = None
-    """Where the searches are kept; runs/<robot>-ablation."""
+    """The study's folder, new or to go on with; runs/<robot>-ablation."""
     out: Path | None = None
-    """Where to write the numbers, with a figure beside them; ablation.json in that directory."""
+    """Where to write the numbers, with a figure beside them; ablation.json in that folder."""
 
+    def execute(self, *, open_evaluator: "Open | None" = None) -> dict[str, Any]:
+        """Runs the searches that are not done and publishes what they show.
 
-def ablation(args: AblationCfg, *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
-    """The command; returns what it writes.
+        Args:
+            open_evaluator: Opens what crosses the terrains.
 
-    Args:
-        args: What to compare.
-        open_evaluator: Opens what crosses the terrains.
+        Raises:
+            FileNotFoundError: If --run is no run.
+            ValueError: If the searches cannot be compared, or something asked for cannot be.
+            Interrupted: On Ctrl-C; all iterations that ended are saved.
+            EvaluatorError: If a worker is lost; likewise.
+        """
+        from qd.studies.study import Study, publish_with_figure, run_study
+        from qd.workers.evaluator import open_evaluator as opened
+        from qd.workers.evaluator import resolve_device
+        from sim.robots.robot import get_robot, robot_of
 
-    Raises:
-        FileNotFoundError: If --run is no run.
-        ValueError: If the searches cannot be compared, or something asked for cannot be.
-        Interrupted: On Ctrl-C; all iterations that ended are saved.
-        EvaluatorError: If a worker is lost; likewise.
-    """
-    from sim.robots.robot import get_robot
-
-    name = get_robot(args.robot).name
-    folder = args.run_dir or Path("runs") / f"{name}-ablation"
-    out = args.out or folder / "ablation.json"
-    device = resolve_device(args.device, args.workers)
-    asked = _asked(args, "paper" if device.startswith("cuda") else "small")
-    if args.out is not None:
-        prepare_numbers(out)
-    with naming_what_is_next("finished iterations are saved", lambda: "The same command goes on"):
-        if args.run is None:
-            _check_looks(asked)
-            cfg = _search(asked, 1.0, folder, open_evaluator)
+        device = resolve_device(self.device, self.workers)
+        if self.run is None:
+            robot = get_robot(self.robot or "anymal")
         else:
-            cfg = _checked(RunDirectory(args.run).read_cfg(), args)
-            asked = _of_run(cfg, asked, args)
-            _check_looks(asked)
-        other = _search(asked, 0.0, folder, open_evaluator)
-    _check_alike(cfg, other)
-    metrics = {
-        "alpha_1": RunDirectory(args.run or folder / "alpha_1").read_metrics(),
-        "alpha_0": RunDirectory(folder / "alpha_0").read_metrics(),
-    }
-    report = {**origin_of(device, other.seed, args.workers), "robot": name, "preset": other.preset}
-    report |= numbers_of(metrics, asked["iterations"])
-    _print(report)
-    write_atomically(out, to_json(report))
-    save_figure(out.with_suffix(".png"), draw_ablation(report))
-    print(f"written to {out} and {out.with_suffix('.png')}")
-    return report
+            robot = robot_of(RunDirectory(self.run).read_cfg().robot, self.robot, self.run)
+        path = self.run_dir or RUNS / f"{robot.name}-ablation"
+        base = self._begun(robot, device) if self.run is None else self._of_run(self.run, robot)
+        if base.iterations < base.reevaluate_every:
+            raise ValueError(
+                f"no iteration up to {base.iterations} at which elites cross fresh episodes, which is every "
+                f"{base.reevaluate_every}: give at least {base.reevaluate_every} --iterations"
+            )
+        names = _ALPHAS if self.run is None else ("alpha_0",)
+        runs = {name: changed(base, {"alpha": _ALPHAS[name]}) for name in names}
+        moved = None if self.run is None else moved_policy(base, self.policy)
+        study = Study.of(path, runs, robot, device=device, workers=self.workers, sampled=True, moved=moved)
 
+        def measure() -> dict[str, Any]:
+            metrics = run_study(study, open_evaluator or opened)
+            if self.run is not None:
+                metrics["alpha_1"] = RunDirectory(self.run).read_metrics()
+            numbers = numbers_of(metrics, base.iterations)
+            return {**study.origin, "robot": robot.name, "preset": base.preset, **numbers}
 
-def _asked(args: AblationCfg, preset: str) -> dict[str, Any]:
-    """What the command line asks of a search, with what it leaves out."""
-    name = args.preset or preset
-    iterations, every = _DEFAULTS.get(name, (1, 1))  # an unknown preset is refused where it is looked up
-    given = {key: getattr(args, key) for key in ("robot", "seed", "policy", "device", "workers")}
-    return {**given, "preset": name, "iterations": args.iterations or iterations, "reevaluate_every": every}
+        return publish_with_figure(self.out or path / "ablation.json", measure, _show, draw_ablation)
 
+    def _begun(self, robot: "RobotCfg", device: str) -> SearchCfg:
+        """Settings of searches from the start."""
+        size = self.preset or ("paper" if device.startswith("cuda") else "small")
+        cfg = preset(size, robot)
+        iterations, every = _DEFAULTS[size]
+        asked = {"iterations": self.iterations or iterations, "seed": self.seed, "policy": self.policy}
+        return measured_now(changed(cfg, {**asked, "reevaluate_every": every}), robot)
 
-def _check_looks(asked: dict[str, Any]) -> None:
-    """Refuse searches at the end of which nothing could be compared."""
-    iterations, every = asked["iterations"], asked["reevaluate_every"]
-    if iterations < every:
-        raise ValueError(
-            f"no iteration up to {iterations} at which elites are looked at again, which is every {every}: give at "
-            f"least {every} --iterations"
-        )
+    def _of_run(self, path: Path, robot: "RobotCfg") -> SearchCfg:
+        """Settings of a run with alpha 1.
 
-
-def _checked(cfg: SearchCfg, args: AblationCfg) -> SearchCfg:
-    """The settings of the run with alpha 1."""
-    from sim.robots.robot import get_robot
-
-    wrong = [
-        f"{name} {there}, got {wanted}"
-        for name, there, wanted in (
-            ("robot", cfg.robot, get_robot(args.robot).name),
-            ("preset", cfg.preset, args.preset or cfg.preset),
-            ("seed", cfg.seed, cfg.seed if args.seed is None else args.seed),
-            ("policy", cfg.policy, args.policy or cfg.policy),
-            ("alpha 1; it has", cfg.fitness.alpha, 1.0),
-        )
-        if there != wanted
-    ]
-    if wrong:
-        raise ValueError(f"{args.run} is a run of {'; '.join(wrong)}: leave that out, or give another --run")
-    if cfg.reevaluate_every == 0:
-        raise ValueError(f"{args.run} never looked at its elites again (reevaluate_every 0): give another --run")
-    return cfg
-
-
-def _of_run(cfg: SearchCfg, asked: dict[str, Any], args: AblationCfg) -> dict[str, Any]:
-    """What to ask of a search for it to have a run's settings."""
-    from sim.robots.robot import robot_of
-
-    assert args.run is not None
-    robot = robot_of(cfg.robot, args.robot, args.run)
-    refuse_unnamed_code(cfg.policy, args.policy, args.run)
-
-    parts = (cfg, cfg.scheduler, cfg.fitness)
-    own = {
-        field.name: next(getattr(part, field.name) for part in parts if hasattr(part, field.name))
-        for field in fields(Arguments)
-        if any(hasattr(part, field.name) for part in parts)
-    }
-    left_out = tuple(name for name in robot.penalties if name not in cfg.fitness.penalties)
-    own |= {"robot": robot.spec, "without": left_out or None, "policy": None if cfg.policy == "shipped" else cfg.policy}
-    iterations = asked["iterations"] if asked["preset"] == cfg.preset else _DEFAULTS[cfg.preset][0]
-    return {**asked, **own, "iterations": iterations}
-
-
-def _search(asked: dict[str, Any], alpha: float, folder: Path, open_evaluator: Open) -> SearchCfg:
-    """A search, made or gone on with; returns its settings."""
-    path = folder / _NAMES[alpha]
-    if (path / CONFIG_FILE).exists():
-        iterations = max(asked["iterations"], RunDirectory(path).iterations_done())
-        asked = {**asked, "iterations": iterations, "resume": path}
-    else:
-        asked = {**asked, "run_dir": path}
-    job = job_of(Arguments(**{**asked, "alpha": alpha, "reproduce": "no"}))
-    run_search(job, open_evaluator=open_evaluator)
-    return job.cfg
-
-
-def _check_alike(cfg: SearchCfg, other: SearchCfg) -> None:
-    found = [item for item in differences(as_settings(cfg), as_settings(other)) if not item.startswith("fitness.alpha")]
-    if found:
-        raise ValueError(f"the searches must differ in alpha alone, but: {', '.join(found)}")
+        Raises:
+            ValueError: If it is another run than the one asked for, its elites never crossed fresh episodes, or its
+                robot or controller has changed since.
+        """
+        cfg = RunDirectory(path).read_cfg()
+        moved = moved_policy(cfg, self.policy)
+        wrong = [
+            f"{name} {there}, got {wanted}"
+            for name, there, wanted in (
+                ("preset", cfg.preset, self.preset or cfg.preset),
+                ("seed", cfg.seed, cfg.seed if self.seed is None else self.seed),
+                ("policy", cfg.policy, cfg.policy if moved else self.policy or cfg.policy),
+                ("alpha 1; it has", cfg.fitness.alpha, 1.0),
+            )
+            if there != wanted
+        ]
+        if wrong:
+            raise ValueError(f"{path} is a run of {'; '.join(wrong)}: leave that out, or give another --run")
+        if cfg.reevaluate_every == 0:
+            raise ValueError(f"{path} has no fresh episodes of its elites (reevaluate_every 0): give another --run")
+        refuse_unnamed_code(cfg.policy, self.policy, path)
+        now = resumed(path, cfg, robot, {"iterations": self.iterations or _DEFAULTS[cfg.preset][0]}, moved)
+        refuse_changes(path, "run", as_settings(cfg), as_settings(now))
+        return now
 
 
 def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
@@ -186,9 +140,9 @@ def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
         iterations: Up to which they are compared.
 
     Returns:
-        ``iterations`` at which elites of all were looked at, the ``mean_std`` and their ``intervals`` (95 %, bootstrap
-        over elites) by name, the ``elites`` and ``mean_fitness`` there, and ``below_by_more_than_intervals``: whether,
-        of each, the interval with alpha 1 ends before that with alpha 0 begins.
+        ``iterations`` at which elites of all crossed fresh episodes; by name the ``mean_std``, their ``intervals``
+        (95 %, bootstrap over elites), ``elites`` and ``mean_fitness`` there; and ``below_by_more_than_intervals``:
+        whether, of each, the interval with alpha 1 ends before that with alpha 0 begins.
 
     Raises:
         ValueError: If there is no such iteration.
@@ -201,7 +155,7 @@ def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
     }
     at = sorted(set.intersection(*(set(found) for found in looks.values())))
     if not at:
-        raise ValueError(f"no iteration up to {iterations} at which elites of all searches were looked at again")
+        raise ValueError(f"no iteration up to {iterations} at which elites of all searches crossed fresh episodes")
     rows = {name: [found[iteration] for iteration in at] for name, found in looks.items()}
     intervals = {name: [row["mean_std_interval"] for row in own] for name, own in rows.items()}
     return {
@@ -216,7 +170,9 @@ def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
     }
 
 
-def _print(report: dict[str, Any]) -> None:
+def _show(report: dict[str, Any]) -> None:
+    from qd.fresh import FRESH_EPISODES
+
     print(f"\nmean STD of elites over {FRESH_EPISODES} fresh episodes, 95 % interval over elites")
     for k, iteration in enumerate(report["iterations"]):
         cells = []
@@ -228,6 +184,10 @@ def _print(report: dict[str, Any]) -> None:
 
 def draw_ablation(report: dict[str, Any]) -> "Figure":
     """Mean STD over the iterations with its intervals, and the number of elites (the paper's ablation figure)."""
+    from qd.fresh import FRESH_EPISODES
+    from qd.show.figures import new_figure
+    from qd.studies.study import LOOKS
+
     figure = new_figure(8.5, 3.6)
     figure.suptitle(f"{report['robot']}: the standard deviations in the fitness (alpha 1) and left out (alpha 0)")
     left, right = figure.subplots(1, 2)
@@ -245,7 +205,3 @@ def draw_ablation(report: dict[str, Any]) -> "Figure":
         axes.grid(alpha=0.3)
     left.legend(frameon=False)
     return figure
-
-
-if __name__ == "__main__":
-    run_command(AblationCfg, ablation)

@@ -9,30 +9,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
-from qd.run.cli import run_command
-from qd.run.directory import Metrics, RunDirectory, differences
-from qd.run.settings import as_settings
-from qd.show.figures import PENALTY_LABELS, new_figure, save_figure
-from sim.files.atomic import prepare_output, to_json, write_atomically
+from qd.fitness import FAILING_GOAL_RATE
+from qd.run.directory import Metrics, RunDirectory
+from qd.run.settings import as_settings, differences
 from sim.files.intervals import bootstrap_interval
-from sim.files.provenance import provenance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LOOKS = (("#0072b2", "-"), ("#d55e00", "--"), ("#009e73", "-."), ("#cc79a7", ":"))
-"""Colour and line of each run."""
 _CURVES = ("qd_score", "elites", "batch_goal_rate")
 _MAY_DIFFER = ("policy", "policy_sha256", "seed")
+_MOST_RUNS = 4  # lines that can be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
-class BesideCfg:
+class Beside:
     """Lay searches against different controllers side by side: curves, and how their elites end.
 
-    The searches must be of one robot, with the same settings and equally many iterations; only controller and seed may
-    differ.
+    The searches are finished runs of one robot, with the same settings and equally many iterations; only controller and
+    seed may differ.
     """
 
     runs: tuple[str, ...]
@@ -40,17 +36,24 @@ class BesideCfg:
     out: Path
     """Where to write the numbers; the figure goes beside it as .png."""
 
+    def execute(self) -> dict[str, Any]:
+        """Publishes the numbers.
 
-def prepare_numbers(out: Path) -> None:
-    """Find out whether a file of numbers and its figure, ``.png`` in place of ``.json``, can be written.
+        Raises:
+            FileNotFoundError: If there is no run.
+            ValueError: If runs cannot be compared, or a file cannot be written.
+        """
+        from qd.studies.study import publish_with_figure
+        from sim.files.provenance import provenance
 
-    Raises:
-        ValueError: If they cannot, or it has another name: the figure would take its place.
-    """
-    if out.suffix != ".json":
-        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
-    for file in (out, out.with_suffix(".png")):
-        prepare_output(file)
+        sides = sides_of(self.runs)
+        report = {
+            **provenance("cpu", 0),
+            "robot": sides[0].archive.robot,
+            "iterations": sides[0].archive.iterations,
+            "runs": {side.name: numbers_of(side) for side in sides},
+        }
+        return publish_with_figure(self.out, lambda: report, _show, lambda _: draw_beside(sides))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +76,8 @@ def sides_of(runs: Sequence[str]) -> list[Side]:
     named = [run.partition("=") for run in runs]
     if any(not name or not folder for name, _, folder in named) or len({name for name, _, _ in named}) < len(named):
         raise ValueError(f"runs must be NAME=DIR each, with different names, got {' '.join(runs)}")
-    if not 2 <= len(named) <= len(LOOKS):
-        raise ValueError(f"runs must be 2 to {len(LOOKS)}, got {len(named)}")
+    if not 2 <= len(named) <= _MOST_RUNS:
+        raise ValueError(f"runs must be 2 to {_MOST_RUNS}, got {len(named)}")
     sides = []
     for name, _, folder in named:
         run = RunDirectory(Path(folder))
@@ -107,7 +110,7 @@ def numbers_of(side: Side) -> dict[str, Any]:
     measured = {
         "goal_rate": archive.goal_rate,
         "collision_rate": archive.collision_rate,
-        "under_half_cross": (archive.goal_rate < 0.5).astype(float),
+        "under_half_cross": (archive.goal_rate < FAILING_GOAL_RATE).astype(float),
         "half_collide": (archive.collision_rate >= 0.5).astype(float),
     }
     return {
@@ -124,6 +127,9 @@ def numbers_of(side: Side) -> dict[str, Any]:
 
 def draw_beside(sides: Sequence[Side]) -> "Figure":
     """Curves of the searches, how often their elites are crossed, and where their penalties lie."""
+    from qd.show.figures import new_figure
+    from qd.studies.study import LOOKS
+
     figure = new_figure(13.0, 4.4)
     archive = sides[0].archive
     names = " and ".join(side.name for side in sides)
@@ -146,6 +152,8 @@ def draw_beside(sides: Sequence[Side]) -> "Figure":
 
 
 def _label(axes: "NDArray[Any] | Sequence[Axes]", archive: Archive) -> None:
+    from qd.show.figures import PENALTY_LABELS
+
     labels = (
         ("iteration", "elites"),
         ("iteration", "robots that reach the goal,\nof all that are evaluated [%]"),
@@ -164,21 +172,7 @@ def _label(axes: "NDArray[Any] | Sequence[Axes]", archive: Archive) -> None:
     axes[3].set_yticks(range(len(names)), names)
 
 
-def beside(cfg: BesideCfg) -> dict[str, Any]:
-    """The command; returns what it writes.
-
-    Raises:
-        FileNotFoundError: If there is no run.
-        ValueError: If runs cannot be compared, or the file cannot be written.
-    """
-    sides = sides_of(cfg.runs)
-    prepare_numbers(cfg.out)
-    report = {
-        **provenance("cpu", 0),
-        "robot": sides[0].archive.robot,
-        "iterations": sides[0].archive.iterations,
-        "runs": {side.name: numbers_of(side) for side in sides},
-    }
+def _show(report: dict[str, Any]) -> None:
     for name, numbers in report["runs"].items():
         low, high = numbers["intervals"]["under_half_cross"]
         print(
@@ -186,12 +180,3 @@ def beside(cfg: BesideCfg) -> dict[str, Any]:
             f"{numbers['under_half_cross']:.0%} of them ({low:.0%}-{high:.0%}); mean goal rate "
             f"{numbers['goal_rate']:.3f}, base collisions {numbers['collision_rate']:.3f}"
         )
-    figure = cfg.out.with_suffix(".png")
-    write_atomically(cfg.out, to_json(report))
-    save_figure(figure, draw_beside(sides))
-    print(f"written to {cfg.out} and {figure}")
-    return report
-
-
-if __name__ == "__main__":
-    run_command(BesideCfg, beside)

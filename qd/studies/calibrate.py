@@ -6,47 +6,86 @@ Scales are measured once with the shipped controller, before any search, and nev
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from qd.run.cli import run_command
-from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
-from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.command import Where, Who, publish
+from sim.files.settings import check, setting
 from sim.policy.spec import ControllerSpec
 
 if TYPE_CHECKING:
+    from qd.fresh import Open
     from sim.rollout import RolloutResult
 
 _CPU_TERRAINS = 16  # at once: enough to keep some cores busy, little enough memory
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateCfg:
+class Calibrate(Who, Where):
     """Measure the penalty scales of a robot with a controller, on hard-random terrains.
 
-    Writes them beside the robot's own controller, or the settings file of a robot that is not shipped, where every
-    search reads them.
+    Writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped, where
+    every search reads them.
     """
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    policy: str | None = None
-    """Controller: a file, file.py:callable or module:callable; the one that comes with the robot."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
-    terrains: int = 300
+    terrains: int = setting(300, least=1)
     """Hard-random terrains."""
-    replicas: int = 20
+    replicas: int = setting(20, least=1)
     """Episodes a terrain."""
-    seed: int = 0
+    seed: int = setting(0, least=0)
     """Draws terrains and starts."""
-    workers: int | Literal["auto"] | None = None
-    """Cross on so many Ray workers, a GPU or a CPU core each; auto: as many as there are."""
     out: Path | None = None
     """Where to write; sim/robots/<robot>.scales.json, or <name>.scales.json beside a settings file."""
+
+    def execute(self, *, open_evaluator: "Open | None" = None) -> None:
+        """Measures the scales and publishes them.
+
+        Args:
+            open_evaluator: Opens what crosses the terrains.
+
+        Raises:
+            ValueError: If something asked for cannot be had, or a penalty never occurred.
+        """
+        from qd.run.progress import share_bar
+        from qd.workers import evaluator as workers
+        from sim.robots.robot import get_robot
+        from sim.space import SUPER_GAUSSIAN
+
+        check(self)
+        robot = get_robot(self.robot or "anymal")
+        if self.policy is not None and self.out is None and robot.settings_file is None:
+            raise ValueError(
+                "the scales kept with a robot are those of its shipped controller, got another one (--policy): "
+                "name a file for its scales with --out"
+            )
+        device, policy = workers.resolve_device(self.device, self.workers), self.policy or str(robot.policy_file)
+        workers.check_policy(policy, robot, device)
+        evaluator = workers.EvaluatorCfg(
+            robot=robot,
+            policy=policy,
+            num_terrains=self.terrains if device.startswith("cuda") else min(self.terrains, _CPU_TERRAINS),
+            num_replicas=self.replicas,
+            device=device,
+            workers=self.workers,
+        )
+        genes = SUPER_GAUSSIAN.hard_random(self.terrains, self.seed)
+        seeds = np.random.SeedSequence(self.seed).generate_state(self.terrains, np.uint32)
+
+        def measure() -> dict[str, Any]:
+            print(f"Crossing {self.terrains} hard-random terrains {self.replicas} times on {device}.", flush=True)
+            opened = open_evaluator or workers.open_evaluator
+            with opened(evaluator) as evaluate, share_bar("calibrate") as progress:
+                result = evaluate(genes, seeds, progress)
+            return {
+                **workers.origin_of(device, self.seed, self.workers),
+                "robot": robot.name,
+                "policy": ControllerSpec.parse(policy).label,
+                **_measured(result),
+            }
+
+        publish(self.out or robot.scales_file, measure, _show)
 
 
 def penalty_scales(result: "RolloutResult") -> dict[str, float]:
@@ -70,53 +109,6 @@ def penalty_scales(result: "RolloutResult") -> dict[str, float]:
     return scales
 
 
-def calibrate(cfg: CalibrateCfg) -> Path:
-    """Measure the scales, print them, write the file; returns its path.
-
-    Raises:
-        ValueError: If something asked for cannot be had, or a penalty never occurred.
-    """
-    from sim.robots.robot import get_robot
-    from sim.space import SUPER_GAUSSIAN
-
-    if cfg.terrains < 1 or cfg.replicas < 1:
-        raise ValueError(f"terrains and replicas must be at least 1, got {cfg.terrains} and {cfg.replicas}")
-    robot = get_robot(cfg.robot)
-    if cfg.policy is not None and cfg.out is None and robot.settings_file is None:
-        raise ValueError(
-            "the scales kept with a robot are those of its shipped controller, got another one (--policy): "
-            "name a file for its scales with --out"
-        )
-    device = resolve_device(cfg.device, cfg.workers)
-    policy = cfg.policy or str(robot.policy_file)
-    check_policy(policy, robot, device)
-    out = cfg.out or robot.scales_file
-    prepare_output(out)
-    print(f"Crossing {cfg.terrains} hard-random terrains {cfg.replicas} times on {device}.", flush=True)
-    evaluator = EvaluatorCfg(
-        robot=robot,
-        policy=policy,
-        num_terrains=cfg.terrains if device.startswith("cuda") else min(cfg.terrains, _CPU_TERRAINS),
-        num_replicas=cfg.replicas,
-        device=device,
-        workers=cfg.workers,
-    )
-    genes = SUPER_GAUSSIAN.hard_random(cfg.terrains, cfg.seed)
-    seeds = np.random.SeedSequence(cfg.seed).generate_state(cfg.terrains, np.uint32)
-    with open_evaluator(evaluator) as evaluate, tqdm(total=100, unit="%", desc="calibrate", disable=None) as bar:
-        result = evaluate(genes, seeds, lambda share: _move(bar, share))
-    report = {
-        **origin_of(device, cfg.seed, cfg.workers),
-        "robot": robot.name,
-        "policy": ControllerSpec.parse(policy).label,
-        **_measured(result),
-    }
-    write_atomically(out, to_json(report))
-    print("\n".join(f"  {name:<14}{scale:12.4f}" for name, scale in report["scales"].items()))
-    print(f"Written to {out}")
-    return out
-
-
 def _measured(result: "RolloutResult") -> dict[str, Any]:
     """The scales, and what they were measured on."""
     rows = np.asarray(result.penalties)[~result.invalid]
@@ -130,9 +122,5 @@ def _measured(result: "RolloutResult") -> dict[str, Any]:
     }
 
 
-def _move(bar: tqdm, share: float) -> None:
-    bar.update(round(100 * share) - bar.n)
-
-
-if __name__ == "__main__":
-    run_command(CalibrateCfg, calibrate)
+def _show(report: dict[str, Any]) -> None:
+    print("\n".join(f"  {name:<14}{scale:12.4f}" for name, scale in report["scales"].items()))

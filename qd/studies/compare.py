@@ -110,9 +110,7 @@ class Compare(Who, Where):
         seeds = range(self.seed, self.seed + self.seeds)
         runs = {f"{name}-{seed}": replace(cfg, seed=seed) for name, cfg in methods.items() for seed in seeds}
         path = self.run_dir or RUNS / f"{robot.name}-compare"
-        study = Study.of(
-            path, runs, robot, policy=self.policy, device=device, workers=self.workers, sampled=False
-        )
+        study = Study.of(path, runs, robot, device=device, workers=self.workers, sampled=False)
 
         def measure() -> dict[str, Any]:
             found = run_study(study, open_evaluator or opened)
@@ -234,6 +232,8 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     Args:
         report: As of :func:`report_of`, with ``robot`` and ``seeds``.
     """
+    from qd.show.figures import new_figure
+
     figure, seeds = new_figure(12.0, 4.6), len(report["seeds"])
     figure.suptitle(
         f"{report['robot']}: {report['terrains_evaluated'][-1]:,} terrains a run, "
@@ -267,6 +267,8 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
 
 def _show(report: dict[str, Any]) -> None:
     """Prints the last corrected QD score of each method."""
+    if not report["corrected_at"]:
+        return  # some runs were extended alone, with fresh episodes of some elites only
     print(f"\ncorrected QD score after {report['corrected_at'][-1]:,} terrains, 95 % interval over seeds")
     for name, method in report["methods"].items():
         last = method["corrected_qd_score"][-1]

@@ -1,4 +1,4 @@
-"""What more devices bring: ``python -m qd.studies.scale --workers 1 2 4 --out results/anymal/scale.json``.
+"""What more devices bring: ``faultline scale --counts 1 2 4 --out results/anymal/scale.json``.
 
 The same evaluation by 1 to N Ray workers on one host: with as many environments a worker as keep a GPU busy, and at the
 size of the paper's iteration, which they share.
@@ -11,37 +11,41 @@ from typing import Any
 
 import numpy as np
 
-from qd.run.cli import run_command
 from qd.run.settings import preset
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, crew_status, open_evaluator, resolve_device
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device, worker_status
 from sim.files.command import publish, show_json
 from sim.files.provenance import provenance
+from sim.files.settings import check, setting
 
 _PAPER_ITERATIONS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
-    """Time evaluations on hard-random terrains by different numbers of workers, against one process without Ray."""
+class Scale:
+    """Time evaluations on hard-random terrains by different numbers of Ray workers, against one process without Ray."""
 
     robot: str = "anymal"
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     device: str | None = None
     """cpu or cuda; CUDA where there is one."""
-    workers: tuple[int, ...] = (1, 2, 4)
-    """Numbers of workers to try, rising."""
-    terrains: int | None = None
+    counts: tuple[int, ...] = setting((1, 2, 4), least=1)
+    """Numbers of Ray workers to try, rising."""
+    terrains: int | None = setting(None, least=1)
     """Terrains a worker; 256 on CUDA, 4 on the CPU."""
-    replicas: int | None = None
+    replicas: int | None = setting(None, least=1)
     """Episodes a terrain; 16 on CUDA, 4 on the CPU."""
     preset: str | None = None
     """Whose iteration is shared among the workers; paper on CUDA, small on the CPU."""
-    rounds: int = 3
+    rounds: int = setting(3, least=1)
     """Evaluations timed of each, after one that is not; the median counts."""
-    seed: int = 0
+    seed: int = setting(0, least=0)
     """Draws terrains and starts."""
     out: Path | None = None
     """Where to write; printed alone if left out."""
+
+    def execute(self) -> None:
+        """Times and publishes."""
+        publish(self.out, lambda: measure(self), show_json)
 
 
 def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
@@ -56,13 +60,13 @@ def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
     with open_evaluator(cfg) as evaluate:
         seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]
-        crew = crew_status(evaluate)
-    if crew is not None and (crew.workers != cfg.workers or crew.retries):
-        raise EvaluatorError(f"expected {cfg.workers} workers throughout, got {crew}: nothing was measured")
+        found = worker_status(evaluate)
+    if found is not None and (found.workers != cfg.num_workers or found.retries):
+        raise EvaluatorError(f"expected {cfg.num_workers} workers throughout, got {found}: nothing was measured")
     return statistics.median(seconds[1:])
 
 
-def measure(args: Arguments) -> dict[str, Any]:
+def measure(args: Scale) -> dict[str, Any]:
     """Everything of ``scale.json``.
 
     Raises:
@@ -70,11 +74,11 @@ def measure(args: Arguments) -> dict[str, Any]:
     """
     from sim.robots.robot import get_robot
 
-    numbers = (*args.workers, args.rounds, *(n for n in (args.terrains, args.replicas) if n is not None))
-    if not args.workers or min(numbers) < 1 or list(args.workers) != sorted(set(args.workers)):
-        raise ValueError(f"all numbers must be positive and those of --workers rise, got {args}")
+    check(args)
+    if not args.counts or list(args.counts) != sorted(set(args.counts)):
+        raise ValueError(f"counts must be numbers of workers that rise, got {args.counts}")
     robot = get_robot(args.robot)
-    resolve_device(args.device, args.workers[-1])  # so many must be there
+    resolve_device(args.device, f"ray:{args.counts[-1]}")  # so many must be there
     device = resolve_device(args.device)
     on_gpu = device.startswith("cuda")
     search = preset(args.preset or ("paper" if on_gpu else "small"), robot)
@@ -86,7 +90,7 @@ def measure(args: Arguments) -> dict[str, Any]:
         num_terrains=terrains,
         num_replicas=replicas,
         device=device,
-        num_processes=1,
+        workers="1",
     )
     shared = replace(alone, num_terrains=search.scheduler.num_terrains, num_replicas=search.replicas)
     alone_s, shared_alone_s = (time_evaluation(cfg, args.rounds, args.seed) for cfg in (alone, shared))
@@ -94,10 +98,10 @@ def measure(args: Arguments) -> dict[str, Any]:
     print(f"without Ray: {one:,.1f} episodes/s; {shared_alone_s:.2f} s an iteration of {search.preset}", flush=True)
     rows = []
     dealt = "cuda" if on_gpu else "cpu"  # which GPU is Ray's to say
-    for count in args.workers:
-        crew = replace(alone, num_terrains=terrains * count, workers=count, device=dealt)
-        rate = terrains * count * replicas / time_evaluation(crew, args.rounds, args.seed)
-        iteration_s = time_evaluation(replace(shared, workers=count, device=dealt), args.rounds, args.seed)
+    for count in args.counts:
+        wide = replace(alone, num_terrains=terrains * count, workers=f"ray:{count}", device=dealt)
+        rate = terrains * count * replicas / time_evaluation(wide, args.rounds, args.seed)
+        iteration_s = time_evaluation(replace(shared, workers=f"ray:{count}", device=dealt), args.rounds, args.seed)
         rows.append(
             {
                 "workers": count,
@@ -133,12 +137,3 @@ def measure(args: Arguments) -> dict[str, Any]:
         },
         "rows": rows,
     }
-
-
-def main(args: Arguments) -> None:
-    """The command."""
-    publish(args.out, lambda: measure(args), show_json)
-
-
-if __name__ == "__main__":
-    run_command(Arguments, main)

@@ -1,4 +1,4 @@
-"""How fast the search runs beside the bare physics it is made of: ``python -m qd.studies.speed --robot anymal``.
+"""How fast the search runs beside the bare physics it is made of.
 
 The iterations timed are those of a real search, ask to saved checkpoint, in a directory that is thrown away. The bare
 rates are measured right after, on the terrains of the last of them, with as many environments and the same solver.
@@ -12,23 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.run.cli import run_command
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.progress import ProgressBar
 from qd.run.settings import SearchCfg, changed, policy_spec, preset, refuse_unnamed_code
-from qd.scheduler import Scheduler
-from qd.search import search_terrains
+from qd.search import begin, search_terrains
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
 from sim.files.atomic import read_json
 from sim.files.command import publish, show_json
 from sim.files.provenance import provenance
+from sim.files.settings import check, setting
 
 _WARM_UP = 2
 _CURVE_REPLICAS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Speed:
     """Time a preset's iteration, the bare physics of the same crossings, and episodes a second over env counts.
 
     The bare rate is that of contacts and solver alone: `walking` in the crossings' own motion, replayed from recorded
@@ -43,9 +42,9 @@ class Arguments:
     """cpu, cuda or cuda:N; CUDA where there is one."""
     run: Path | None = None
     """Time the last iterations of this run, made on this GPU, instead of running a search for it."""
-    iterations: int = 20
+    iterations: int = setting(20, least=1)
     """Iterations timed, after two that are not."""
-    steps: int = 1000
+    steps: int = setting(1000, least=1)
     """Physics steps of the bare measurement."""
     curve: tuple[int, ...] = (1024, 2048, 4096, 8192, 16384, 32768)
     """Numbers of environments of the curve, multiples of 16; none to leave it out."""
@@ -53,6 +52,10 @@ class Arguments:
     """Output of train.ppo.speed, whose rates are taken over."""
     out: Path | None = None
     """Where to write; printed alone if left out."""
+
+    def execute(self) -> None:
+        """Times and publishes."""
+        publish(self.out, lambda: measure(self), show_json)
 
 
 class _Recorder:
@@ -69,10 +72,7 @@ class _Recorder:
 
 def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, NDArray[Any]]:
     """Runs a search from the start; its metrics rows, and the terrains of its last iteration."""
-    search = Scheduler(
-        cfg.scheduler, num_cells=cfg.cells.num_cells, num_ratios=len(cfg.fitness.penalties), seed=cfg.seed
-    )
-    metrics: Metrics = []
+    search, metrics = begin(cfg), list[dict[str, Any]]()
     with (
         tempfile.TemporaryDirectory() as folder,
         open_evaluator(evaluator) as evaluate,
@@ -134,7 +134,7 @@ def training_rates(file: Path | None) -> dict[str, float | None]:
     return {"train_env_steps_per_s": rate.get(4096), "train_env_steps_per_s_8192": rate.get(8192)}
 
 
-def measure(args: Arguments) -> dict[str, Any]:
+def measure(args: Speed) -> dict[str, Any]:
     """Everything of ``speed.json``.
 
     Raises:
@@ -143,11 +143,9 @@ def measure(args: Arguments) -> dict[str, Any]:
     from sim.bench.physics import measure_bare_physics
     from sim.robots.robot import get_robot, robot_of
 
-    if min(args.iterations, args.steps) < 1 or any(count < 1 or count % _CURVE_REPLICAS for count in args.curve):
-        raise ValueError(
-            f"iterations and steps must be positive and --curve multiples of {_CURVE_REPLICAS}, got {args.iterations}, "
-            f"{args.steps} and {args.curve}"
-        )
+    check(args)
+    if any(count < 1 or count % _CURVE_REPLICAS for count in args.curve):
+        raise ValueError(f"curve must be multiples of {_CURVE_REPLICAS}, got {args.curve}")
     robot, device = get_robot(args.robot), resolve_device(args.device)
     training = training_rates(args.train_speed)
     if args.run is not None:
@@ -165,7 +163,7 @@ def measure(args: Arguments) -> dict[str, Any]:
         num_terrains=cfg.scheduler.num_terrains,
         num_replicas=cfg.replicas,
         device=device,
-        num_processes=1,  # bare physics is measured in one process too
+        workers="1",  # bare physics is measured in one process too
     )
     if terrains is None:
         metrics, terrains = time_iterations(cfg, evaluator)
@@ -193,12 +191,3 @@ def measure(args: Arguments) -> dict[str, Any]:
         **training,
         "envs_curve": time_curve(evaluator, terrains, args.curve) or None,
     }
-
-
-def main(args: Arguments) -> None:
-    """The command."""
-    publish(args.out, lambda: measure(args), show_json)
-
-
-if __name__ == "__main__":
-    run_command(Arguments, main)

@@ -48,7 +48,7 @@ class Study:
     origin: dict[str, Any]
     """Provenance."""
     sampled: bool
-    """Whether up to 200 drawn elites cross fresh episodes every so many iterations, or all elites, and at the end too."""
+    """Whether up to 200 drawn elites cross fresh episodes every so many iterations; else all do, and at the end too."""
 
     @classmethod
     def of(
@@ -57,10 +57,10 @@ class Study:
         runs: dict[str, SearchCfg],
         robot: "RobotCfg",
         *,
-        policy: str | None,
         device: str,
         workers: str | None,
         sampled: bool,
+        moved: str | None = None,
     ) -> "Study":
         """A study whose controller was tried.
 
@@ -68,16 +68,16 @@ class Study:
             path: Its folder.
             runs: Settings of each search, by the name of its folder.
             robot: The robot.
-            policy: Controller that the command line names, None for that of the settings.
             device: Warp device name.
             workers: Who crosses terrains, as on a command line.
             sampled: As of the field.
+            moved: Where the controller is, if not where the settings say.
 
         Raises:
             ValueError: If the controller cannot be loaded or does not fit the robot.
         """
         cfg = next(iter(runs.values()))
-        controller = policy or policy_spec(cfg, robot)
+        controller = moved or policy_spec(cfg, robot)
         return cls(
             path=path,
             runs=runs,
@@ -112,10 +112,10 @@ def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
         open_evaluator: Opens what crosses the terrains.
 
     Returns:
-        Rows of metrics, by name.
+        Rows of metrics by name, of the iterations asked for.
 
     Raises:
-        ValueError: If a run that is there has other settings, is damaged or at work, or has gone further than asked.
+        ValueError: If a run that is there has other settings, is damaged, or is at work.
         Interrupted: On Ctrl-C; all iterations that ended are saved.
         EvaluatorError: If a worker is lost; likewise.
     """
@@ -134,7 +134,7 @@ def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
                 found = one.run.with_fresh_values(archive_of(one.cfg, one.search, one.done))
                 by = one.run.read_summary().get("reproduced_by") if found.fresh is not None else None
                 write_results(one.run, found, one.metrics, {**one.origin, "reproduced_by": by})
-        return {name: one.metrics for name, one in searches.items()}
+        return {name: one.metrics[: study.runs[name].iterations] for name, one in searches.items()}
 
 
 def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
@@ -152,24 +152,19 @@ def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
     else:
         raise ValueError(f"{run.path} is not empty and holds no run: give another --run-dir")
     search, metrics = loaded or (begin(cfg), [])
-    if len(metrics) > cfg.iterations:
-        raise ValueError(
-            f"iterations must be at least {len(metrics)}, as many as {run.path} has done, got {cfg.iterations}"
-        )
+    cfg = replace(cfg, iterations=max(cfg.iterations, len(metrics)))  # one that was extended alone is not shortened
     return _Search(cfg=cfg, run=run, origin=origin, search=search, metrics=metrics)
 
 
 def _lock_step(searches: Sequence[_Search], evaluate: Evaluate, *, sampled: bool) -> None:
     """Runs the iterations that are left; searches behind the others, as after a kill, catch up first."""
-    iterations = searches[0].cfg.iterations
+    iterations = min(one.cfg.iterations for one in searches)
     with ProgressBar(iterations, min(one.done for one in searches)) as bar:
         while (done := min(one.done for one in searches)) < iterations:
             _iterate([one for one in searches if one.done == done], evaluate, done + 1, bar, sampled=sampled)
 
 
-def _iterate(
-    active: Sequence[_Search], evaluate: Evaluate, iteration: int, bar: ProgressBar, *, sampled: bool
-) -> None:
+def _iterate(active: Sequence[_Search], evaluate: Evaluate, iteration: int, bar: ProgressBar, *, sampled: bool) -> None:
     """One iteration of some searches, saved."""
     began, every = time.perf_counter(), active[0].cfg.reevaluate_every
     asked = [one.search.ask() for one in active]
@@ -190,9 +185,7 @@ def _iterate(
     best = max((one.metrics[-1] for one in active), key=lambda row: row["elites"])
     episodes = sum(row["episodes"] for row in rows)
     status = worker_status(evaluate)
-    bar.show(
-        {**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}, None if status is None else str(status)
-    )
+    bar.show({**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}, None if status is None else str(status))
 
 
 def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) -> list[dict[str, Any]]:

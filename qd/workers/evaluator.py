@@ -322,7 +322,7 @@ def _ready(processes: list[WorkerProcess], results: dict[int, Any]) -> list[int]
 
 
 def _in_turns(evaluate: Evaluate, at_once: int) -> Evaluate:
-    """Evaluates any number of terrains, ``at_once`` at a time; the last turn is filled up with terrains crossed before."""
+    """Evaluates any number of terrains, ``at_once`` at a time; the last turn is filled up with earlier ones."""
 
     def in_turns(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
         count = checked_count(terrains, seeds)

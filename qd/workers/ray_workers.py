@@ -177,6 +177,7 @@ class _Worker:
     def wait_for(self) -> None:
         """Takes its task away; the worker is there again when it introduces itself, in whichever process."""
         self.task = self.shard = self.question = None
+        self.share = 0.0
         self.coming = self.actor.introduce.options(max_task_retries=-1).remote()
 
     def restart(self) -> None:
@@ -246,7 +247,7 @@ class RayWorkers:
         count, size, began = checked_count(terrains, seeds), self._shard_size(), time.monotonic()
         shards = [_Shard(slice(first, min(first + size, count))) for first in range(0, count, size)]
         try:
-            self._cross_all(shards, terrains, seeds, progress or (lambda share: None))
+            self._cross_all(shards, size, terrains, seeds, progress or (lambda share: None))
         except BaseException:  # Ctrl-C too: what is under way belongs to no later call
             for worker in self._busy:
                 worker.restart()
@@ -255,10 +256,9 @@ class RayWorkers:
         return replace(whole, wall_s=time.monotonic() - began)
 
     def _cross_all(
-        self, shards: list[_Shard], terrains: NDArray, seeds: NDArray, progress: Callable[[float], None]
+        self, shards: list[_Shard], size: int, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None]
     ) -> None:
-        size, waiting = self._shard_size(), deque(shards)
-        shown, busy_at = 0.0, time.monotonic()
+        waiting, shown, busy_at = deque(shards), 0.0, time.monotonic()
         while any(shard.result is None for shard in shards):
             self._start_missing()
             for worker in self._ready:
@@ -272,7 +272,7 @@ class RayWorkers:
                 raise self._nobody_came()
             self._wait()
             waiting.extendleft(shard for worker in self._busy if (shard := self._failed_shard(worker, size)))
-            done = sum(shard.result is not None for shard in shards) + sum(map(_share_of, self._busy))
+            done = sum(shard.result is not None for shard in shards) + sum(map(_share_of, self._ready))
             shown = max(shown, min(1.0, done / len(shards)))
             progress(shown)
 
@@ -367,7 +367,8 @@ class RayWorkers:
             result, seconds = ray.get(worker.task)
             flaw = flaw_of(result, size, replicas)
             if flaw is None:
-                shard.result, worker.task = taken(result, shard.part.stop - shard.part.start), None
+                shard.result = taken(result, shard.part.stop - shard.part.start)
+                worker.task, worker.share = None, 0.0
                 worker.episodes_per_s = size * replicas / seconds
                 return None
             trouble = f"answered with nonsense: {flaw}"
@@ -390,13 +391,19 @@ class RayWorkers:
 
 
 def _share_of(worker: _Worker) -> float:
-    """Share of its shard that a worker has done when it last said so; asks it again without waiting."""
+    """Share of its shard that a worker has done when it last said so; asks it again without waiting.
+
+    The question also shows that an idle worker died; the task of a busy one fails, and says why.
+    """
     if worker.question is None:
         worker.question = worker.actor.share.remote()
     elif ray.wait([worker.question], timeout=0)[0]:
-        with suppress(RayError):  # it died: its task says so too, and why
-            worker.share = ray.get(worker.question)
-        worker.question = None
+        question, worker.question = worker.question, None
+        try:
+            worker.share = ray.get(question)
+        except RayError:
+            if worker.task is None:
+                worker.wait_for()
     return worker.share
 
 

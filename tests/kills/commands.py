@@ -15,6 +15,7 @@ from kernels.episode import Outcome
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.show import replay
 from qd.studies import calibrate
+from qd.workers import evaluator
 from sim import rollout
 from sim.files import command
 from tests.kills import searches, trainings
@@ -57,7 +58,7 @@ def resume_training(run_dir: Path) -> int:
 
 def calibrate_with(policy: Path) -> None:
     """Penalty scales with a controller."""
-    calibrate.open_evaluator = stand_in.open_stand_in
+    evaluator.open_evaluator = stand_in.open_stand_in
     out = str(policy.parent / "scales.json")
     argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
     sys.exit(command.run_command(calibrate.Calibrate, argv, name="calibrate"))

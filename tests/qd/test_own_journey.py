@@ -69,7 +69,7 @@ def searched(calibrated, home, robot, trot):
 
 
 def test_its_scales_lie_beside_its_settings(calibrated, home):
-    assert f"Written to {home / 'dog.scales.json'}" in calibrated
+    assert f"written to {home / 'dog.scales.json'}" in calibrated
     scales = json.loads((home / "dog.scales.json").read_text())
     assert (scales["robot"], scales["policy"], scales["terrains"]) == ("dog", "dog_trot.py:Trot", 4)
     assert list(scales["scales"]) == ["yaw_rate", "vel_x", "vel_y", "collision"]

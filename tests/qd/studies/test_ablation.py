@@ -6,20 +6,22 @@ from pathlib import Path
 
 import pytest
 
-from qd.run.cli import Interrupted
 from qd.run.directory import RunDirectory
-from qd.studies.ablation import AblationCfg, ablation, numbers_of
+from qd.studies.ablation import Ablation, numbers_of
+from sim.files.command import Interrupted
 from tests.qd.stand_in import open_stand_in
 
 
-def config(folder, **changes) -> AblationCfg:
-    return AblationCfg(**{"preset": "small", "iterations": 4, "device": "cpu", "run_dir": folder / "both", **changes})
+def config(folder, **changes) -> Ablation:
+    return Ablation(**{"preset": "small", "iterations": 4, "device": "cpu", "run_dir": folder / "both", **changes})
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ablation")
-    return folder, ablation(config(folder), open_evaluator=open_stand_in)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
+        return folder, config(folder).execute(open_evaluator=open_stand_in)
 
 
 def test_both_searches_and_their_looks(finished):
@@ -37,6 +39,11 @@ def test_both_searches_and_their_looks(finished):
             report["intervals"][name], report["mean_std"][name], strict=True))  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def without_figures_of_runs(monkeypatch):
+    monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
+
+
 @contextmanager
 def never(cfg):
     raise AssertionError("nothing is left to evaluate")
@@ -45,16 +52,16 @@ def never(cfg):
 
 def test_done_it_is_drawn_again_without_evaluating(finished):
     folder, report = finished
-    again = ablation(config(folder, out=folder / "again.json"), open_evaluator=never)
+    again = config(folder, out=folder / "again.json").execute(open_evaluator=never)
     assert again["mean_std"] == report["mean_std"]
 
 
 def test_a_run_that_is_there_is_the_one_with_alpha_1(finished, tmp_path):
     folder, report = finished
-    found = ablation(config(tmp_path, preset=None, run=folder / "both" / "alpha_1"), open_evaluator=open_stand_in)
+    found = config(tmp_path, preset=None, run=folder / "both" / "alpha_1").execute(open_evaluator=open_stand_in)
     assert not (tmp_path / "both" / "alpha_1").exists()
     assert found["mean_std"] == report["mean_std"]  # the stand-in is the same for the same seed
-    longer = ablation(config(tmp_path, iterations=2, run=folder / "both" / "alpha_1"), open_evaluator=open_stand_in)
+    longer = config(tmp_path, iterations=2, run=folder / "both" / "alpha_1").execute(open_evaluator=open_stand_in)
     assert longer["iterations"] == [2]
 
 
@@ -75,9 +82,9 @@ def test_stopped_the_same_command_goes_on(finished, tmp_path):
             yield stopping
 
     with pytest.raises(Interrupted, match="The same command goes on"):
-        ablation(config(tmp_path), open_evaluator=open_stopping)
+        config(tmp_path).execute(open_evaluator=open_stopping)
     assert 0 < RunDirectory(tmp_path / "both" / "alpha_0").iterations_done() < 4
-    assert ablation(config(tmp_path), open_evaluator=open_stand_in)["mean_std"] == report["mean_std"]
+    assert config(tmp_path).execute(open_evaluator=open_stand_in)["mean_std"] == report["mean_std"]
 
 
 @pytest.mark.parametrize(
@@ -85,7 +92,7 @@ def test_stopped_the_same_command_goes_on(finished, tmp_path):
     [
         ({"run": "{folder}/nowhere"}, "no run at"),
         ({"run": "{folder}/both/alpha_0"}, "alpha 1; it has 0.0, got 1.0"),
-        ({"run": "{folder}/both/alpha_1", "robot": "cassie"}, "is a run of robot anymal, got cassie"),
+        ({"run": "{folder}/both/alpha_1", "robot": "cassie"}, "is of anymal, got --robot cassie"),
         ({"run": "{folder}/both/alpha_1", "preset": "paper"}, "preset small, got paper"),
         ({"preset": "huge"}, "unknown preset 'huge'"),
         ({"out": Path("numbers.png")}, "out must be a file named *.json"),
@@ -98,13 +105,13 @@ def test_what_cannot_be_compared_is_named(finished, tmp_path, changes, message):
         key: folder.parent / value.format(folder=folder) if key == "run" else value for key, value in changes.items()
     }
     with pytest.raises((ValueError, FileNotFoundError)) as error:
-        ablation(config(tmp_path, **given), open_evaluator=open_stand_in)
+        config(tmp_path, **given).execute(open_evaluator=open_stand_in)
     assert message in str(error.value)
 
 
 def test_too_few_iterations_are_refused_before_any_search(tmp_path):
-    with pytest.raises(ValueError, match=r"no iteration up to 1 .* which is every 2: give at least 2 --iterations"):
-        ablation(config(tmp_path, iterations=1), open_evaluator=never)
+    with pytest.raises(ValueError, match=r"no iteration up to 1 .* give at least 2 --iterations"):
+        config(tmp_path, iterations=1).execute(open_evaluator=never)
     assert not (tmp_path / "both").exists()
 
 

@@ -9,9 +9,8 @@ import pytest
 
 from qd.archive import read_archive, write_archive
 from qd.run.directory import RunDirectory
-from qd.run.settings import as_settings
 from qd.search import run_search
-from qd.studies.beside import BesideCfg, beside, draw_beside, sides_of
+from qd.studies.beside import Beside, draw_beside, sides_of
 from tests.qd.stand_in import open_stand_in
 from tests.qd.test_search import CFG, make_job
 
@@ -24,7 +23,7 @@ def runs(tmp_path_factory):
     run_search(job, open_evaluator=open_stand_in)
     shutil.copytree(folder / "base", folder / "tuned")
     tuned = RunDirectory(folder / "tuned")
-    tuned.write_config(as_settings(replace(CFG, policy="tuned.pt", seed=9)), 2, job.origin)
+    tuned.write_config(replace(CFG, policy="tuned.pt", seed=9, iterations=2), job.origin)
     archive = read_archive(folder / "base")
     rates = np.linspace(0.0, 1.0, len(archive))
     write_archive(folder / "base" / "archive.npz", replace(archive, goal_rate=0.6 * rates, collision_rate=0.4 * rates))
@@ -33,7 +32,7 @@ def runs(tmp_path_factory):
 
 
 def test_numbers_of_both(runs, tmp_path, capsys):
-    report = beside(BesideCfg(runs=(f"base={runs / 'base'}", f"C-G={runs / 'tuned'}"), out=tmp_path / "both.json"))
+    report = Beside(runs=(f"base={runs / 'base'}", f"C-G={runs / 'tuned'}"), out=tmp_path / "both.json").execute()
     assert report == json.loads((tmp_path / "both.json").read_text())
     assert (tmp_path / "both.png").stat().st_size > 10_000
     base, tuned = report["runs"]["base"], report["runs"]["C-G"]
@@ -60,7 +59,7 @@ def test_figure_has_a_line_a_run_in_every_panel(runs):
 
 def test_the_figure_does_not_take_the_place_of_the_numbers(runs, tmp_path):
     with pytest.raises(ValueError, match=r"out must be a file named \*.json, .* got .*both.png"):
-        beside(BesideCfg(runs=(f"a={runs / 'base'}", f"b={runs / 'tuned'}"), out=tmp_path / "both.png"))
+        Beside(runs=(f"a={runs / 'base'}", f"b={runs / 'tuned'}"), out=tmp_path / "both.png").execute()
     assert not any(tmp_path.iterdir())
 
 
@@ -83,13 +82,13 @@ def test_what_cannot_be_compared_is_refused_before_anything_is_written(runs, tmp
     archive = read_archive(runs / "base")
     write_archive(tmp_path / "longer" / "archive.npz", replace(archive, iterations=3))
     shutil.copytree(runs / "base", tmp_path / "other")
-    settings = as_settings(replace(CFG, fitness=replace(CFG.fitness, alpha=0.0)))
-    RunDirectory(tmp_path / "other").write_config(settings, 2, make_job(tmp_path).origin)
+    cfg = replace(CFG, fitness=replace(CFG.fitness, alpha=0.0), iterations=2)
+    RunDirectory(tmp_path / "other").write_config(cfg, make_job(tmp_path).origin)
     shutil.copytree(runs / "base", tmp_path / "torn")
     (tmp_path / "torn" / "metrics.jsonl").write_text('{"iteration":')
     places = {name: tmp_path / name for name in ("longer", "other", "torn")}
     named = tuple(item.format(base=runs / "base", tuned=runs / "tuned", **places) for item in runs_asked)
     with pytest.raises((ValueError, FileNotFoundError)) as error:
-        beside(BesideCfg(runs=named, out=tmp_path / "both.json"))
+        Beside(runs=named, out=tmp_path / "both.json").execute()
     assert message in str(error.value)
     assert not (tmp_path / "both.json").exists()

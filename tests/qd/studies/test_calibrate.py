@@ -4,8 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.studies import calibrate
-from qd.studies.calibrate import CalibrateCfg, penalty_scales
+from qd.studies.calibrate import Calibrate, penalty_scales
 from tests.qd import stand_in
 from tests.qd.stand_in import make_result
 
@@ -33,16 +32,15 @@ def test_no_valid_episode():
 
 
 @pytest.fixture
-def stand_in_evaluator(monkeypatch):
-    monkeypatch.setattr(calibrate, "open_evaluator", stand_in.open_stand_in)
-    monkeypatch.setattr(calibrate, "check_policy", lambda *_: None)
+def any_policy(monkeypatch):
+    monkeypatch.setattr("qd.workers.evaluator.check_policy", lambda *_: None)
 
 
-def test_the_file_is_what_the_robot_reads(tmp_path, stand_in_evaluator, monkeypatch):
+def test_the_file_is_what_the_robot_reads(tmp_path, any_policy, monkeypatch):
     from sim.robots.robot import RobotCfg, get_robot
 
     out = tmp_path / "anymal.scales.json"
-    calibrate.calibrate(CalibrateCfg(device="cpu", terrains=12, replicas=4, out=out))
+    Calibrate(device="cpu", terrains=12, replicas=4, out=out).execute(open_evaluator=stand_in.open_stand_in)
     monkeypatch.setattr(RobotCfg, "scales_file", property(lambda self: out))
     content = json.loads(out.read_text())
     assert get_robot("anymal").read_penalty_scales() == tuple(content["scales"].values())
@@ -50,14 +48,14 @@ def test_the_file_is_what_the_robot_reads(tmp_path, stand_in_evaluator, monkeypa
     assert set(content) >= {"command", "commit", "device", "versions", "seed", "date", "share_of_episodes_with"}
 
 
-def test_mistakes_are_found_before_the_work(tmp_path, stand_in_evaluator):
+def test_mistakes_are_found_before_the_work(tmp_path, any_policy):
     with pytest.raises(ValueError, match="unknown robot 'dog': expected one of anymal"):
-        calibrate.calibrate(CalibrateCfg(robot="dog"))
+        Calibrate(robot="dog").execute(open_evaluator=stand_in.open_stand_in)
     with pytest.raises(ValueError, match="cannot write to /proc/missing: "):
-        calibrate.calibrate(CalibrateCfg(device="cpu", out=Path("/proc/missing/scales.json")))
+        Calibrate(device="cpu", out=Path("/proc/missing/scales.json")).execute(open_evaluator=stand_in.open_stand_in)
     with pytest.raises(ValueError, match="is a directory, expected a file to write: name a file in it"):
-        calibrate.calibrate(CalibrateCfg(device="cpu", out=tmp_path))
-    with pytest.raises(ValueError, match="terrains and replicas must be at least 1, got 0 and 20"):
-        calibrate.calibrate(CalibrateCfg(device="cpu", terrains=0))
+        Calibrate(device="cpu", out=tmp_path).execute(open_evaluator=stand_in.open_stand_in)
+    with pytest.raises(ValueError, match="terrains must be at least 1, got 0"):
+        Calibrate(device="cpu", terrains=0).execute(open_evaluator=stand_in.open_stand_in)
     with pytest.raises(ValueError, match=r"those of its shipped controller, got another one .* name a file"):
-        calibrate.calibrate(CalibrateCfg(device="cpu", policy="mine.pt"))
+        Calibrate(device="cpu", policy="mine.pt").execute(open_evaluator=stand_in.open_stand_in)

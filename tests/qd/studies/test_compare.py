@@ -1,38 +1,44 @@
 """The comparison over the stand-in evaluator: its runs are those of the search, whatever stops it in between."""
 
 import json
+import math
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qd import search
 from qd.archive import read_archive
 from qd.fresh import Reevaluate, reevaluate_run
-from qd.run import arguments
-from qd.run.arguments import job_of
-from qd.run.cli import Interrupted
+from qd.run.arguments import Archive, job_of
 from qd.run.directory import RunDirectory, claimed
 from qd.search import run_search
-from qd.studies import compare
-from qd.studies.compare import Arguments
+from qd.studies.compare import AGAIN, LABELS, METHODS, Compare, draw_comparison, report_of
+from sim.files.command import Interrupted
 from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
 from tests.qd.run.test_arguments import fine_policy
 from tests.qd.stand_in import open_stand_in
 
 POLICY = "shipped"
-METHODS = ("uniform_random", "cma_mae_narrow")
-ASKED = {"methods": METHODS, "seeds": 2, "seed": 5, "iterations": 3, "reevaluate_every": 2, "device": "cpu"}
+TWO = ("uniform_random", "cma_mae_narrow")
+ASKED = {
+    "methods": TWO,
+    "seeds": 2,
+    "seed": 5,
+    "iterations": 3,
+    "reevaluate_every": 2,
+    "device": "cpu",
+    "policy": POLICY,
+}
 
 
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self: stand_in.SCALES)
-    monkeypatch.setattr(compare, "save_figure", lambda path, figure: path.write_bytes(b"a figure"))
-    monkeypatch.setattr(search, "write_figures", lambda folder, archive, metrics: [])
+    monkeypatch.setattr("qd.show.figures.save_figure", lambda path, figure: path.write_bytes(b"a figure"))
+    monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
 
 
 @contextmanager
@@ -42,13 +48,7 @@ def never(cfg):
 
 
 def run(path: str, *, open_evaluator=open_stand_in, **changes) -> Path:
-    args = Arguments(run_dir=Path(path), policy=POLICY, **{**ASKED, **changes})
-    compare.compare(args, open_evaluator=open_evaluator)
-    return Path(path)
-
-
-def go_on(path: str, *, open_evaluator=open_stand_in, **given) -> Path:
-    compare.compare(Arguments(resume=Path(path), device="cpu", **given), open_evaluator=open_evaluator)
+    Compare(run_dir=Path(path), **{**ASKED, **changes}).execute(open_evaluator=open_evaluator)
     return Path(path)
 
 
@@ -84,7 +84,7 @@ def test_every_run_is_the_searchs_own():
     settings = {"cma_mae_narrow": {"method": "cma_mae", "sigma0": 0.5}, "uniform_random": {"method": "uniform_random"}}
     for name in runs_of(path):
         method, seed = name.rsplit("-", 1)
-        asked = arguments.Arguments(
+        asked = Archive(
             preset="small", device="cpu", policy=POLICY, iterations=3, seed=int(seed), reevaluate_every=0,
             run_dir=Path("alone", name), **settings[method],
         )  # fmt: skip
@@ -117,11 +117,11 @@ def test_interrupted_and_resumed_it_finds_the_same():
 
         yield evaluate
 
-    with pytest.raises(Interrupted, match="Go on with:  make compare ROBOT=anymal RESUME=a DEVICE=cpu"):
+    with pytest.raises(Interrupted, match="The same command goes on"):
         run("a", open_evaluator=interrupted)
     assert calls == [4 * 32, 4 * 32]
     assert [len(rows_of(Path("a", name))) for name in runs_of(Path("a"))] == [1] * 4
-    assert_same(go_on("a"), whole)
+    assert_same(run("a"), whole)
 
 
 def interrupt_at_save(monkeypatch, number: int) -> None:
@@ -146,12 +146,12 @@ def test_runs_behind_the_others_catch_up(monkeypatch, number):
     done = [RunDirectory(Path("a", name)).iterations_done() for name in runs_of(Path("a"))]
     # Of 4 runs an iteration, number - 1 saves were made.
     assert (sum(done), len(set(done))) == (number - 1, 2)
-    assert_same(go_on("a"), whole)
+    assert_same(run("a"), whole)
 
 
 def test_it_is_extended_and_keeps_its_corrected_rows():
     path, whole = run("a"), run("whole", iterations=4)
-    assert go_on("a", iterations=4) == path
+    assert run("a", iterations=4) == path
     assert numbers_of(path)["corrected_at"] == [64, 96, 128]  # 3 was the last iteration once
     assert numbers_of(whole)["corrected_at"] == [64, 128]
     for name in runs_of(path):
@@ -163,17 +163,17 @@ def test_stopped_in_its_last_iteration_and_extended_only_what_all_runs_have_is_c
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
         interrupt_at_save(patch, 11)
         run("a")
-    assert numbers_of(go_on("a", iterations=4))["corrected_at"] == [64, 128]
+    assert numbers_of(run("a", iterations=4))["corrected_at"] == [64, 128]
 
 
 def test_resuming_a_finished_one_evaluates_nothing_and_writes_its_numbers_again():
     before = numbers_of(run("a"))
     Path("a/compare.json").unlink()
-    assert numbers_of(go_on("a", open_evaluator=never)) == before
+    assert numbers_of(run("a", open_evaluator=never)) == before
 
 
 def search_alone(path: Path, **given):
-    asked = arguments.Arguments(resume=path, device="cpu", reproduce="no", **given)
+    asked = Archive(resume=path, device="cpu", reproduce="no", **given)
     return run_search(job_of(asked), open_evaluator=open_stand_in)
 
 
@@ -181,9 +181,9 @@ def test_a_run_is_extended_alone_and_the_others_follow():
     path, whole, name = run("a"), run("whole", iterations=5), "cma_mae_narrow-6"
     search_alone(path / name, iterations=5)
     assert (path / name / "archive.npz").read_bytes() == (whole / name / "archive.npz").read_bytes()
-    with pytest.raises(ValueError, match=f"iterations must be at least 5, as many as a/{name} has done, got 3"):
-        go_on("a", open_evaluator=never)
-    go_on("a", iterations=5)
+    assert numbers_of(run("a"))["iterations"] == 3  # the first three of all are compared
+    assert RunDirectory(path / name).read_cfg().iterations == 5
+    run("a", iterations=5)
     for name in runs_of(path):
         assert (path / name / "archive.npz").read_bytes() == (whole / name / "archive.npz").read_bytes()
     # Alone it had some of its elites looked at, not all: the common looks are those at iterations 2 and 3.
@@ -199,22 +199,22 @@ def test_a_search_and_a_comparison_do_not_share_a_run():
             search_alone(path / "uniform_random-5", iterations=2)
         yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds, cfg.num_replicas)
 
-    go_on("a", open_evaluator=intruding, iterations=2)
+    run("a", open_evaluator=intruding, iterations=2)
     with (
         claimed(path / "uniform_random-6"),
         pytest.raises(ValueError, match="another search works in a/uniform_random-6"),
     ):
-        go_on("a", open_evaluator=never, iterations=3)
-    go_on("a", iterations=3)
+        run("a", open_evaluator=never, iterations=3)
+    run("a", iterations=3)
 
 
 def test_a_comparison_killed_before_it_wrote_anything_is_begun_again():
     Path("a/uniform_random-5").mkdir(parents=True)
     Path("a/uniform_random-5/.write-test").touch()
     run("a", iterations=1)
-    Path("b/mine").mkdir(parents=True)
-    Path("b/mine/thesis.tex").touch()
-    with pytest.raises(ValueError, match="b is not empty and holds no comparison"):
+    Path("b/uniform_random-5").mkdir(parents=True)
+    Path("b/uniform_random-5/thesis.tex").write_text("years of work")
+    with pytest.raises(ValueError, match="b/uniform_random-5 is not empty and holds no run: give another --run-dir"):
         run("b", iterations=1)
 
 
@@ -222,9 +222,9 @@ def test_fresh_values_of_a_run_stay_while_it_does_not_grow():
     path = run("a", iterations=1) / "cma_mae_narrow-5"
     reevaluate_run(Reevaluate(run=path, device="cpu"), open_evaluator=open_stand_in)
     kept = (path / "archive.npz").read_bytes()
-    go_on("a", open_evaluator=never)
+    run("a", iterations=1, open_evaluator=never)
     assert (path / "archive.npz").read_bytes() == kept
-    go_on("a", iterations=2)
+    run("a", iterations=2)
     assert read_archive(path).fresh is None
 
 
@@ -239,7 +239,7 @@ def test_numbers_go_where_they_are_asked_for():
         ({"methods": ("cma_mae", "annealing")}, "methods must be some of .* each once, got cma_mae, annealing"),
         ({"methods": ("cma_mae:colour=3",)}, "no setting named colour in cma_mae:colour=3: expected some of method"),
         ({"methods": ("cma_mae:sigma0=wide",)}, "sigma0 must be float, got 'wide'"),
-        ({"methods": ("cma_mae:learning-rate=7",)}, "learning_rate must lie in"),
+        ({"methods": ("cma_mae:learning-rate=7",)}, "learning_rate must be"),
         ({"methods": ("cma_mae:sigma0=1:alpha=0",)}, "sigma0 must be float, got '1:alpha=0'"),
         ({"methods": ("cma_mae:sigma0=1,sigma0=2",)}, "sigma0 is given twice in cma_mae:sigma0=1,sigma0=2"),
         ({"methods": ("cma_mae:",)}, "no setting named  in cma_mae:"),
@@ -257,10 +257,9 @@ def test_numbers_go_where_they_are_asked_for():
         ({"seeds": 11}, "seeds must be 1 to 10, got 11"),
         ({"iterations": 0}, "iterations must be at least 1, got 0"),
         ({"reevaluate_every": 0}, "reevaluate_every must be at least 1, got 0"),
-        ({"seed": -1}, "seed must not be negative, got -1"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
         ({"preset": "huge"}, "unknown preset 'huge'"),
         ({"robot": "dog"}, "unknown robot 'dog'"),
-        ({"resume": Path("b")}, "give --resume for a comparison that is there or --run-dir for a new one, not both"),
     ],
 )
 def test_what_cannot_be_compared(changes, message):
@@ -269,64 +268,103 @@ def test_what_cannot_be_compared(changes, message):
     assert not Path("a").exists()
 
 
-def test_directories_that_hold_no_comparison_or_one_already():
-    Path("empty").mkdir()
-    for path in ("empty", "nowhere"):
-        with pytest.raises(FileNotFoundError, match=f"no comparison at {path}: it has no compare.config.json"):
-            go_on(path, open_evaluator=never)
-    assert not Path("nowhere").exists()
-    Path("full").mkdir()
-    Path("full/thesis.tex").write_text("years of work")
-    with pytest.raises(ValueError, match="full is not empty and holds no comparison: give another --run-dir"):
-        run("full", open_evaluator=never)
-    run("a", iterations=1)
-    with pytest.raises(ValueError, match="a holds a comparison already: go on with --resume a"):
-        run("a", open_evaluator=never)
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"methods": ("mixed",)}, r'methods \(\["uniform_random", "cma_mae_narrow"\] there, \["mixed"\] wanted\)'),
-        ({"seeds": 1}, r"seeds \(2 there, 1 wanted\)"),
-        ({"seed": 0}, r"seed \(5 there, 0 wanted\)"),
         ({"reevaluate_every": 3}, r"reevaluate_every \(2 there, 3 wanted\)"),
         ({"preset": "paper"}, r'preset \("small" there, "paper" wanted\)'),
         ({"policy": f"{fine_policy.__module__}:{fine_policy.__name__}"}, r"policy \(.* there, .* wanted\)"),
-        ({"iterations": 1}, "iterations must be at least 2, as many as a/uniform_random-5 has done, got 1"),
     ],
 )
 def test_it_goes_on_only_as_it_was_asked_for(given, message):
     path = run("a", iterations=2)
-    before = (path / "compare.config.json").read_bytes()
+    before = (path / "uniform_random-5" / "config.json").read_bytes()
     with pytest.raises(ValueError, match=message):
-        go_on("a", open_evaluator=never, **given)
-    assert (path / "compare.config.json").read_bytes() == before
-    go_on("a", open_evaluator=never, methods=METHODS, seeds=2, seed=5, policy=POLICY)
+        run("a", open_evaluator=never, **{"iterations": 2, **given})
+    assert (path / "uniform_random-5" / "config.json").read_bytes() == before
+    run("a", open_evaluator=never, iterations=2)
 
 
-def test_a_damaged_config_is_named():
-    file = run("a", iterations=1) / "compare.config.json"
-    whole = json.loads(file.read_text())
-    for content, message in (
-        (
-            {**whole, "settings": {**whole["settings"], "methods": 3}},
-            "a/compare.config.json: methods and seeds must be",
-        ),
-        ({**whole, "settings": {}}, "a/compare.config.json: methods and seeds must be"),
-        ({"settings": whole["settings"]}, "must hold settings and iterations of a comparison"),
-    ):
-        file.write_text(json.dumps(content))
-        with pytest.raises(ValueError, match=message):
-            go_on("a", open_evaluator=never)
+def test_methods_and_seeds_may_be_added():
+    whole = run("whole", iterations=2)
+    run("a", iterations=2, methods=TWO[:1], seeds=1)
+    assert_same(run("a", iterations=2), whole)
 
 
-def test_a_simulation_that_cannot_be_built_leaves_no_directory():
-    @contextmanager
-    def refusing(cfg):
-        raise ValueError("no room on the device")
-        yield
+# The numbers of a comparison by hand, and what its figure shows of them.
 
-    with pytest.raises(ValueError, match="no room on the device"):
-        run("a", open_evaluator=refusing)
-    assert not Path("a").exists()
+
+def row(qd_score: float, *, corrected: float | None = None, collision_rate: float = 0.0) -> dict:
+    """Metrics of one iteration of 10 terrains x 4 episodes."""
+    again = {} if corrected is None else {**dict.fromkeys(AGAIN, 1.0), "corrected_qd_score": corrected}
+    return {
+        "qd_score": qd_score, "reachable_coverage": 0.25, "elites": 5, "mean_fitness": -1.0, "batch_fitness": 2.0,
+        "batch_collision_rate": collision_rate, "batch_goal_rate": 0.5, "terrains": 10, "episodes": 40,
+        "invalid_episodes": 1, "wall_s": 1.5, **again,
+    }  # fmt: skip
+
+
+RUNS = {
+    "cma_mae": [[row(score), row(10 * score, corrected=5 * score, collision_rate=0.5)] for score in (1.0, 2.0, 3.0)],
+    "hard_random": [[row(4.0), row(8.0, corrected=6.0)] for _ in range(3)],
+}
+HALF = 4.303 / math.sqrt(3)  # of 1, 2, 3: standard deviation 1, Student's quantile of 2 degrees of freedom
+
+
+def reported(runs: dict) -> dict:
+    seeds = list(range(len(next(iter(runs.values())))))
+    return {"robot": "anymal", "seeds": seeds, **report_of(runs, {name: {"method": name} for name in runs})}
+
+
+def test_report_by_hand():
+    report = reported(RUNS)
+    assert (report["iterations"], report["terrains_evaluated"], report["corrected_at"]) == (2, [10, 20], [20])
+    found = report["methods"]["cma_mae"]
+    assert found["settings"] == {"method": "cma_mae"}
+    assert [point["mean"] for point in found["qd_score"]] == [2.0, 20.0]
+    assert found["qd_score"][0]["interval"] == pytest.approx([2.0 - HALF, 2.0 + HALF])
+    assert found["qd_score"][1]["seeds"] == [10.0, 20.0, 30.0]
+    assert [point["mean"] for point in found["corrected_qd_score"]] == [10.0]
+    assert found["corrected_qd_score"][0]["interval"] == pytest.approx([10.0 - 5 * HALF, 10.0 + 5 * HALF])
+    assert found["batch_collision_rate"]["mean"] == 0.25  # 0 in the first iteration, .5 in the second
+    assert (found["episodes"], found["invalid_episodes"], found["wall_s"]) == (3 * 2 * 40, 3 * 2, 3 * 2 * 1.5)
+    assert report["methods"]["hard_random"]["qd_score"][1] == {"mean": 8.0, "interval": [8.0, 8.0], "seeds": [8.0] * 3}
+
+
+def test_a_seed_without_a_value_leaves_the_mean_out():
+    runs = {"mixed": [[{**row(1.0, corrected=1.0), "mean_std": value}] for value in (0.5, None)]}
+    point = reported(runs)["methods"]["mixed"]["mean_std"][0]
+    assert point == {"mean": None, "interval": None, "seeds": [0.5, None]}
+
+
+def test_corrected_rows_that_some_runs_lack_are_left_out():
+    runs = {"mixed": [[row(1.0, corrected=1.0), row(2.0, corrected=2.0)], [row(1.0), row(2.0, corrected=2.0)]]}
+    report = reported(runs)
+    assert report["corrected_at"] == [20]
+    assert [point["mean"] for point in report["methods"]["mixed"]["corrected_qd_score"]] == [2.0]
+
+
+def test_figure_has_a_line_a_method_and_panel_with_bands():
+    figure = draw_comparison(reported(RUNS))
+    score, coverage, corrected = figure.axes
+    assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2]
+    assert score.lines[0].get_xydata().tolist() == [[10, 2], [20, 20]]
+    assert coverage.lines[0].get_ydata().tolist() == [25, 25]  # per cent
+    assert corrected.lines[0].get_xydata().tolist() == [[20, 10]]
+    band = score.collections[0].get_paths()[0].vertices
+    assert band[:, 1].max() == pytest.approx(20 + 10 * HALF)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["CMA-MAE", "hard-random"]
+    assert "3 seeds a method" in figure.get_suptitle()
+
+
+def test_figure_of_one_seed_has_lines_without_bands(tmp_path):
+    report = reported({name: seeds[:1] for name, seeds in RUNS.items()})
+    assert report["methods"]["cma_mae"]["qd_score"][0] == {"mean": 1.0, "interval": None, "seeds": [1.0]}
+    figure = draw_comparison(report)
+    assert figure.axes[0].lines[0].get_xydata().tolist() == [[10, 1], [20, 10]]
+    figure.savefig(tmp_path / "figure.png")
+
+
+def test_every_method_has_a_look_of_its_own():
+    assert LABELS.keys() == METHODS.keys()
+    assert len({look[1:] for look in LABELS.values()}) == len(METHODS)

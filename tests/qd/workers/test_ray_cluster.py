@@ -103,3 +103,17 @@ def test_no_cluster_at_the_address_is_said_in_one_line(monkeypatch):
     monkeypatch.setattr("ray.is_initialized", lambda: False)  # other tests have a Ray of their own
     with pytest.raises(OSError, match=r"no Ray cluster at RAY_ADDRESS=127.0.0.1:\d+: .* start one with"):
         resolve_device("cpu", "ray:2")
+
+
+def test_a_cluster_that_wants_its_token_says_how_to_give_it(monkeypatch):
+    def refuse(**options):
+        raise RuntimeError("rejected") from Exception("AuthenticationError: no token")  # as Ray does, after 20 s
+
+    with socket.socket() as cluster:
+        cluster.bind(("127.0.0.1", 0))
+        cluster.listen()
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{cluster.getsockname()[1]}")
+        monkeypatch.setattr("ray.is_initialized", lambda: False)
+        monkeypatch.setattr("ray.init", refuse)
+        with pytest.raises(OSError, match="wants its token: set RAY_AUTH_MODE=token"):
+            resolve_device("cpu", "ray")

@@ -100,7 +100,7 @@ def test_a_worker_that_died_is_started_again(tmp_path):
 
 
 def test_three_deaths_in_a_search_change_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("qd.search.write_figures", lambda folder, archive, metrics: [])
+    monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
     alone = run_search(make_job(tmp_path / "alone"), open_evaluator=stand_in.open_stand_in)
     job = make_job(tmp_path / "on-ray")
     deadly = dataclasses.replace(job.evaluator, workers="ray:2", policy=f"die:{tmp_path}:3")
@@ -155,7 +155,7 @@ def test_a_worker_of_other_code_is_refused_and_the_others_go_on(capsys):
         assert same(evaluate(GENES[:8], SEEDS[:8]), expected(8))
         assert "has other code or packages" in capsys.readouterr().err
         evaluate._workers[0].restart()
-        with pytest.raises(EvaluatorError, match="no worker can be used: worker 2 .* has other code"):
+        with pytest.raises(EvaluatorError, match=r"no worker can be used: worker 2 .* has other code"):
             evaluate(GENES[:8], SEEDS[:8])
 
 
@@ -174,7 +174,10 @@ def test_leaving_ends_the_workers():
     [
         ("cuda:1", "ray:2", "device must be cpu or cuda, got cuda:1"),
         pytest.param(
-            "cuda", "ray", "the cluster has no GPU", marks=pytest.mark.skipif(os.path.exists("/dev/nvidia0"), reason="has")
+            "cuda",
+            "ray",
+            "the cluster has no GPU",
+            marks=pytest.mark.skipif(os.path.exists("/dev/nvidia0"), reason="has"),
         ),
     ],
 )

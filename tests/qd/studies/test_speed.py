@@ -1,0 +1,56 @@
+"""What the timing of the search refuses, before anything is timed; the timing itself needs a GPU."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from qd.studies import scale
+from qd.studies import speed as speed_module
+from qd.studies.scale import Scale
+from qd.studies.speed import Speed, read_iterations, time_iterations
+from tests.qd.stand_in import open_stand_in
+from tests.qd.test_search import CFG, make_job
+
+
+def fail(*_):
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("out", ["/proc/nowhere/speed.json", "{folder}"])
+@pytest.mark.parametrize(("module", "command"), [(speed_module, Speed), (scale, Scale)])
+def test_where_to_write_is_tried_before_the_timing(tmp_path, monkeypatch, module, command, out):
+    monkeypatch.setattr(module, "measure", fail)
+    with pytest.raises(ValueError, match="cannot write to|is a directory"):
+        command(device="cpu", out=tmp_path if out == "{folder}" else Path(out)).execute()
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (Speed(iterations=0), "iterations must be at least 1, got 0"),
+        (Speed(steps=0), "steps must be at least 1, got 0"),
+        (Speed(curve=(1000,)), "curve must be multiples of 16, got"),
+        (Speed(curve=(0,)), "curve must be multiples of 16, got"),
+        (Scale(counts=(2, 1)), "counts must be numbers of workers that rise"),
+        (Scale(counts=(0, 1)), "counts must be at least 1"),
+        (Scale(rounds=0), "rounds must be at least 1, got 0"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused_before_the_timing(command, says):
+    with pytest.raises(ValueError, match=says):
+        command.execute()
+
+
+def test_a_run_of_another_device_is_not_timed_against_this_one(shipped_search):
+    with pytest.raises(ValueError, match="was made on NVIDIA H200, the bare rate would be that of NVIDIA H100"):
+        read_iterations(shipped_search, 20, "NVIDIA H100")
+    cfg, metrics, terrains = read_iterations(shipped_search, 20, "NVIDIA H200")
+    assert (cfg.robot, len(metrics), terrains.shape) == ("anymal", 20, (200, 64))
+
+
+def test_a_search_is_timed_from_its_start(monkeypatch):
+    monkeypatch.setattr(speed_module, "open_evaluator", open_stand_in)
+    cfg = replace(CFG, iterations=2)
+    metrics, terrains = time_iterations(cfg, make_job(Path("unused")).evaluator)
+    assert len(metrics) == 2 and len(terrains) == cfg.scheduler.num_terrains
