@@ -1,6 +1,6 @@
 """The archive of a search as data: terrains that break the controller, one a cell, and the file that holds them.
 
-Reading an archive needs NumPy alone, so that training and figures do not depend on the search's libraries.
+Training and figures read archives without the search's libraries.
 """
 
 import io
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
-from qd.space import NUM_GENES
 from sim.files.atomic import write_atomically
 
 ARCHIVE_FILE = "archive.npz"
@@ -57,13 +56,15 @@ FRESH = tuple(field.name for field in fields(FreshValues))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Archive:
-    """Elites by descending fitness, the corrected one if there are fresh values: elite 0 is the worst for the robot.
+class Archive(Evaluation):
+    """Elites as they were found, by descending fitness, the corrected one if there are fresh values.
 
-    Statistics are over the valid episodes of the evaluation that found the elite; penalties are scaled.
+    Elite 0 is the worst for the robot.
     """
 
     robot: str
+    space: str
+    """Name of the terrain space of the genes (:data:`sim.space.SPACES`)."""
     penalties: tuple[str, ...]
     """Names of the P penalties, in the order of the ratios."""
     scales: tuple[float, ...]
@@ -75,31 +76,11 @@ class Archive:
     iterations: int
     """Iterations the search had done."""
     genes: NDArray[np.float32]
-    """Clipped genes, shape (N, 64)."""
-    ratios: NDArray[np.float64]
-    """Shape (N, P)."""
-    cell: NDArray[np.int64]
-    """Reachable cell, shape (N,)."""
-    fitness: NDArray[np.float64]
-    """Shape (N,)."""
-    penalty_mean: NDArray[np.float64]
-    """Shape (N, P)."""
-    penalty_std: NDArray[np.float64]
-    """Shape (N, P), ddof 0."""
-    collision_rate: NDArray[np.float64]
-    """Share of episodes with a base collision, shape (N,)."""
-    goal_rate: NDArray[np.float64]
-    """Share of episodes that reached the goal, shape (N,)."""
-    fallen_rate: NDArray[np.float64]
-    """Share of episodes that ended tilted by more than 60 degrees, shape (N,)."""
-    invalid_episodes: NDArray[np.int64]
-    """Episodes left out, shape (N,)."""
-    episodes: NDArray[np.int64]
-    """Episodes run, the invalid ones included, shape (N,)."""
+    """Clipped genes, shape (N, num_genes)."""
     iteration: NDArray[np.int64]
     """Iteration that found the elite, from 1, shape (N,)."""
     fresh: FreshValues | None = None
-    """What fresh episodes say of the elites; None if nobody looked."""
+    """What fresh episodes say of the elites; None if there were none."""
 
     def __len__(self) -> int:
         """Number of elites."""
@@ -150,9 +131,9 @@ class Archive:
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
 
-_SETTINGS = ("robot", "penalties", "scales", "intervals", "collision_bit", "iterations")
+_SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations")
 _PREFIX = "fresh_"
-_KINDS = {"robot": "U", "penalties": "U", "collision_bit": "b", "reproduced": "b"} | dict.fromkeys(
+_KINDS = {"robot": "U", "space": "U", "penalties": "U", "collision_bit": "b", "reproduced": "b"} | dict.fromkeys(
     ("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"
 )
 _MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
@@ -205,16 +186,16 @@ def read_archive(path: str | Path) -> Archive:
                 names += [_PREFIX + name for name in FRESH]
             content = {name: _read_array(members.read(f"{name}.npy")) for name in names}
         _check_kinds(content)
+        fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
+        found = {name: _from_array(name, value) for name, value in content.items()}
+        archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
+        _check_shapes(archive)
+        _check_values(archive)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         raise ValueError(
             f"{file} must be the archive of a search, but it is damaged or another file: {error}: going on with its "
             "run (--resume) writes it again"
         ) from None
-    fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
-    found = {name: _from_array(name, value) for name, value in content.items()}
-    archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
-    _check_shapes(archive, file)
-    _check_values(archive, file)
     return archive
 
 
@@ -239,29 +220,26 @@ def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
             raise ValueError(f"{name} has shape {value.shape}")
 
 
-def _check_shapes(archive: Archive, file: Path) -> None:
+def _check_shapes(archive: Archive) -> None:
+    from sim.space import get_space  # which imports Warp: not for `--help`
+
     num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
-    columns = {"genes": NUM_GENES, "ratios": num_penalties, "penalty_mean": num_penalties, "penalty_std": num_penalties}
+    columns = {"genes": get_space(archive.space).num_genes, "ratios": num_penalties}
+    columns |= {"penalty_mean": num_penalties, "penalty_std": num_penalties}
     for name, array in _arrays(archive).items():
         column = columns.get(name.removeprefix(_PREFIX))
         expected = (num_elites,) if column is None else (num_elites, column)
         if array.shape != expected:
-            raise ValueError(
-                f"{file}: {name} must have shape {expected}, got {array.shape}: the file is no archive of a search"
-            )
+            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
 
 
-def _check_values(archive: Archive, file: Path) -> None:
-    """That the numbers are such as a search finds."""
+def _check_values(archive: Archive) -> None:
     finite = all(np.isfinite(array).all() for array in _arrays(archive).values())
     if not finite or not (np.abs(archive.genes) <= 1.0).all():
-        raise ValueError(f"{file} must hold finite numbers, and genes in [-1, 1]: it is no archive of a search")
+        raise ValueError("it must hold finite numbers, and genes in [-1, 1]")
     if len(archive.scales) != len(archive.penalties) or not all(0.0 < scale < np.inf for scale in archive.scales):
-        raise ValueError(f"{file}: scales must be one positive number a penalty, got {archive.scales}")
-    try:
-        num_cells = archive.cells.num_cells
-    except ValueError as error:
-        raise ValueError(f"{file} is no archive of a search: {error}") from None
+        raise ValueError(f"scales must be one positive number a penalty, got {archive.scales}")
+    num_cells = archive.cells.num_cells
     cells = [archive.cell] if archive.fresh is None else [archive.cell, archive.fresh.cell]
     if not all(((cell >= 0) & (cell < num_cells)).all() for cell in cells):
-        raise ValueError(f"{file}: cell must lie in 0 to {num_cells - 1}: the file is no archive of a search")
+        raise ValueError(f"cell must lie in 0 to {num_cells - 1}")

@@ -86,7 +86,7 @@ def cross(cfg: CrossCfg) -> dict[str, Any]:
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.episodes, device=device)
     with share_bar("crossing") as progress:
         result = rollout.evaluate(
-            terrain.heights[None], own_seeds(cfg.seed), record_paths=True, progress=lambda done, of: progress(done / of)
+            terrain.heights[None], own_seeds(cfg.seed), record_paths=True, progress=progress
         )
     report = {**origin_of(device, cfg.seed, None), **_about(cfg, robot.name, terrain, policy), **numbers_of(result)}
     print(describe(report))

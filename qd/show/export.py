@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from qd.archive import Archive
 from qd.run.cli import run_command
-from qd.run.places import folder_for
+from qd.run.directory import folder_for
 from qd.show.recordings import archive_of_robot
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import chosen_elites, split_words

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
-from qd.run.places import directory_of, newest_or_published
-from qd.run.resuming import refuse_unnamed_code
+from qd.run.directory import directory_of, newest_or_published
+from qd.run.settings import refuse_unnamed_code
 from qd.show.own_terrain import own_seeds
 from qd.show.replay import REPLAY_STREAM, as_searched, check_penalties
 from qd.workers.evaluator import episode_seeds
@@ -163,7 +163,6 @@ def _record(
     if episodes < 1 or seed < 0:
         raise ValueError(f"episodes must be at least 1 and seed at least 0, got {episodes} and {seed}")
     rollout = Rollout(robot, policy, num_terrains=len(terrains), num_replicas=episodes, device=device)
-    told = None if progress is None else lambda done, most: progress(done / most)
     return record(
-        rollout, terrains, seeds, policy=policy, replicas=replicas, labels=labels, seed=seed, progress=told
+        rollout, terrains, seeds, policy=policy, replicas=replicas, labels=labels, seed=seed, progress=progress
     )  # fmt: skip

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from qd.archive import Archive, read_archive
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.run.cli import run_command
-from qd.run.directory import CONFIG_FILE, RunDirectory
-from qd.run.places import directory_of, elite_name, folder_for, newest_or_published
-from qd.run.resuming import refuse_unnamed_code
+from qd.run.directory import CONFIG_FILE, RunDirectory, directory_of, elite_name, folder_for, newest_or_published
+from qd.run.settings import refuse_unnamed_code
 from qd.show.figures import save_figure
 from qd.show.paths_figure import draw_paths
 from qd.workers.evaluator import check_policy, episode_seeds, resolve_device

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from qd.run.cli import run_command
-from qd.run.places import RUNS, elite_name, folder_for
+from qd.run.directory import RUNS, elite_name, folder_for
 from qd.run.progress import share_bar
 from qd.show.own_terrain import read_own_terrain
 from qd.show.recordings import archive_of_robot, policy_of, record_elites, record_heights

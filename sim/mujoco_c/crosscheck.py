@@ -25,7 +25,7 @@ from sim.policy.spec import ControllerSpec
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
@@ -49,7 +49,7 @@ def read_pool(path: Path) -> NDArray[np.float32]:
             genes = genes.astype(np.float32)
     if (
         genes.ndim != 2
-        or genes.shape[1] != 64
+        or genes.shape[1] != SUPER_GAUSSIAN.num_genes
         or not len(genes)
         or genes.dtype.kind != "f"
         or not np.isfinite(genes).all()
@@ -123,7 +123,7 @@ class Comparison:
         if self._named is not None:
             return self._named
         cfg, at_once = self.cfg, 200 if self.device.startswith("cuda") else 32
-        pool = hard_random_genes(_MAX_POOL, self.rng).astype(np.float32) if self._pool is None else self._pool
+        pool = SUPER_GAUSSIAN.hard_random(_MAX_POOL, self.rng).astype(np.float32) if self._pool is None else self._pool
         order = self.rng.permutation(len(pool))
         rollout = Rollout(self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device)
         chosen: list[int] = []

@@ -12,7 +12,8 @@ from sim.robots.model import build_robot, geom_names, leaf_name
 from sim.robots.probes import placed
 from sim.robots.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS, Simulation
-from sim.terrain import SPACING, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import SPACING
 
 _GRAVITY = 9.81
 _TERRAINS = 4
@@ -68,7 +69,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     """
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)
-    genes = np.concatenate([np.zeros((1, 64)), hard_random_genes(_TERRAINS, seed)])
+    genes = np.concatenate([np.zeros((1, SUPER_GAUSSIAN.num_genes)), SUPER_GAUSSIAN.hard_random(_TERRAINS, seed)])
     bank.set_genes(genes.astype(np.float32))
     heights = np.array(bank.heights.numpy())
     heights[0] = 0.0

@@ -3,8 +3,9 @@
 import dataclasses
 import os
 import resource
+import sys
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from kernels.episode import Outcome
-from qd import reevaluate
-from qd.run.cli import run_command
+from qd.fresh import Reevaluate, reevaluate_run
 from qd.show import replay
 from qd.studies import calibrate
 from sim import rollout
+from sim.files import command
 from sim.files.command import exit_code_of
 from tests.kills import searches, trainings
 from tests.qd import stand_in
@@ -33,15 +34,22 @@ def resume_search(path: Path) -> None:
 def reevaluate_search(path: Path) -> None:
     """All elites again."""
     searches.without_figures()
-    main = partial(reevaluate.reevaluate_run, open_evaluator=stand_in.open_stand_in)
-    run_command(reevaluate.ReevaluateCfg, main, ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY])
+    argv = ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY]
+    if status := command.run_command(_StandInReevaluate, argv, name="reevaluate"):
+        sys.exit(status)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _StandInReevaluate(Reevaluate):
+    def execute(self) -> None:
+        reevaluate_run(self, open_evaluator=stand_in.open_stand_in)
 
 
 def replay_elite(path: Path) -> None:
     """The worst elite again."""
     rollout.Rollout = _StandInRollout
     argv = ["--run", str(path), "--device", "cpu", "--replicas", "4", "--policy", searches.POLICY]
-    run_command(replay.ReplayCfg, replay.main, argv)
+    sys.exit(command.run_command(replay.ReplayElite, argv, name="replay"))
 
 
 def resume_training(run_dir: Path) -> int:
@@ -56,7 +64,7 @@ def calibrate_with(policy: Path) -> None:
     calibrate.open_evaluator = stand_in.open_stand_in
     out = str(policy.parent / "scales.json")
     argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
-    run_command(calibrate.CalibrateCfg, calibrate.calibrate, argv)
+    sys.exit(command.run_command(calibrate.Calibrate, argv, name="calibrate"))
 
 
 def evaluate_with(policy: Path) -> int:

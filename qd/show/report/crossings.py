@@ -79,7 +79,7 @@ def recorder(place: Place) -> Record:
             )
         _, recording = record(
             rollouts[wanted.policy], wanted.genes[None], wanted.seeds, policy=wanted.policy, labels=[wanted.label],
-            seed=_SEED, progress=lambda done, most: progress(done / most),
+            seed=_SEED, progress=progress,
         )  # fmt: skip
         return recording
 

@@ -5,9 +5,17 @@ from pathlib import Path
 from typing import Any
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
-from qd.run.directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory
+from qd.run.directory import (
+    CONFIG_FILE,
+    METRICS_FILE,
+    RESULTS,
+    Metrics,
+    RunDirectory,
+    directory_of,
+    folder_for,
+    newest_or_published,
+)
 from qd.run.next_commands import make_command
-from qd.run.places import RESULTS, directory_of, folder_for, newest_or_published
 from qd.run.settings import SearchCfg
 from qd.show.figures import summary
 from qd.show.replay import as_searched, check_penalties

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from qd.run.places import RESULTS
+from qd.run.directory import RESULTS
 from qd.show.recordings import Found, archive_of_robot, policy_of
 from qd.show.replay import as_searched
 from qd.workers.evaluator import check_policy

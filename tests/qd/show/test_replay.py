@@ -9,8 +9,7 @@ from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.run.directory import RunDirectory
-from qd.run.places import elite_name, folder_for, newest_or_published, newest_run
+from qd.run.directory import RunDirectory, elite_name, folder_for, newest_or_published, newest_run
 from qd.run.settings import as_settings
 from qd.show.recordings import archive_of_robot
 from qd.show.replay import Replay, ReplayCfg, describe, draw, replay

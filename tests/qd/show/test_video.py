@@ -24,7 +24,7 @@ from sim.bank import heights_of
 from sim.maps.heightmap import as_terrain, read_heightmap
 from sim.recording.file import read_recording
 from sim.recording.renderer import open_context
-from tests.qd.run.test_cli import fails
+from tests.qd.run.test_arguments import fails
 from tests.qd.test_archive import fresh_values, small_archive
 
 pytestmark = pytest.mark.usefixtures("in_a_folder_of_its_own")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive
-from qd.run.places import RESULTS
+from qd.run.directory import RESULTS
 from qd.show.view.app import App
 from qd.show.view.arguments import ViewCfg, show_of
 from qd.show.view.crossings import Crossings

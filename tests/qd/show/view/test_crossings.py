@@ -98,7 +98,7 @@ def test_a_cache_that_cannot_be_written_to_is_named(anymal, tmp_path):
 
 def test_the_published_recording_is_that_of_the_published_archive(anymal, tmp_path):
     from qd.archive import read_archive
-    from qd.run.places import RESULTS
+    from qd.run.directory import RESULTS
 
     archive = read_archive(RESULTS.resolve() / "anymal" / "archive")
     crossings = Crossings(anymal, cache=tmp_path, published=RESULTS.resolve() / "anymal" / "view")
