@@ -18,7 +18,7 @@ from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
 from sim.files.command import command_line
-from sim.policy.names import controller_suffix
+from sim.policy.spec import controller_suffix
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler

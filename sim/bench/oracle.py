@@ -137,7 +137,7 @@ def geom_forces(
     """
     total = np.zeros((*shape, 3))
     for c in np.flatnonzero((column >= 0) & (efc_address[:, 0] >= 0)):
-        total[world[c], column[c]] += np.float64(efc_force[world[c], efc_address[c, :3]]) @ np.float64(frame[c])
+        total[world[c], column[c]] += efc_force[world[c], efc_address[c, :3]].astype(np.float64) @ frame[c].astype(np.float64)
     return total
 
 
@@ -185,7 +185,7 @@ def observation(
             2 * lin_vel_b,
             0.25 * ang_vel_b,
             gravity_b,
-            np.float64(command) * [2, 2, 0.25],
+            np.asarray(command, np.float64) * [2, 2, 0.25],
             q[7:] - default_joint_pos,
             0.05 * qd[6 : 6 + num_joints],
             np.float64(last_action),

@@ -49,7 +49,7 @@ def read_pool(path: Path) -> NDArray[np.float32]:
             genes = genes.astype(np.float32)
     if (
         genes.ndim != 2
-        or genes.shape[1] != 64
+        or genes.shape[1] != SUPER_GAUSSIAN.num_genes
         or not len(genes)
         or genes.dtype.kind != "f"
         or not np.isfinite(genes).all()

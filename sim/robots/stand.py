@@ -69,7 +69,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     """
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)
-    genes = np.concatenate([np.zeros((1, 64)), SUPER_GAUSSIAN.hard_random(_TERRAINS, seed)])
+    genes = np.concatenate([np.zeros((1, SUPER_GAUSSIAN.num_genes)), SUPER_GAUSSIAN.hard_random(_TERRAINS, seed)])
     bank.set_genes(genes.astype(np.float32))
     heights = np.array(bank.heights.numpy())
     heights[0] = 0.0
