@@ -137,7 +137,8 @@ def geom_forces(
     """
     total = np.zeros((*shape, 3))
     for c in np.flatnonzero((column >= 0) & (efc_address[:, 0] >= 0)):
-        total[world[c], column[c]] += efc_force[world[c], efc_address[c, :3]].astype(np.float64) @ frame[c].astype(np.float64)
+        force = efc_force[world[c], efc_address[c, :3]].astype(np.float64)
+        total[world[c], column[c]] += force @ frame[c].astype(np.float64)
     return total
 
 

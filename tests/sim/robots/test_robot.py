@@ -11,7 +11,7 @@ from kernels.penalties import BASE, FOOT, LIMB
 from sim.bench import oracle
 from sim.robots.model import build_robot, leaf_name
 from sim.robots.robot import ROBOTS, get_robot
-from tests.sim import mujoco_c
+from tests.sim import plain_mujoco
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE, lying
 
 LEGS = ("LF", "RF", "LH", "RH")
@@ -127,7 +127,7 @@ def test_cassies_published_limits_and_frames(c_model, builder):
 def test_the_default_pose_is_symmetric(robot, c_model):
     q = np.concatenate([lying(1, 0, 0, robot.default_base_height)[0], robot.default_joint_pos])
     left = [name for name in robot.foot_geoms if name != mirrored(name)]
-    at = dict(zip(robot.foot_geoms, mujoco_c.geom_positions(c_model, q, robot.foot_geoms), strict=True))
+    at = dict(zip(robot.foot_geoms, plain_mujoco.geom_positions(c_model, q, robot.foot_geoms), strict=True))
     assert len(at) == 2 * len(left)
     for name in left:
         np.testing.assert_allclose(at[name] * [1, -1, 1], at[mirrored(name)], atol=1e-6)

@@ -13,7 +13,7 @@ from sim.robots.model import build_robot
 from sim.simulation import GROUND_FRICTION, SolverCfg
 from sim.space import SUPER_GAUSSIAN
 from sim.terrain import SPACING
-from tests.sim import mujoco_c
+from tests.sim import plain_mujoco
 from tests.sim.scenes import ONLY_ANYMAL, PHYSICS_DT, Stepper, lying, positions, put, slope
 
 SETTLE_S = 2.0
@@ -171,7 +171,7 @@ def test_slopes_equal_mujocos_tilted_plane(eight, eight_stepper, robot, duration
     put(eight, q)
     eight_stepper.run(duration_s)
     for start, row in zip(q, positions(eight), strict=True):
-        expected = mujoco_c.run(mujoco_c.on_plane(robot, mujoco_c.to_c(start)[3:7]), start, duration_s)
+        expected = plain_mujoco.run(plain_mujoco.on_plane(robot, plain_mujoco.to_c(start)[3:7]), start, duration_s)
         assert np.linalg.norm(expected[7:] - start[7:]) > 0.05  # it is no free fall
         assert np.linalg.norm(row[:3] - expected[:3]) < metres
         assert tilt_between(row, expected) < degrees
@@ -200,7 +200,7 @@ def stand_on_hill(robot, model, grid, rng):
     pose = lying(1, x, y, height, axis / np.linalg.norm(axis), np.arcsin(np.linalg.norm(axis)))[0]
     q = np.concatenate([pose, robot.default_joint_pos])
     q[:3] += robot.default_base_height * normal
-    feet = mujoco_c.geom_positions(model, q, robot.foot_geoms)
+    feet = plain_mujoco.geom_positions(model, q, robot.foot_geoms)
     clearance = min(oracle.nearest_on_surface(grid, SPACING, foot, 0.5)[0] - 0.03 for foot in feet)
     q[2] -= clearance - 0.003
     return q
@@ -227,7 +227,7 @@ def test_hills_equal_mujocos_heightfield(eight, eight_stepper, anymal):
     # the shape of the ground; MuJoCo C needs 1 ms steps to stay calm with them.
     eight.bank.set_genes(SUPER_GAUSSIAN.uniform_random(8, 11))
     grids = np.array(eight.bank.heights.numpy())
-    models = [mujoco_c.on_heights(anymal, grid) for grid in grids]
+    models = [plain_mujoco.on_heights(anymal, grid) for grid in grids]
     rng = np.random.default_rng(1)
     q = np.array([stand_on_hill(anymal, model, grid, rng) for model, grid in zip(models, grids, strict=True)])
     put(eight, q)
@@ -235,6 +235,6 @@ def test_hills_equal_mujocos_heightfield(eight, eight_stepper, anymal):
     for model, start, row in zip(models, q, positions(eight), strict=True):
         model.opt.timestep, model.opt.iterations, model.opt.ls_iterations = 0.001, 100, 50
         model.geom_solimp[:, :3] = NEARLY_HARD
-        expected = mujoco_c.run(model, start, SETTLE_S)
+        expected = plain_mujoco.run(model, start, SETTLE_S)
         assert abs(row[2] - expected[2]) < 0.005
         assert tilt_between(row, expected) < 1.0
