@@ -34,11 +34,17 @@ class Who:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Where:
-    """Options that say where a command works."""
+class OnDevice:
+    """The option that says on which device a command works."""
 
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Where(OnDevice):
+    """Options that say where a command works."""
+
     workers: str | None = None
     """Who works: a number of processes on the CPU (one a core if left out), ray for every device of a Ray cluster, or
     ray:N for N of them. RAY_ADDRESS names a running cluster."""

@@ -108,6 +108,26 @@ class Recording:
         genes = None if self.genes is None else self.genes[terrain : terrain + 1]
         return replace(self, num_frames=num_frames, genes=genes, **cut)
 
+    def result(self) -> "RolloutResult":
+        """What came of the recorded episodes; positions are those of the last frame, what they took is not known."""
+        from sim.rollout import RolloutResult
+
+        last = np.maximum(self.num_frames - 1, 0)[..., None, None]
+        penalties, position = (
+            np.take_along_axis(values, last, axis=2)[:, :, 0] for values in (self.penalties, self.base_position)
+        )
+        invalid = (self.outcome == Outcome.INVALID)[..., None]
+        return RolloutResult(
+            penalties=np.where(invalid, np.nan, penalties.astype(np.float64)),
+            penalty_names=self.penalty_names,
+            outcome=self.outcome,
+            fallen=self.fallen,
+            duration_s=self.duration_s,
+            final_position=position,
+            physics_steps=0,
+            wall_s=0.0,
+        )
+
     def qpos(self, terrain: int, episode: int) -> NDArray[np.float64]:
         """MuJoCo's joint coordinates of an episode: position, quaternion w x y z, joints.
 
