@@ -73,7 +73,9 @@ class Found:
         """
         numbers = chosen_elites(text, len(self.archive), self.run)
         if len(numbers) != 1:
-            raise ValueError(f"--elite must name one elite here, got '{text}': give one of 0 to {len(self.archive) - 1}")
+            raise ValueError(
+                f"--elite must name one elite here, got '{text}': give one of 0 to {len(self.archive) - 1}"
+            )
         return numbers[0]
 
 

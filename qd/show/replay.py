@@ -112,7 +112,9 @@ def describe(replay: Replay) -> str:
     for label, name in (("base collision", "collision_rate"), ("goal reached", "goal_rate"), ("fallen", "fallen_rate")):
         counted = [(getattr(values, name)[k], _counted(values, k)) for _, values, k in columns]
         rows[label] = [rate_words(round(rate * count) if count else 0, count) for rate, count in counted]
-    again = f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} again."
+    again = (
+        f"  It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} again."
+    )
     if replay.controller:
         again = f"  Now it was crossed with {replay.controller}; all else is of the controller that was searched."
     table = [f"  {label:22}" + "".join(f"{cell:>34}" for cell in row) for label, row in rows.items()]

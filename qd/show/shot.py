@@ -101,7 +101,8 @@ def caption(shot: Shot) -> tuple[str, str]:
         "goal": recording.outcome[t] == Outcome.GOAL,
         "fallen": recording.fallen[t] & valid,
     }
-    rates = [f"{name} {rate_words(int(flags.sum()), count, short=True)}" for name, flags in hits.items()] if count else ["none valid"]
+    rates = [f"{name} {rate_words(int(flags.sum()), count, short=True)}" for name, flags in hits.items()]
+    rates = rates if count else ["none valid"]
     of = f"{len(valid)} episode{'s' * (len(valid) != 1)}" + f", {len(valid) - count} invalid" * (count < len(valid))
     if policy := recording.origin.get("policy"):
         of += f" with {ControllerSpec.parse(str(policy)).label}"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.show.report.elites import FAILING_BELOW, Elites
+from qd.show.elites import FAILING_BELOW, Elites
 
 MAX_MODES = 7
 """Most groups that are tried: as many as colours and markers stay apart."""
