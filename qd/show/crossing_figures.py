@@ -78,7 +78,7 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
             axes.plot(*crossed.path(int(k))[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
         if len(chosen):
             places = crossed.ends[chosen]
-            looks = {"color": end.color, "marker": end.marker, "s": 55, "edgecolors": "white", "zorder": 3}
+            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "s": 55, "edgecolors": "white", "zorder": 3}
             axes.scatter(*places[:, :2].T, label=f"{end.words} ({len(chosen)})", **looks)
     white = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
     axes.plot(*CrossingCfg.start, marker=">", markersize=11, label="start", **white)
@@ -97,7 +97,7 @@ def _legend(axes: "Axes") -> tuple[list[Any], list[str]]:
     shown = []
     for handle, label in zip(handles, labels, strict=True):
         if end := lines.get(label.rpartition(" (")[0]):
-            looks = {"color": end.color, "marker": end.marker, "linestyle": end.line}
+            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line}
             handle = Line2D([], [], **looks, markeredgecolor="white", markersize=9)
         shown.append(handle)
     return shown, labels
