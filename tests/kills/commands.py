@@ -3,10 +3,10 @@
 import dataclasses
 import os
 import resource
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,12 @@ import numpy as np
 from kernels.episode import Outcome
 from qd import reevaluate
 from qd.run.cli import run_command
-from qd.show import replay
+from qd.show import recordings, replay
 from qd.studies import calibrate
-from sim import rollout
-from sim.files.command import exit_code_of
+from sim.files.command import run_command as run_in_process
 from tests.kills import searches, trainings
 from tests.qd import stand_in
+from tests.qd.recordings import recording_of
 from train.evaluate.evaluate import evaluate
 
 SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
@@ -39,9 +39,9 @@ def reevaluate_search(path: Path) -> None:
 
 def replay_elite(path: Path) -> None:
     """The worst elite again."""
-    rollout.Rollout = _StandInRollout
+    recordings.Simulation = lambda robot, device: _cross
     argv = ["--run", str(path), "--device", "cpu", "--replicas", "4", "--policy", searches.POLICY]
-    run_command(replay.ReplayCfg, replay.main, argv)
+    sys.exit(run_in_process(replay.ReplayElite, argv, name="replay"))
 
 
 def resume_training(run_dir: Path) -> int:
@@ -76,16 +76,14 @@ def as_nobody(command: Callable[[Path], Any], path: Path) -> Any:
     return command(path)
 
 
-class _StandInRollout:
-    def __init__(self, robot: Any, policy: Any, *, num_terrains: int, num_replicas: int, device: str) -> None:
-        self.num_replicas = num_replicas
-        self.sim = SimpleNamespace(bank=SimpleNamespace(heights=SimpleNamespace(numpy=lambda: np.zeros((1, 161, 321)))))
-
-    def evaluate(self, genes: np.ndarray, seeds: np.ndarray, *, record_paths: bool) -> Any:
-        result = stand_in.evaluate(genes, seeds, self.num_replicas)
-        shape = result.invalid.shape
-        extra = {"outcome": np.full(shape, int(Outcome.GOAL)), "final_position": np.zeros((*shape, 3)), "paths": None}
-        return SimpleNamespace(**vars(result), **extra)
+def _cross(wanted: list[recordings.Wanted], progress: Any) -> list[Any]:
+    """Recordings of robots that all arrive."""
+    made = []
+    for one in wanted:
+        result = stand_in.evaluate(one.terrain[None], np.array([one.terrain_seed]), one.replicas)
+        outcomes = [Outcome.GOAL] * one.replicas
+        made.append(recording_of(outcomes, [14.0] * one.replicas, penalties=result.penalties[0]))
+    return made
 
 
 def search_below(limit: int, path: Path, iterations: int) -> None:

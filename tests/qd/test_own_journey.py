@@ -12,7 +12,7 @@ import pytest
 from qd.archive import read_archive
 from qd.reevaluate import ReevaluateCfg, reevaluate_run
 from qd.run.arguments import Arguments, job_of
-from qd.show.replay import ReplayCfg, replay
+from qd.show.replay import ReplayElite, replay
 from tests.sim.dogs import write_dog
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +90,7 @@ def test_its_archive_is_that_of_its_own_penalties(searched, home, robot, trot):
 
 def test_an_elite_is_replayed(searched, robot, trot):
     path, _ = searched
-    said = run("qd.show.replay", *robot, *trot, "--run", str(path), "--replicas", "4")
+    said = run("faultline", "replay", *robot, *trot, "--run", str(path), "--replicas", "4")
     assert "of dog, found in iteration" in said
     assert (path / "elite-0.png").exists()
 
@@ -126,7 +126,7 @@ def test_a_run_that_is_handed_over_runs_nothing_of_its_own(searched, tmp_path, h
     settings = {**config["settings"], "robot": f"{tmp_path}/evil.py", "policy": f"{tmp_path}/evil.py:act"}
     (tmp_path / "config.json").write_text(json.dumps({**config, "settings": settings}))
     for command in (
-        lambda: replay(ReplayCfg(robot=robot[1], run=tmp_path, device="cpu")),
+        lambda: replay(ReplayElite(robot=robot[1], run=tmp_path, device="cpu")),
         lambda: job_of(Arguments(resume=tmp_path, device="cpu")),
         lambda: job_of(Arguments(resume=tmp_path, robot=robot[1], device="cpu")),
         lambda: reevaluate_run(ReevaluateCfg(run=tmp_path, device="cpu")),

@@ -16,7 +16,6 @@ from qd import search
 from qd.run import arguments
 from qd.run.arguments import Arguments
 from qd.run.cli import Interrupted, run_command
-from qd.show import replay
 from qd.workers.process import EvaluatorError
 from sim.robots.robot import RobotCfg, get_robot
 from tests.qd import stand_in
@@ -239,23 +238,6 @@ def test_a_resumed_run_keeps_where_it_came_from():
     assert set(first) >= {"settings", "command", "commit", "device", "versions", "seed", "date"}
 
 
-def test_replay_of_an_elite_that_is_not_there(capsys):
-    from qd.archive import write_archive
-
-    write_archive(Path("archive.npz"), small_archive())
-
-    def run_replay(*argv):
-        run_command(replay.ReplayCfg, replay.main, list(argv))
-
-    def replayed(*argv):
-        return fails(capsys, *argv, run=run_replay)
-
-    assert replayed("--run", "archive.npz", "--elite", "3") == "archive.npz has no elite 3: expected 0 to 2"
-    assert replayed("--run", "archive.npz", "--elite", "-1") == "archive.npz has no elite -1: expected 0 to 2"
-    assert "no archive of anymal under runs/" in replayed()
-    assert "no archive at elsewhere" in replayed("--run", "elsewhere")
-
-
 @dataclass
 class Nothing:
     """No arguments."""
@@ -305,7 +287,7 @@ def test_sigterm_is_an_interrupt(capsys):
     assert exit.value.code == 130
 
 
-@pytest.mark.parametrize("module", ["qd.search", "qd.studies.compare", "qd.studies.calibrate", "qd.show.replay"])
+@pytest.mark.parametrize("module", ["qd.search", "qd.studies.compare", "qd.studies.calibrate"])
 def test_help_teaches_and_is_fast(module):
     code = f"""
 import runpy, sys

@@ -134,7 +134,9 @@ def test_playing_and_dragging_move_the_robot(app):
     assert app._panel._time.value == 5.0
     done(app, (app.play,))
     assert app._clock.playing and app._panel._play.label == "Pause"
-    done(app, (app.play,), (app.set_speed, 0.25), (app.set_follow, True), (app.set_forces, False), (app.set_paths, False))
+    done(
+        app, (app.play,), (app.set_speed, 0.25), (app.set_follow, True), (app.set_forces, False), (app.set_paths, False)
+    )
     assert not app._clock.playing and app._clock.speed == 0.25
     assert not any(arrow.visible for arrow in app._scene._forces) and not app._scene._paths.visible
     pushing = app._crossing.force_newtons >= 100.0

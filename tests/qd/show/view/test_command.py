@@ -120,7 +120,19 @@ def test_what_cannot_be_listened_at_is_refused(host, port, message):
 
 
 def test_flags_are_handed_over():
-    words = ["--robot", "cassie", "--run", "a b", "--policies", "base=shipped", "x=y.pt", "--port", "9000", "--elite", "3"]
+    words = [
+        "--robot",
+        "cassie",
+        "--run",
+        "a b",
+        "--policies",
+        "base=shipped",
+        "x=y.pt",
+        "--port",
+        "9000",
+        "--elite",
+        "3",
+    ]
     expected = View(robot="cassie", run=Path("a b"), policies=("base=shipped", "x=y.pt"), port=9000, elite="3")
     assert tyro.cli(View, args=words) == expected
     assert View().host == "127.0.0.1"  # nobody else's business unless asked for
