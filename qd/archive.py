@@ -1,6 +1,6 @@
 """The archive of a search as data: terrains that break the controller, one a cell, and the file that holds them.
 
-Reading an archive needs NumPy alone, so that training and figures do not depend on the search's libraries.
+Training and figures read archives without the search's libraries.
 """
 
 import io
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
-from qd.space import NUM_GENES
 from sim.files.atomic import write_atomically
 
 ARCHIVE_FILE = "archive.npz"
@@ -64,6 +63,8 @@ class Archive:
     """
 
     robot: str
+    space: str
+    """Name of the terrain space of the genes (:data:`sim.space.SPACES`)."""
     penalties: tuple[str, ...]
     """Names of the P penalties, in the order of the ratios."""
     scales: tuple[float, ...]
@@ -75,7 +76,7 @@ class Archive:
     iterations: int
     """Iterations the search had done."""
     genes: NDArray[np.float32]
-    """Clipped genes, shape (N, 64)."""
+    """Clipped genes, shape (N, num_genes)."""
     ratios: NDArray[np.float64]
     """Shape (N, P)."""
     cell: NDArray[np.int64]
@@ -150,9 +151,9 @@ class Archive:
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
 
-_SETTINGS = ("robot", "penalties", "scales", "intervals", "collision_bit", "iterations")
+_SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations")
 _PREFIX = "fresh_"
-_KINDS = {"robot": "U", "penalties": "U", "collision_bit": "b", "reproduced": "b"} | dict.fromkeys(
+_KINDS = {"robot": "U", "space": "U", "penalties": "U", "collision_bit": "b", "reproduced": "b"} | dict.fromkeys(
     ("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"
 )
 _MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
@@ -240,8 +241,14 @@ def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
 
 
 def _check_shapes(archive: Archive, file: Path) -> None:
+    from sim.space import get_space  # which imports Warp: not for `--help`
+
+    try:
+        num_genes = get_space(archive.space).num_genes
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
-    columns = {"genes": NUM_GENES, "ratios": num_penalties, "penalty_mean": num_penalties, "penalty_std": num_penalties}
+    columns = {"genes": num_genes, "ratios": num_penalties, "penalty_mean": num_penalties, "penalty_std": num_penalties}
     for name, array in _arrays(archive).items():
         column = columns.get(name.removeprefix(_PREFIX))
         expected = (num_elites,) if column is None else (num_elites, column)

@@ -7,12 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.descriptors import Cells, terrain_ratios
+from sim.files.settings import check, setting
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
 FITNESS_FLOOR = -20.0
 """Fitness an invalid terrain is told with; an elite's is above it, so that every elite adds to the QD score."""
+FAILING_GOAL_RATE = 0.5
+"""A controller fails a terrain on which it reaches the goal less often."""
 MAX_INVALID_SHARE = 0.25
 """A terrain with more than this share of invalid episodes is invalid."""
 
@@ -25,14 +28,13 @@ class FitnessCfg:
     """Names of the penalties, in the order of the ratios."""
     scales: tuple[float, ...]
     """Scale of each penalty: raw sums are divided by it."""
-    alpha: float = 1.0
+    alpha: float = setting(1.0)
     """Weight of the standard deviations."""
-    lam: float = 2.0
-    """Weight of the share of episodes without a base collision."""
+    lam: float = setting(2.0)
+    """Weight of u, the share of episodes without a base collision; u is 0 if none collided."""
 
     def __post_init__(self) -> None:
-        if not np.isfinite([self.alpha, self.lam]).all():
-            raise ValueError(f"alpha and lam must be finite numbers, got {self.alpha} and {self.lam}")
+        check(self)
 
 
 @dataclass(frozen=True, kw_only=True)

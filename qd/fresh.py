@@ -7,7 +7,8 @@ CPU they give the same numbers whenever they are run.
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,12 +18,14 @@ from qd.archive import Archive, FreshValues
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, FitnessCfg, evaluation_of
 from qd.run.progress import share_bar
-from qd.workers.evaluator import Evaluate, EvaluatorCfg
+from qd.workers.evaluator import Evaluate, EvaluatorCfg, open_evaluator, origin_of, resolve_device
 from qd.workers.shards import taken
+from sim.files.command import Where, Who, command_line, naming_what_is_next
 from sim.files.intervals import bootstrap_interval, wilson_interval
 
 if TYPE_CHECKING:
     from qd.run.settings import SearchCfg
+    from sim.robots.robot import RobotCfg
 
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""
@@ -179,3 +182,87 @@ def numbers_of(again: FreshValues, cells: Cells, *, sampled: bool = False) -> di
         "corrected_coverage": len(kept) / cells.num_cells,
         "corrected_qd_score": float((again.fitness[kept] - FITNESS_FLOOR).sum()),
     }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reevaluate(Who, Where):
+    """Evaluate every elite of a run again with 40 fresh episodes.
+
+    An elite is the best of many noisy evaluations; its fresh episodes say what it is worth. The run's archive, numbers
+    and figures are written again with them, elites by descending corrected fitness.
+    """
+
+    run: Path | None = None
+    """Run directory; the newest of the robot under runs/."""
+    seed: int | None = None
+    """Seed of the fresh episodes; the run's."""
+
+    def execute(self) -> None:
+        """Runs the command."""
+        reevaluate_run(self)
+
+
+def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -> Archive:
+    """Evaluates all elites of a run again and writes what it leaves with their fresh values.
+
+    Args:
+        args: Which run, and where to work. ``policy`` may be another controller than the run's.
+        open_evaluator: Opens what crosses the terrains.
+
+    Returns:
+        The corrected archive.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+        ValueError: If the run is damaged or empty, its controller is another now, or an argument is not as it must be.
+        Interrupted: On Ctrl-C; the run is as it was.
+        EvaluatorError: If a worker is lost; likewise.
+    """
+    from qd.run.arguments import evaluator_of
+    from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, origin_in
+    from qd.run.settings import file_hash
+    from qd.search import write_results
+    from sim.robots.robot import get_robot, robot_of
+
+    path = args.run or newest_run(get_robot(args.robot or "anymal"))
+    run = RunDirectory(path)
+    config, cfg = run.read_config(), run.read_cfg()
+    robot = robot_of(cfg.robot, args.robot, path)
+    seed = cfg.seed if args.seed is None else args.seed
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
+    device = resolve_device(args.device, args.workers)
+    policy = args.policy or _own_policy(path, cfg, robot)
+    evaluator = evaluator_of(cfg, robot, policy, device, args.workers)
+    given = {"run": path, "policy": args.policy, "seed": args.seed, "device": args.device, "workers": args.workers}
+    again = f"Start again with:  {command_line('reevaluate', robot=robot.spec, **given)}"
+    with claimed(path):
+        loaded = run.load(cfg)
+        if loaded is None:
+            raise ValueError(f"{path} has no finished iteration, expected at least one: go on with it (--resume)")
+        search, metrics = loaded
+        with naming_what_is_next(f"{path} is as it was", lambda: again):
+            found = archive_of(cfg, search, len(metrics))
+            archive = corrected(found, cfg, evaluator, open_evaluator, seed)
+        by = origin_of(device, seed, args.workers)
+        if args.policy is not None:
+            by |= {"policy": args.policy, "policy_sha256": file_hash(args.policy)}
+        with naming_what_is_next("some files may not be written", lambda: again):
+            write_results(run, archive, metrics, {**origin_in(config), "reproduced_by": by})
+    return archive
+
+
+def _own_policy(path: Path, cfg: "SearchCfg", robot: "RobotCfg") -> str:
+    """The run's own controller, which must be what it was."""
+    from qd.run.settings import file_hash, policy_spec, refuse_unnamed_code
+
+    refuse_unnamed_code(cfg.policy, None, path)
+    policy = policy_spec(cfg, robot)
+    digest = file_hash(policy)
+    if digest != cfg.policy_sha256:
+        state = "lost" if digest is None else "another one now"
+        raise ValueError(
+            f"{path} was searched with the controller in {policy}, which is {state} (expected SHA-256 "
+            f"{cfg.policy_sha256}, got {digest}): put it back, or say with --policy which one to evaluate with"
+        )
+    return policy

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
-from qd import space
-from qd.directions import DirectionEmitter
 from qd.fitness import FITNESS_FLOOR, Evaluation
-from qd.scheduler_cfg import SchedulerCfg
-from sim.terrain import hard_random_genes, uniform_random_genes
+from qd.run.settings import SchedulerCfg
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
 
@@ -27,25 +25,29 @@ class RandomEmitter:
 
     Args:
         archive: The elites, of which it learns nothing.
+        space: Name of the terrain space.
         method: ``uniform_random`` or ``hard_random``.
         batch_size: Terrains asked for at once.
         stream: Seed.
     """
 
-    def __init__(self, archive: GridArchive, method: str, batch_size: int, stream: np.random.SeedSequence) -> None:
-        self.archive, self.method, self.batch_size = archive, method, batch_size
+    def __init__(
+        self, archive: GridArchive, space: str, method: str, batch_size: int, stream: np.random.SeedSequence
+    ) -> None:
+        self.archive, self.space, self.method, self.batch_size = archive, space, method, batch_size
         self._rng = np.random.default_rng(stream)
 
     def ask(self) -> NDArray[np.float32]:
-        """Genes, shape (batch_size, 64)."""
-        draw = uniform_random_genes if self.method == "uniform_random" else hard_random_genes
+        """Genes, shape (batch_size, num_genes)."""
+        space = get_space(self.space)
+        draw = space.uniform_random if self.method == "uniform_random" else space.hard_random
         return draw(self.batch_size, self._rng)
 
     def tell(self, **told: Any) -> None:
         """Learns nothing."""
 
 
-Emitter = EvolutionStrategyEmitter | IsoLineEmitter | DirectionEmitter | RandomEmitter
+Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter
 
 
 class Scheduler:
@@ -57,44 +59,45 @@ class Scheduler:
 
     Args:
         cfg: Settings.
+        space: What genes mean.
         num_cells: Number of reachable cells.
         num_ratios: Number of ratio descriptors.
         seed: Seed of emitters and archives.
     """
 
-    def __init__(self, cfg: SchedulerCfg, *, num_cells: int, num_ratios: int, seed: int) -> None:
+    def __init__(
+        self,
+        cfg: SchedulerCfg,
+        *,
+        num_cells: int,
+        num_ratios: int,
+        seed: int,
+        space: TerrainSpace = SUPER_GAUSSIAN,
+    ) -> None:
         streams = np.random.SeedSequence(seed).spawn(cfg.emitters + 2)
         learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
-        self.result = _make_archive(num_cells, num_ratios, streams[1], {})
+        self.result = _make_archive(space.num_genes, num_cells, num_ratios, streams[1], {})
         in_turn = list(zip(cycle(cfg.methods), streams[2:], strict=False))
         learns = any(name == "cma_mae" for name, _ in in_turn)
-        self.archive = _make_archive(num_cells, num_ratios, streams[0], learning) if learns else self.result
-        self.emitters: list[Emitter] = [self._emitter(cfg, name, num_ratios, stream) for name, stream in in_turn]
+        self.archive = self.result
+        if learns:
+            self.archive = _make_archive(space.num_genes, num_cells, num_ratios, streams[0], learning)
+        self.emitters: list[Emitter] = [self._emitter(cfg, name, space, stream) for name, stream in in_turn]
         self._asked: NDArray[np.float32] | None = None
 
-    def _emitter(self, cfg: SchedulerCfg, method: str, num_ratios: int, stream: Any) -> Emitter:
+    def _emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
         if method.endswith("random"):
-            return RandomEmitter(self.result, method, cfg.batch_size, stream)
-        if method == "directions":
-            return DirectionEmitter(
-                self.result,
-                num_ratios=num_ratios,
-                es=cfg.es,
-                sigma0=cfg.direction_sigma,
-                restart_every=cfg.direction_restart,
-                batch_size=cfg.batch_size,
-                stream=stream,
-            )
+            return RandomEmitter(self.result, space.name, method, cfg.batch_size, stream)
         if method == "map_elites":
             first, later = stream.spawn(2)
             return IsoLineEmitter(
                 self.result,
                 iso_sigma=cfg.iso_sigma,
                 line_sigma=cfg.line_sigma,
-                initial_solutions=hard_random_genes(cfg.batch_size, np.random.default_rng(first)),
-                bounds=[(-1.0, 1.0)] * space.NUM_GENES,
+                initial_solutions=space.hard_random(cfg.batch_size, np.random.default_rng(first)),
+                bounds=[(-1.0, 1.0)] * space.num_genes,
                 batch_size=cfg.batch_size,
                 seed=later,
             )
@@ -102,7 +105,7 @@ class Scheduler:
         improves = method == "cma_me"  # ranks and selects by what is new in the archive, and restarts without it
         return EvolutionStrategyEmitter(
             self.result if improves else self.archive,
-            x0=np.zeros(space.NUM_GENES),
+            x0=np.zeros(space.num_genes),
             sigma0=cfg.sigma0,
             ranker="2imp" if improves else "imp",
             es=cfg.es,
@@ -116,10 +119,10 @@ class Scheduler:
         """The next terrains to evaluate.
 
         Returns:
-            Clipped genes, shape (emitters * batch_size, 64).
+            Clipped genes, shape (emitters * batch_size, num_genes).
         """
         self._asked = np.concatenate([emitter.ask() for emitter in self.emitters])
-        return space.clip(self._asked)
+        return _clip(self._asked)
 
     def tell(self, evaluation: Evaluation, iteration: int) -> None:
         """What became of the terrains last asked for.
@@ -209,12 +212,14 @@ _FIELDS = (
 )
 
 
-def _make_archive(num_cells: int, num_ratios: int, stream: np.random.SeedSequence, learning: dict) -> GridArchive:
+def _make_archive(
+    num_genes: int, num_cells: int, num_ratios: int, stream: np.random.SeedSequence, learning: dict[str, Any]
+) -> GridArchive:
     per_ratio = ((num_ratios,), np.float64)
     rate, count = ((), np.float64), ((), np.int64)
-    shapes = ((space.NUM_GENES,), np.float32), per_ratio, per_ratio, per_ratio, rate, rate, rate, count, count, count
+    shapes = ((num_genes,), np.float32), per_ratio, per_ratio, per_ratio, rate, rate, rate, count, count, count
     return GridArchive(
-        solution_dim=space.NUM_GENES,
+        solution_dim=num_genes,
         dims=[num_cells],
         ranges=[(0, num_cells)],
         seed=stream,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
@@ -226,6 +231,11 @@ def _make_archive(num_cells: int, num_ratios: int, stream: np.random.SeedSequenc
     )
 
 
+def _clip(genes: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Genes as the terrain has them, in [-1, 1]."""
+    return np.clip(genes, -1.0, 1.0, dtype=np.float32)
+
+
 def _rows(solutions: NDArray[np.float32], evaluation: Evaluation, iteration: int) -> dict[str, NDArray[Any]]:
     """What both archives are told: one row a terrain."""
     taken = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
@@ -233,6 +243,6 @@ def _rows(solutions: NDArray[np.float32], evaluation: Evaluation, iteration: int
         "solution": solutions,
         "objective": evaluation.fitness,
         "measures": evaluation.cell[:, None] + 0.5,
-        "genes": space.clip(solutions),
+        "genes": _clip(solutions),
         "iteration": np.full(len(solutions), iteration),
     }

@@ -1,4 +1,4 @@
-"""Search the terrains that break a controller: ask for terrains, let robots cross them, tell what became of them."""
+"""The search: ask for terrains, let robots cross them, tell the emitters what became of them."""
 
 import time
 from contextlib import nullcontext
@@ -7,23 +7,20 @@ from typing import TYPE_CHECKING, Any
 from qd.archive import Archive
 from qd.fitness import Evaluation, evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
-from qd.run.arguments import Arguments, Job, job_of
-from qd.run.cli import naming_what_is_next, run_command
-from qd.run.directory import CONFIG_FILE, SUMMARY_FILE, Metrics, RunDirectory, archive_of, claimed
-from qd.run.next_commands import make_command
+from qd.run.arguments import Job
+from qd.run.directory import CONFIG_FILE, SUMMARY_FILE, Metrics, RunDirectory, archive_of, claimed, reached
 from qd.run.progress import ProgressBar, clock, plan
-from qd.run.resuming import code_of
-from qd.run.settings import SearchCfg, as_settings
-from qd.show.figures import summary, write_figures
-from qd.workers.evaluator import Evaluate, crew_status, episode_seeds, open_evaluator, origin_of
+from qd.run.settings import SearchCfg, code_of
+from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, worker_status
 from sim.files.atomic import to_json, write_atomically
+from sim.files.command import command_line, naming_what_is_next
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
     from sim.rollout import RolloutResult
 
 MOST_DRAWN = 200
-"""Elites drawn for a look at them in the middle of a search (the paper's figure of mean STD)."""
+"""Elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)."""
 
 
 def search_terrains(
@@ -49,12 +46,12 @@ def search_terrains(
             row |= _look_again(cfg, found, evaluate)
         ended = time.perf_counter()
         wall_s = ended - began  # from the end of the iteration before, so saving counts
-        crew = crew_status(evaluate)
-        staff = {"workers": crew.workers, "retries": crew.retries} if crew else {}
-        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **staff})
+        workers = worker_status(evaluate)
+        counts = {"workers": workers.workers, "retries": workers.retries} if workers else {}
+        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **counts})
         began = ended
-        run.save(as_settings(cfg), search, metrics, found)
-        bar.show(metrics[-1], None if crew is None else str(crew))
+        run.save(cfg, search, metrics, found)
+        bar.show(metrics[-1], None if workers is None else str(workers))
 
 
 def take_in(
@@ -73,7 +70,7 @@ def take_in(
     """
     evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
     search.tell(evaluation, iteration)
-    found = archive_of(as_settings(cfg), search, iteration)
+    found = archive_of(cfg, search, iteration)
     physics = {
         "physics_steps": int(result.physics_steps),
         "rollout_s": float(result.wall_s),
@@ -113,7 +110,7 @@ def _batch_row(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
-    """Runs a search to its end: loop, figures, numbers, and what to do next.
+    """Runs a search to its end: the loop, figures, numbers, and what to do next.
 
     Args:
         job: What to do; nothing is written before the simulation stands.
@@ -129,27 +126,29 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
     """
     cfg, run = job.cfg, RunDirectory(job.path)
     with claimed(job.path):
-        loaded = run.load(as_settings(cfg)) if job.resumes else None
+        loaded = run.load(cfg) if job.resumes else None
         done = len(loaded[1]) if loaded else 0
         if done > cfg.iterations:
             raise ValueError(
                 f"iterations must be at least {done}, as many as {job.path} has done, got {cfg.iterations}"
             )
-        print(plan(cfg, job.path, done, job.device, job.evaluator.processes), flush=True)
+        print(plan(cfg, job.path, done, job.device, job.evaluator.num_workers), flush=True)
         _mention_fresh_values(job, run, done)
+        own = [{**job.session, "iterations": cfg.iterations}] if done < cfg.iterations else []
+        origin = {**job.origin, "sessions": [*reached(job.origin["sessions"], done), *own]}
         with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(job)):
             with open_evaluator(job.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
                 search, metrics = loaded or (begin(cfg), [])
-                run.write_config(as_settings(cfg), cfg.iterations, job.origin)
+                run.write_config(cfg, origin)
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:
                         search_terrains(cfg, run, search, metrics, evaluate, bar)
-            archive = _write_found(job, run, search, metrics)
+            archive = _write_found(job, run, search, metrics, origin)
         if job.reproduce:
             again = f"Go on with:  {job.reevaluate_command}"
             with naming_what_is_next("the archive is saved as found", lambda: again):
-                archive = _write_corrected(job, run, archive, metrics, open_evaluator)
-    worst = make_command("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
+                archive = _write_corrected(job, run, archive, metrics, origin, open_evaluator)
+    worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
     print(f"Next, see the worst terrain:  {worst}")
     return archive
 
@@ -171,27 +170,37 @@ def _how_to_go_on(job: Job) -> str:
 
 def begin(cfg: SearchCfg) -> "Scheduler":
     """A search that has asked for nothing yet."""
-    from qd.scheduler import Scheduler
+    from qd.scheduler import Scheduler  # pyribs takes two seconds to import
+    from sim.space import get_space
 
-    num_ratios = len(cfg.fitness.penalties)
-    return Scheduler(cfg.scheduler, num_cells=cfg.cells.num_cells, num_ratios=num_ratios, seed=cfg.seed)
+    return Scheduler(
+        cfg.scheduler,
+        space=get_space(cfg.space),
+        num_cells=cfg.cells.num_cells,
+        num_ratios=len(cfg.fitness.penalties),
+        seed=cfg.seed,
+    )
 
 
-def _write_found(job: Job, run: RunDirectory, search: "Scheduler", metrics: Metrics) -> Archive:
-    """Figures and numbers of a search that reached its iterations, with the fresh values that still hold."""
-    found = archive_of(as_settings(job.cfg), search, len(metrics))
+def _write_found(
+    job: Job, run: RunDirectory, search: "Scheduler", metrics: Metrics, origin: dict[str, Any]
+) -> Archive:
+    """Writes figures and numbers of a search that reached its iterations, with the fresh values that still hold."""
+    found = archive_of(job.cfg, search, len(metrics))
     archive = found if job.reproduce else run.with_fresh_values(found)
     by = run.read_summary().get("reproduced_by") if archive.fresh is not None else None
-    write_results(run, archive, metrics, {**job.origin, "reproduced_by": by})
+    write_results(run, archive, metrics, {**origin, "reproduced_by": by})
     return archive
 
 
-def _write_corrected(job: Job, run: RunDirectory, archive: Archive, metrics: Metrics, open_evaluator: Open) -> Archive:
-    """The same as 40 fresh episodes of each elite correct it."""
+def _write_corrected(
+    job: Job, run: RunDirectory, archive: Archive, metrics: Metrics, origin: dict[str, Any], open_evaluator: Open
+) -> Archive:
+    """Writes the same as 40 fresh episodes of each elite correct it."""
     archive = corrected(archive, job.cfg, job.evaluator, open_evaluator, job.cfg.seed)
     # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
     again = origin_of(job.device, job.cfg.seed, job.evaluator.workers)
-    write_results(run, archive, metrics, {**job.origin, "reproduced_by": again})
+    write_results(run, archive, metrics, {**origin, "reproduced_by": again})
     return archive
 
 
@@ -202,9 +211,12 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics, origin:
         run: The run directory, claimed.
         archive: What was found; with fresh values its numbers and figures have them.
         metrics: One row an iteration.
-        origin: Provenance.
+        origin: Provenance, with the sessions of the run.
     """
+    from qd.show.figures import summary, write_figures
+
     run.write_derived(metrics, archive)
+    origin = {**origin, "sessions": reached(origin["sessions"], len(metrics))}
     figures = write_figures(run.path, archive, metrics)
     gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
     numbers = summary(archive, metrics, gpus=gpus, origin=origin)
@@ -222,12 +234,3 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics, origin:
         f"{numbers['corrected_coverage']:.1%} of the reachable cells, QD score {numbers['corrected_qd_score']:.0f}; "
         f"in {run.path / SUMMARY_FILE} and the figures"
     )
-
-
-def main(args: Arguments) -> None:
-    """The command."""
-    run_search(job_of(args))
-
-
-if __name__ == "__main__":
-    run_command(Arguments, main)

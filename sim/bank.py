@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
-from kernels.super_gaussian import GENES_PER_BUMP, rasterise
+from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 
@@ -60,37 +60,34 @@ class TerrainBank:
         self.heights.assign(heights.astype(np.float32))
         max_blocks(self.terrain.heights, self.terrain.ceilings)
 
-    def set_genes(self, genes: np.ndarray) -> None:
-        """Replace all terrains by the Super-Gaussian mixtures of ``genes``, shape (num_terrains, 8 * num_bumps).
+    def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN) -> None:
+        """Replace all terrains by those of genes of a space, shape (num_terrains, num_genes).
 
         Raises:
             ValueError: If the shape differs or a gene is not finite.
         """
-        if genes.ndim != 2 or genes.shape[1] == 0 or genes.shape[1] % GENES_PER_BUMP or len(genes) != self.num_terrains:
-            raise ValueError(
-                f"genes must have shape ({self.num_terrains}, 64), got {genes.shape}: one row is 8 bumps x 8"
-            )
-        if not np.isfinite(genes).all():
-            raise ValueError(f"genes must be finite, got {np.count_nonzero(~np.isfinite(genes))} that are not")
-        on_device = wp.array(genes.astype(np.float32), dtype=float, device=self.device)
-        rasterise(on_device, SPACING, self.terrain.heights)
+        valid = space.validate(genes)
+        if len(valid) != self.num_terrains:
+            raise ValueError(f"genes must be of {self.num_terrains} terrains, one row each, got {len(valid)} rows")
+        space.rasterise(wp.array(valid, dtype=float, device=self.device), SPACING, self.terrain.heights)
         max_blocks(self.terrain.heights, self.terrain.ceilings)
 
 
-def heights_of(genes: np.ndarray, *, device: str = "cpu") -> np.ndarray:
+def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str = "cpu") -> np.ndarray:
     """Height grids [m] of genes as a simulation has them, on the host.
 
     Args:
-        genes: Shape (num_terrains, 8 * num_bumps), at least one terrain.
+        genes: Shape (num_terrains, num_genes), at least one terrain.
+        space: What the genes mean.
         device: Warp device name.
 
     Returns:
         Float32, shape (num_terrains, NUM_ROWS, NUM_COLS).
 
     Raises:
-        ValueError: If the shape is another one or a gene is not finite.
+        ValueError: If the shape differs or a gene is not finite.
     """
     bank = TerrainBank(len(genes), device=device)
     with wp.ScopedDevice(device):
-        bank.set_genes(genes)
+        bank.set_genes(genes, space)
         return np.array(bank.heights.numpy())

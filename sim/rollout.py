@@ -18,6 +18,7 @@ from sim.reward import RewardSum
 from sim.robots.robot import RobotCfg
 from sim.rollout_result import RolloutResult, RolloutState
 from sim.simulation import Simulation, SolverCfg
+from sim.space import SUPER_GAUSSIAN, TerrainSpace
 
 __all__ = ["Rollout", "RolloutResult", "evaluate"]
 
@@ -37,6 +38,7 @@ class Rollout:
         device: str,
         cfg: CrossingCfg | None = None,
         solver: SolverCfg | None = None,
+        space: TerrainSpace = SUPER_GAUSSIAN,
     ) -> None:
         """Load the policy, build the simulation and capture the control step.
 
@@ -48,6 +50,7 @@ class Rollout:
             device: Warp device name.
             cfg: The crossing.
             solver: Solver options.
+            space: What the genes of terrains mean.
 
         Raises:
             ValueError: If the policy does not fit the robot, or a number is not positive.
@@ -58,6 +61,7 @@ class Rollout:
         self.cfg = cfg or CrossingCfg()
         self.num_terrains = num_terrains
         self.num_replicas = num_replicas
+        self.space = space
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         bank = TerrainBank(num_terrains, device=device)
@@ -141,18 +145,18 @@ class Rollout:
         *,
         record_paths: bool = False,
         before_step: Callable[[], None] | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Callable[[float], None] | None = None,
     ) -> RolloutResult:
         """Run one crossing of every replica on every terrain.
 
         An episode depends on its terrain, the terrain's seed and its replica alone.
 
         Args:
-            terrains: Genes, shape (num_terrains, 64), or heights [m], shape (num_terrains, nrow, ncol).
+            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
             seeds: One seed a terrain, shape (num_terrains,), uint32.
             record_paths: Keep the base's position at every control step.
             before_step: Called before every control step, to look at :attr:`state` (:mod:`sim.recording.recorder`).
-            progress: Called with (control steps done, most control steps) at every poll.
+            progress: Called at every poll with the share done of the most control steps.
 
         Raises:
             ValueError: If a shape does not fit or a value is not finite.
@@ -191,7 +195,7 @@ class Rollout:
             if terrains.ndim == 3:
                 self.sim.bank.set_heights(terrains)
             else:
-                self.sim.bank.set_genes(terrains)
+                self.sim.bank.set_genes(terrains, self.space)
             self._start(seeds.astype(np.uint32))
         self._policy.reset()
 
@@ -200,7 +204,7 @@ class Rollout:
         self._policy()
         self.sim.launch(self._graph)
 
-    def _run(self, progress: Callable[[int, int], None] | None, look: Callable[[], None]) -> int:
+    def _run(self, progress: Callable[[float], None] | None, look: Callable[[], None]) -> int:
         most = round(self.cfg.max_duration_s / self.robot.control_dt)
         poll = max(1, round(self.cfg.poll_every_s / self.robot.control_dt))
         for step in range(1, most + 1):
@@ -209,7 +213,7 @@ class Rollout:
             if step % poll == 0 or step == most:
                 running_count = int(self._stepped.num_running.numpy()[0])
                 if progress is not None:
-                    progress(step, most)
+                    progress(step / most)
                 if running_count == 0:
                     return step
         return most

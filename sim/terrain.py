@@ -1,4 +1,4 @@
-"""Terrains as height grids: hand-crafted crossings, random genes, and the tiles of the training curriculum.
+"""Terrains as height grids: hand-crafted crossings, and the tiles of the training curriculum.
 
 Every grid is 16 m x 8 m at 0.05 m: heights [m] of shape ``(NUM_ROWS, NUM_COLS)``, row along y (0..8 m), column along x
 (0..16 m). A feature fills the 8 m x 8 m square 4 <= x <= 12 in the middle. A crossing starts at (2, 4) on flat ground
@@ -12,8 +12,6 @@ Every random terrain has its own generator, spawned from the seed: terrain i doe
 """
 
 import numpy as np
-
-from kernels.super_gaussian import GENES_PER_BUMP, PARAMETERS
 
 Seed = int | np.random.Generator
 """What the generators draw from. A Generator gives other terrains on each call, an int the same ones."""
@@ -151,36 +149,6 @@ def hand_crafted_crossings(count: int, seed: Seed) -> tuple[np.ndarray, np.ndarr
         levels[i] = rng.integers(NUM_LEVELS)
         heights[i] = crossing_terrain(CROSSING_TYPES[types[i]], levels[i], rng)
     return heights, types, levels
-
-
-def uniform_random_genes(count: int, seed: Seed, num_bumps: int = 8) -> np.ndarray:
-    """Genes drawn uniformly from [-1, 1].
-
-    Args:
-        count: Number of terrains.
-        seed: Int or Generator.
-        num_bumps: Super-Gaussians a terrain.
-
-    Returns:
-        Genes, float32, shape (count, 8 * num_bumps), bump after bump.
-
-    Raises:
-        ValueError: If ``count`` or ``num_bumps`` is not positive.
-    """
-    _check_positive(count=count, num_bumps=num_bumps)
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-1.0, 1.0, (count, GENES_PER_BUMP * num_bumps)).astype(np.float32)
-
-
-def hard_random_genes(count: int, seed: Seed, num_bumps: int = 8) -> np.ndarray:
-    """Genes drawn uniformly, but each bump's height gene w at -1 or 1: the paper's hard-random terrains.
-
-    Arguments, result and errors are those of :func:`uniform_random_genes`.
-    """
-    genes = uniform_random_genes(count, seed, num_bumps)
-    height_genes = genes[:, PARAMETERS.index("w") :: GENES_PER_BUMP]
-    height_genes[:] = np.where(height_genes < 0.0, -1.0, 1.0)
-    return genes
 
 
 def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) -> np.ndarray:

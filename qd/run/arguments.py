@@ -1,51 +1,59 @@
-"""What a command line of the search means: a new run, or an old one that goes on."""
+"""The search as a command: what its flags mean, for a new run or one that goes on."""
 
 import itertools
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from qd.run.directory import CONFIG_FILE, RunDirectory, differences
-from qd.run.next_commands import Placed, next_command
-from qd.run.places import RUNS, numbered
-from qd.run.resuming import code_of, moved_policy, origin_in, own_file, refuse_changes, refuse_unnamed_code, resumed
-from qd.run.settings import SearchCfg, as_settings, changed, kept_penalties, measured_now, policy_spec, preset
+from qd.run.directory import CONFIG_FILE, RUNS, RunDirectory, numbered, origin_in
+from qd.run.settings import (
+    SearchCfg,
+    as_settings,
+    changed,
+    code_of,
+    differences,
+    kept_penalties,
+    measured_now,
+    moved_policy,
+    policy_spec,
+    preset,
+    refuse_changes,
+    refuse_unnamed_code,
+    resumed,
+)
 from qd.workers.evaluator import EvaluatorCfg, check_policy, origin_of, resolve_device
 from sim.files.atomic import is_leftover
+from sim.files.command import Where, Who, command_line
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Archive(Who, Where):
     """Search the terrains on which a controller fails, each in its own way.
 
-    Every iteration asks CMA-MAE for terrains, lets robots cross them, and files each terrain by the proportions of what
-    went wrong. State is saved after every iteration: stop with Ctrl-C whenever you like and go on with --resume.
+    Every iteration asks CMA-MAE and MAP-Elites for terrains, lets robots cross them, and files each terrain by the
+    proportions of what went wrong. State is saved after every iteration: stop with Ctrl-C whenever you like and go on
+    with --resume.
     """
 
-    robot: str | None = None
-    """Which robot: anymal, unless resuming; anymal, cassie, or the settings file of another (my_robot.py)."""
     preset: str | None = None
     """Size of the search: paper (a GPU's work) or small (minutes on a CPU); by default what the device can do."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
     iterations: int | None = None
     """Iterations to reach; with --resume, more than before extend a finished run."""
-    policy: str | None = None
-    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
-    module:callable, or file.py:adapter@FILE for a file that expects another observation."""
     seed: int | None = None
     """Seed of everything drawn; 0."""
     resume: Path | None = None
     """Go on with the run in this directory."""
     run_dir: Path | None = None
     """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
+    space: str | None = None
+    """Terrain space: super_gaussian (the paper's eight bumps) is the only one so far."""
     replicas: int | None = None
     """Episodes a terrain."""
     method: str | None = None
-    """Where terrains come from: cma_mae, cma_me, map_elites, directions, hard_random, uniform_random, joined by +."""
+    """Where terrains come from: cma_mae, cma_me, map_elites, hard_random, uniform_random; several joined by +."""
     emitters: int | None = None
     """Emitters."""
     batch_size: int | None = None
@@ -65,28 +73,26 @@ class Arguments:
     alpha: float | None = None
     """Weight of the standard deviations in the fitness."""
     lam: float | None = None
-    """Weight of the share of episodes without collision in the fitness."""
+    """Weight in the fitness of u, the share of episodes without base collision; u is 0 if none collided."""
     reevaluate_every: int | None = None
-    """Every so many iterations, look at up to 200 elites again in 40 fresh episodes; 0: never."""
-    processes: int | None = None
-    """Processes on the CPU, without Ray; one a core."""
-    workers: int | Literal["auto"] | None = None
-    """Search on so many Ray workers, a GPU or a CPU core each; auto: as many as there are. RAY_ADDRESS names a running
-    cluster; without it they are this machine's."""
-    worker_limit_s: float = 300.0
-    """A Ray worker that gets no further for so many seconds is given up, and its terrains go to another; building its
-    simulation has a limit of its own."""
+    """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
     """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
 
+    def execute(self) -> None:
+        """Runs the search."""
+        from qd.search import run_search
 
-_PLACED = ("device", "processes", "workers", "worker_limit_s")
-_NOT_SETTINGS = (*_PLACED, "robot", "resume", "run_dir", "without", "reproduce")
+        run_search(job_of(self))
+
+
+_NOT_SETTINGS = ("device", "workers", "robot", "resume", "run_dir", "without", "reproduce")
+_SESSION = ("command", "commit", "device")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A search that can begin: everything a user may have got wrong has been looked at."""
+    """A search that can begin: all that a user may have got wrong is checked."""
 
     cfg: SearchCfg
     path: Path
@@ -97,7 +103,9 @@ class Job:
     reproduce: bool
     """Whether the elites are evaluated again at the end."""
     origin: dict[str, Any]
-    """Provenance of the run's beginning."""
+    """Provenance of the run's beginning, and the sessions before this one."""
+    session: dict[str, Any]
+    """Command, commit and device of this session."""
     resume_command: str
     """How to go on with it."""
     reevaluate_command: str
@@ -115,13 +123,15 @@ class Job:
         return robot if isinstance(robot, str) else robot.spec
 
 
-def job_of(args: Arguments) -> Job:
+def job_of(args: Archive) -> Job:
     """The job that a command line asks for.
 
     Raises:
         FileNotFoundError: If there is no run to resume.
-        ValueError: If robot, preset, device, controller, a setting or the run directory is not as it must be.
+        ValueError: If robot, preset, device, controller, space, a setting or the run directory is not as it must be.
     """
+    from sim.space import get_space
+
     if args.resume and args.run_dir:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
     there = RunDirectory(args.resume).read_cfg() if args.resume else None
@@ -136,26 +146,34 @@ def job_of(args: Arguments) -> Job:
         moved = moved_policy(there, args.policy)
         path, cfg = args.resume, resumed(args.resume, there, robot, changes, moved)
         refuse_changes(path, "run", as_settings(there), as_settings(cfg))
-        origin = origin_in(RunDirectory(path).read_config())
     else:
         name = args.preset or ("paper" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
-        path, origin = _free_path(args, cfg, robot), origin_of(device, cfg.seed, args.workers) | own_file(robot)
-    policy = moved or policy_spec(cfg, robot)
+        path = _free_path(args, cfg, robot)
+    get_space(cfg.space)
+    now = origin_of(device, cfg.seed, args.workers)
     named = moved or code_of(cfg)
     return Job(
         cfg=cfg,
         path=path,
         resumes=there is not None,
-        evaluator=evaluator_of(cfg, robot, policy, device, args),
+        evaluator=evaluator_of(cfg, robot, moved or policy_spec(cfg, robot), device, args.workers),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
-        origin=origin,
-        resume_command=_resume_command(robot.spec, path, args, named),
-        reevaluate_command=next_command("reevaluate", args, robot=robot.spec, run=path, policy=named),
+        origin=origin_in(RunDirectory(path).read_config()) if there else {**now, **own_file(robot), "sessions": []},
+        session={name: now[name] for name in _SESSION},
+        resume_command=_resume_command(robot, path, args, named),
+        reevaluate_command=command_line(
+            "reevaluate", robot=robot.spec, run=path, policy=named, device=args.device, workers=args.workers
+        ),
     )
 
 
-def _robot_of(args: Arguments, there: SearchCfg | None) -> "RobotCfg":
+def own_file(robot: "RobotCfg") -> dict[str, Any]:
+    """For the origin of a run: where the settings of a robot that is not shipped were."""
+    return {} if robot.settings_file is None else {"robot_file": str(robot.settings_file)}
+
+
+def _robot_of(args: Archive, there: SearchCfg | None) -> "RobotCfg":
     from sim.robots.robot import get_robot, robot_of
 
     if args.resume and there:
@@ -163,13 +181,16 @@ def _robot_of(args: Arguments, there: SearchCfg | None) -> "RobotCfg":
     return get_robot(args.robot or "anymal")
 
 
-def _resume_command(robot: str, path: Path, args: Arguments, policy: str | None) -> str:
+def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | None) -> str:
     reproduce = None if args.reproduce == "auto" else args.reproduce
-    return next_command("archive", args, robot=robot, resume=path, policy=policy, reproduce=reproduce)
+    return command_line(
+        "archive", robot=robot.spec, resume=path, policy=policy, device=args.device, workers=args.workers,
+        reproduce=reproduce,
+    )  # fmt: skip
 
 
 def evaluator_of(
-    cfg: SearchCfg, robot: "RobotCfg", policy: str, device: str, args: Placed, *, runs_on_gpu: int = 1
+    cfg: SearchCfg, robot: "RobotCfg", policy: str, device: str, workers: str | None, *, runs_on_gpu: int = 1
 ) -> EvaluatorCfg:
     """What evaluates an iteration's terrains all at once, with a controller that was tried.
 
@@ -178,8 +199,8 @@ def evaluator_of(
         robot: Its robot.
         policy: Controller.
         device: Warp device name.
-        args: Where to work.
-        runs_on_gpu: Searches a GPU crosses the terrains of at once; a CPU is full with one's.
+        workers: Who crosses them, as on a command line.
+        runs_on_gpu: Searches whose terrains a GPU crosses at once; the CPU is busy with those of one.
 
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot.
@@ -191,13 +212,12 @@ def evaluator_of(
         num_terrains=cfg.scheduler.num_terrains * (runs_on_gpu if device.startswith("cuda") else 1),
         num_replicas=cfg.replicas,
         device=device,
-        num_processes=args.processes,
-        workers=args.workers,
-        worker_limit_s=args.worker_limit_s,
+        workers=workers,
+        space=cfg.space,
     )
 
 
-def _free_path(args: Arguments, cfg: SearchCfg, robot: "RobotCfg") -> Path:
+def _free_path(args: Archive, cfg: SearchCfg, robot: "RobotCfg") -> Path:
     """Directory of a new run; never one that holds something."""
     if args.run_dir is None:
         name = f"{cfg.robot}-{cfg.preset}-{cfg.seed}"
@@ -209,14 +229,14 @@ def _free_path(args: Arguments, cfg: SearchCfg, robot: "RobotCfg") -> Path:
         if different:
             found = f"{args.run_dir} holds a run of other settings"
             raise ValueError(f"{found}: {', '.join(different)}: give another --run-dir")
-        command = _resume_command(robot.spec, args.run_dir, args, code_of(cfg))
+        command = _resume_command(robot, args.run_dir, args, code_of(cfg))
         raise ValueError(f"{args.run_dir} holds this run already: go on with `{command}`")
     if args.run_dir.is_dir() and not all(map(is_leftover, args.run_dir.iterdir())):
         raise ValueError(f"{args.run_dir} is not empty and holds no run: give another --run-dir")
     return args.run_dir
 
 
-def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments, robot: "RobotCfg") -> None:
+def _mention_unfinished(name: str, cfg: SearchCfg, args: Archive, robot: "RobotCfg") -> None:
     """Says so where the new run repeats one that was stopped; starting over is still the user's to choose."""
     for path in itertools.takewhile(Path.exists, numbered(RUNS, name)):
         run = RunDirectory(path)
@@ -227,4 +247,4 @@ def _mention_unfinished(name: str, cfg: SearchCfg, args: Arguments, robot: "Robo
         if done < there.iterations and as_settings(there) == as_settings(cfg):
             state = f"stopped after {done} of {there.iterations} iterations"
             print(f"{path} holds the same search, {state}. Go on with:")
-            print(f"  {_resume_command(robot.spec, path, args, code_of(cfg))}")
+            print(f"  {_resume_command(robot, path, args, code_of(cfg))}")

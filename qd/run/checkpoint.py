@@ -45,7 +45,6 @@ _ADMITTED = frozenset(
         ("ribs.emitters.opt._sep_cma_es", "SeparableCMAEvolutionStrategy"),
         ("ribs.emitters.rankers", "ImprovementRanker"),
         ("ribs.emitters.rankers", "TwoStageImprovementRanker"),
-        ("qd.directions", "DirectionEmitter"),
         ("qd.scheduler", "RandomEmitter"),
     }
 )

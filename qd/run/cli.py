@@ -3,43 +3,18 @@
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from types import FrameType
 from typing import NoReturn, TypeVar
 
 import tyro
 
 from qd.workers.process import EvaluatorError
+from sim.files.command import Interrupted, naming_what_is_next  # noqa: F401
 
 _DEBUG = "FAULTLINE_DEBUG"
 
 Arguments = TypeVar("Arguments")
-
-
-class Interrupted(KeyboardInterrupt):
-    """The program was asked to stop; what it says next, such as how to resume, is its text."""
-
-
-@contextmanager
-def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None]:
-    """Ends work that is stopped or fails half way with what there is and how to go on.
-
-    Args:
-        state: What is saved, after ``Stopped;``.
-        command: Says what to do next, once it is known.
-
-    Raises:
-        Interrupted: On Ctrl-C.
-        EvaluatorError: If a worker is lost.
-        OSError: If a file cannot be written.
-    """
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise Interrupted(f"Stopped; {state}. {command()}") from None
-    except (EvaluatorError, OSError) as error:
-        raise type(error)(f"{error}. {command()}") from None
 
 
 def run_command(arguments: type[Arguments], main: Callable[[Arguments], object], argv: list[str] | None = None) -> None:

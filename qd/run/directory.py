@@ -1,9 +1,10 @@
-"""The directory of a search's run: what it was asked to do, how far it is, and what it found.
+"""The directory of a search's run: where it is, what it was asked to do, how far it is, and what it found.
 
-The checkpoint is the one truth and is written first; metrics and archive are made from it and made again on resume, so
-that a kill between any two writes leaves a run that goes on as if nothing had been.
+The checkpoint is the one truth and is written first. Metrics and archive are made from it, and made again on resume, so
+a run that was killed between any two writes goes on as if nothing had been.
 """
 
+import itertools
 import json
 import os
 from collections.abc import Iterator
@@ -14,12 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
-from qd.run.settings import SearchCfg, Settings, as_settings, from_settings
+from qd.run.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
+from sim.files.command import command_line
+from sim.policy.names import controller_suffix
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
+    from sim.robots.robot import RobotCfg
 
+RUNS = Path("runs")
+RESULTS = Path("results")
+"""Where published archives and tables lie, <robot>/archive and <robot>/tables.json."""
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"
@@ -30,21 +37,82 @@ Metrics = list[dict[str, Any]]
 """One row an iteration."""
 
 
-def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:
-    """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
-    found = []
-    for key in sorted(there.keys() | wanted.keys()):
-        a, b = there.get(key), wanted.get(key)
-        if isinstance(a, dict) and isinstance(b, dict):
-            found += differences(a, b, f"{prefix}{key}.")
-        elif a != b:
-            found.append(f"{prefix}{key} ({_short(a)} there, {_short(b)} wanted)")
-    return found
+def newest_run(robot: "RobotCfg") -> Path:
+    """The run of a robot under runs/ whose archive changed last.
+
+    Raises:
+        FileNotFoundError: If there is none.
+    """
+    run = _newest(robot.name)
+    if run is not None:
+        return run
+    published = _published(robot.name)
+    such = f", such as the published {published}" if published else ""
+    make = f"`{command_line('archive', robot=robot.spec)}`"
+    raise FileNotFoundError(f"no archive of {robot.name} under {RUNS}/: make one with {make}, or give --run{such}")
 
 
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."
+def newest_or_published(robot: "RobotCfg") -> Path:
+    """The newest run of a robot under runs/, or its published archive where there is none.
+
+    Raises:
+        FileNotFoundError: If there is neither.
+    """
+    return _newest(robot.name) or _published(robot.name) or newest_run(robot)
+
+
+def _newest(name: str) -> Path | None:
+    files = sorted(RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
+    return next((file.parent for file in files if read_archive(file).robot == name), None)
+
+
+def _published(name: str) -> Path | None:
+    folder = RESULTS / name / "archive"
+    return folder if (folder / ARCHIVE_FILE).exists() else None
+
+
+def directory_of(run: Path) -> Path:
+    """The directory of a run that is given as such or as its archive file."""
+    return run if run.is_dir() else run.parent
+
+
+def folder_for(run: Path, robot: str) -> Path:
+    """Where what is made from a run goes: into its directory, or of a published one to runs/<robot>-published.
+
+    Args:
+        run: Run directory or archive file.
+        robot: Name of its robot.
+    """
+    folder = directory_of(run)
+    published = RESULTS.resolve() in folder.resolve().parents
+    return RUNS / f"{robot}-published" if published else folder
+
+
+def elite_name(elite: int, policy: str, searched: str) -> str:
+    """What a file about an elite is called: elite-3; of another controller than the search's elite-3-C-G.
+
+    Args:
+        elite: Its number.
+        policy: The controller that crosses it.
+        searched: That of the search.
+    """
+    return f"elite-{elite}{controller_suffix(policy, searched)}"
+
+
+def numbered(root: Path, name: str) -> Iterator[Path]:
+    """Directories a run may be put in: ``name``, ``name-2``, ``name-3`` and so on."""
+    yield root / name
+    yield from (root / f"{name}-{number}" for number in itertools.count(2))
+
+
+def origin_in(config: dict[str, Any]) -> dict[str, Any]:
+    """Where a run comes from, as its config has it: provenance of its beginning, and its sessions."""
+    return {name: value for name, value in config.items() if name not in ("settings", "iterations")}
+
+
+def reached(sessions: list[dict[str, Any]], iterations: int) -> list[dict[str, Any]]:
+    """The sessions of a run, of which the last has come to a number of iterations."""
+    return [*sessions[:-1], *({**last, "iterations": iterations} for last in sessions[-1:])]
 
 
 @contextmanager
@@ -85,7 +153,7 @@ class RunDirectory:
         self.path = path
 
     def read_config(self) -> dict[str, Any]:
-        """What the run was asked to do: ``settings``, ``iterations`` and where it comes from.
+        """What the run was asked to do: ``settings``, ``iterations``, and its origin.
 
         Raises:
             FileNotFoundError: If there is no run here.
@@ -95,10 +163,10 @@ class RunDirectory:
         if not os.path.lexists(file):
             raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
         config = read_json(file)
-        kinds = {"settings": dict, "iterations": int, "device": str}
+        kinds = {"settings": dict, "iterations": int, "device": str, "sessions": list}
         if any(type(config.get(name)) is not kind for name, kind in kinds.items()):
             raise ValueError(
-                f"{file} must hold settings, iterations and device of a search, got {', '.join(config)}; {_REMEDY}"
+                f"{file} must hold settings, iterations, device and sessions, got {', '.join(config)}; {_REMEDY}"
             )
         return config
 
@@ -115,27 +183,22 @@ class RunDirectory:
         except ValueError as error:
             raise ValueError(f"{self.path / CONFIG_FILE}: {error}; {_REMEDY}") from None
 
-    def write_config(self, settings: Settings, iterations: int, origin: dict[str, Any]) -> None:
-        """Writes what the run is asked to do.
-
-        Args:
-            settings: Everything that must not change on resume.
-            iterations: Iterations to reach; may grow.
-            origin: Provenance.
-        """
-        content = {"settings": settings, "iterations": iterations, **origin}
+    def write_config(self, cfg: SearchCfg, origin: dict[str, Any]) -> None:
+        """Writes what the run is asked to do, and where it comes from (:func:`origin_in`)."""
+        content = {"settings": as_settings(cfg), "iterations": cfg.iterations, **origin}
         write_atomically(self.path / CONFIG_FILE, to_json(content))
 
-    def save(self, settings: Settings, search: "Scheduler", metrics: Metrics, archive: Archive) -> None:
+    def save(self, cfg: SearchCfg, search: "Scheduler", metrics: Metrics, archive: Archive) -> None:
         """Saves an iteration; killed anywhere in here, the run is either before or after it.
 
         Args:
-            settings: The run's settings, so that a checkpoint that strayed here is noticed.
+            cfg: The run's settings, so that a checkpoint that strayed here is noticed.
             search: The search after ``tell``.
             metrics: All rows up to this iteration.
             archive: What the search has found.
         """
-        save_checkpoint(self.path / CHECKPOINT_FILE, {"settings": settings, "metrics": metrics, **search.state()})
+        state = {"settings": as_settings(cfg), "metrics": metrics, **search.state()}
+        save_checkpoint(self.path / CHECKPOINT_FILE, state)
         self.write_derived(metrics, archive)
 
     def write_derived(self, metrics: Metrics, archive: Archive) -> None:
@@ -193,11 +256,11 @@ class RunDirectory:
         file = self.path / METRICS_FILE
         return len(file.read_text(encoding="utf-8").splitlines()) if file.exists() else 0
 
-    def load(self, settings: Settings) -> tuple["Scheduler", Metrics] | None:
+    def load(self, cfg: SearchCfg) -> tuple["Scheduler", Metrics] | None:
         """The search as its checkpoint has it.
 
         Args:
-            settings: The settings that the run's config has.
+            cfg: The search that the run's config has.
 
         Returns:
             The search and its metrics, or None if the run was killed before its first checkpoint.
@@ -221,7 +284,7 @@ class RunDirectory:
         there, metrics = state.get("settings"), state.get("metrics")
         if not isinstance(there, dict) or not isinstance(metrics, list):
             raise ValueError(f"{file} is no checkpoint of a search: it lacks settings or metrics; {_REMEDY}")
-        different = differences(_of_now(there), settings)
+        different = differences(there, as_settings(cfg))
         if different:
             raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}; {_REMEDY}")
         try:
@@ -230,29 +293,15 @@ class RunDirectory:
             raise ValueError(f"{file} is no checkpoint of a search: {error}; {_REMEDY}") from None
 
 
-def _of_now(settings: Settings) -> Settings:
-    """Settings with those that later versions added, which stand for what was done before; damaged ones as they are."""
-    try:
-        return as_settings(from_settings(settings, iterations=1))
-    except ValueError:
-        return settings
-
-
-def archive_of(settings: Settings, search: "Scheduler", iterations: int) -> Archive:
-    """What a search has found so far.
-
-    Args:
-        settings: Settings of the run.
-        search: The search.
-        iterations: Iterations done.
-    """
-    elites: dict[str, Any] = search.elites()
+def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
+    """What a search has found after a number of iterations."""
     return Archive(
-        robot=settings["robot"],
-        penalties=tuple(settings["fitness"]["penalties"]),
-        scales=tuple(settings["fitness"]["scales"]),
-        intervals=settings["intervals"],
-        collision_bit=settings["collision_bit"],
+        robot=cfg.robot,
+        space=cfg.space,
+        penalties=cfg.fitness.penalties,
+        scales=cfg.fitness.scales,
+        intervals=cfg.intervals,
+        collision_bit=cfg.collision_bit,
         iterations=iterations,
-        **elites,
+        **search.elites(),
     )

@@ -2,7 +2,7 @@
 
 import shlex
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 
 class Placed(Protocol):
@@ -13,16 +13,8 @@ class Placed(Protocol):
         """Warp device name."""
 
     @property
-    def workers(self) -> int | Literal["auto"] | None:
-        """Ray workers."""
-
-    @property
-    def processes(self) -> int | None:
-        """Processes without Ray."""
-
-    @property
-    def worker_limit_s(self) -> float:
-        """When a Ray worker is given up [s]."""
+    def workers(self) -> str | None:
+        """Who works."""
         ...
 
 
@@ -45,14 +37,11 @@ def next_command(target: str, args: Placed, **variables: str | int | Path | None
         args: Where the other one worked; what is not as by default is handed on.
         variables: As of :func:`make_command`.
     """
-    by_default = args.worker_limit_s == vars(type(args)).get("worker_limit_s")
     return make_command(
         target,
         **variables,
         device=args.device,
         workers=args.workers,
-        processes=args.processes,
-        worker_limit_s=None if by_default else f"{args.worker_limit_s:g}",
     )
 
 

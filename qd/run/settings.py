@@ -1,4 +1,4 @@
-"""Settings of a search: presets, what the command line changes of them, and what a run directory remembers.
+"""Settings of a search: presets, what a command line changes of them, and what a run that goes on must still be.
 
 Nothing here imports pyribs, which takes seconds: `--help` and the worker processes do without.
 """
@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
-from qd.scheduler_cfg import SchedulerCfg
 from sim.files.command import split_words
 from sim.files.remembered import built
+from sim.files.settings import check, setting
 from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
 
 if TYPE_CHECKING:
@@ -21,6 +21,63 @@ if TYPE_CHECKING:
 
 Settings = dict[str, Any]
 """The settings that make a run what it is, as JSON values."""
+
+METHODS = ("cma_mae", "cma_me", "map_elites", "hard_random", "uniform_random")
+ES_KINDS = ("cma_es", "sep_cma_es")
+RESTART_RULES = ("basic", "no_improvement")
+_STEPS = {"least": 1e-6, "most": 1e3}  # what evolution strategies can reckon with; genes are float32 in [-1, 1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SchedulerCfg:
+    """How terrains are asked for."""
+
+    method: str = "cma_mae+map_elites"
+    """Where new terrains come from: `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
+    `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `hard_random`, the paper's, every height at
+    its limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn,
+    and where there are fewer emitters, the first methods count. After 75 iterations of the paper preset the default's
+    corrected QD score was 6,103, that of CMA-MAE alone 5,675 (one seed each; `results/anymal/compare_long.json`)."""
+    emitters: int = setting(10, least=1)
+    """Emitters, each with an evolution strategy or a stream of its own."""
+    batch_size: int = setting(20, least=2)
+    """Terrains an emitter asks for in an iteration."""
+    learning_rate: float = setting(0.09, least=0.0, most=1.0)
+    """Step of a cell's acceptance threshold toward the fitness found there; 1 is elitist, 0 pure optimisation."""
+    sigma0: float = setting(2.0, **_STEPS)
+    """First step size; genes live in [-1, 1]. So wide a start asks for terrains at the genes' limits, which are the
+    hard ones: 172 elites after 15 iterations of the paper preset, against 152 from 1.0 and 114 from 0.5 (a seed each).
+    """
+    restart_rule: str = "50"
+    """When an emitter restarts at an elite: every so many iterations, or one of `basic` and `no_improvement`."""
+    es: str = setting("cma_es", one_of=ES_KINDS)
+    """Evolution strategy: `cma_es` adapts all covariances, `sep_cma_es` the variances alone."""
+    iso_sigma: float = setting(0.02, least=0.0, most=_STEPS["most"])
+    """Iso+line: standard deviation of each gene's own change (published: .01 of the genes' range)."""
+    line_sigma: float = setting(0.2, least=0.0, most=_STEPS["most"])
+    """Iso+line: standard deviation of the step along the line to another elite, in its length (published: .2)."""
+
+    def __post_init__(self) -> None:
+        check(self)
+        if not set(self.methods) <= set(METHODS) or len(set(self.methods)) < len(self.methods):
+            raise ValueError(
+                f"method must be one of {', '.join(METHODS)}, or several joined by a plus, each once, got {self.method}"
+            )
+        if self.restart_rule not in RESTART_RULES and not (self.restart_rule.isdecimal() and int(self.restart_rule)):
+            raise ValueError(
+                f"restart_rule must be a positive number of iterations or one of {', '.join(RESTART_RULES)}, "
+                f"got {self.restart_rule}"
+            )
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods joined in ``method``."""
+        return tuple(self.method.split("+"))
+
+    @property
+    def num_terrains(self) -> int:
+        """Terrains of one iteration."""
+        return self.emitters * self.batch_size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,31 +91,27 @@ class SearchCfg:
     """Controller: ``shipped``, or as :func:`sim.policy.loaders.load_policy` takes it."""
     policy_sha256: str | None
     """Hash of the controller's files, None for the code of a module."""
-    seed: int
-    iterations: int
+    seed: int = setting(least=0)
+    iterations: int = setting(least=1)
     """Iterations to reach; may be raised later."""
-    replicas: int
+    replicas: int = setting(least=1)
     """Episodes a terrain."""
-    intervals: int
+    intervals: int = setting(least=1)
     """Intervals of each ratio."""
     collision_bit: bool
     """Whether base collision is a descriptor of its own."""
     fitness: FitnessCfg
     scheduler: SchedulerCfg
+    space: str = "super_gaussian"
+    """Terrain space (:data:`sim.space.SPACES`)."""
     robot_sha256: str | None = None
     """Hash of the settings, model and meshes of a robot that is not shipped."""
-    reevaluate_every: int = 50
-    """Every so many iterations, up to 200 elites are looked at again in 40 fresh episodes each; 0: never."""
+    reevaluate_every: int = setting(50, least=0)
+    """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "replicas", "intervals"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check(self)
         Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
-        if self.reevaluate_every < 0:
-            raise ValueError(f"reevaluate_every must not be negative, got {self.reevaluate_every}")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
 
     @property
     def cells(self) -> Cells:
@@ -95,7 +148,7 @@ def small(robot: "RobotCfg") -> SearchCfg:
     )
 
 
-PRESETS = {"paper": paper, "small": small}
+_PRESETS = {"paper": paper, "small": small}
 
 
 def preset(name: str, robot: "RobotCfg") -> SearchCfg:
@@ -104,9 +157,9 @@ def preset(name: str, robot: "RobotCfg") -> SearchCfg:
     Raises:
         ValueError: If there is no such preset, or the robot's penalty scales were never measured.
     """
-    if name not in PRESETS:
-        raise ValueError(f"unknown preset '{name}': expected one of {', '.join(sorted(PRESETS))}")
-    return PRESETS[name](robot)
+    if name not in _PRESETS:
+        raise ValueError(f"unknown preset '{name}': expected one of {', '.join(sorted(_PRESETS))}")
+    return _PRESETS[name](robot)
 
 
 def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:
@@ -129,8 +182,13 @@ def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:
 
 def as_settings(cfg: SearchCfg) -> Settings:
     """What makes a run what it is: all fields but ``iterations``, as JSON values."""
-    values = {name: value for name, value in asdict(cfg).items() if name != "iterations"}
-    return json.loads(json.dumps(values))
+    settings = asdict(cfg, dict_factory=_json_object)
+    del settings["iterations"]
+    return settings
+
+
+def _json_object(items: list[tuple[str, Any]]) -> Settings:
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in items}
 
 
 def from_settings(settings: Settings, iterations: int) -> SearchCfg:
@@ -149,6 +207,23 @@ def from_settings(settings: Settings, iterations: int) -> SearchCfg:
         raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
 
 
+def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:
+    """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
+    found = []
+    for key in sorted(there.keys() | wanted.keys()):
+        a, b = there.get(key), wanted.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += differences(a, b, f"{prefix}{key}.")
+        elif a != b:
+            found.append(f"{prefix}{key} ({_short(a)} there, {_short(b)} wanted)")
+    return found
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
 def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
     """What to load the controller from, as :func:`sim.policy.loaders.load_policy` takes it."""
     return spec_of(cfg.policy, robot)
@@ -164,7 +239,7 @@ def kept_penalties(robot: "RobotCfg", without: Sequence[str]) -> tuple[str, ...]
 
     Args:
         robot: The robot.
-        without: Names to leave out; several may stand in one, apart by spaces or commas, as make hands them over.
+        without: Names to leave out; several may stand in one, apart by spaces or commas.
 
     Raises:
         ValueError: If a name is unknown, or fewer than 2 penalties are left.
@@ -192,24 +267,89 @@ def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
     Raises:
         ValueError: If the robot lacks one of the penalties, or their scales were never measured.
     """
-    digest = file_hash(policy_spec(cfg, robot))
+    from sim.robots.own import robot_digest
+
     penalties = cfg.fitness.penalties
     _check_known(penalties, robot)
     scales = dict(zip(robot.penalties, robot.read_penalty_scales(), strict=True))
-    fitness = replace(cfg.fitness, scales=tuple(scales[name] for name in penalties))
     return replace(
         cfg,
         robot=robot.name,
-        robot_sha256=_robot_hash(robot),
-        policy_sha256=digest,
-        fitness=fitness,
+        robot_sha256=None if robot.settings_file is None else robot_digest(robot),
+        policy_sha256=file_hash(policy_spec(cfg, robot)),
+        fitness=replace(cfg.fitness, scales=tuple(scales[name] for name in penalties)),
         collision_bit=robot.collision_bit,
     )
 
 
-def _robot_hash(robot: "RobotCfg") -> str | None:
-    if robot.settings_file is None:
-        return None
-    from sim.robots.own import robot_digest
+def code_of(cfg: SearchCfg) -> str | None:
+    """The controller if it is code, which every command that goes on with the run must name; else None."""
+    return cfg.policy if ControllerSpec.parse(cfg.policy).runs_code else None
 
-    return robot_digest(robot)
+
+def refuse_unnamed_code(policy: str, given: str | None, path: Path) -> None:
+    """Refuses to run code that a run directory names and the command line does not.
+
+    Args:
+        policy: Controller of the run.
+        given: That of the command line, if any.
+        path: The run directory.
+
+    Raises:
+        ValueError: If the run's is code and none is given.
+    """
+    if given is None and ControllerSpec.parse(policy).runs_code:
+        raise ValueError(
+            f"{path} was searched with the controller {policy}, which is code: name it again (--policy), since no code "
+            "runs that the command line does not name"
+        )
+
+
+def moved_policy(there: SearchCfg, given: str | None) -> str | None:
+    """The file given for a run's controller, if it is the run's own in another place."""
+    same = given is not None and there.policy_sha256 is not None and file_hash(given) == there.policy_sha256
+    return given if same else None
+
+
+def resumed(path: Path, there: SearchCfg, robot: "RobotCfg", changes: Settings, moved: str | None) -> SearchCfg:
+    """The settings that a run would go on with.
+
+    Args:
+        path: Its directory.
+        there: Its settings.
+        robot: Its robot as it is now.
+        changes: What the command line gives, as :func:`changed` takes it.
+        moved: Where the run's controller is now, if elsewhere.
+
+    Raises:
+        ValueError: If its robot is another now, its controller is lost, or a setting is out of range.
+    """
+    if moved is not None:
+        changes = {**changes, "policy": None}
+    wanted = measured_now(changed(there, changes), robot)
+    if wanted.robot_sha256 != there.robot_sha256:
+        raise ValueError(
+            f"{path} was searched with robot '{there.robot}' as it was: its settings, model or meshes have changed "
+            f"since ({robot.spec}): put them back, or start a new run"
+        )
+    if moved is not None:
+        return replace(wanted, policy_sha256=there.policy_sha256)
+    if wanted.policy == there.policy and there.policy_sha256 is not None and wanted.policy_sha256 is None:
+        raise ValueError(
+            f"{path} was searched with the controller in {policy_spec(there, robot)}, got no such file now: put it "
+            "back, or say where it is now with --policy"
+        )
+    return wanted
+
+
+def refuse_changes(path: Path, what: str, there: Settings, wanted: Settings) -> None:
+    """Refuses to go on with settings that differ in more than the number of iterations.
+
+    Raises:
+        ValueError: If a setting differs.
+    """
+    different = differences(there, wanted)
+    if different:
+        raise ValueError(
+            f"{path} holds a {what} of other settings: {', '.join(different)}: start a new {what} for those"
+        )

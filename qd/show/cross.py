@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.run.places import RUNS
+from qd.run.directory import RUNS
 from qd.show.elites import robot_named
 from qd.show.figures import PENALTY_UNITS, save_figure
 from qd.workers.evaluator import check_policy, origin_of, resolve_device

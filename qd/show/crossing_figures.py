@@ -78,7 +78,13 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
             axes.plot(*crossed.path(int(k))[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
         if len(chosen):
             places = crossed.ends[chosen]
-            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "s": 55, "edgecolors": "white", "zorder": 3}
+            looks: dict[str, Any] = {
+                "color": end.color,
+                "marker": end.marker,
+                "s": 55,
+                "edgecolors": "white",
+                "zorder": 3,
+            }
             axes.scatter(*places[:, :2].T, label=f"{end.words} ({len(chosen)})", **looks)
     white = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
     axes.plot(*CrossingCfg.start, marker=">", markersize=11, label="start", **white)

@@ -8,18 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
-from qd.fitness import FitnessCfg
-from qd.run.directory import CONFIG_FILE, RunDirectory
-from qd.run.places import directory_of, newest_or_published
-from qd.run.resuming import refuse_unnamed_code
+from qd.fitness import FAILING_GOAL_RATE, FitnessCfg
+from qd.run.directory import CONFIG_FILE, RunDirectory, directory_of, newest_or_published
+from qd.run.settings import refuse_unnamed_code
 from sim.files.command import chosen_elites
 from sim.policy.spec import SHIPPED, spec_of
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
-FAILING_BELOW = 0.5
-"""Goal rate below which a controller fails a terrain, as in the evaluation tables."""
 _USUAL_ROBOT = "anymal"
 
 
@@ -156,7 +153,7 @@ class Elites:
     @property
     def failing(self) -> NDArray[np.bool_]:
         """Whether under half of the robots reach the goal, shape (N,)."""
-        return self.goal_rate < FAILING_BELOW
+        return self.goal_rate < FAILING_GOAL_RATE
 
     @property
     def failing_cells(self) -> int:

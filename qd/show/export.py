@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.archive import Archive
-from qd.run.places import folder_for
+from qd.run.directory import folder_for
 from qd.show.elites import find_archive
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import Which, chosen_elites, split_words

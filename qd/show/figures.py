@@ -266,6 +266,7 @@ def summary(
     return {
         **origin,
         "robot": archive.robot,
+        "space": archive.space,
         "iterations": archive.iterations,
         "terrains_evaluated": sum(row["terrains"] for row in metrics),
         "episodes": sum(row["episodes"] for row in metrics),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from qd.run.places import elite_name, folder_for
+from qd.run.directory import elite_name, folder_for
 from qd.show.cross import OWN_FOLDER, read_own_terrain
 from qd.show.elites import find_archive, robot_named
 from qd.workers.evaluator import check_policy, resolve_device

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.run.places import RUNS
+from qd.run.directory import RUNS
 from qd.run.progress import share_bar
 from qd.workers.evaluator import episode_seeds
 from sim.files.provenance import code_fingerprint, controller_hash
@@ -124,7 +124,7 @@ class Simulation:
             policy=first.policy,
             labels=[one.label for one in wanted],
             seed=first.seed,
-            progress=lambda done, most: progress(done / most),
+            progress=progress,
         )
         return [recording.of_terrain(k) for k in range(len(wanted))]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from qd.archive import Archive
 from qd.fitness import Evaluation, evaluation_of
-from qd.run.places import elite_name, folder_for
+from qd.run.directory import elite_name, folder_for
 from qd.show.elites import Found, find_archive
 from qd.show.figures import PENALTY_UNITS, save_figure
 from qd.workers.evaluator import check_policy, resolve_device

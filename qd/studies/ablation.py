@@ -10,8 +10,7 @@ from qd.fresh import FRESH_EPISODES, Open
 from qd.run.arguments import Arguments, job_of
 from qd.run.cli import naming_what_is_next, run_command
 from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, differences
-from qd.run.resuming import refuse_unnamed_code
-from qd.run.settings import SearchCfg, as_settings
+from qd.run.settings import SearchCfg, as_settings, refuse_unnamed_code
 from qd.search import run_search
 from qd.show.figures import new_figure, save_figure
 from qd.studies.beside import LOOKS, prepare_numbers

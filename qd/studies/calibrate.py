@@ -77,7 +77,7 @@ def calibrate(cfg: CalibrateCfg) -> Path:
         ValueError: If something asked for cannot be had, or a penalty never occurred.
     """
     from sim.robots.robot import get_robot
-    from sim.terrain import hard_random_genes
+    from sim.space import SUPER_GAUSSIAN
 
     if cfg.terrains < 1 or cfg.replicas < 1:
         raise ValueError(f"terrains and replicas must be at least 1, got {cfg.terrains} and {cfg.replicas}")
@@ -101,7 +101,7 @@ def calibrate(cfg: CalibrateCfg) -> Path:
         device=device,
         workers=cfg.workers,
     )
-    genes = hard_random_genes(cfg.terrains, cfg.seed)
+    genes = SUPER_GAUSSIAN.hard_random(cfg.terrains, cfg.seed)
     seeds = np.random.SeedSequence(cfg.seed).generate_state(cfg.terrains, np.uint32)
     with open_evaluator(evaluator) as evaluate, tqdm(total=100, unit="%", desc="calibrate", disable=None) as bar:
         result = evaluate(genes, seeds, lambda share: _move(bar, share))

@@ -1,194 +1,276 @@
-"""Does the search earn its cost? ``make compare`` lets it and its baselines loose on the same number of terrains.
+"""Does the search earn its cost? The comparison lets it and its baselines loose on the same number of terrains."""
 
-Every method is a run of the ordinary search, in a run directory of its own that can be looked at and extended. They go
-in lock-step: each iteration's terrains of all runs are crossed together, so that a GPU is full.
-"""
-
-import itertools
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass, field
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.archive import Archive
 from qd.fitness import FITNESS_FLOOR
-from qd.fresh import Open, numbers_of, reevaluate
-from qd.run.cli import naming_what_is_next, run_command
-from qd.run.directory import Metrics, RunDirectory, archive_of, claimed
-from qd.run.progress import ProgressBar
-from qd.run.settings import SearchCfg, as_settings
-from qd.search import begin, take_in
-from qd.show.figures import save_figure
-from qd.studies.compare_arguments import Arguments, Comparison, comparison_of
-from qd.studies.comparison import draw_comparison, report_of
-from qd.workers.evaluator import Evaluate, crew_status, episode_seeds, open_evaluator
-from qd.workers.shards import taken
-from sim.files.atomic import to_json, write_atomically
+from qd.run.directory import RUNS, Metrics
+from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
+from sim.files.command import Where, Who
+from sim.files.intervals import MAX_T_VALUES, t_interval
 
 if TYPE_CHECKING:
-    from qd.scheduler import Scheduler
+    from matplotlib.figure import Figure
+
+    from qd.fresh import Open
+
+METHODS: dict[str, dict[str, Any]] = {
+    "uniform_random": {"method": "uniform_random"},
+    "hard_random": {"method": "hard_random"},
+    "map_elites": {"method": "map_elites"},
+    "cma_me": {"method": "cma_me"},
+    "cma_mae": {"method": "cma_mae", "es": "cma_es"},
+    "cma_mae_sep": {"method": "cma_mae", "es": "sep_cma_es"},
+    "cma_mae_narrow": {"method": "cma_mae", "es": "cma_es", "sigma0": 0.5},
+    "mixed": {"method": "cma_mae+map_elites", "es": "cma_es"},
+}
+"""What is compared: changes of the search's settings."""
+LABELS = {
+    "uniform_random": ("uniform random", "#999999", ":"),
+    "hard_random": ("hard-random", "#000000", "--"),
+    "map_elites": ("MAP-Elites (iso+line)", "#009e73", "-"),
+    "cma_me": ("CMA-ME", "#56b4e9", "-."),
+    "cma_mae": ("CMA-MAE", "#0072b2", "-"),
+    "cma_mae_sep": ("CMA-MAE, sep-CMA", "#cc79a7", "--"),
+    "cma_mae_narrow": ("CMA-MAE, first step .5", "#e69f00", ":"),
+    "mixed": ("CMA-MAE and iso+line", "#d55e00", "-"),
+}
+"""Name, colour and line of each method in the figure."""
+_OTHER_LOOKS = [
+    (color, style) for style in ((0, (6, 2, 1, 2)), (0, (1, 3))) for color in ("#009e73", "#0072b2", "#cc79a7")
+]
+CURVES = ("qd_score", "reachable_coverage", "elites", "mean_fitness")
+AGAIN = (
+    "corrected_qd_score",
+    "corrected_coverage",
+    "corrected_elites",
+    "corrected_mean_fitness",
+    "reproduced",
+    "mean_std",
+)
+"""What a row of metrics has more where all elites crossed fresh episodes."""
+_BATCH = ("batch_fitness", "batch_collision_rate", "batch_goal_rate")
+_NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called, with a seed behind it
 
 
-@dataclass(kw_only=True)
-class Entrant:
-    """One run of one method."""
+@dataclass(frozen=True, kw_only=True)
+class Compare(Who, Where):
+    """Compare ways to search on the same number of terrains, several seeds each, all in lock-step.
 
-    method: str
-    cfg: SearchCfg
-    run: RunDirectory
-    search: "Scheduler"
-    metrics: Metrics = field(default_factory=list)
-    found: Archive | None = None
-
-    @property
-    def done(self) -> int:
-        """Iterations done."""
-        return len(self.metrics)
-
-
-def lock_step(entrants: Sequence[Entrant], evaluate: Evaluate, cfg: SearchCfg, bar: ProgressBar) -> None:
-    """Runs the iterations that are left; runs behind the others, as after a kill, catch up first.
-
-    Args:
-        entrants: The runs.
-        evaluate: Crosses the terrains of all of them.
-        cfg: Iterations, and how often to evaluate elites again.
-        bar: Shows progress.
+    Every search is an ordinary run in its own folder METHOD-SEED. State is saved after every iteration: stop with
+    Ctrl-C whenever you like, and the same command goes on.
     """
-    while (done := min(entrant.done for entrant in entrants)) < cfg.iterations:
-        began, iteration = time.perf_counter(), done + 1
-        active = [entrant for entrant in entrants if entrant.done == done]
-        asked = [entrant.search.ask() for entrant in active]
-        seeds = [episode_seeds(one.cfg.seed, iteration, len(genes)) for one, genes in zip(active, asked, strict=True)]
-        result = evaluate(np.concatenate(asked), np.concatenate(seeds), bar.within(iteration))
-        rows, first = [], 0
-        for entrant, genes in zip(active, asked, strict=True):
-            part = taken(result, len(genes), first=first)
-            entrant.found, row = take_in(entrant.cfg, entrant.search, part, iteration)
-            rows.append(row)
-            first += len(genes)
-        if iteration % cfg.reevaluate_every == 0 or iteration == cfg.iterations:
-            rows = [row | again for row, again in zip(rows, _again(active, evaluate), strict=True)]
-        wall_s = time.perf_counter() - began
-        for entrant, row in zip(active, rows, strict=True):
-            entrant.metrics.append({**row, "wall_s": wall_s / len(active), "episodes_per_s": row["episodes"] / wall_s})
-            assert entrant.found is not None
-            entrant.run.save(as_settings(entrant.cfg), entrant.search, entrant.metrics, entrant.found)
-        crew = crew_status(evaluate)
-        bar.show(_shown(active, wall_s), None if crew is None else str(crew))
 
+    preset: str | None = None
+    """Size of an iteration: paper (a GPU's work) or small; by default what the device can do."""
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
+    size .5), mixed (cma_mae+map_elites); all. Settings of the search after a colon make another one of it:
+    cma_mae:restart-rule=20,learning-rate=0.3."""
+    seeds: int = 3
+    """Runs of each method, with seeds from --seed on."""
+    seed: int = 0
+    """The first seed."""
+    iterations: int = 33
+    """Iterations of every run; more than before extend a comparison that is there."""
+    reevaluate_every: int = 11
+    """Every so many iterations, and at the end, all elites cross 40 fresh episodes."""
+    run_dir: Path | None = None
+    """The comparison's folder, new or to go on with; runs/<robot>-compare."""
+    out: Path | None = None
+    """Where to write the numbers, with a figure beside them; compare.json in that folder."""
 
-def _again(active: Sequence[Entrant], evaluate: Evaluate) -> list[dict[str, Any]]:
-    """What the elites of all runs are worth in fresh episodes."""
-    archives = [entrant.found for entrant in active if entrant.found is not None]
-    cfg = active[0].cfg
-    seeds = [entrant.cfg.seed for entrant in active]
-    found = reevaluate(archives, evaluate, cfg.fitness, num_replicas=cfg.replicas, seeds=seeds)
-    return [numbers_of(again, cfg.cells) for again in found]
+    def execute(self, *, open_evaluator: "Open | None" = None) -> dict[str, Any]:
+        """Runs the searches that are not done and publishes the comparison.
 
+        Args:
+            open_evaluator: Opens what crosses the terrains.
 
-def _shown(active: Sequence[Entrant], wall_s: float) -> dict[str, Any]:
-    """A row for the progress bar: of the run with most elites, at the speed of all."""
-    best = max(active, key=lambda entrant: entrant.metrics[-1]["elites"])
-    episodes = sum(entrant.metrics[-1]["episodes"] for entrant in active)
-    return {**best.metrics[-1], "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
+        Raises:
+            ValueError: If something asked for cannot be.
+            Interrupted: On Ctrl-C; all iterations that ended are saved.
+            EvaluatorError: If a worker is lost; likewise.
+        """
+        from qd.studies.study import Study, publish_with_figure, run_study
+        from qd.workers.evaluator import open_evaluator as opened
+        from qd.workers.evaluator import resolve_device
+        from sim.robots.robot import get_robot
 
-
-def entrants_of(asked: Comparison, claims: ExitStack) -> Iterator[Entrant]:
-    """The runs of a comparison, new or as far as they are.
-
-    Args:
-        asked: The comparison.
-        claims: Keeps searches that extend one of the runs out of their directories until it ends.
-
-    Raises:
-        ValueError: If a run that is there has other settings, is damaged or at work, or has gone further than asked.
-    """
-    first, iterations = asked.cfg.seed, asked.cfg.iterations
-    for method, seed in itertools.product(asked.methods, range(first, first + asked.seeds)):
-        cfg, run = asked.cfg_of(method, seed), RunDirectory(asked.path / f"{method}-{seed}")
-        claims.enter_context(claimed(run.path))
-        search, metrics = run.load(as_settings(cfg)) or (begin(cfg), [])
-        if len(metrics) > iterations:
-            raise ValueError(
-                f"iterations must be at least {len(metrics)}, as many as {run.path} has done, got {iterations}"
-            )
-        yield Entrant(method=method, cfg=cfg, run=run, search=search, metrics=metrics)
-
-
-def compare(args: Arguments, *, open_evaluator: Open = open_evaluator) -> None:
-    """The command.
-
-    Args:
-        args: What to compare.
-        open_evaluator: Opens what crosses the terrains.
-
-    Raises:
-        FileNotFoundError: If there is no comparison to resume.
-        ValueError: If something asked for cannot be.
-        Interrupted: On Ctrl-C; all iterations that ended are saved.
-        EvaluatorError: If a worker is lost; likewise.
-    """
-    asked = comparison_of(args)
-    cfg = asked.cfg
-    with ExitStack() as claims:
-        claims.enter_context(claimed(asked.path))
-        entrants = list(entrants_of(asked, claims))
-        done = min(entrant.done for entrant in entrants)
-        episodes = sum(cfg.iterations - entrant.done for entrant in entrants) * cfg.episodes_per_iteration
-        print(
-            f"Comparing {len(asked.methods)} methods, {asked.seeds} seeds each, {cfg.iterations} iterations of preset "
-            f"{cfg.preset}: {episodes:,} episodes, and those of the elites evaluated again; runs in {asked.path}",
-            flush=True,
+        robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device, self.workers)
+        size = self.preset or ("paper" if device.startswith("cuda") else "small")
+        asked = {name: getattr(self, name) for name in ("seed", "iterations", "reevaluate_every", "policy")}
+        shared = measured_now(changed(preset(size, robot), asked), robot)
+        methods = self._methods(shared)
+        seeds = range(self.seed, self.seed + self.seeds)
+        runs = {f"{name}-{seed}": replace(cfg, seed=seed) for name, cfg in methods.items() for seed in seeds}
+        path = self.run_dir or RUNS / f"{robot.name}-compare"
+        study = Study.of(
+            path, runs, robot, policy=self.policy, device=device, workers=self.workers, sampled=False
         )
-        with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(asked)):
-            with open_evaluator(asked.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
-                _write_configs(asked, entrants)
-                if evaluate is not None:
-                    with ProgressBar(cfg.iterations, done) as bar:
-                        lock_step(entrants, evaluate, cfg, bar)
-            _finish(asked, entrants)
+
+        def measure() -> dict[str, Any]:
+            found = run_study(study, open_evaluator or opened)
+            metrics = {name: [found[f"{name}-{seed}"] for seed in seeds] for name in methods}
+            return {
+                **study.origin,
+                "robot": robot.name,
+                "preset": size,
+                "seeds": list(seeds),
+                "reachable_cells": shared.cells.num_cells,
+                "qd_score_offset": -FITNESS_FLOOR,
+                **report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()}),
+            }
+
+        return publish_with_figure(self.out or path / "compare.json", measure, _show, draw_comparison)
+
+    def _methods(self, shared: SearchCfg) -> dict[str, SearchCfg]:
+        """Settings of each method: different searches on the same number of terrains.
+
+        Raises:
+            ValueError: If they are not, or a name cannot be that of a folder.
+        """
+        unknown = [name for name in self.methods if name.split(":")[0] not in METHODS]
+        if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
+            raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(self.methods)}")
+        if not 1 <= self.seeds <= MAX_T_VALUES:
+            raise ValueError(f"seeds must be 1 to {MAX_T_VALUES}, got {self.seeds}")
+        if self.reevaluate_every < 1:
+            raise ValueError(f"reevaluate_every must be at least 1, got {self.reevaluate_every}")
+        names: dict[SearchCfg, str] = {}
+        for name in self.methods:
+            if not _NAME.fullmatch(name):
+                raise ValueError(
+                    f"methods: a name must be up to 200 letters, digits and _+-.,:= without spaces, got {name!r}"
+                )
+            cfg = changed(shared, changes_of(name))
+            if cfg in names:
+                raise ValueError(f"methods: {names[cfg]} and {name} are the same search: leave one of them out")
+            if cfg.scheduler.num_terrains != shared.scheduler.num_terrains:
+                raise ValueError(
+                    f"methods: emitters times batch_size must be {shared.scheduler.num_terrains} as in all runs of the "
+                    f"comparison, got {cfg.scheduler.num_terrains} in {name}"
+                )
+            names[cfg] = name
+        return {name: cfg for cfg, name in names.items()}
 
 
-def _how_to_go_on(asked: Comparison) -> str:
-    if not asked.has_config:
-        return "No iteration is finished: start it again"
-    return f"Go on with:  {asked.resume_command}"
+def changes_of(method: str) -> dict[str, Any]:
+    """Changes of the search's settings that a method is, those after its colon included.
+
+    Raises:
+        ValueError: If a setting is unknown, given twice, or of another type.
+    """
+    name, colon, given = method.partition(":")
+    found, seen = dict(METHODS[name]), set()
+    kinds = {field.name: type(field.default) for field in fields(SchedulerCfg)}
+    for item in given.split(",") if colon else ():
+        key, _, value = item.partition("=")
+        key = key.replace("-", "_")
+        if key not in kinds:
+            raise ValueError(f"methods: no setting named {key} in {method}: expected some of {', '.join(kinds)}")
+        if key in seen:
+            raise ValueError(f"methods: {key} is given twice in {method}")
+        seen.add(key)
+        try:
+            found[key] = kinds[key](value)
+        except ValueError:
+            raise ValueError(f"methods: {key} must be {kinds[key].__name__}, got '{value}' in {method}") from None
+    return found
 
 
-def _write_configs(asked: Comparison, entrants: Sequence[Entrant]) -> None:
-    asked.write_config()
-    for entrant in entrants:
-        origin = {**asked.origin, "seed": entrant.cfg.seed}
-        entrant.run.write_config(as_settings(entrant.cfg), asked.cfg.iterations, origin)
+def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[str, Any]:
+    """The numbers of a comparison.
 
+    Args:
+        runs: Metrics of every seed, by method; equally many rows.
+        settings: Settings of each method's scheduler.
 
-def _finish(asked: Comparison, entrants: Sequence[Entrant]) -> None:
-    """Archives, numbers and figure of a comparison that reached its iterations."""
-    runs: dict[str, list[Metrics]] = {method: [] for method in asked.methods}
-    for entrant in entrants:
-        found = archive_of(as_settings(entrant.cfg), entrant.search, entrant.done)
-        entrant.run.write_derived(entrant.metrics, entrant.run.with_fresh_values(found))
-        runs[entrant.method].append(entrant.metrics)
-    cfg = asked.cfg
-    settings = {name: as_settings(asked.cfg_of(name, cfg.seed))["scheduler"] for name in asked.methods}
-    report = {
-        **asked.origin,
-        "robot": cfg.robot,
-        "preset": cfg.preset,
-        "seeds": list(range(cfg.seed, cfg.seed + asked.seeds)),
-        "reachable_cells": cfg.cells.num_cells,
-        "qd_score_offset": -FITNESS_FLOOR,
-        **report_of(runs, settings),
+    Returns:
+        ``iterations``, ``terrains_evaluated`` (cumulative, one an iteration), and ``methods``: of each its settings,
+        the curves found (``CURVES``, every iteration) and corrected (``AGAIN``, at ``corrected_at`` terrains) as mean
+        and 95 % t interval over seeds, what its terrains did to the robots on average, and its episodes.
+    """
+    first = next(iter(runs.values()))[0]
+    terrains = np.cumsum([row["terrains"] for row in first])
+    every = [rows for seeds in runs.values() for rows in seeds]
+    # The last iteration of a comparison that was stopped in it and then extended has them in some runs only.
+    at = [k for k in range(len(first)) if all("corrected_qd_score" in rows[k] for rows in every)]
+    methods = {}
+    for name, seeds in runs.items():
+        methods[name] = {
+            "settings": settings[name],
+            **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in range(len(first))] for key in CURVES},
+            **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in at] for key in AGAIN},
+            **{key: _over_seeds([float(np.mean([row[key] for row in rows])) for rows in seeds]) for key in _BATCH},
+            "episodes": sum(row["episodes"] for rows in seeds for row in rows),
+            "invalid_episodes": sum(row["invalid_episodes"] for rows in seeds for row in rows),
+            "wall_s": sum(row["wall_s"] for rows in seeds for row in rows),
+        }
+    return {
+        "iterations": len(first),
+        "terrains_evaluated": terrains.tolist(),
+        "corrected_at": terrains[at].tolist(),
+        "methods": methods,
     }
-    figure = asked.out.with_suffix(".png")
-    write_atomically(asked.out, to_json(report))
-    save_figure(figure, draw_comparison(report))
-    print(f"written to {asked.out} and {figure}")
 
 
-if __name__ == "__main__":
-    run_command(Arguments, compare)
+def _over_seeds(values: Sequence[float | None]) -> dict[str, Any]:
+    """Mean over seeds and its interval; None where a seed has no value, or there is one seed only."""
+    if any(value is None for value in values):
+        return {"mean": None, "interval": None, "seeds": list(values)}
+    numbers = np.asarray(values, dtype=float)
+    return {"mean": float(numbers.mean()), "interval": t_interval(numbers), "seeds": numbers.tolist()}
+
+
+def draw_comparison(report: dict[str, Any]) -> "Figure":
+    """QD score, reachable coverage and corrected QD score over terrains evaluated; bands are 95 % t intervals.
+
+    Args:
+        report: As of :func:`report_of`, with ``robot`` and ``seeds``.
+    """
+    figure, seeds = new_figure(12.0, 4.6), len(report["seeds"])
+    figure.suptitle(
+        f"{report['robot']}: {report['terrains_evaluated'][-1]:,} terrains a run, "
+        + (f"{seeds} seeds a method, mean and 95 % interval over them" if seeds > 1 else "one seed")
+    )
+    panels = (
+        ("qd_score", "QD score, as found", 1.0, "terrains_evaluated"),
+        ("reachable_coverage", "reachable coverage, as found [%]", 100.0, "terrains_evaluated"),
+        ("corrected_qd_score", "QD score, corrected by fresh episodes", 1.0, "corrected_at"),
+    )
+    lines: dict[str, Any] = {}
+    for axes, (key, label, factor, along) in zip(figure.subplots(1, 3), panels, strict=True):
+        others = iter(_OTHER_LOOKS * len(report["methods"]))
+        for name, method in report["methods"].items():
+            title, color, style = LABELS.get(name) or (name.replace(":", ": "), *next(others))
+            points = [point for point in zip(report[along], method[key], strict=True) if point[1]["mean"] is not None]
+            x = [terrains for terrains, _ in points]
+            mean = [factor * point["mean"] for _, point in points]
+            marker = "o" if along == "corrected_at" else ""
+            lines[title] = axes.plot(x, mean, color=color, linestyle=style, marker=marker, markersize=4)[0]
+            bounds = [point["interval"] or (math.nan, math.nan) for _, point in points]
+            low, high = ([factor * bound[side] for bound in bounds] for side in (0, 1))
+            axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+        axes.set_xlabel("terrains evaluated")
+        axes.set_ylabel(label)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+    figure.legend(list(lines.values()), list(lines), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _show(report: dict[str, Any]) -> None:
+    """Prints the last corrected QD score of each method."""
+    print(f"\ncorrected QD score after {report['corrected_at'][-1]:,} terrains, 95 % interval over seeds")
+    for name, method in report["methods"].items():
+        last = method["corrected_qd_score"][-1]
+        words = "none" if last["mean"] is None else f"{last['mean']:.0f}"
+        if last["interval"]:
+            words += " ({:.0f} to {:.0f})".format(*last["interval"])
+        print(f"  {name}: {words}")

@@ -50,9 +50,9 @@ def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
     Raises:
         EvaluatorError: If fewer workers than wanted took part, or one had to be replaced.
     """
-    from sim.terrain import hard_random_genes
+    from sim.space import SUPER_GAUSSIAN
 
-    genes = hard_random_genes(cfg.num_terrains, seed)
+    genes = SUPER_GAUSSIAN.hard_random(cfg.num_terrains, seed)
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
     with open_evaluator(cfg) as evaluate:
         seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]

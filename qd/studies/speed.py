@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from qd.run.cli import run_command
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.progress import ProgressBar
-from qd.run.resuming import refuse_unnamed_code
-from qd.run.settings import SearchCfg, as_settings, changed, policy_spec, preset
+from qd.run.settings import SearchCfg, changed, policy_spec, preset, refuse_unnamed_code
 from qd.scheduler import Scheduler
 from qd.search import search_terrains
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
@@ -99,7 +98,7 @@ def read_iterations(folder: Path, count: int, device_name: str) -> tuple[SearchC
     cfg, made_on = run.read_cfg(), run.read_config()["device"]
     if made_on != device_name:
         raise ValueError(f"--run {folder} was made on {made_on}, the bare rate would be that of {device_name}")
-    search, metrics = run.load(as_settings(cfg)) or (None, [])
+    search, metrics = run.load(cfg) or (None, [])
     if search is None or len(metrics) < count + _WARM_UP:
         raise ValueError(f"--run {folder} must have at least {count + _WARM_UP} iterations, got {len(metrics)}")
     return cfg, metrics[-count:], search.ask()

@@ -1,16 +1,17 @@
-"""Evaluation of many terrains: in this process on a GPU, over several processes on a CPU, or by Ray workers.
+"""Evaluation of many terrains: in this process on a GPU, by several processes on a CPU, or by Ray workers.
 
-Whole terrains are handed out, and an episode depends on its terrain, seed and replica alone, so that how terrains are
-spread changes nothing in the result.
+Workers are handed whole terrains. An episode depends on its terrain, seed and replica alone, so the result is the same
+however terrains are spread.
 """
 
 import importlib
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ from qd.workers.shards import MIN_ROWS, checked_count, merged, taken
 from sim.files.provenance import provenance
 
 if TYPE_CHECKING:
-    from qd.workers.crew import CrewStatus
     from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
 
@@ -28,15 +28,44 @@ __all__ = [
     "Evaluate",
     "EvaluatorCfg",
     "EvaluatorError",
+    "WorkerStatus",
+    "Workers",
     "available_cores",
     "build_rollout",
     "check_policy",
-    "crew_status",
     "episode_seeds",
     "open_evaluator",
     "origin_of",
+    "parse_workers",
     "resolve_device",
+    "worker_status",
 ]
+
+_WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
+
+
+class Workers(NamedTuple):
+    """Who crosses terrains."""
+
+    on_ray: bool
+    """Ray actors, a GPU or a CPU core each, or processes of this machine."""
+    count: int | None
+    """How many; None: one a device of the cluster, or a core of this machine."""
+
+
+def parse_workers(text: str | None) -> Workers:
+    """Reads ``--workers``: ``4`` processes, ``ray``, or ``ray:4``; None for one process a core.
+
+    Raises:
+        ValueError: If it is something else.
+    """
+    if text is None:
+        return Workers(on_ray=False, count=None)
+    match = _WORKERS.fullmatch(text)
+    if match is None:
+        raise ValueError(f"workers must be a number of processes from 1 on, ray, or ray:N, got '{text}'")
+    number = match["actors"] or match["processes"]
+    return Workers(on_ray=match["ray"] is not None, count=None if number is None else int(number))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,30 +82,42 @@ class EvaluatorCfg:
     """Episodes a terrain."""
     device: str = "cpu"
     """Warp device name."""
-    num_processes: int | None = None
-    """Processes on the CPU without Ray; None: one a core."""
-    workers: int | Literal["auto"] | None = None
-    """Ray actors, a GPU or a CPU core each; `auto`: as many as the cluster has; None: no Ray."""
-    worker_limit_s: float = 300.0
-    """A Ray actor that gets no further for so long [s] is given up."""
+    workers: str | None = None
+    """Who crosses them, as :func:`parse_workers` takes it; a GPU without Ray needs one process."""
     penalties_from_s: float = 0.0
     """Penalties are summed from this time of an episode on [s]."""
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.worker_limit_s < 1e6:
-            raise ValueError(f"worker_limit_s must be a positive number of seconds, got {self.worker_limit_s}")
+    space: str = "super_gaussian"
+    """Terrain space of the genes."""
 
     @property
-    def processes(self) -> int:
-        """Processes that evaluate: this one on a GPU; on the CPU no more than there is work for; or Ray's."""
-        if self.workers is not None:
-            return _cluster("cluster").num_devices(self.device) if self.workers == "auto" else self.workers
+    def num_workers(self) -> int:
+        """How many work at once: one on a GPU without Ray; on the CPU no more than there is work for."""
+        on_ray, count = parse_workers(self.workers)
+        if on_ray:
+            return count or _ray_module("ray_cluster").num_devices(self.device)
         if self.device.startswith("cuda"):
             return 1
         by_rows = self.num_terrains * self.num_replicas // MIN_ROWS
-        return max(1, min(self.num_processes or available_cores(), self.num_terrains, by_rows))
+        return max(1, min(count or available_cores(), self.num_terrains, by_rows))
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerStatus:
+    """How Ray workers fare."""
+
+    workers: int
+    """Workers that are there."""
+    episodes_per_s: tuple[float, ...]
+    """Of each that has crossed terrains, the last time."""
+    retries: int
+    """How often terrains had to be crossed again by another worker."""
+
+    def __str__(self) -> str:
+        rates = " + ".join(f"{rate:.1f}" for rate in self.episodes_per_s)
+        again = f", {self.retries} crossed again" if self.retries else ""
+        return f"{self.workers} worker{'s' * (self.workers != 1)} ({rates} episodes/s{again})"
 
 
 class Evaluate(Protocol):
@@ -96,17 +137,13 @@ class Evaluate(Protocol):
 
 
 @runtime_checkable
-class _Staffed(Protocol):
-    """An :class:`Evaluate` that has workers to report on."""
-
-    def status(self) -> "CrewStatus":
-        """How they fare."""
-        ...
+class _HasStatus(Protocol):
+    def status(self) -> WorkerStatus: ...
 
 
-def crew_status(evaluate: Evaluate) -> "CrewStatus | None":
+def worker_status(evaluate: Evaluate) -> WorkerStatus | None:
     """How the Ray workers of an evaluator fare; None if it has none."""
-    return evaluate.status() if isinstance(evaluate, _Staffed) else None
+    return evaluate.status() if isinstance(evaluate, _HasStatus) else None
 
 
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = 0) -> NDArray[np.uint32]:
@@ -130,32 +167,37 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def resolve_device(name: str | None, workers: int | Literal["auto"] | None = None) -> str:
-    """Warp device name; None means CUDA where it is there, else the CPU.
+def resolve_device(name: str | None, workers: str | None = None) -> str:
+    """Warp device name; None means CUDA where there is one, else the CPU.
 
     Args:
         name: What the user asked for.
-        workers: Ray workers, whose devices are meant then; None without Ray.
+        workers: Who works there, as :func:`parse_workers` takes it; the devices of a cluster are meant on Ray.
 
     Raises:
-        ValueError: If the device is unknown or absent, or there are not so many.
+        ValueError: If the device is unknown or absent, or cannot have such workers.
         OSError: If there is no Ray cluster at RAY_ADDRESS.
     """
-    if workers is not None:
-        return _cluster("cluster").cluster_device(name, workers)
+    on_ray, count = parse_workers(workers)
+    if on_ray:
+        return _ray_module("ray_cluster").cluster_device(name, count)
     from sim.simulation import resolve_device as resolve
 
-    return resolve(name)
+    device = resolve(name)
+    if device.startswith("cuda") and (count or 1) > 1:
+        raise ValueError(f"{count} workers need the CPU, got device {device}: give --device cpu, or --workers ray:N")
+    return device
 
 
-def origin_of(device: str, seed: int, workers: int | Literal["auto"] | None) -> dict[str, Any]:
-    """Provenance of what Ray workers, or this machine without them, evaluate on a device."""
+def origin_of(device: str, seed: int, workers: str | None) -> dict[str, Any]:
+    """Provenance of what workers evaluate on a device."""
     origin = provenance(device, seed)
-    return origin if workers is None else {**origin, "device": _cluster("cluster").name_of_device(device)}
+    on_ray = parse_workers(workers).on_ray
+    return {**origin, "device": _ray_module("ray_cluster").name_of_device(device)} if on_ray else origin
 
 
 def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
-    """Loads a controller and tries it on the robot that is named, so that a bad one is found before any long work.
+    """Loads a controller and tries it on the robot, so that a bad one is found before any long work.
 
     Raises:
         ValueError: If it cannot be loaded or does not fit the robot.
@@ -172,6 +214,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
     from sim.robots.robot import get_robot
     from sim.rollout import CrossingCfg, Rollout
+    from sim.space import get_space
 
     return Rollout(
         get_robot(cfg.robot),
@@ -180,21 +223,22 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
         num_replicas=cfg.num_replicas,
         device=cfg.device,
         cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
+        space=get_space(cfg.space),
     )
 
 
-def _cluster(module: str) -> Any:
-    """A module of this room that needs Ray, which nothing else imports.
+def _ray_module(name: str) -> Any:
+    """A module of this folder that imports Ray, which takes seconds and need not be installed.
 
     Raises:
         ValueError: If Ray is not installed.
     """
     try:
-        return importlib.import_module(f"qd.{module}")
+        return importlib.import_module(f"qd.workers.{name}")
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
-        raise ValueError("workers need Ray, which is not installed: pip install -e '.[cluster]'") from None
+        raise ValueError("--workers ray needs Ray, which is not installed: pip install -e '.[cluster]'") from None
 
 
 Build = Callable[[EvaluatorCfg, int], Crosser]
@@ -202,7 +246,7 @@ Build = Callable[[EvaluatorCfg, int], Crosser]
 
 @contextmanager
 def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterator[Evaluate]:
-    """Builds the simulation, in as many processes as pay or on a Ray cluster, and keeps it until the end.
+    """Builds the simulation, in as many processes as there is work for or on a Ray cluster, and keeps it until the end.
 
     Args:
         cfg: What, with what, where.
@@ -216,70 +260,69 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
         EvaluatorError: If a process dies; of a Ray cluster, if no worker is left and none comes.
         OSError: If there is no Ray cluster at RAY_ADDRESS.
     """
-    if cfg.workers is not None:
-        with _cluster("crew").open_crew(cfg, build) as crew:
-            yield crew
+    if parse_workers(cfg.workers).on_ray:
+        with _ray_module("ray_workers").open_ray_workers(cfg, build) as workers:
+            yield workers
         return
     if cfg.device.startswith("cuda"):
         crosser = build(cfg, cfg.num_terrains)
         yield _in_turns(_in_process(crosser), cfg.num_terrains)
         return
-    workers: list[WorkerProcess] = []
+    processes: list[WorkerProcess] = []
     try:
-        per_worker = -(-cfg.num_terrains // cfg.processes)
-        for first in range(0, cfg.num_terrains, per_worker):
-            num_terrains = min(per_worker, cfg.num_terrains - first)
-            workers.append(WorkerProcess(num_terrains, build, cfg))
+        per_process = -(-cfg.num_terrains // cfg.num_workers)
+        for first in range(0, cfg.num_terrains, per_process):
+            num_terrains = min(per_process, cfg.num_terrains - first)
+            processes.append(WorkerProcess(num_terrains, build, cfg))
             if first == 0:
-                workers[0].receive()  # it compiles the kernels; the others then find them compiled
-        for worker in workers[1:]:
-            worker.receive()
-        yield _in_turns(_over_workers(workers), cfg.num_terrains)
+                processes[0].receive()  # it compiles the kernels; the others then find them compiled
+        for process in processes[1:]:
+            process.receive()
+        yield _in_turns(_over_processes(processes), cfg.num_terrains)
     finally:
-        for worker in workers:
-            worker.stop()
+        for process in processes:
+            process.stop()
 
 
 def _in_process(crosser: Crosser) -> Evaluate:
     def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
-        report = None if progress is None else lambda done, most: progress(done / most)
-        return crosser.evaluate(terrains, seeds, progress=report)
+        return crosser.evaluate(terrains, seeds, progress=progress)
 
     return evaluate
 
 
-def _over_workers(workers: list["WorkerProcess"]) -> Evaluate:
-    """Shards of whole terrains, one a worker, put together again in order."""
+def _over_processes(processes: list[WorkerProcess]) -> Evaluate:
+    """Crosses shards of whole terrains, one a process, and puts them together in order."""
 
     def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
         first = 0
-        for worker in workers:
-            own = slice(first, first + worker.num_terrains)
-            worker.send(terrains[own], seeds[own])
+        for process in processes:
+            own = slice(first, first + process.num_terrains)
+            process.send(terrains[own], seeds[own])
             first = own.stop
         results: dict[int, Any] = {}
-        shares = np.zeros(len(workers))
-        while len(results) < len(workers):
-            for index in _ready(workers, results):
-                message, value = workers[index].receive()
+        shares = np.zeros(len(processes))
+        while len(results) < len(processes):
+            for index in _ready(processes, results):
+                message, value = processes[index].receive()
                 if message == "result":
                     results[index] = value
                 shares[index] = value if message == "progress" else 1.0
             if progress is not None:
                 progress(float(shares.mean()))
-        return merged([results[index] for index in range(len(workers))], join=0)
+        return merged([results[index] for index in range(len(processes))], join=0)
 
     return evaluate
 
 
-def _ready(workers: list["WorkerProcess"], results: dict[int, Any]) -> list[int]:
-    """Workers still at it that have something to say, or died."""
-    waiting = {workers[k].connection: k for k in range(len(workers)) if k not in results}
+def _ready(processes: list[WorkerProcess], results: dict[int, Any]) -> list[int]:
+    """Processes without a result yet that have something to say, or died."""
+    waiting = {processes[k].connection: k for k in range(len(processes)) if k not in results}
     return [waiting[connection] for connection in wait(list(waiting)) if isinstance(connection, Connection)]
 
 
 def _in_turns(evaluate: Evaluate, at_once: int) -> Evaluate:
-    """Any number of terrains, ``at_once`` at a time; the last turn is filled up and what fills it is dropped."""
+    """Evaluates any number of terrains, ``at_once`` at a time; the last turn is filled up with terrains crossed before."""
 
     def in_turns(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
         count = checked_count(terrains, seeds)

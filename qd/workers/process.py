@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from numpy.typing import NDArray
 
+from sim.files.command import UserError
+
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
 
-class EvaluatorError(RuntimeError):
+class EvaluatorError(UserError):
     """The evaluation cannot go on; what was saved before is whole."""
 
 
@@ -23,7 +25,7 @@ class Crosser(Protocol):
     """What evaluates a fixed number of terrains, such as :class:`sim.rollout.Rollout`."""
 
     def evaluate(
-        self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[int, int], None] | None = None
+        self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None
     ) -> "RolloutResult":
         """Cross each terrain."""
         ...
@@ -98,7 +100,7 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
         connection.send(("ready", None))
         while True:
             terrains, seeds = connection.recv()
-            report = lambda done, most: connection.send(("progress", done / most))  # noqa: E731
+            report = lambda share: connection.send(("progress", share))  # noqa: E731
             connection.send(("result", crosser.evaluate(terrains, seeds, progress=report)))
     except (EOFError, ConnectionError):  # the other end is gone: closed, or killed with unread messages
         sys.exit(0)

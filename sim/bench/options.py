@@ -18,7 +18,7 @@ from sim.files.provenance import provenance
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ def measure(cfg: OptionsCfg) -> dict[str, Any]:
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     rng = np.random.default_rng(cfg.seed)
-    genes = hard_random_genes(cfg.terrains, rng)
+    genes = SUPER_GAUSSIAN.hard_random(cfg.terrains, rng)
     seeds = rng.integers(2**32, size=cfg.terrains, dtype=np.uint32)
     tried = choices(cfg, robot)
     rows = []

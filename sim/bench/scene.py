@@ -13,7 +13,7 @@ from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_task
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ def build_scene(robot: RobotCfg, cfg: SceneCfg, device: str) -> Scene:
     """
     rollout = _build_rollout(robot, cfg, device)
     sim = rollout.sim
-    genes = hard_random_genes(rollout.num_terrains, cfg.seed)
+    genes = SUPER_GAUSSIAN.hard_random(rollout.num_terrains, cfg.seed)
     seeds = np.random.SeedSequence(cfg.seed).generate_state(rollout.num_terrains, np.uint32)
     rollout.begin(genes, seeds)
     for _ in range(round(cfg.walk_s / robot.control_dt)):

@@ -30,7 +30,7 @@ from sim.policy.spec import ControllerSpec
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
@@ -174,7 +174,7 @@ class Crosscheck:
         if self._named is not None:
             return self._named
         cfg, at_once = self.cfg, 200 if self.device.startswith("cuda") else 32
-        pool = hard_random_genes(_MAX_POOL, self.rng).astype(np.float32) if self._pool is None else self._pool
+        pool = SUPER_GAUSSIAN.hard_random(_MAX_POOL, self.rng).astype(np.float32) if self._pool is None else self._pool
         order = self.rng.permutation(len(pool))
         rollout = Rollout(self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device)
         chosen: list[int] = []

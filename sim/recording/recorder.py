@@ -199,7 +199,7 @@ def record(
     replicas: Sequence[int] | None = None,
     labels: Sequence[str] | None = None,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> "tuple[RolloutResult, Recording]":
     """Runs a rollout's episodes and records some of them; the episodes are those that ``rollout.evaluate`` would run.
 

@@ -15,7 +15,8 @@ from sim.robots.model import build_robot, geom_names, leaf_name
 from sim.robots.probes import placed
 from sim.robots.robot import RobotCfg, get_robot
 from sim.simulation import CAPACITY_OVERFLOWS, Simulation, resolve_device
-from sim.terrain import SPACING, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import SPACING
 
 _GRAVITY = 9.81
 _TERRAINS = 4
@@ -95,7 +96,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         )
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)
-    genes = np.concatenate([np.zeros((1, 64)), hard_random_genes(_TERRAINS, seed)])
+    genes = np.concatenate([np.zeros((1, 64)), SUPER_GAUSSIAN.hard_random(_TERRAINS, seed)])
     bank.set_genes(genes.astype(np.float32))
     heights = np.array(bank.heights.numpy())
     heights[0] = 0.0

@@ -6,7 +6,8 @@ import warp as wp
 
 from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
 from sim.bench import oracle
-from sim.terrain import SPACING, crossing_terrain, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import SPACING, crossing_terrain
 from tests.kernels.test_heightfield import make_terrain
 
 RADII = (0.0175, 0.03, 0.06, 0.1)
@@ -76,7 +77,7 @@ def random_rotations(rng, count):
 def hard_terrain(kind):
     if kind == "genes":
         x, y = np.arange(321)[None, :] * SPACING, np.arange(161)[:, None] * SPACING
-        return np.float32(oracle.mixture_height(hard_random_genes(1, 3)[0], x, y))
+        return np.float32(oracle.mixture_height(SUPER_GAUSSIAN.hard_random(1, 3)[0], x, y))
     return crossing_terrain(kind, 9, 4)
 
 

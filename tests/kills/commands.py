@@ -5,18 +5,19 @@ import os
 import resource
 import sys
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from kernels.episode import Outcome
-from qd import reevaluate
+from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.cli import run_command
 from qd.show import recordings, replay
 from qd.studies import calibrate
-from sim.files.command import run_command as run_in_process
+from sim.files import command
+from sim.files.command import exit_code_of
 from tests.kills import searches, trainings
 from tests.qd import stand_in
 from tests.qd.recordings import recording_of
@@ -33,15 +34,22 @@ def resume_search(path: Path) -> None:
 def reevaluate_search(path: Path) -> None:
     """All elites again."""
     searches.without_figures()
-    main = partial(reevaluate.reevaluate_run, open_evaluator=stand_in.open_stand_in)
-    run_command(reevaluate.ReevaluateCfg, main, ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY])
+    argv = ["--run", str(path), "--device", "cpu", "--policy", searches.POLICY]
+    if status := command.run_command(_StandInReevaluate, argv, name="reevaluate"):
+        sys.exit(status)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _StandInReevaluate(Reevaluate):
+    def execute(self) -> None:
+        reevaluate_run(self, open_evaluator=stand_in.open_stand_in)
 
 
 def replay_elite(path: Path) -> None:
     """The worst elite again."""
     recordings.Simulation = lambda robot, device: _cross
     argv = ["--run", str(path), "--device", "cpu", "--replicas", "4", "--policy", searches.POLICY]
-    sys.exit(run_in_process(replay.ReplayElite, argv, name="replay"))
+    sys.exit(command.run_command(replay.ReplayElite, argv, name="replay"))
 
 
 def resume_training(run_dir: Path) -> int:

@@ -1,17 +1,21 @@
 """A search that takes a fraction of a second, by its own command over the stand-in evaluator, and what it comes to."""
 
 import json
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qd import search as search_module
 from qd.archive import ARCHIVE_FILE, read_archive
-from qd.run.arguments import Arguments, job_of
+from qd.run.arguments import Archive as ArchiveCommand
+from qd.run.arguments import job_of
 from qd.run.checkpoint import load_checkpoint
-from qd.run.cli import run_command
 from qd.run.directory import CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE
 from qd.scheduler import Scheduler
+from qd.search import run_search
+from qd.show import figures
 from sim.files.atomic import write_atomically
+from sim.files.command import run_command
 from tests.kills.steps import Steps
 from tests.qd.stand_in import open_stand_in
 
@@ -40,15 +44,25 @@ def search_watched(path: Path, *, iterations: int, **watched: Any) -> None:
     search(path, iterations=iterations)
 
 
+@dataclass(frozen=True, kw_only=True)
+class StandInArchive(ArchiveCommand):
+    """The search's command over the stand-in evaluator."""
+
+    def execute(self) -> None:
+        """Runs the search."""
+        run_search(job_of(self), open_evaluator=open_stand_in)
+
+
 def run(argv: list[str]) -> None:
-    """The search's command over the stand-in evaluator, with figures that take no time to draw."""
+    """Runs the command, with figures that take no time to draw; exits if it fails."""
     without_figures()
-    run_command(Arguments, lambda args: search_module.run_search(job_of(args), open_evaluator=open_stand_in), argv)
+    if status := run_command(StandInArchive, argv, name="archive"):
+        sys.exit(status)
 
 
 def without_figures() -> None:
     """From now on figures take no time to draw."""
-    search_module.write_figures = _write_plain_figures
+    figures.write_figures = _write_plain_figures
 
 
 def _write_plain_figures(folder: Path, archive: Any, metrics: Any) -> list[Path]:

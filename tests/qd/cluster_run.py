@@ -13,10 +13,9 @@ SEEDS = np.arange(12, dtype=np.uint32)
 
 def main() -> None:
     """For each line of input, number of workers to wait for: workers at hand and the sum of the penalties."""
-    device = resolve_device("cpu", "auto")
-    cfg = EvaluatorCfg(
-        robot="anymal", policy="p", num_terrains=12, num_replicas=4, device=device, workers="auto", worker_limit_s=90.0
-    )
+    import faulthandler; faulthandler.dump_traceback_later(40, file=open("/tmp/wt_workers_trace","w"))
+    device = resolve_device("cpu", "ray")
+    cfg = EvaluatorCfg(robot="anymal", policy="p", num_terrains=12, num_replicas=4, device=device, workers="ray")
     with open_evaluator(cfg, build=crossers.Crosser) as evaluate:
         for line in sys.stdin:
             result = evaluate(GENES, SEEDS)
@@ -24,7 +23,7 @@ def main() -> None:
                 if evaluate.status().workers == int(line):
                     break
                 result = evaluate(GENES, SEEDS)
-                evaluate._roster.wait([])
+                evaluate._wait()
             print("found", evaluate.status().workers, repr(float(result.penalties.sum())), flush=True)
 
 

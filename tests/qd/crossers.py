@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,8 @@ class Crosser:
     def evaluate(self, terrains, seeds, *, progress=None):
         assert len(terrains) == len(seeds) == self.num_terrains
         if progress is not None:
-            progress(1, 2)
-            progress(2, 2)
+            progress(0.5)
+            progress(1.0)
         return stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
 
 
@@ -41,10 +40,6 @@ class Failing(Crosser):
     def _fail(self, how, terrains, seeds):
         if how == "die":
             os.kill(os.getpid(), signal.SIGKILL)
-        if how == "hang":
-            time.sleep(600)
-        if how == "stop":
-            os.kill(os.getpid(), signal.SIGSTOP)
         if how == "raise":
             raise RuntimeError("the solver is broken")
         if how == "refuse":
@@ -57,14 +52,6 @@ class Failing(Crosser):
         if how == "nonsense":
             return "all went well"
         return result
-
-
-class Slow(Crosser):
-    """Takes three seconds to be built."""
-
-    def __init__(self, cfg, num_terrains: int) -> None:
-        time.sleep(3.0)
-        super().__init__(cfg, num_terrains)
 
 
 class Refusing(Crosser):

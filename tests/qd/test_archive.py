@@ -12,6 +12,7 @@ def small_archive(num_elites: int = 3) -> Archive:
     rows = rng.random(num_elites)
     return Archive(
         robot="anymal",
+        space="super_gaussian",
         penalties=("yaw_rate", "vel_x"),
         scales=(0.5, 2.0),
         intervals=10,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive
-from qd.reevaluate import ReevaluateCfg, reevaluate_run
-from qd.run.arguments import Arguments, job_of
+from qd.fresh import Reevaluate, reevaluate_run
+from qd.run.arguments import Archive, job_of
 from qd.show.replay import ReplayElite, replay
 from tests.sim.dogs import write_dog
 
@@ -100,7 +100,7 @@ def test_it_goes_on_only_if_robot_and_controller_are_named_and_are_what_they_wer
 
     def refused(message, **named):
         with pytest.raises(ValueError, match=message):
-            job_of(Arguments(resume=path, device="cpu", **named))
+            job_of(Archive(resume=path, device="cpu", **named))
 
     dog, policy = robot[1], trot[1]
     refused("is of robot 'dog', which is not shipped: name its settings file too", policy=policy)
@@ -127,9 +127,9 @@ def test_a_run_that_is_handed_over_runs_nothing_of_its_own(searched, tmp_path, h
     (tmp_path / "config.json").write_text(json.dumps({**config, "settings": settings}))
     for command in (
         lambda: replay(ReplayElite(robot=robot[1], run=tmp_path, device="cpu")),
-        lambda: job_of(Arguments(resume=tmp_path, device="cpu")),
-        lambda: job_of(Arguments(resume=tmp_path, robot=robot[1], device="cpu")),
-        lambda: reevaluate_run(ReevaluateCfg(run=tmp_path, device="cpu")),
+        lambda: job_of(Archive(resume=tmp_path, device="cpu")),
+        lambda: job_of(Archive(resume=tmp_path, robot=robot[1], device="cpu")),
+        lambda: reevaluate_run(Reevaluate(run=tmp_path, device="cpu")),
     ):
         with pytest.raises(ValueError, match=r"not shipped|which is code|is of .*evil"):
             command()

@@ -12,13 +12,13 @@ from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
 from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
-from sim.terrain import uniform_random_genes
+from sim.space import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.test_search import make_job, rows_of
 
 ROBOT = get_robot("anymal")
 CFG = EvaluatorCfg(
-    robot="anymal", policy=str(ROBOT.policy_file), num_terrains=4, num_replicas=2, device="cpu", num_processes=2
+    robot="anymal", policy=str(ROBOT.policy_file), num_terrains=4, num_replicas=2, device="cpu", workers="2"
 )
 SETTINGS = {
     "replicas": 2,
@@ -40,8 +40,8 @@ def test_the_stand_in_has_the_fields_of_a_result():
 
 
 def test_one_and_two_processes_give_the_same_bits(evaluate):
-    terrains, seeds = uniform_random_genes(4, 0), episode_seeds(0, 1, 4)
-    with open_evaluator(dataclasses.replace(CFG, num_processes=1)) as evaluate_alone:
+    terrains, seeds = SUPER_GAUSSIAN.uniform_random(4, 0), episode_seeds(0, 1, 4)
+    with open_evaluator(dataclasses.replace(CFG, workers="1")) as evaluate_alone:
         one = evaluate_alone(terrains, seeds)
     two = evaluate(terrains, seeds)
     assert np.array_equal(one.penalties, two.penalties)

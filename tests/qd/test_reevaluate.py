@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd import search
 from qd.archive import read_archive
-from qd.reevaluate import ReevaluateCfg, reevaluate_run
-from qd.run.cli import Interrupted
+from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.settings import file_hash
 from qd.search import run_search
+from qd.show import figures
 from qd.workers.evaluator import EvaluatorError
+from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
@@ -26,11 +26,11 @@ SHIPPED = {"policy": "shipped", "policy_sha256": file_hash(get_robot("anymal").p
 
 @pytest.fixture(autouse=True)
 def no_figures(monkeypatch):
-    monkeypatch.setattr(search, "write_figures", lambda folder, archive, metrics: [])
+    monkeypatch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
 
 
 def again(path, **arguments):
-    return reevaluate_run(ReevaluateCfg(run=path, device="cpu", **arguments), open_evaluator=open_stand_in)
+    return reevaluate_run(Reevaluate(run=path, device="cpu", **arguments), open_evaluator=open_stand_in)
 
 
 def numbers_in(path):
@@ -105,7 +105,7 @@ def test_stopped_in_the_fresh_episodes_a_search_leaves_what_it_found_and_the_com
     with pytest.raises(kind) as raised:
         job = make_job(path, reproduce=True, **SHIPPED)
         run_search(job, open_evaluator=ended_in_fresh_episodes(error))
-    assert str(raised.value) == f"{message}Go on with:  make reevaluate RUN={path}"
+    assert str(raised.value) == f"{message}Go on with:  faultline reevaluate --run {path}"
     found = run(tmp_path / "found", **SHIPPED)
     assert (path / "archive.npz").read_bytes() == (tmp_path / "found/archive.npz").read_bytes()
     assert numbers_in(path)["elites_reproduced"] is None
@@ -137,14 +137,12 @@ def test_stopped_the_command_leaves_the_run_as_it_was_and_says_how_to_start_agai
     path = tmp_path / "run"
     run(path, **SHIPPED)
     before = {file.name: file.read_bytes() for file in path.iterdir()}
-    args = ReevaluateCfg(run=path, device="cpu", seed=7, processes=1, worker_limit_s=20.0)
+    args = Reevaluate(run=path, device="cpu", seed=7)
     with pytest.raises((Interrupted, EvaluatorError)) as raised:
         reevaluate_run(args, open_evaluator=ended_in_fresh_episodes(error))
     state = f"Stopped; {path} is as it was" if isinstance(error, KeyboardInterrupt) else "no worker came"
-    assert str(raised.value) == (
-        f"{state}. Start again with:  make reevaluate ROBOT=anymal RUN={path} SEED=7 DEVICE=cpu PROCESSES=1 "
-        "WORKER_LIMIT_S=20"
-    )
+    assert str(raised.value).startswith(f"{state}. Start again with:  ")
+    assert str(raised.value).endswith(f"reevaluate --robot anymal --run {path} --seed 7 --device cpu")
     assert {file.name: file.read_bytes() for file in path.iterdir()} == before
 
 
@@ -170,7 +168,7 @@ def test_a_run_that_grows_says_that_its_fresh_values_go(tmp_path, capsys):
     again(path)
     run(path, **SHIPPED, resumes=True, iterations=4)
     output = capsys.readouterr().out
-    assert f"the first new iteration drops those values. Afterwards:  make reevaluate RUN={path}" in output
+    assert f"the first new iteration drops those values. Afterwards:  faultline reevaluate --run {path}" in output
     assert read_archive(path).fresh is None
     assert numbers_in(path)["reproduced_by"] is None
     run(tmp_path / "whole", **SHIPPED, iterations=4)
@@ -196,13 +194,13 @@ def test_the_newest_run_of_the_robot_is_taken_and_another_robots_is_refused(tmp_
     run(tmp_path / "runs/older", **SHIPPED)
     run(tmp_path / "runs/newer", **SHIPPED)
     os.utime(tmp_path / "runs/older/archive.npz", (0, 0))
-    reevaluate_run(ReevaluateCfg(device="cpu"), open_evaluator=open_stand_in)
+    reevaluate_run(Reevaluate(device="cpu"), open_evaluator=open_stand_in)
     assert read_archive("runs/older").fresh is None
     assert read_archive("runs/newer").fresh is not None
     with pytest.raises(ValueError, match=r"runs/newer is of anymal, got --robot cassie: give that robot or another"):
-        reevaluate_run(ReevaluateCfg(robot="cassie", run=Path("runs/newer"), device="cpu"))
+        reevaluate_run(Reevaluate(robot="cassie", run=Path("runs/newer"), device="cpu"))
     with pytest.raises(FileNotFoundError, match="no archive of cassie under runs/"):
-        reevaluate_run(ReevaluateCfg(robot="cassie", device="cpu"))
+        reevaluate_run(Reevaluate(robot="cassie", device="cpu"))
 
 
 def test_a_controller_that_is_another_now_is_refused_unless_it_is_given(tmp_path):
@@ -223,7 +221,7 @@ def test_what_is_no_run_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no run at .*: it has no config\.json"):
         again(tmp_path)
     run(tmp_path / "run", **SHIPPED)
-    with pytest.raises(ValueError, match="seed must not be negative, got -1"):
+    with pytest.raises(ValueError, match="seed must be at least 0, got -1"):
         again(tmp_path / "run", seed=-1)
     for name in ("checkpoint.bin", "metrics.jsonl", "archive.npz"):
         (tmp_path / "run" / name).unlink()

@@ -3,16 +3,15 @@ import pytest
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd.descriptors import Cells
-from qd.directions import DirectionEmitter
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
-from qd.scheduler import Scheduler
-from qd.scheduler_cfg import ES_KINDS, METHODS, SchedulerCfg
+from qd.run.settings import ES_KINDS, METHODS, SchedulerCfg
+from qd.scheduler import RandomEmitter, Scheduler
 from tests.qd import stand_in
 
 CELLS = Cells(6)
 FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
-JOINED = ("cma_me+cma_mae", "map_elites+directions")
+JOINED = ("cma_me+cma_mae", "map_elites+hard_random")
 SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4")
 
 
@@ -161,9 +160,9 @@ def test_cma_me_is_judged_by_the_archive_it_fills():
 
 
 def test_joined_methods_take_turns_each_judged_by_its_own_archive():
-    search = make_search(SchedulerCfg(emitters=5, batch_size=2, method="cma_me+cma_mae+directions"))
+    search = make_search(SchedulerCfg(emitters=5, batch_size=2, method="cma_me+cma_mae+uniform_random"))
     assert [type(emitter) for emitter in search.emitters] == [
-        EvolutionStrategyEmitter, EvolutionStrategyEmitter, DirectionEmitter,
+        EvolutionStrategyEmitter, EvolutionStrategyEmitter, RandomEmitter,
         EvolutionStrategyEmitter, EvolutionStrategyEmitter,
     ]  # fmt: skip
     of_result = [emitter.archive is search.result for emitter in search.emitters]
@@ -187,11 +186,11 @@ def test_a_state_of_something_else_is_refused(state):
     ("setting", "value"),
     [
         ("emitters", 0), ("batch_size", 1), ("method", "cma_me+"), ("method", "cma_me+cma_me"),
-        ("direction_restart", 0), ("direction_sigma", 0.0), ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
+        ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
         ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")),
         ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(setting, value):
-    with pytest.raises(ValueError, match=f"{setting} must|{setting} at least"):
+    with pytest.raises(ValueError, match=f"{setting} must"):
         SchedulerCfg(**{setting: value})

@@ -13,17 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd import search
 from qd.archive import read_archive
 from qd.fitness import FitnessCfg
 from qd.run.arguments import Job
-from qd.run.checkpoint import load_checkpoint, save_checkpoint
-from qd.run.cli import Interrupted
-from qd.run.directory import RunDirectory
+from qd.run.directory import RunDirectory, origin_in
 from qd.run.settings import SchedulerCfg, SearchCfg
 from qd.search import run_search
+from qd.show import figures
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError
-from sim.files.atomic import atomic as files
+from sim.files import atomic as files
+from sim.files.command import Interrupted
 from sim.files.provenance import provenance
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
@@ -48,17 +47,20 @@ KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.
 def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
     cfg = dataclasses.replace(CFG, **changes)
     evaluator = EvaluatorCfg(
-        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, num_processes=1
+        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, workers="1"
     )
+    begun = {**provenance("cpu", cfg.seed), "sessions": []}
+    origin = origin_in(RunDirectory(path).read_config()) if resumes else begun
     return Job(
         cfg=cfg,
         path=path,
         resumes=resumes,
         evaluator=evaluator,
         reproduce=reproduce,
-        origin=provenance("cpu", cfg.seed),
-        resume_command=f"make archive RESUME={path}",
-        reevaluate_command=f"make reevaluate RUN={path}",
+        origin=origin,
+        session={"command": f"to {cfg.iterations}", "commit": "c", "device": "d"},
+        resume_command=f"faultline archive --resume {path}",
+        reevaluate_command=f"faultline reevaluate --run {path}",
     )
 
 
@@ -79,7 +81,7 @@ def plain_figures(monkeypatch):
         files.write_atomically(folder / "archive.png", b"a figure")
         return [folder / "archive.png"]
 
-    monkeypatch.setattr(search, "write_figures", write_figures)
+    monkeypatch.setattr(figures, "write_figures", write_figures)
 
 
 @pytest.mark.parametrize("method", ["cma_mae", "cma_mae+map_elites"])
@@ -91,7 +93,7 @@ def test_golden_search(tmp_path, capsys, method):
     assert archive.fitness[:5] == pytest.approx(GOLDEN[method]["fitness"], abs=1e-4)
     output = capsys.readouterr().out
     assert "2 iterations of 12 terrains x 4 episodes of up to 20 s" in output
-    assert f"make replay ROBOT=anymal RUN={tmp_path / 'run'} ELITE=0" in output
+    assert f"replay --robot anymal --run {tmp_path / 'run'} --elite 0" in output
 
 
 GOLDEN = {
@@ -143,6 +145,21 @@ def test_a_finished_run_is_extended_as_if_it_had_been_longer_from_the_start(tmp_
     assert json.loads((tmp_path / "pieces/config.json").read_text())["iterations"] == 9
 
 
+def test_every_session_of_a_run_is_told_with_what_it_came_to(tmp_path, plain_figures):
+    path = tmp_path / "run"
+    for iterations in (2, 5):
+        run(path, iterations=iterations, resumes=path.exists())
+    numbers, config = (json.loads((path / name).read_text()) for name in ("archive.json", "config.json"))
+    assert [(one["command"], one["iterations"]) for one in numbers["sessions"]] == [("to 2", 2), ("to 5", 5)]
+    assert config["sessions"] == numbers["sessions"]
+    assert config["command"] == numbers["command"] == provenance("cpu", 0)["command"]  # of the run's beginning
+    stopped = [{**numbers["sessions"][0], "iterations": 9}]  # asked for 9, killed after 5
+    (path / "config.json").write_text(json.dumps({**config, "sessions": stopped}))
+    run(path, iterations=6, resumes=True)
+    sessions = json.loads((path / "archive.json").read_text())["sessions"]
+    assert [one["iterations"] for one in sessions] == [5, 6]
+
+
 def test_resuming_a_finished_run_evaluates_nothing_and_writes_its_results_again(tmp_path, plain_figures, capsys):
     path = tmp_path / "run"
     run(path)
@@ -157,26 +174,6 @@ def test_resuming_a_finished_run_evaluates_nothing_and_writes_its_results_again(
     assert (path / "archive.npz").read_bytes() == before
     assert json.loads((path / "archive.json").read_text())["iterations"] == 2
     assert "All 2 iterations" in capsys.readouterr().out
-
-
-def test_a_run_from_before_a_setting_was_added_goes_on(tmp_path, plain_figures):
-    path, added = tmp_path / "run", ("direction_sigma", "direction_restart")
-    run(path)
-    state = load_checkpoint(path / "checkpoint.bin")
-    config = json.loads((path / "config.json").read_text())
-    for settings in (state["settings"], config["settings"]):
-        for name in added:
-            del settings["scheduler"][name]
-    save_checkpoint(path / "checkpoint.bin", state)
-    (path / "config.json").write_text(json.dumps(config))
-    assert RunDirectory(path).read_cfg() == CFG
-    run(path, iterations=4, resumes=True)
-    run(tmp_path / "whole", iterations=4)
-    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
-    assert set(added) < set(json.loads((path / "config.json").read_text())["settings"]["scheduler"])
-    # What is no default is a difference still.
-    with pytest.raises(ValueError, match=r"scheduler\.direction_restart \(20 there, 7 wanted\)"):
-        run(path, resumes=True, scheduler=dataclasses.replace(CFG.scheduler, direction_restart=7))
 
 
 def test_fewer_iterations_than_done_are_refused(tmp_path, plain_figures):
@@ -197,7 +194,7 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, plain_figures):
 
         yield evaluate
 
-    with pytest.raises(Interrupted, match=f"Go on with:  make archive RESUME={path}"):
+    with pytest.raises(Interrupted, match=f"Go on with:  faultline archive --resume {path}"):
         run_search(make_job(path, iterations=3), open_evaluator=interrupted)
     assert len(rows_of(path)) == 1
     run(path, iterations=3, resumes=True)
@@ -213,7 +210,7 @@ def test_a_lost_worker_says_how_to_go_on(tmp_path):
 
         yield evaluate
 
-    with pytest.raises(EvaluatorError, match=r"SIGKILL.*Go on with:  make archive RESUME="):
+    with pytest.raises(EvaluatorError, match=r"SIGKILL.*Go on with:  faultline archive --resume "):
         run_search(make_job(tmp_path / "run"), open_evaluator=lost)
 
 
@@ -263,8 +260,8 @@ def test_a_directory_that_cannot_be_written_to(target):
 SLOW_SEARCH = """
 import signal, sys, time
 from pathlib import Path
-from qd.run.cli import run_command
 from qd.search import run_search
+from sim.files.command import run_command
 from tests.qd import stand_in, test_search
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -277,11 +274,14 @@ def slow(cfg):
     yield evaluate
 
 @dataclass
-class Arguments:
+class Slow:
     path: Path
 
+    def execute(self):
+        run_search(test_search.make_job(self.path, iterations=500), open_evaluator=slow)
+
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored
-run_command(Arguments, lambda args: run_search(test_search.make_job(args.path, iterations=500), open_evaluator=slow))
+sys.exit(run_command(Slow, sys.argv[1:], name="slow"))
 """
 
 
@@ -304,4 +304,4 @@ def test_ctrl_c_ends_without_a_traceback_and_says_how_to_go_on(tmp_path):
     code, errors = stopped_by(signal.SIGINT, path, NUMBA_DISABLE_JIT="1")  # spares compiling for a look at the messages
     assert code == 130
     assert "Traceback" not in errors
-    assert f"Go on with:  make archive RESUME={path}" in errors
+    assert f"Go on with:  faultline archive --resume {path}" in errors

@@ -15,7 +15,7 @@ from sim.policy.loaders import load_policy
 from sim.policy.sensed import read_row
 from sim.policy.spec import ControllerSpec
 from sim.rollout import Rollout
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 from tests.sim.policies import stretch
 from tests.sim.policy.test_loaders import rsl_rl_actor, save_checkpoint
 from tests.sim.scenes import positions, velocities
@@ -129,7 +129,7 @@ def test_a_crossing_through_an_adapter_is_the_same_crossing(tmp_path, write, any
     ends = []
     for spec in specs:
         rollout = Rollout(anymal, spec, num_terrains=2, num_replicas=2, device=device, cfg=SHORT)
-        result = rollout.evaluate(hard_random_genes(2, 5), np.arange(2, dtype=np.uint32))
+        result = rollout.evaluate(SUPER_GAUSSIAN.hard_random(2, 5), np.arange(2, dtype=np.uint32))
         ends.append((result.penalties, positions(rollout.sim)))
     np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=1e-2, atol=1e-3)
     np.testing.assert_allclose(ends[0][1], ends[1][1], atol=2e-3)
@@ -138,7 +138,7 @@ def test_a_crossing_through_an_adapter_is_the_same_crossing(tmp_path, write, any
 
 def test_what_is_sensed_is_the_state_in_physical_units(anymal, device):
     rollout = Rollout(anymal, stretch, num_terrains=2, num_replicas=2, device=device, cfg=SHORT)
-    rollout.evaluate(hard_random_genes(2, 6), np.arange(2, dtype=np.uint32))
+    rollout.evaluate(SUPER_GAUSSIAN.hard_random(2, 6), np.arange(2, dtype=np.uint32))
     sensed = read_row(wp.to_torch(rollout._observation), anymal)
     q, qd = positions(rollout.sim), velocities(rollout.sim)
     heights = np.array(rollout.sim.bank.heights.numpy(), dtype=np.float64)
@@ -183,7 +183,7 @@ class Counts:
 def test_memory_is_cleared_before_every_evaluation(anymal, device):
     policy = Counts()
     rollout = Rollout(anymal, policy, num_terrains=1, num_replicas=2, device=device, cfg=SHORT)
-    genes, seeds = hard_random_genes(1, 2), np.zeros(1, np.uint32)
+    genes, seeds = SUPER_GAUSSIAN.hard_random(1, 2), np.zeros(1, np.uint32)
     first, second = (rollout.evaluate(genes, seeds) for _ in range(2))
     assert (policy.resets, policy.steps) == (2, 20)
     np.testing.assert_array_equal(first.penalties, second.penalties)

@@ -15,7 +15,8 @@ from kernels.heightfield import Terrain, nearest_surface_point
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_task
 from sim.simulation import Simulation
-from sim.terrain import CROSSING_TYPES, crossing_terrain, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import CROSSING_TYPES, crossing_terrain
 from tests.sim.scenes import positions, put, velocities
 
 NUM_DROPS = int(os.environ.get("FAULTLINE_DROPS", "256"))
@@ -89,7 +90,7 @@ def measure_gaps(sim):
 def mixed_ground(num, device):
     """Hard-random gene terrains and every hand-crafted kind at its hardest, in turn."""
     bank = TerrainBank(4, device=device)
-    bank.set_genes(hard_random_genes(4, 21))
+    bank.set_genes(SUPER_GAUSSIAN.hard_random(4, 21))
     crossings = [crossing_terrain(kind, 9, 22) for kind in CROSSING_TYPES]
     grids = np.concatenate([np.array(bank.heights.numpy()), np.stack(crossings)])
     return grids, np.arange(num) % len(grids)

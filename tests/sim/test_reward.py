@@ -110,7 +110,8 @@ def test_out_of_the_world_nothing_is_paid(tracker, device):
 def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker, device):
     rollout = crossing(tracker, device, num_terrains=2, replicas=2)
 
-    def break_one(step, most):
+    def break_one(share):
+        step = round(30 * share)  # of 0.6 s
         q = np.array(rollout.sim.joint_q.numpy())
         if step == 10:
             q[0, 8] = np.nan  # still on its way

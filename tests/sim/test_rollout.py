@@ -13,7 +13,8 @@ from sim.bench import oracle
 from sim.crossing import CrossingCfg
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout, evaluate
-from sim.terrain import crossing_terrain, uniform_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import crossing_terrain
 from tests.sim.policies import stand, stretch
 from tests.sim.scenes import positions, put, velocities
 
@@ -101,7 +102,7 @@ def test_a_robot_out_of_bounds_is_out(robot, device, start):
 def test_a_robot_on_its_back_has_fallen(anymal, device):
     stander = crossing(anymal, device, max_duration_s=0.1, poll_every_s=0.02, base_force=1e9)
 
-    def turn(step, most):
+    def turn(share):
         q = np.array(stander.sim.joint_q.numpy())
         q[1:, 3:7] = [1, 0, 0, 0]
         q[1:, 2] = 0.6
@@ -133,7 +134,7 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
     seeds = np.arange(TERRAINS)
     clean = rollout.evaluate(grids, seeds)
 
-    def break_one(step, most):
+    def break_one(share):
         array = rollout.sim.joint_q if what == "not a number" else rollout.sim.joint_qd
         values = np.array(array.numpy())
         values[6, 8] = np.nan if what == "not a number" else 3000.0  # terrain 1, replica 2
@@ -248,7 +249,7 @@ def test_an_episode_depends_on_nothing_but_its_terrain_seed_and_replica(anymal, 
 
 
 def test_genes_and_their_heights_are_the_same_terrain(rollout):
-    genes, seeds = uniform_random_genes(TERRAINS, 3), np.arange(TERRAINS)
+    genes, seeds = SUPER_GAUSSIAN.uniform_random(TERRAINS, 3), np.arange(TERRAINS)
     by_genes = rollout.evaluate(genes, seeds)
     by_heights = rollout.evaluate(np.array(rollout.sim.bank.heights.numpy()), seeds)
     np.testing.assert_array_equal(by_genes.final_position, by_heights.final_position)
@@ -256,8 +257,8 @@ def test_genes_and_their_heights_are_the_same_terrain(rollout):
 
 def test_progress_is_told_at_every_poll(rollout, grids):
     told = []
-    rollout.evaluate(grids, np.arange(TERRAINS), progress=lambda done, most: told.append((done, most)))
-    assert told == [(5 * k, 30) for k in range(1, 7)]
+    rollout.evaluate(grids, np.arange(TERRAINS), progress=told.append)
+    assert told == [5 * k / 30 for k in range(1, 7)]
 
 
 def test_a_robots_choice_of_penalties_is_kept(anymal, device):

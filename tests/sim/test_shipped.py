@@ -3,7 +3,8 @@
 import numpy as np
 
 from sim.rollout import Rollout
-from sim.terrain import NUM_COLS, NUM_ROWS, crossing_terrain, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import NUM_COLS, NUM_ROWS, crossing_terrain
 
 FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 
@@ -19,7 +20,7 @@ def test_the_shipped_controller_walks_to_the_goal(robot, device):
 
 def test_a_robot_whose_legs_whip_as_it_falls_has_failed(cassie, device):
     # On this terrain all eight fall, and two of them swing an ankle at more than 100 rad/s before the pelvis is down.
-    genes = hard_random_genes(300, 0)[7:8]
+    genes = SUPER_GAUSSIAN.hard_random(300, 0)[7:8]
     result = Rollout(cassie, cassie.policy_file, num_terrains=1, num_replicas=8, device=device).evaluate(
         genes, np.array([7], np.uint32)
     )

@@ -9,7 +9,7 @@ import warp as wp
 from sim.bank import TerrainBank
 from sim.bench import oracle
 from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, resolve_device
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, Stepper, lying, positions, put, velocities
 
 
@@ -100,7 +100,7 @@ def run_rough(sim, q, steps):
 
 @pytest.fixture
 def rough_start(eight, robot):
-    eight.bank.set_genes(hard_random_genes(8, 3))
+    eight.bank.set_genes(SUPER_GAUSSIAN.hard_random(8, 3))
     return standing(robot, 8, z=robot.default_base_height + 0.4, x=7.0)
 
 
@@ -124,7 +124,7 @@ def test_captured_equals_eager(eight, eight_stepper, rough_start):
 def test_permuting_environments(eight, rough_start):
     order = np.array([3, 1, 7, 0, 2, 6, 5, 4])
     expected = run_rough(eight, rough_start, 40)
-    eight.bank.set_genes(hard_random_genes(8, 3)[order])
+    eight.bank.set_genes(SUPER_GAUSSIAN.hard_random(8, 3)[order])
     got = run_rough(eight, rough_start[order], 40)
     np.testing.assert_array_equal(got[0], expected[0][order])
     # Forces of one geom's contacts add up in the order they were found, which rounds differently.

@@ -11,7 +11,8 @@ import warp as wp
 from sim.bench import oracle
 from sim.robots.model import build_robot
 from sim.simulation import GROUND_FRICTION, SolverCfg
-from sim.terrain import SPACING, uniform_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import SPACING
 from tests.sim import mujoco_c
 from tests.sim.scenes import ONLY_ANYMAL, PHYSICS_DT, Stepper, lying, positions, put, slope
 
@@ -224,7 +225,7 @@ def test_hills_equal_mujocos_heightfield(eight, eight_stepper, anymal):
     # With soft contacts their number sets how fast loaded feet creep sideways, so that on flat ground already its
     # heightfield and its plane differ by 8 mm after 2 s. Nearly hard contacts (both engines) take that away and leave
     # the shape of the ground; MuJoCo C needs 1 ms steps to stay calm with them.
-    eight.bank.set_genes(uniform_random_genes(8, 11))
+    eight.bank.set_genes(SUPER_GAUSSIAN.uniform_random(8, 11))
     grids = np.array(eight.bank.heights.numpy())
     models = [mujoco_c.on_heights(anymal, grid) for grid in grids]
     rng = np.random.default_rng(1)

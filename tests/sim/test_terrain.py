@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sim import terrain
+from sim.space import SUPER_GAUSSIAN
 from sim.terrain import CROSSING_TYPES, TILE_TYPES, crossing_terrain, training_tile
 
 GRID = (161, 321)
@@ -139,7 +140,7 @@ def test_level_0_is_nearly_flat():
     assert not crossing_terrain("slope", 0, 5).any()
 
 
-@pytest.mark.parametrize("generate", [terrain.hand_crafted_crossings, terrain.hard_random_genes])
+@pytest.mark.parametrize("generate", [terrain.hand_crafted_crossings, SUPER_GAUSSIAN.hard_random])
 def test_a_seed_gives_the_same_terrains_and_another_seed_others(generate):
     def first(count, seed):
         drawn = generate(count, seed)
@@ -150,29 +151,6 @@ def test_a_seed_gives_the_same_terrains_and_another_seed_others(generate):
     assert not np.array_equal(first(12, 5), first(12, 6))
     rng = np.random.default_rng(5)
     assert not np.array_equal(first(12, rng), first(12, rng))
-
-
-# Genes
-
-
-def test_uniform_random_genes_fill_the_range():
-    genes = terrain.uniform_random_genes(500, 0)
-    assert genes.shape == (500, 64)
-    assert genes.dtype == np.float32
-    assert np.abs(genes).max() <= 1.0
-    assert np.abs(genes.mean(axis=0)).max() < 0.12  # standard error 0.577 / sqrt(500) = 0.026
-    assert (genes.std(axis=0) > 0.5).all()
-
-
-def test_hard_random_genes_have_every_bump_at_full_height():
-    genes = terrain.hard_random_genes(500, 0, num_bumps=3)
-    bumps = genes.reshape(500, 3, 8)
-    assert genes.dtype == np.float32
-    assert set(np.unique(bumps[..., 7])) == {-1.0, 1.0}
-    assert abs(bumps[..., 7].mean()) < 0.1  # both signs equally often: standard error 1 / sqrt(1500) = 0.026
-    np.testing.assert_array_equal(
-        bumps[..., :7], terrain.uniform_random_genes(500, 0, num_bumps=3).reshape(500, 3, 8)[..., :7]
-    )
 
 
 # Training tiles
@@ -251,8 +229,6 @@ def test_tiles_of_a_seed_are_the_same_and_of_another_others(tiles):
     ("call", "message"),
     [
         (lambda: terrain.hand_crafted_crossings(0, 0), "count must be at least 1, got 0"),
-        (lambda: terrain.uniform_random_genes(-1, 0), "count must be at least 1, got -1"),
-        (lambda: terrain.hard_random_genes(1, 0, num_bumps=0), "num_bumps must be at least 1, got 0"),
         (lambda: terrain.training_tiles(0, 1, 0), "num_levels must be at least 1, got 0"),
         (lambda: terrain.training_tiles(1, 0, 0), "num_columns must be at least 1, got 0"),
         (lambda: terrain.training_tiles(11, 1, 0), "num_levels must be at most 10, got 11"),

@@ -3,18 +3,19 @@
 import numpy as np
 
 from qd.archive import Archive
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 
 
 def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Archive:
     """So many elites with random genes, one a cell."""
-    genes = np.clip(hard_random_genes(max(num_elites, 1), seed)[:num_elites], -1.0, 1.0)
+    genes = np.clip(SUPER_GAUSSIAN.hard_random(max(num_elites, 1), seed)[:num_elites], -1.0, 1.0)
     columns, rates = np.full((num_elites, 6), 1.0 / 6.0), np.zeros(num_elites)
     counts = np.zeros(num_elites, np.int64)
     return Archive(
         robot=robot,
+        space="super_gaussian",
         penalties=PENALTIES,
         scales=(1.0,) * 6,
         intervals=10,

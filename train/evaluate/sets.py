@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive
 from sim.bank import TerrainBank
-from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 
 SETS = ("hand_crafted", "hard_random", "generated", "generated_far")
 """Sets of the tables; the last two need an archive, and the last is a part of the third."""
@@ -130,7 +131,7 @@ def plain_set(name: str, count: int, seed: int) -> TerrainSet:
     if name == "hand_crafted":
         terrains, types, levels = hand_crafted_crossings(count, rng)
     elif name == "hard_random":
-        terrains = hard_random_genes(count, rng)
+        terrains = SUPER_GAUSSIAN.hard_random(count, rng)
     else:
         terrains = np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)
     return TerrainSet(

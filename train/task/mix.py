@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.bank import TerrainBank
+from sim.space import SUPER_GAUSSIAN
 from sim.terrain import (
     CROSSING_TYPES,
     NUM_COLS,
@@ -14,7 +15,6 @@ from sim.terrain import (
     NUM_ROWS,
     TILE_TYPES,
     hand_crafted_crossings,
-    hard_random_genes,
     training_tile,
 )
 from train.task.curriculum import Tiles
@@ -110,7 +110,7 @@ class Mix:
         heights, types = self._hand_crafted(rng)
         if self.cfg.mix != "hand-crafted":
             count = self.cfg.terrains - self.cfg.hand_crafted
-            genes = self.genes[self.rows] if self.cfg.mix == "generated" else hard_random_genes(count, rng)
+            genes = self.genes[self.rows] if self.cfg.mix == "generated" else SUPER_GAUSSIAN.hard_random(count, rng)
             bank = TerrainBank(count, device=self.device)
             bank.set_genes(genes)
             heights = np.concatenate([heights, bank.heights.numpy()])

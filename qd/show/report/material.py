@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive
-from qd.run.directory import CONFIG_FILE, METRICS_FILE, Metrics, RunDirectory
-from qd.run.places import RESULTS, folder_for
+from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
 from qd.show.elites import Elites, find_archive

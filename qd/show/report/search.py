@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
-from qd.show.elites import FAILING_BELOW, Elites
+from qd.show.elites import Elites
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
 from qd.show.report.evaluation import fates, most_mended
 from qd.show.report.figures import draw_pairs
@@ -55,7 +56,7 @@ def outcome_section(shown: Shown) -> Section:
     explained = (
         f"A cell is a combination of shares of the penalties, each in {archive.intervals} intervals; terrains in "
         "different cells make the robot struggle differently. A terrain counts as failed if under "
-        f"{percent(FAILING_BELOW)} of the robots reach the goal. The rates are means over terrains"
+        f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal. The rates are means over terrains"
         f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
     told = (_common(shown), text, _others(tables) if tables else "", explained)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from qd.run.places import RESULTS, RUNS
+from qd.run.directory import RESULTS, RUNS
 from qd.show.elites import Found, find_archive
 from qd.workers.evaluator import check_policy
 from sim.files.atomic import prepare_output

@@ -56,7 +56,7 @@ class _Recording:
         self._policy = cfg.policy
         self._rollout = Rollout(cfg.robot, cfg.policy, num_terrains=1, num_replicas=cfg.replicas, device="cpu")
 
-    def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[int, int], None] | None = None) -> Any:
+    def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None) -> Any:
         """The recording of the crossings of one terrain."""
         from sim.recording.recorder import record
 

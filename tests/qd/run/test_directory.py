@@ -3,24 +3,7 @@ import os
 
 import pytest
 
-from qd.run.directory import RunDirectory, claimed, differences
-from qd.run.places import numbered
-
-
-def test_differences_name_every_key():
-    there = {"seed": 0, "scheduler": {"sigma0": 0.5, "es": "cma_es"}, "old": 1, "same": [1, 2]}
-    wanted = {"seed": 0, "scheduler": {"sigma0": 0.2, "es": "cma_es"}, "new": "x", "same": [1, 2]}
-    assert differences(there, wanted) == [
-        'new (null there, "x" wanted)',
-        "old (1 there, null wanted)",
-        "scheduler.sigma0 (0.5 there, 0.2 wanted)",
-    ]
-    assert differences(there, there) == []
-
-
-def test_long_values_are_shortened():
-    (line,) = differences({"sha": "a" * 64}, {"sha": "b" * 64})
-    assert line == f'sha ("{"a" * 36}... there, "{"b" * 36}... wanted)'
+from qd.run.directory import RunDirectory, claimed, numbered
 
 
 def test_numbered_directories(tmp_path):
@@ -61,7 +44,7 @@ def test_a_name_that_is_too_long_is_refused(tmp_path):
     [
         ("{", "must be a JSON file"),
         ("[]", "must hold a JSON object, got list"),
-        ('{"seed": 1}', "must hold settings, iterations and device of a search, got seed"),
+        ('{"seed": 1}', "must hold settings, iterations, device and sessions, got seed"),
     ],
 )
 def test_damaged_config(tmp_path, content, message):

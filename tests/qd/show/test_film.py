@@ -58,7 +58,7 @@ def test_an_elite_is_recorded_in_the_episodes_that_a_rollout_has(run):
     recordings = Recordings(found.robot).all_of(wanted)
     assert [one.labels for one in recordings] == [("elite 2 of anymal",), ("elite 1 of anymal",)]
     assert recordings[1].origin["policy"] == policy
-    rollout = Rollout(found.robot, policy, num_terrains=2, num_replicas=4, device="cpu")  # side by side, where those were alone
+    rollout = Rollout(found.robot, policy, num_terrains=2, num_replicas=4, device="cpu")  # side by side
     seeds = np.array([one.terrain_seed for one in wanted], np.uint32)
     result, both = record(rollout, found.archive.genes[[2, 1]], seeds, policy=policy)
     for k, recording in enumerate(recordings):

@@ -125,7 +125,7 @@ def test_what_is_missing_is_crossed_in_batches_of_one_controller(anymal, tmp_pat
 
 def test_the_published_recording_is_that_of_the_published_archive(anymal, tmp_path):
     from qd.archive import read_archive
-    from qd.run.places import RESULTS
+    from qd.run.directory import RESULTS
 
     archive = read_archive(RESULTS.resolve() / "anymal" / "archive")
     recordings = Recordings(anymal, folder=tmp_path, published=RESULTS.resolve() / "anymal" / "view")

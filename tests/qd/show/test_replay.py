@@ -8,8 +8,7 @@ from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.run.directory import RunDirectory
-from qd.run.places import elite_name, folder_for, newest_or_published, newest_run
+from qd.run.directory import RunDirectory, elite_name, folder_for, newest_or_published, newest_run
 from qd.run.settings import as_settings
 from qd.show.elites import Found, find_archive
 from qd.show.replay import Replay, ReplayElite, describe, draw, replay

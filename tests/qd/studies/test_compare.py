@@ -9,7 +9,7 @@ import pytest
 
 from qd import search
 from qd.archive import read_archive
-from qd.reevaluate import ReevaluateCfg, reevaluate_run
+from qd.fresh import Reevaluate, reevaluate_run
 from qd.run import arguments
 from qd.run.arguments import job_of
 from qd.run.cli import Interrupted
@@ -220,7 +220,7 @@ def test_a_comparison_killed_before_it_wrote_anything_is_begun_again():
 
 def test_fresh_values_of_a_run_stay_while_it_does_not_grow():
     path = run("a", iterations=1) / "cma_mae_narrow-5"
-    reevaluate_run(ReevaluateCfg(run=path, device="cpu"), open_evaluator=open_stand_in)
+    reevaluate_run(Reevaluate(run=path, device="cpu"), open_evaluator=open_stand_in)
     kept = (path / "archive.npz").read_bytes()
     go_on("a", open_evaluator=never)
     assert (path / "archive.npz").read_bytes() == kept

@@ -8,12 +8,12 @@ import time
 import numpy as np
 import pytest
 
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator
-from qd.workers.evaluator import evaluator as workers
+from qd.workers import evaluator
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, Workers, open_evaluator, parse_workers, resolve_device
 from qd.workers.process import _serve
 from tests.qd import crossers, stand_in
 
-CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", num_processes=1)
+CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", workers="1")
 GENES = np.random.default_rng(0).uniform(-1, 1, (15, 64)).astype(np.float32)
 SEEDS = np.arange(100, 115, dtype=np.uint32)
 
@@ -42,26 +42,45 @@ def same(a, b) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in arrays)
 
 
-@pytest.mark.parametrize(("num_processes", "processes"), [(1, 1), (2, 2), (4, 4)])
-@pytest.mark.parametrize("count", [1, 6, 15])
-def test_how_terrains_are_spread_changes_nothing(num_processes, processes, count):
-    cfg = dataclasses.replace(CFG, num_processes=num_processes)
-    assert cfg.processes == processes
+@pytest.mark.parametrize(
+    ("text", "workers"),
+    [
+        (None, Workers(on_ray=False, count=None)),
+        ("4", Workers(on_ray=False, count=4)),
+        ("ray", Workers(on_ray=True, count=None)),
+        ("ray:16", Workers(on_ray=True, count=16)),
+    ],
+)
+def test_workers_as_the_command_line_names_them(text, workers):
+    assert parse_workers(text) == workers
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "1.5", "auto", "ray:0", "ray:", "ray4", "4 ", "ray:-1", "9999999"])
+def test_workers_that_are_no_number_and_not_on_ray(text):
+    with pytest.raises(ValueError, match=f"number of processes from 1 on, ray, or ray:N, got '{text}'"):
+        resolve_device("cpu", text)
+
+
+@pytest.mark.parametrize("num_processes", [1, 2, 4])
+def test_how_terrains_are_spread_changes_nothing(num_processes):
+    cfg = dataclasses.replace(CFG, workers=str(num_processes))
+    assert cfg.num_workers == num_processes
     with open_evaluator(cfg, build=Crosser) as evaluate:
-        result = evaluate(GENES[:count], SEEDS[:count])
-    assert result.penalties.shape == (count, 4, 6)
-    assert same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
+        for count in (1, 6, 15):
+            result = evaluate(GENES[:count], SEEDS[:count])
+            assert result.penalties.shape == (count, 4, 6)
+            assert same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
 
 
 def test_shards_run_at_the_same_time_and_turns_one_after_the_other():
-    with open_evaluator(dataclasses.replace(CFG, num_processes=2), build=Crosser) as evaluate:
+    with open_evaluator(dataclasses.replace(CFG, workers="2"), build=Crosser) as evaluate:
         assert evaluate(GENES[:6], SEEDS[:6]).wall_s == 103.0  # shards begin at seeds 100 and 103
         assert evaluate(GENES[:12], SEEDS[:12]).physics_steps == 103 + 109
 
 
 def test_progress_rises_to_one():
     seen = []
-    with open_evaluator(dataclasses.replace(CFG, num_processes=2), build=Crosser) as evaluate:
+    with open_evaluator(dataclasses.replace(CFG, workers="2"), build=Crosser) as evaluate:
         evaluate(GENES, SEEDS, seen.append)
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
@@ -69,7 +88,7 @@ def test_progress_rises_to_one():
 
 
 def test_on_cuda_everything_stays_in_this_process():
-    cfg = dataclasses.replace(CFG, device="cuda:0", num_processes=4, policy=str(os.getpid()))
+    cfg = dataclasses.replace(CFG, device="cuda:0", policy=str(os.getpid()))
     seen = []
     with open_evaluator(cfg, build=Crosser) as evaluate:
         assert same(evaluate(GENES, SEEDS, seen.append), stand_in.evaluate(GENES, SEEDS, 4))
@@ -77,22 +96,22 @@ def test_on_cuda_everything_stays_in_this_process():
 
 
 @pytest.mark.parametrize(
-    ("num_terrains", "num_replicas", "num_processes", "processes"),
+    ("num_terrains", "num_replicas", "workers", "expected"),
     [
-        (8, 4, 2, 2),
-        (3, 4, 8, 3),  # no more than terrains
-        (8, 1, 8, 2),  # no fewer than 4 rows each
-        (1, 1, 8, 1),
+        (8, 4, "2", 2),
+        (3, 4, "8", 3),  # no more than terrains
+        (8, 1, "8", 2),  # no fewer than 4 rows each
+        (1, 1, "8", 1),
     ],
 )
-def test_number_of_processes(num_terrains, num_replicas, num_processes, processes):
-    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, num_replicas=num_replicas, num_processes=num_processes)
-    assert cfg.processes == processes
+def test_number_of_processes(num_terrains, num_replicas, workers, expected):
+    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, num_replicas=num_replicas, workers=workers)
+    assert cfg.num_workers == expected
 
 
 def test_one_a_core_by_default(monkeypatch):
-    monkeypatch.setattr(workers, "available_cores", lambda: 3)
-    assert dataclasses.replace(CFG, num_processes=None).processes == 3
+    monkeypatch.setattr(evaluator, "available_cores", lambda: 3)
+    assert dataclasses.replace(CFG, workers=None).num_workers == 3
 
 
 def test_a_refusal_arrives_as_it_was_said():
@@ -111,7 +130,7 @@ def test_a_failure_in_a_worker_names_its_reason():
 
 
 def test_a_dead_worker_is_noticed():
-    cfg = dataclasses.replace(CFG, policy="die", num_processes=2)
+    cfg = dataclasses.replace(CFG, policy="die", workers="2")
     with (
         open_evaluator(cfg, build=Crosser) as evaluate,
         pytest.raises(EvaluatorError, match=r"a worker process died \(signal SIGKILL\)"),
@@ -132,7 +151,7 @@ def test_leaving_ends_workers_in_the_midst_of_work():
     try:
         with (
             pytest.raises(EnoughError),
-            open_evaluator(dataclasses.replace(CFG, policy="sleep", num_processes=2), build=Crosser) as evaluate,
+            open_evaluator(dataclasses.replace(CFG, policy="sleep", workers="2"), build=Crosser) as evaluate,
         ):
             signal.setitimer(signal.ITIMER_REAL, 0.3)
             evaluate(GENES, SEEDS)

@@ -15,14 +15,15 @@ from sim.maps.heightmap import as_terrain, read_heightmap
 from sim.maps.hfield import as_hfield
 from sim.maps.terrain_files import FORMATS, gray_scale, mjcf_of, png_of, stl_of, triangles_of, write_terrain
 from sim.mujoco_c.model import surface_heights
-from sim.terrain import NUM_COLS, NUM_ROWS, SPACING, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 FLAT = np.full((NUM_ROWS, NUM_COLS), 0.2, np.float32)
 
 
 @pytest.fixture(scope="module")
 def hill():
-    return heights_of(hard_random_genes(1, 4))[0]
+    return heights_of(SUPER_GAUSSIAN.hard_random(1, 4))[0]
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +139,7 @@ def test_an_image_shows_the_terrain_as_seen_from_above():
 
 
 def test_an_npz_is_the_grid_itself(hill, tmp_path):
-    genes = hard_random_genes(1, 4)[0]
+    genes = SUPER_GAUSSIAN.hard_random(1, 4)[0]
     paths = write_terrain(tmp_path / "elite-0.1", hill, formats=list(FORMATS), about={}, genes=genes)
     assert [path.name for path in paths] == [f"elite-0.1.{ending}" for ending in ("npz", "png", "xml", "stl", "json")]
     with np.load(paths[0]) as content:

@@ -10,7 +10,7 @@ import pytest
 from kernels.episode import Outcome
 from sim.mujoco_c.agreement import Pair, summarise
 from sim.mujoco_c.crosscheck import Crosscheck, CrosscheckCfg, read_pool
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 
 
 def outcomes(goal, collision, time_out, invalid=0):
@@ -110,7 +110,7 @@ def test_terrains_of_a_pool_can_be_named_whatever_their_rates(tmp_path):
 
 def test_named_terrains_are_crossed_in_both_simulators(tmp_path):
     genes = np.zeros((3, 64), np.float32)  # flat, but for the last
-    genes[2] = hard_random_genes(1, np.random.default_rng(3))[0]
+    genes[2] = SUPER_GAUSSIAN.hard_random(1, np.random.default_rng(3))[0]
     np.savez(tmp_path / "pool.npz", genes=genes)
     counts = {"episodes": 1, "plain_episodes": 1, "processes": 1}
     report = Crosscheck(CrosscheckCfg(device="cpu", genes=tmp_path / "pool.npz", elite="2 0", **counts)).run()

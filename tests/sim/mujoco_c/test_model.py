@@ -17,7 +17,8 @@ from sim.mujoco_c.processes import run_plain
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.simulation import GROUND_FRICTION, SolverCfg
-from sim.terrain import NUM_COLS, NUM_ROWS, SPACING, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.sim.policies import stand
 
 EPISODES = 3
@@ -68,7 +69,7 @@ def test_observation_command_and_penalties_are_those_of_the_oracle(robot, height
 
 
 def test_starts_are_those_of_the_rollout(robot):
-    genes = hard_random_genes(1, 5)
+    genes = SUPER_GAUSSIAN.hard_random(1, 5)
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
     rollout.begin(genes, np.array([77], np.uint32))
     expected = to_mujoco(

@@ -15,7 +15,7 @@ from sim.mujoco_c.model import surface_heights
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import FRAME_ARRAYS, Recording, record
 from sim.rollout import Rollout
-from sim.terrain import uniform_random_genes
+from sim.space import SUPER_GAUSSIAN
 from tests.sim.scenes import slope
 from tests.sim.test_rollout import FLAT, spike
 
@@ -112,7 +112,7 @@ def test_of_all_episodes_some_may_be_recorded(rollout, recording, anymal):
 
 
 def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
-    def break_one(step, most):
+    def break_one(share):
         values = np.array(rollout.sim.joint_q.numpy())
         values[6, 8] = np.nan
         rollout.sim.joint_q.assign(values)
@@ -144,7 +144,7 @@ def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
 
 
 def test_terrains_given_by_genes_are_kept_as_genes(rollout, anymal, tmp_path):
-    genes = uniform_random_genes(2, 3)
+    genes = SUPER_GAUSSIAN.uniform_random(2, 3)
     _, recording = record(rollout, genes, SEEDS, policy=anymal.policy_file, replicas=[0])
     write_recording(tmp_path / "a.npz", recording)
     with np.load(tmp_path / "a.npz") as content:

@@ -49,7 +49,7 @@ class Crossings:
             if len(self.sets) == self.die_after:
                 raise KeyboardInterrupt
             self.sets.append((cfg.policy, len(seeds)))
-            return rollout.evaluate(terrains, seeds, progress=lambda done, most: progress(done / most))
+            return rollout.evaluate(terrains, seeds, progress=progress)
 
         yield evaluate
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.archive import Archive
-from sim.terrain import hard_random_genes
+from sim.space import SUPER_GAUSSIAN
 from tests.train.archives import make_archive
 from train.evaluate.sets import (
     SETS,
@@ -124,8 +124,8 @@ def test_generated_terrains_are_those_held_out():
 
 
 def test_the_far_third_is_the_farthest():
-    training = hard_random_genes(4, 0)
-    genes = hard_random_genes(7, 1)
+    training = SUPER_GAUSSIAN.hard_random(4, 0)
+    genes = SUPER_GAUSSIAN.hard_random(7, 1)
     genes[2], genes[5] = training[1], training[3]  # trained on: distance 0
     distance = nearest_distance(genes, training)
     np.testing.assert_allclose(distance[[2, 5]], 0.0, atol=1e-6)

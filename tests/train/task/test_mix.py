@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from sim.bank import TerrainBank
-from sim.terrain import CROSSING_TYPES, TILE_TYPES, hard_random_genes
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import CROSSING_TYPES, TILE_TYPES
 from train.task.mix import Mix, MixCfg
 
-ELITES = hard_random_genes(7, 0)
+ELITES = SUPER_GAUSSIAN.hard_random(7, 0)
 
 
 def make_mix(*, elites=ELITES, crosses=True, seed=0, **changes) -> Mix:

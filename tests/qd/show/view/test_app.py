@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive
-from qd.run.places import RESULTS
+from qd.run.directory import RESULTS
 from qd.show.recordings import Recordings
 from qd.show.view.app import App
 from qd.show.view.command import View, show_of

@@ -9,7 +9,7 @@ import pytest
 import tyro
 
 from qd.archive import read_archive, write_archive
-from qd.run.places import RESULTS
+from qd.run.directory import RESULTS
 from qd.show.view.command import View, check_port, show_of
 from tests.qd.test_archive import small_archive
 

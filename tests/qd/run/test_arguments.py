@@ -4,22 +4,18 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
 
-from qd import search
-from qd.run import arguments
-from qd.run.arguments import Arguments
-from qd.run.cli import Interrupted, run_command
-from qd.workers.process import EvaluatorError
+from qd.run.arguments import Archive, job_of
+from qd.search import run_search
+from qd.show import figures
+from sim.files.command import run_command
 from sim.robots.robot import RobotCfg, get_robot
 from tests.qd import stand_in
-from tests.qd.test_archive import small_archive
 
 TINY = ["--device", "cpu", "--emitters", "1", "--batch-size", "4", "--replicas", "1", "--iterations", "1"]
 
@@ -39,28 +35,30 @@ def nan_policy(observation: torch.Tensor) -> torch.Tensor:
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(figures, "write_figures", lambda *_: [])  # they take longer than the searches
     monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self: stand_in.SCALES)
     before = signal.getsignal(signal.SIGTERM)
     yield
     signal.signal(signal.SIGTERM, before)
 
 
-def run_main(*argv: str) -> None:
+@dataclass(frozen=True, kw_only=True)
+class StandInArchive(Archive):
     """The search's command on the stand-in evaluator."""
 
-    def main(args: Arguments) -> None:
-        search.run_search(arguments.job_of(args), open_evaluator=stand_in.open_stand_in)
-
-    run_command(Arguments, main, list(argv))
+    def execute(self) -> None:
+        run_search(job_of(self), open_evaluator=stand_in.open_stand_in)
 
 
-def fails(capsys, *argv: str, run=run_main) -> str:
+def run_main(*argv: str) -> int:
+    return run_command(StandInArchive, argv, name="archive")
+
+
+def fails(capsys, *argv: str) -> str:
     """The error line of a command that must fail as a user's mistake."""
     capsys.readouterr()
-    with pytest.raises(SystemExit) as exit:
-        run(*argv)
+    assert run_main(*argv) == 2
     errors = capsys.readouterr().err
-    assert exit.value.code == 2
     lines = [line for line in errors.splitlines() if "Warp CUDA warning" not in line]
     assert len(lines) == 1, errors
     return lines[0].removeprefix("error: ")
@@ -72,6 +70,7 @@ def test_unknown_robot_and_preset(capsys):
         "robot)"
     )
     assert fails(capsys, "--robot", "dog.py") == "dog.py: no such file"
+    assert fails(capsys, "--space", "blocks", *TINY) == "unknown terrain space 'blocks': expected one of super_gaussian"
     assert fails(capsys, "--preset", "huge", *TINY) == "unknown preset 'huge': expected one of paper, small"
     assert not Path("runs").exists()
 
@@ -99,7 +98,7 @@ def test_controllers_that_cannot_be_used(capsys, policy, message):
 
 
 def test_a_setting_out_of_range(capsys):
-    assert fails(capsys, *TINY, "--sigma0", "0") == "sigma0 must lie in [1e-06, 1000], got 0.0"
+    assert fails(capsys, *TINY, "--sigma0", "0") == "sigma0 must be at least 1e-06 and at most 1000, got 0.0"
 
 
 def test_directories(capsys):
@@ -118,11 +117,11 @@ def everything_in(folder: str) -> dict[str, bytes]:
 
 
 def test_a_run_is_never_overwritten(capsys):
-    run_main(*TINY, "--run-dir", "a")
+    assert run_main(*TINY, "--run-dir", "a") == 0
     before = everything_in("a")
-    assert "a holds this run already: go on with `make archive ROBOT=anymal RESUME=a DEVICE=cpu`" in fails(
-        capsys, *TINY, "--run-dir", "a"
-    )
+    again = fails(capsys, *TINY, "--run-dir", "a")
+    assert "a holds this run already: go on with" in again
+    assert "archive --robot anymal --resume a --device cpu`" in again
     assert "a holds a run of other settings: seed (0 there, 1 wanted)" in fails(
         capsys, *TINY, "--run-dir", "a", "--seed", "1"
     )
@@ -133,7 +132,7 @@ def test_a_run_is_never_overwritten(capsys):
 
 
 def test_a_damaged_checkpoint_is_reported_and_left_alone(capsys):
-    run_main(*TINY, "--run-dir", "a")
+    assert run_main(*TINY, "--run-dir", "a") == 0
     checkpoint = Path("a/checkpoint.bin")
     whole = checkpoint.read_bytes()
     for content, message in ((whole[:-100], "truncated or damaged"), (b"hello", "it is another file")):
@@ -142,12 +141,12 @@ def test_a_damaged_checkpoint_is_reported_and_left_alone(capsys):
         assert message in fails(capsys, "--resume", "a", "--iterations", "3")
         assert everything_in("a") == before
     checkpoint.write_bytes(whole)
-    run_main("--resume", "a", "--iterations", "3")
+    assert run_main("--resume", "a", "--iterations", "3") == 0
 
 
 def test_a_controller_that_moved_is_asked_for_and_taken_where_it_is_now(capsys):
     shutil.copy(get_robot("anymal").policy_file, "mine.pt")
-    run_main(*TINY, "--policy", "mine.pt", "--run-dir", "a")
+    assert run_main(*TINY, "--policy", "mine.pt", "--run-dir", "a") == 0
     Path("mine.pt").rename("moved.pt")
     Path("other.pt").write_bytes(Path("moved.pt").read_bytes() + b"\0")
     before = everything_in("a")
@@ -157,21 +156,21 @@ def test_a_controller_that_moved_is_asked_for_and_taken_where_it_is_now(capsys):
     )
     assert 'policy ("mine.pt" there, "other.pt" wanted)' in fails(capsys, "--resume", "a", "--policy", "other.pt")
     assert everything_in("a") == before
-    run_main("--resume", "a", "--iterations", "2", "--policy", "moved.pt")
+    assert run_main("--resume", "a", "--iterations", "2", "--policy", "moved.pt") == 0
     assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
     Path("moved.pt").rename("mine.pt")
-    run_main("--resume", "a", "--iterations", "3")
+    assert run_main("--resume", "a", "--iterations", "3") == 0
 
 
 def test_code_runs_only_if_it_is_named_again(capsys):
     fine = f"{__name__}:fine_policy"
-    run_main(*TINY, "--policy", fine, "--run-dir", "a")
+    assert run_main(*TINY, "--policy", fine, "--run-dir", "a") == 0
     told = capsys.readouterr().out
-    assert f"make replay ROBOT=anymal RUN=a ELITE=0 POLICY={fine}" in told
+    assert f"replay --robot anymal --run a --elite 0 --policy {fine}" in told
     before = everything_in("a")
     refused = f"a was searched with the controller {fine}, which is code: name it again (--policy)"
     assert refused in fails(capsys, "--resume", "a", "--iterations", "2")
-    assert f"make archive ROBOT=anymal RESUME=a POLICY={fine} DEVICE=cpu" in fails(
+    assert f"archive --robot anymal --resume a --policy {fine} --device cpu" in fails(
         capsys, *TINY, "--policy", fine, "--run-dir", "a"
     )
     config = json.loads(Path("a/config.json").read_text())
@@ -185,7 +184,7 @@ def test_code_runs_only_if_it_is_named_again(capsys):
     assert "which is not shipped: name its settings file too" in fails(capsys, "--resume", "a", "--policy", fine)
     assert not Path("it_ran").exists()
     Path("a/config.json").write_bytes(before["config.json"])
-    run_main("--resume", "a", "--iterations", "2", "--policy", fine)
+    assert run_main("--resume", "a", "--iterations", "2", "--policy", fine) == 0
     assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
 
 
@@ -193,12 +192,12 @@ def test_what_a_killed_beginning_leaves_is_begun_in_again():
     Path("a").mkdir()
     for name in (".config.json.tmp", ".write-test"):
         Path("a", name).write_text("{")
-    run_main(*TINY, "--run-dir", "a")
+    assert run_main(*TINY, "--run-dir", "a") == 0
     assert Path("a/archive.npz").exists()
 
 
 def test_a_lost_checkpoint_is_not_begun_over(capsys):
-    run_main(*TINY, "--run-dir", "a")
+    assert run_main(*TINY, "--run-dir", "a") == 0
     Path("a/checkpoint.bin").unlink()
     assert "a/checkpoint.bin is lost: expected it beside metrics.jsonl and archive.npz" in fails(
         capsys, "--resume", "a"
@@ -206,98 +205,30 @@ def test_a_lost_checkpoint_is_not_begun_over(capsys):
 
 
 def test_new_runs_get_directories_of_their_own_and_stopped_ones_are_mentioned(capsys):
-    run_main(*TINY)
-    run_main(*TINY)
+    assert run_main(*TINY) == 0
+    assert run_main(*TINY) == 0
     assert sorted(os.listdir("runs")) == ["anymal-small-0", "anymal-small-0-2"]
     assert "holds the same search" not in capsys.readouterr().out
     config = json.loads(Path("runs/anymal-small-0/config.json").read_text())
     Path("runs/anymal-small-0/config.json").write_text(json.dumps({**config, "iterations": 9}))
-    run_main(*TINY)
+    assert run_main(*TINY) == 0
     output = capsys.readouterr().out
     assert "runs/anymal-small-0 holds the same search, stopped after 1 of 9 iterations" in output
-    assert "make archive ROBOT=anymal RESUME=runs/anymal-small-0 DEVICE=cpu" in output
+    assert "archive --robot anymal --resume runs/anymal-small-0 --device cpu" in output
 
 
 def test_the_command_to_go_on_says_all_that_was_given_of_where_to_work(capsys):
-    run_main(*TINY, "--run-dir", "a  b$c")
-    given = ["--processes", "1", "--worker-limit-s", "20.5", "--reproduce", "yes"]
-    message = fails(capsys, *TINY, "--run-dir", "a  b$c", *given)
-    assert message.endswith(
-        "go on with `make archive ROBOT=anymal RESUME='a  b$$c' REPRODUCE=yes DEVICE=cpu PROCESSES=1 "
-        "WORKER_LIMIT_S=20.5`"
-    )
+    assert run_main(*TINY, "--run-dir", "a b$c") == 0
+    message = fails(capsys, *TINY, "--run-dir", "a b$c", "--workers", "1", "--reproduce", "yes")
+    assert message.endswith("archive --robot anymal --resume 'a b$c' --device cpu --workers 1 --reproduce yes`")
 
 
 def test_a_resumed_run_keeps_where_it_came_from():
-    run_main(*TINY, "--run-dir", "a")
+    assert run_main(*TINY, "--run-dir", "a") == 0
     first = json.loads(Path("a/config.json").read_text())
-    run_main("--resume", "a", "--iterations", "2")
+    assert run_main("--resume", "a", "--iterations", "2") == 0
     second = json.loads(Path("a/config.json").read_text())
     assert second.pop("iterations") == 2
-    assert {**second, "iterations": 1} == first
+    assert [one["iterations"] for one in second.pop("sessions")] == [1, 2]
+    assert {**second, "iterations": 1, "sessions": first["sessions"]} == first
     assert set(first) >= {"settings", "command", "commit", "device", "versions", "seed", "date"}
-
-
-@dataclass
-class Nothing:
-    """No arguments."""
-
-
-@pytest.mark.parametrize(
-    ("error", "code", "message"),
-    [
-        (ValueError("two\nlines"), 2, "error: two lines\n"),
-        (PermissionError(13, "Permission denied", "x"), 2, "error: [Errno 13] Permission denied: 'x'\n"),
-        (EvaluatorError("a worker died"), 2, "error: a worker died\n"),
-        (Interrupted("Go on with: x"), 130, "\nGo on with: x\n"),
-        (KeyboardInterrupt(), 130, "\nStopped.\n"),
-    ],
-)
-def test_errors_become_one_line_and_an_exit_code(capsys, error, code, message):
-    def main(args: Nothing) -> None:
-        raise error
-
-    with pytest.raises(SystemExit) as exit:
-        run_command(Nothing, main, [])
-    assert exit.value.code == code
-    assert capsys.readouterr().err == message
-
-
-def test_a_bug_keeps_its_traceback(monkeypatch):
-    def main(args: Nothing) -> None:
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        run_command(Nothing, main, [])
-
-    def mistake(args: Nothing) -> None:
-        raise ValueError("mistake")
-
-    monkeypatch.setenv("FAULTLINE_DEBUG", "1")
-    with pytest.raises(ValueError, match="mistake"):
-        run_command(Nothing, mistake, [])
-
-
-def test_sigterm_is_an_interrupt(capsys):
-    def main(args: Nothing) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    with pytest.raises(SystemExit) as exit:
-        run_command(Nothing, main, [])
-    assert exit.value.code == 130
-
-
-@pytest.mark.parametrize("module", ["qd.search", "qd.studies.compare", "qd.studies.calibrate"])
-def test_help_teaches_and_is_fast(module):
-    code = f"""
-import runpy, sys
-sys.argv = ["{module}", "--help"]
-try:
-    runpy.run_module("{module}", run_name="__main__")
-finally:
-    print("slow imports:", [name for name in ("torch", "warp", "newton", "ribs") if name in sys.modules])
-"""
-    root = Path(__file__).parents[3]
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True)
-    assert "--device" in done.stdout
-    assert "slow imports: []" in done.stdout

@@ -3,18 +3,22 @@
 import dataclasses
 import os
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 
+from qd.run.directory import RunDirectory
+from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device
 from qd.workers.shards import flaw_of
 from tests.qd import crossers, stand_in
+from tests.qd.test_search import make_job
 from tests.qd.workers.test_evaluator import same
 
 ray = pytest.importorskip("ray")
 
-CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=8, num_replicas=4, device="cpu", workers=2)
+CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=8, num_replicas=4, device="cpu", workers="ray:2")
 GENES = np.random.default_rng(0).uniform(-1, 1, (21, 64)).astype(np.float32)
 SEEDS = np.arange(100, 121, dtype=np.uint32)
 
@@ -22,7 +26,7 @@ SEEDS = np.arange(100, 121, dtype=np.uint32)
 @pytest.fixture(autouse=True, scope="module")
 def cluster():
     """One Ray for all tests of the file, ended after them."""
-    resolve_device("cpu", 4)
+    resolve_device("cpu", "ray:4")
     yield
     ray.shutdown()
 
@@ -33,7 +37,7 @@ def expected(count):
 
 @pytest.mark.parametrize("name", ["{}/model.pt", "{}/mine.py:act", "{}/mine.py:adapt@{}/model.pt", "os.path:join"])
 def test_the_files_of_a_controller_travel(tmp_path, name):
-    from qd.workers.ray_worker import Controller
+    from qd.workers.ray_workers import Controller
 
     here, there = tmp_path / "here", tmp_path / "there"
     here.mkdir(), there.mkdir()
@@ -50,7 +54,7 @@ def test_the_files_of_a_controller_travel(tmp_path, name):
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_how_terrains_are_spread_changes_nothing(workers):
-    with open_evaluator(dataclasses.replace(CFG, workers=workers), build=crossers.Crosser) as evaluate:
+    with open_evaluator(dataclasses.replace(CFG, workers=f"ray:{workers}"), build=crossers.Crosser) as evaluate:
         for count in (1, 8, 21):
             seen = []
             result = evaluate(GENES[:count], SEEDS[:count], seen.append)
@@ -66,8 +70,6 @@ def test_how_terrains_are_spread_changes_nothing(workers):
     ("how", "says"),
     [
         ("die", "failed: "),
-        ("hang", "got no further for 2 s"),
-        ("stop", "got no further for 2 s"),
         ("raise", "failed: RuntimeError: the solver is broken"),
         ("nan", "answered with nonsense: valid episodes with penalties"),
         ("short", "answered with nonsense: penalties of shape (3, 4, 6)"),
@@ -75,9 +77,7 @@ def test_how_terrains_are_spread_changes_nothing(workers):
     ],
 )
 def test_a_failed_shard_is_crossed_again_by_another(tmp_path, capsys, how, says):
-    cfg = dataclasses.replace(
-        CFG, policy=f"{how}:{tmp_path}:1", worker_limit_s=2.0 if how in ("hang", "stop") else 60.0
-    )
+    cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:1")
     with open_evaluator(cfg, build=crossers.Failing) as evaluate:
         first = evaluate(GENES[:8], SEEDS[:8])
         again = evaluate(GENES[:8], SEEDS[:8])
@@ -88,7 +88,7 @@ def test_a_failed_shard_is_crossed_again_by_another(tmp_path, capsys, how, says)
     assert says in said and "are crossed again by another" in said
 
 
-def test_a_replacement_joins(tmp_path):
+def test_a_worker_that_died_is_started_again(tmp_path):
     cfg = dataclasses.replace(CFG, policy=f"die:{tmp_path}:2")
     with open_evaluator(cfg, build=crossers.Failing) as evaluate:
         evaluate(GENES[:8], SEEDS[:8])
@@ -99,12 +99,25 @@ def test_a_replacement_joins(tmp_path):
         assert evaluate.status().retries == 2
 
 
+def test_three_deaths_in_a_search_change_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("qd.search.write_figures", lambda folder, archive, metrics: [])
+    alone = run_search(make_job(tmp_path / "alone"), open_evaluator=stand_in.open_stand_in)
+    job = make_job(tmp_path / "on-ray")
+    deadly = dataclasses.replace(job.evaluator, workers="ray:2", policy=f"die:{tmp_path}:3")
+    found = run_search(
+        dataclasses.replace(job, evaluator=deadly), open_evaluator=partial(open_evaluator, build=crossers.Failing)
+    )
+    assert RunDirectory(tmp_path / "on-ray").read_metrics()[-1]["retries"] == 3
+    for name in ("genes", "cell", "iteration", "fitness", "ratios"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+
+
 @pytest.mark.parametrize(("how", "error"), [("refuse", ValueError), ("raise", EvaluatorError), ("nan", EvaluatorError)])
 def test_a_shard_that_fails_everywhere_ends_the_evaluation(tmp_path, how, error):
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:99")
     with (
         open_evaluator(cfg, build=crossers.Failing) as evaluate,
-        pytest.raises(error, match=r"terrains \d to \d failed on 5 workers; the last, worker \d"),
+        pytest.raises(error, match=r"terrains \d to \d failed 5 times; the last time worker \d"),
     ):
         evaluate(GENES[:8], SEEDS[:8])
 
@@ -119,18 +132,6 @@ def test_a_refusal_to_build_comes_before_any_work():
         pass
 
 
-def test_building_is_no_hanging():
-    with open_evaluator(dataclasses.replace(CFG, worker_limit_s=1.0), build=crossers.Slow) as evaluate:
-        assert same(evaluate(GENES[:8], SEEDS[:8]), expected(8))
-        assert evaluate.status().retries == 0
-
-
-@pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_limit_without_sense_is_refused(limit_s):
-    with pytest.raises(ValueError, match="worker_limit_s must be a positive number"):
-        dataclasses.replace(CFG, worker_limit_s=limit_s)
-
-
 def test_what_an_interrupted_evaluation_had_under_way_is_of_no_later_one():
     def interrupt(share: float) -> None:
         raise KeyboardInterrupt
@@ -143,37 +144,37 @@ def test_what_an_interrupted_evaluation_had_under_way_is_of_no_later_one():
             assert same(evaluate(GENES[part], SEEDS[part]), stand_in.evaluate(GENES[part], SEEDS[part], 4))
 
 
-def test_newcomers_of_other_code_are_refused_and_those_at_hand_go_on(monkeypatch, capsys):
+def test_a_worker_of_other_code_is_refused_and_the_others_go_on(capsys):
     with open_evaluator(CFG, build=crossers.Crosser) as evaluate:
-        roster = evaluate._roster
-        roster.dismiss(roster.joined[0])
-        roster._code = "another"
-        monkeypatch.setattr("qd.workers.roster._RECRUIT_EVERY_S", 0.0)
+        evaluate._code = "another"
+        evaluate._workers[0].restart()
         end = time.monotonic() + 60
-        while roster._refusals < 5:
+        while len(evaluate._workers) == 2:
             assert time.monotonic() < end
             assert same(evaluate(GENES[:8], SEEDS[:8]), expected(8))
         assert same(evaluate(GENES[:8], SEEDS[:8]), expected(8))
-        assert "has other code or packages than this machine" in capsys.readouterr().err
+        assert "has other code or packages" in capsys.readouterr().err
+        evaluate._workers[0].restart()
+        with pytest.raises(EvaluatorError, match="no worker can be used: worker 2 .* has other code"):
+            evaluate(GENES[:8], SEEDS[:8])
 
 
 def test_leaving_ends_the_workers():
     with open_evaluator(CFG, build=crossers.Crosser) as evaluate:
         evaluate(GENES[:2], SEEDS[:2])
-        pids = [int(member.where.split()[1]) for member in evaluate._roster.joined]
+        pids = [int(worker.where.split()[1]) for worker in evaluate._workers]
     end = time.monotonic() + 20
     while any(os.path.exists(f"/proc/{pid}") for pid in pids):
-        assert time.monotonic() < end, "a worker outlives its crew"
+        assert time.monotonic() < end, "a worker outlives its evaluator"
         time.sleep(0.1)
 
 
 @pytest.mark.parametrize(
     ("device", "workers", "message"),
     [
-        ("cpu", 0, "workers must be at least 1, or auto, got 0"),
-        ("cuda:1", 2, "with workers the device must be cpu or cuda, got cuda:1"),
+        ("cuda:1", "ray:2", "device must be cpu or cuda, got cuda:1"),
         pytest.param(
-            "cuda", 2, "the cluster has no GPU", marks=pytest.mark.skipif(os.path.exists("/dev/nvidia0"), reason="has")
+            "cuda", "ray", "the cluster has no GPU", marks=pytest.mark.skipif(os.path.exists("/dev/nvidia0"), reason="has")
         ),
     ],
 )

@@ -1,0 +1,234 @@
+"""A study: several searches in one folder, whose terrains are crossed together so that a GPU is full.
+
+Each is a run of the ordinary search, in a run directory of its own, which can be looked at and extended like any other.
+The same command goes on where it was stopped.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qd.archive import Archive
+from qd.fresh import Open, drawn_elites, numbers_of, reevaluate
+from qd.run.arguments import evaluator_of, own_file
+from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, origin_in
+from qd.run.progress import ProgressBar
+from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, refuse_changes
+from qd.search import MOST_DRAWN, begin, take_in, write_results
+from qd.workers.evaluator import Evaluate, EvaluatorCfg, episode_seeds, origin_of, worker_status
+from qd.workers.shards import taken
+from sim.files.atomic import is_leftover, prepare_output
+from sim.files.command import naming_what_is_next, publish
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from qd.scheduler import Scheduler
+    from sim.robots.robot import RobotCfg
+
+LOOKS = (("#0072b2", "-"), ("#d55e00", "--"), ("#009e73", "-."), ("#cc79a7", ":"))
+"""Colour and line of each search in a figure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Searches of one robot against one controller, with equally many episodes a terrain."""
+
+    path: Path
+    """The study's folder."""
+    runs: dict[str, SearchCfg]
+    """Settings of each search, by the name of its folder."""
+    evaluator: EvaluatorCfg
+    """Crosses the terrains of all of them."""
+    origin: dict[str, Any]
+    """Provenance."""
+    sampled: bool
+    """Whether up to 200 drawn elites cross fresh episodes every so many iterations, or all elites, and at the end too."""
+
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        runs: dict[str, SearchCfg],
+        robot: "RobotCfg",
+        *,
+        policy: str | None,
+        device: str,
+        workers: str | None,
+        sampled: bool,
+    ) -> "Study":
+        """A study whose controller was tried.
+
+        Args:
+            path: Its folder.
+            runs: Settings of each search, by the name of its folder.
+            robot: The robot.
+            policy: Controller that the command line names, None for that of the settings.
+            device: Warp device name.
+            workers: Who crosses terrains, as on a command line.
+            sampled: As of the field.
+
+        Raises:
+            ValueError: If the controller cannot be loaded or does not fit the robot.
+        """
+        cfg = next(iter(runs.values()))
+        controller = policy or policy_spec(cfg, robot)
+        return cls(
+            path=path,
+            runs=runs,
+            evaluator=evaluator_of(cfg, robot, controller, device, workers, runs_on_gpu=len(runs)),
+            origin={**origin_of(device, cfg.seed, workers), **own_file(robot)},
+            sampled=sampled,
+        )
+
+
+@dataclass(kw_only=True)
+class _Search:
+    """One of the searches, as far as it is."""
+
+    cfg: SearchCfg
+    run: RunDirectory
+    origin: dict[str, Any]
+    search: "Scheduler"
+    metrics: Metrics = field(default_factory=list)
+    found: Archive | None = None
+
+    @property
+    def done(self) -> int:
+        """Iterations done."""
+        return len(self.metrics)
+
+
+def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
+    """Runs the iterations that are left of each search, and writes what each leaves to look at.
+
+    Args:
+        study: The study.
+        open_evaluator: Opens what crosses the terrains.
+
+    Returns:
+        Rows of metrics, by name.
+
+    Raises:
+        ValueError: If a run that is there has other settings, is damaged or at work, or has gone further than asked.
+        Interrupted: On Ctrl-C; all iterations that ended are saved.
+        EvaluatorError: If a worker is lost; likewise.
+    """
+    with ExitStack() as claims:
+        claims.enter_context(claimed(study.path))
+        searches = {name: _opened(study, name, claims) for name in study.runs}
+        left = sum((one.cfg.iterations - one.done) * one.cfg.episodes_per_iteration for one in searches.values())
+        print(f"{len(searches)} searches in {study.path}: {left:,} episodes, and those of elites again", flush=True)
+        with naming_what_is_next("finished iterations are saved", lambda: "The same command goes on"):
+            with open_evaluator(study.evaluator) if left else nullcontext() as evaluate:
+                for one in searches.values():
+                    one.run.write_config(one.cfg, one.origin)
+                if evaluate is not None:
+                    _lock_step(list(searches.values()), evaluate, sampled=study.sampled)
+            for one in searches.values():
+                found = one.run.with_fresh_values(archive_of(one.cfg, one.search, one.done))
+                by = one.run.read_summary().get("reproduced_by") if found.fresh is not None else None
+                write_results(one.run, found, one.metrics, {**one.origin, "reproduced_by": by})
+        return {name: one.metrics for name, one in searches.items()}
+
+
+def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
+    """A search of a study, new or as far as it is, claimed until the end."""
+    cfg, run = study.runs[name], RunDirectory(study.path / name)
+    claims.enter_context(claimed(run.path))
+    if (run.path / CONFIG_FILE).exists():
+        there = run.read_cfg()
+        if moved_policy(there, cfg.policy):
+            cfg = replace(cfg, policy=there.policy)
+        refuse_changes(run.path, "run", as_settings(there), as_settings(cfg))
+        origin, loaded = origin_in(run.read_config()), run.load(cfg)
+    elif all(map(is_leftover, run.path.iterdir())):
+        origin, loaded = {**study.origin, "seed": cfg.seed, "sessions": []}, None
+    else:
+        raise ValueError(f"{run.path} is not empty and holds no run: give another --run-dir")
+    search, metrics = loaded or (begin(cfg), [])
+    if len(metrics) > cfg.iterations:
+        raise ValueError(
+            f"iterations must be at least {len(metrics)}, as many as {run.path} has done, got {cfg.iterations}"
+        )
+    return _Search(cfg=cfg, run=run, origin=origin, search=search, metrics=metrics)
+
+
+def _lock_step(searches: Sequence[_Search], evaluate: Evaluate, *, sampled: bool) -> None:
+    """Runs the iterations that are left; searches behind the others, as after a kill, catch up first."""
+    iterations = searches[0].cfg.iterations
+    with ProgressBar(iterations, min(one.done for one in searches)) as bar:
+        while (done := min(one.done for one in searches)) < iterations:
+            _iterate([one for one in searches if one.done == done], evaluate, done + 1, bar, sampled=sampled)
+
+
+def _iterate(
+    active: Sequence[_Search], evaluate: Evaluate, iteration: int, bar: ProgressBar, *, sampled: bool
+) -> None:
+    """One iteration of some searches, saved."""
+    began, every = time.perf_counter(), active[0].cfg.reevaluate_every
+    asked = [one.search.ask() for one in active]
+    seeds = [episode_seeds(one.cfg.seed, iteration, len(genes)) for one, genes in zip(active, asked, strict=True)]
+    result = evaluate(np.concatenate(asked), np.concatenate(seeds), bar.within(iteration))
+    rows, first = [], 0
+    for one, genes in zip(active, asked, strict=True):
+        one.found, row = take_in(one.cfg, one.search, taken(result, len(genes), first=first), iteration)
+        rows.append(row)
+        first += len(genes)
+    if (every and iteration % every == 0) or (iteration == active[0].cfg.iterations and not sampled):
+        rows = [row | again for row, again in zip(rows, _elites_again(active, evaluate, sampled), strict=True)]
+    wall_s = time.perf_counter() - began
+    for one, row in zip(active, rows, strict=True):
+        one.metrics.append({**row, "wall_s": wall_s / len(active), "episodes_per_s": row["episodes"] / wall_s})
+        assert one.found is not None
+        one.run.save(one.cfg, one.search, one.metrics, one.found)
+    best = max((one.metrics[-1] for one in active), key=lambda row: row["elites"])
+    episodes = sum(row["episodes"] for row in rows)
+    status = worker_status(evaluate)
+    bar.show(
+        {**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}, None if status is None else str(status)
+    )
+
+
+def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) -> list[dict[str, Any]]:
+    """What the elites of all searches are worth in fresh episodes, crossed together."""
+    cfg, archives = active[0].cfg, [one.found for one in active if one.found is not None]
+    seeds = [one.cfg.seed for one in active]
+    if sampled:
+        archives = [drawn_elites(found, MOST_DRAWN, seed) for found, seed in zip(archives, seeds, strict=True)]
+    rows: dict[int, dict[str, Any]] = {}
+    for fitness in dict.fromkeys(one.cfg.fitness for one in active):
+        own = [k for k, one in enumerate(active) if one.cfg.fitness == fitness]
+        again = reevaluate(
+            [archives[k] for k in own], evaluate, fitness, num_replicas=cfg.replicas, seeds=[seeds[k] for k in own]
+        )
+        rows |= {k: numbers_of(one, cfg.cells, sampled=sampled) for k, one in zip(own, again, strict=True)}
+    return [rows[k] for k in range(len(active))]
+
+
+def publish_with_figure(
+    out: Path,
+    measure: Callable[[], dict[str, Any]],
+    show: Callable[[dict[str, Any]], None],
+    draw: Callable[[dict[str, Any]], "Figure"],
+) -> dict[str, Any]:
+    """Publishes a report (:func:`sim.files.command.publish`) and a figure of it, ``.png`` in place of ``.json``.
+
+    Raises:
+        ValueError: If a file cannot be written, or ``out`` has another ending: the figure would take its place.
+    """
+    from qd.show.figures import save_figure
+
+    figure = out.with_suffix(".png")
+    if out.suffix != ".json":
+        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
+    prepare_output(figure)
+    report = publish(out, measure, show)
+    save_figure(figure, draw(report))
+    print(f"written to {figure}")
+    return report

@@ -1,0 +1,81 @@
+"""Terrain spaces: random draws, what is refused, and terrains without some of their parts."""
+
+import numpy as np
+import pytest
+
+from sim.bank import heights_of
+from sim.space import SPACES, SUPER_GAUSSIAN, SuperGaussian, get_space
+
+
+def test_a_space_is_found_by_its_name():
+    assert get_space("super_gaussian") is SUPER_GAUSSIAN
+    assert all(space.name == name for name, space in SPACES.items())
+    assert SUPER_GAUSSIAN.num_genes == 64
+    with pytest.raises(ValueError, match="unknown terrain space 'blocks': expected one of super_gaussian"):
+        get_space("blocks")
+
+
+def test_uniform_random_genes_fill_the_range():
+    genes = SUPER_GAUSSIAN.uniform_random(500, 0)
+    assert genes.shape == (500, 64)
+    assert genes.dtype == np.float32
+    assert np.abs(genes).max() <= 1.0
+    assert np.abs(genes.mean(axis=0)).max() < 0.12  # standard error 0.577 / sqrt(500) = 0.026
+    assert (genes.std(axis=0) > 0.5).all()
+
+
+def test_hard_random_genes_have_every_bump_at_full_height():
+    space = SuperGaussian(num_bumps=3)
+    genes = space.hard_random(500, 0)
+    bumps = genes.reshape(500, 3, 8)
+    assert genes.dtype == np.float32
+    assert set(np.unique(bumps[..., 7])) == {-1.0, 1.0}
+    assert abs(bumps[..., 7].mean()) < 0.1  # both signs equally often: standard error 1 / sqrt(1500) = 0.026
+    np.testing.assert_array_equal(bumps[..., :7], space.uniform_random(500, 0).reshape(500, 3, 8)[..., :7])
+
+
+def test_no_terrain_and_no_bump_are_refused():
+    with pytest.raises(ValueError, match="count must be at least 1, got -1"):
+        SUPER_GAUSSIAN.uniform_random(-1, 0)
+    with pytest.raises(ValueError, match="num_bumps must be at least 1, got 0"):
+        SuperGaussian(num_bumps=0)
+
+
+def test_clip_keeps_the_inside_and_cuts_the_outside():
+    genes = np.zeros((2, 64))
+    genes[0, :3] = [-1.5, 0.25, 7.0]
+    assert SUPER_GAUSSIAN.clip(genes)[0, :4].tolist() == [-1.0, 0.25, 1.0, 0.0]
+    assert SUPER_GAUSSIAN.clip(genes).dtype == np.float32
+    assert genes[0, 0] == -1.5
+
+
+@pytest.mark.parametrize("shape", [(10, 32), (64,), (2, 8, 8), (0, 65)])
+def test_wrong_shape_says_what_was_expected(shape):
+    with pytest.raises(ValueError, match=r"genes must have shape \(num_terrains, 64\), got .*: .* super_gaussian"):
+        SUPER_GAUSSIAN.validate(np.zeros(shape))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_genes_that_are_not_finite_are_refused_by_row(value):
+    genes = np.zeros((3, 64))
+    genes[1, 5] = value
+    with pytest.raises(ValueError, match="row 1"):
+        SUPER_GAUSSIAN.validate(genes)
+
+
+def test_a_terrain_without_some_bumps_is_the_sum_of_the_others():
+    genes = SUPER_GAUSSIAN.hard_random(2, 5)
+    kept = SuperGaussian(num_bumps=5)
+    without = SUPER_GAUSSIAN.without(genes, [0, 3, 7])
+    others = genes.reshape(2, 8, 8)[:, [1, 2, 4, 5, 6]].reshape(2, 40)
+    np.testing.assert_array_equal(heights_of(without), heights_of(others, kept))
+    assert not heights_of(SUPER_GAUSSIAN.without(genes, range(8))).any()
+    np.testing.assert_array_equal(SUPER_GAUSSIAN.without(genes, []), genes)
+
+
+def test_a_bump_in_words():
+    # Table I: mu_x 6 to 10 m, mu_y 2 to 6 m, sigma 0.5 to 3 m, theta -180 to 180 degrees, w -0.25 to 0.25 m.
+    genes = np.array([0.5, 0.0, -1.0, 1.0, 0.0, 0.0, 0.5, -1.0])
+    words = SuperGaussian(num_bumps=1).describe(genes)
+    assert words == "hollow of 0.25 m at (9.0, 4.0) m, half widths 0.5 m and 3.0 m, turned by 90 degrees"
+    assert len(SUPER_GAUSSIAN.parts(np.tile(genes, 8))) == 8
