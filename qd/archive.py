@@ -56,10 +56,10 @@ FRESH = tuple(field.name for field in fields(FreshValues))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Archive:
-    """Elites by descending fitness, the corrected one if there are fresh values: elite 0 is the worst for the robot.
+class Archive(Evaluation):
+    """Elites as they were found, by descending fitness, the corrected one if there are fresh values.
 
-    Statistics are over the valid episodes of the evaluation that found the elite; penalties are scaled.
+    Elite 0 is the worst for the robot.
     """
 
     robot: str
@@ -77,30 +77,10 @@ class Archive:
     """Iterations the search had done."""
     genes: NDArray[np.float32]
     """Clipped genes, shape (N, num_genes)."""
-    ratios: NDArray[np.float64]
-    """Shape (N, P)."""
-    cell: NDArray[np.int64]
-    """Reachable cell, shape (N,)."""
-    fitness: NDArray[np.float64]
-    """Shape (N,)."""
-    penalty_mean: NDArray[np.float64]
-    """Shape (N, P)."""
-    penalty_std: NDArray[np.float64]
-    """Shape (N, P), ddof 0."""
-    collision_rate: NDArray[np.float64]
-    """Share of episodes with a base collision, shape (N,)."""
-    goal_rate: NDArray[np.float64]
-    """Share of episodes that reached the goal, shape (N,)."""
-    fallen_rate: NDArray[np.float64]
-    """Share of episodes that ended tilted by more than 60 degrees, shape (N,)."""
-    invalid_episodes: NDArray[np.int64]
-    """Episodes left out, shape (N,)."""
-    episodes: NDArray[np.int64]
-    """Episodes run, the invalid ones included, shape (N,)."""
     iteration: NDArray[np.int64]
     """Iteration that found the elite, from 1, shape (N,)."""
     fresh: FreshValues | None = None
-    """What fresh episodes say of the elites; None if nobody looked."""
+    """What fresh episodes say of the elites; None if there were none."""
 
     def __len__(self) -> int:
         """Number of elites."""
@@ -206,16 +186,16 @@ def read_archive(path: str | Path) -> Archive:
                 names += [_PREFIX + name for name in FRESH]
             content = {name: _read_array(members.read(f"{name}.npy")) for name in names}
         _check_kinds(content)
+        fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
+        found = {name: _from_array(name, value) for name, value in content.items()}
+        archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
+        _check_shapes(archive)
+        _check_values(archive)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         raise ValueError(
             f"{file} must be the archive of a search, but it is damaged or another file: {error}: going on with its "
             "run (--resume) writes it again"
         ) from None
-    fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
-    found = {name: _from_array(name, value) for name, value in content.items()}
-    archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
-    _check_shapes(archive, file)
-    _check_values(archive, file)
     return archive
 
 
@@ -240,35 +220,26 @@ def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
             raise ValueError(f"{name} has shape {value.shape}")
 
 
-def _check_shapes(archive: Archive, file: Path) -> None:
+def _check_shapes(archive: Archive) -> None:
     from sim.space import get_space  # which imports Warp: not for `--help`
 
-    try:
-        num_genes = get_space(archive.space).num_genes
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
     num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
-    columns = {"genes": num_genes, "ratios": num_penalties, "penalty_mean": num_penalties, "penalty_std": num_penalties}
+    columns = {"genes": get_space(archive.space).num_genes, "ratios": num_penalties}
+    columns |= {"penalty_mean": num_penalties, "penalty_std": num_penalties}
     for name, array in _arrays(archive).items():
         column = columns.get(name.removeprefix(_PREFIX))
         expected = (num_elites,) if column is None else (num_elites, column)
         if array.shape != expected:
-            raise ValueError(
-                f"{file}: {name} must have shape {expected}, got {array.shape}: the file is no archive of a search"
-            )
+            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
 
 
-def _check_values(archive: Archive, file: Path) -> None:
-    """That the numbers are such as a search finds."""
+def _check_values(archive: Archive) -> None:
     finite = all(np.isfinite(array).all() for array in _arrays(archive).values())
     if not finite or not (np.abs(archive.genes) <= 1.0).all():
-        raise ValueError(f"{file} must hold finite numbers, and genes in [-1, 1]: it is no archive of a search")
+        raise ValueError("it must hold finite numbers, and genes in [-1, 1]")
     if len(archive.scales) != len(archive.penalties) or not all(0.0 < scale < np.inf for scale in archive.scales):
-        raise ValueError(f"{file}: scales must be one positive number a penalty, got {archive.scales}")
-    try:
-        num_cells = archive.cells.num_cells
-    except ValueError as error:
-        raise ValueError(f"{file} is no archive of a search: {error}") from None
+        raise ValueError(f"scales must be one positive number a penalty, got {archive.scales}")
+    num_cells = archive.cells.num_cells
     cells = [archive.cell] if archive.fresh is None else [archive.cell, archive.fresh.cell]
     if not all(((cell >= 0) & (cell < num_cells)).all() for cell in cells):
-        raise ValueError(f"{file}: cell must lie in 0 to {num_cells - 1}: the file is no archive of a search")
+        raise ValueError(f"cell must lie in 0 to {num_cells - 1}")

@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 from qd.archive import Archive, FreshValues
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, FitnessCfg, evaluation_of
+from qd.run.arguments import evaluator_of
+from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, origin_in
 from qd.run.progress import share_bar
+from qd.run.settings import SearchCfg, file_hash, policy_spec, refuse_unnamed_code
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, open_evaluator, origin_of, resolve_device
 from qd.workers.shards import taken
 from sim.files.command import Where, Who, command_line, naming_what_is_next
 from sim.files.intervals import bootstrap_interval, wilson_interval
 
 if TYPE_CHECKING:
-    from qd.run.settings import SearchCfg
     from sim.robots.robot import RobotCfg
 
 FRESH_EPISODES = 40
@@ -124,7 +126,7 @@ def _nothing(cells: Cells) -> FreshValues:
     )  # fmt: skip
 
 
-def corrected(archive: Archive, cfg: "SearchCfg", evaluator: EvaluatorCfg, open_evaluator: Open, seed: int) -> Archive:
+def corrected(archive: Archive, cfg: SearchCfg, evaluator: EvaluatorCfg, open_evaluator: Open, seed: int) -> Archive:
     """An archive with what 40 fresh episodes of each elite say, the worst terrain as they confirm it first.
 
     Args:
@@ -218,9 +220,6 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         Interrupted: On Ctrl-C; the run is as it was.
         EvaluatorError: If a worker is lost; likewise.
     """
-    from qd.run.arguments import evaluator_of
-    from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, origin_in
-    from qd.run.settings import file_hash
     from qd.search import write_results
     from sim.robots.robot import get_robot, robot_of
 
@@ -252,10 +251,8 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
     return archive
 
 
-def _own_policy(path: Path, cfg: "SearchCfg", robot: "RobotCfg") -> str:
+def _own_policy(path: Path, cfg: SearchCfg, robot: "RobotCfg") -> str:
     """The run's own controller, which must be what it was."""
-    from qd.run.settings import file_hash, policy_spec, refuse_unnamed_code
-
     refuse_unnamed_code(cfg.policy, None, path)
     policy = policy_spec(cfg, robot)
     digest = file_hash(policy)

@@ -155,7 +155,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
 
 def _mention_fresh_values(job: Job, run: RunDirectory, done: int) -> None:
     """Says so before a run loses what fresh episodes said of its elites."""
-    if job.resumes and not job.reproduce and done < job.cfg.iterations and run.has_fresh_values():
+    if job.resumes and not job.reproduce and done < job.cfg.iterations and run.fresh_archive():
         print(
             "Its elites were evaluated again with fresh episodes; the first new iteration drops those values. "
             f"Afterwards:  {job.reevaluate_command}"

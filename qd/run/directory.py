@@ -207,20 +207,16 @@ class RunDirectory:
         write_atomically(self.path / METRICS_FILE, rows.encode())
         write_archive(self.path / ARCHIVE_FILE, archive)
 
-    def has_fresh_values(self) -> bool:
-        """Whether the archive's file says what fresh episodes made of its elites."""
-        return self._fresh_archive() is not None
-
     def with_fresh_values(self, found: Archive) -> Archive:
         """An archive with the fresh values of its file, where those are of just these elites; else as it is.
 
         Args:
             found: What the search has found.
         """
-        there = self._fresh_archive()
+        there = self.fresh_archive()
         return replace(there, iterations=found.iterations) if there and there.has_elites_of(found) else found
 
-    def _fresh_archive(self) -> Archive | None:
+    def fresh_archive(self) -> Archive | None:
         """The archive of the file if it has fresh values; a damaged one, which is made again, has none."""
         try:
             archive = read_archive(self.path)
@@ -295,6 +291,7 @@ class RunDirectory:
 
 def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
     """What a search has found after a number of iterations."""
+    elites: dict[str, Any] = search.elites()
     return Archive(
         robot=cfg.robot,
         space=cfg.space,
@@ -303,5 +300,5 @@ def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
         intervals=cfg.intervals,
         collision_bit=cfg.collision_bit,
         iterations=iterations,
-        **search.elites(),
+        **elites,
     )

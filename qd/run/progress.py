@@ -23,20 +23,7 @@ def clock(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def expected_s(cfg: SearchCfg, iterations: int, device: str, processes: int) -> float:
-    """A first guess at how long iterations take [s], before any was timed.
-
-    Args:
-        cfg: The search.
-        iterations: How many.
-        device: Warp device name.
-        processes: Processes that evaluate.
-    """
-    rate = _STEPS_PER_S["cuda" if device.startswith("cuda") else "cpu"] * processes
-    return iterations * cfg.episodes_per_iteration * _EPISODE_STEPS / rate
-
-
-def plan(cfg: SearchCfg, path: Path, done: int, device: str, processes: int) -> str:
+def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
     """What a search is about to do, in words.
 
     Args:
@@ -44,17 +31,19 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, processes: int) -> 
         path: Its run directory.
         done: Iterations already done.
         device: Warp device name.
-        processes: Processes that evaluate.
+        workers: How many processes or GPUs evaluate.
     """
     left = cfg.iterations - done
-    where = f"{processes} process{'es' * (processes > 1)} on the CPU"
-    if device.startswith("cuda"):
-        where = device if processes == 1 else f"{processes} GPUs"
+    on_gpu = device.startswith("cuda")
+    where = f"{workers} process{'es' * (workers > 1)} on the CPU"
+    if on_gpu:
+        where = device if workers == 1 else f"{workers} GPUs"
     controller = "its shipped controller" if cfg.policy == SHIPPED else f"controller {cfg.policy}"
     if not left:
         return f"All {done} iterations of {path} are done; writing its figures and results again."
     iterations = f"{left:,} iterations" + (f" after {done:,} done" if done else "")
-    duration = clock(expected_s(cfg, left, device, processes))
+    steps_per_s = workers * _STEPS_PER_S["cuda" if on_gpu else "cpu"]
+    duration = clock(left * cfg.episodes_per_iteration * _EPISODE_STEPS / steps_per_s)
     return "\n".join(
         [
             f"Searching for terrains that break {cfg.robot} with {controller}, each in its own way.",
@@ -96,12 +85,7 @@ class ProgressBar:
     def __init__(self, iterations: int, done: int) -> None:
         self._iterations, self._first, self._at = iterations, done, float(done)
         self._bar = tqdm(
-            total=iterations,
-            initial=done,
-            file=sys.stderr,
-            dynamic_ncols=True,
-            mininterval=0.5,
-            bar_format=_FORMAT,
+            total=iterations, initial=done, file=sys.stderr, dynamic_ncols=True, mininterval=0.5, bar_format=_FORMAT
         )
         self._describe(done, "compiling and evaluating")
 
@@ -117,12 +101,12 @@ class ProgressBar:
         """A function that moves the bar to a share of an iteration, counted from 1."""
         return lambda share: self._move_to(iteration - 1 + share)
 
-    def show(self, row: dict[str, Any], staff: str | None = None) -> None:
+    def show(self, row: dict[str, Any], workers: str | None = None) -> None:
         """Shows where the search stands after an iteration.
 
         Args:
             row: The iteration's metrics.
-            staff: How the workers fare, where there are any.
+            workers: How the workers fare, where there are any.
         """
         self._move_to(row["iteration"])
         if row["iteration"] == self._first + 1:
@@ -132,7 +116,7 @@ class ProgressBar:
             row["iteration"],
             f"{row['elites']} elites ({row['reachable_coverage']:.1%} of reachable), QD {row['qd_score']:.0f}, "
             f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s"
-            + (f" by {staff}" if staff else ""),
+            + (f" by {workers}" if workers else ""),
         )
 
     def _describe(self, done: int, state: str) -> None:

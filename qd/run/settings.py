@@ -124,42 +124,34 @@ class SearchCfg:
         return self.scheduler.num_terrains * self.replicas
 
 
-def paper(robot: "RobotCfg") -> SearchCfg:
-    """The paper's search: 10 emitters x 20 terrains x 20 episodes, 1,000 iterations; for a GPU."""
-    return SearchCfg(
-        robot=robot.name,
-        preset="paper",
-        policy=SHIPPED,
-        policy_sha256=None,
-        seed=0,
-        iterations=1000,
-        replicas=20,
-        intervals=10,
-        collision_bit=robot.collision_bit,
-        fitness=FitnessCfg(penalties=robot.penalties, scales=robot.read_penalty_scales()),
-        scheduler=SchedulerCfg(),
-    )
-
-
-def small(robot: "RobotCfg") -> SearchCfg:
-    """A search that a laptop finishes while one waits: 4 emitters x 8 terrains x 4 episodes, 20 iterations."""
-    return replace(
-        paper(robot), preset="small", iterations=20, replicas=4, scheduler=SchedulerCfg(emitters=4, batch_size=8)
-    )
-
-
-_PRESETS = {"paper": paper, "small": small}
-
-
 def preset(name: str, robot: "RobotCfg") -> SearchCfg:
     """Settings by the name of a preset.
+
+    ``paper`` is the paper's search: 10 emitters x 20 terrains x 20 episodes, 1,000 iterations; for a GPU. ``small`` is
+    one that a laptop finishes while one waits: 4 emitters x 8 terrains x 4 episodes, 20 iterations.
 
     Raises:
         ValueError: If there is no such preset, or the robot's penalty scales were never measured.
     """
     if name not in _PRESETS:
-        raise ValueError(f"unknown preset '{name}': expected one of {', '.join(sorted(_PRESETS))}")
-    return _PRESETS[name](robot)
+        raise ValueError(f"unknown preset '{name}': expected one of {', '.join(_PRESETS)}")
+    return SearchCfg(
+        robot=robot.name,
+        preset=name,
+        policy=SHIPPED,
+        policy_sha256=None,
+        seed=0,
+        intervals=10,
+        collision_bit=robot.collision_bit,
+        fitness=FitnessCfg(penalties=robot.penalties, scales=robot.read_penalty_scales()),
+        **_PRESETS[name],
+    )
+
+
+_PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {"iterations": 1000, "replicas": 20, "scheduler": SchedulerCfg()},
+    "small": {"iterations": 20, "replicas": 4, "scheduler": SchedulerCfg(emitters=4, batch_size=8)},
+}
 
 
 def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:

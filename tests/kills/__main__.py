@@ -1,17 +1,18 @@
 """Kills searches at random moments, goes on with each until it is done, and says whether all came to the same bits.
 
-``python -m tests.kills --kills 100 --real`` does so to ``python -m qd.search`` with the real simulation on the CPU,
+``python -m tests.kills --kills 100 --real`` does so to ``faultline archive`` with the real simulation on the CPU,
 every other time to its main process alone, and writes ``results/<robot>/faults.json``.
 """
 
+import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from qd.run.cli import run_command
 from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.command import run_command
 from sim.files.provenance import provenance
 from tests.kills import searches
 from tests.kills.campaign import Kill, Killable, RealSearch, kill_and_resume
@@ -36,6 +37,10 @@ class FaultsCfg:
     """Draws the moments."""
     out: Path | None = None
     """Where to write the numbers; results/<robot>/faults.json with --real, else nowhere."""
+
+    def execute(self) -> None:
+        """Runs the command."""
+        main(self)
 
 
 def measure(cfg: FaultsCfg, folder: Path) -> dict[str, Any]:
@@ -92,4 +97,4 @@ def main(cfg: FaultsCfg) -> None:
 
 
 if __name__ == "__main__":
-    run_command(FaultsCfg, main)
+    sys.exit(run_command(FaultsCfg, sys.argv[1:], name="kills"))

@@ -97,7 +97,7 @@ def kill_and_resume(
 
 
 class RealSearch:
-    """``python -m qd.search`` with the real simulation, in a session of its own.
+    """``faultline archive`` with the real simulation, in a session of its own.
 
     Args:
         path: Run directory; gone on with if it holds a run.
@@ -113,10 +113,10 @@ class RealSearch:
         self._whole_group = whole_group
         self._log = path.with_name(f"{path.name}.log")
         place = ["--resume", str(path)] if (path / CONFIG_FILE).exists() else ["--run-dir", str(path), *REAL_SIZE]
-        size = ["--device", "cpu", "--iterations", str(iterations), "--processes", str(workers)]
+        size = ["--device", "cpu", "--iterations", str(iterations), "--workers", str(workers)]
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "qd.search", *place, *size],
+                [sys.executable, "-m", "faultline", "archive", *place, *size],
                 stdout=log, stderr=log, cwd=ROOT, start_new_session=True, env={**os.environ, **environment},
             )  # fmt: skip
 

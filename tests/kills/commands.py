@@ -13,7 +13,6 @@ import numpy as np
 
 from kernels.episode import Outcome
 from qd.fresh import Reevaluate, reevaluate_run
-from qd.run.cli import run_command
 from qd.show import recordings, replay
 from qd.studies import calibrate
 from sim.files import command
@@ -64,7 +63,7 @@ def calibrate_with(policy: Path) -> None:
     calibrate.open_evaluator = stand_in.open_stand_in
     out = str(policy.parent / "scales.json")
     argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
-    run_command(calibrate.CalibrateCfg, calibrate.calibrate, argv)
+    sys.exit(command.run_command(calibrate.Calibrate, argv, name="calibrate"))
 
 
 def evaluate_with(policy: Path) -> int:

@@ -97,5 +97,5 @@ def test_scales_must_be_positive_one_a_penalty(scales):
 
 @pytest.mark.parametrize("weight", [{"alpha": float("nan")}, {"lam": float("inf")}])
 def test_weights_must_be_finite(weight):
-    with pytest.raises(ValueError, match="must be finite"):
+    with pytest.raises(ValueError, match="must be a finite number"):
         FitnessCfg(penalties=("a", "b"), scales=(1.0, 1.0), **weight)

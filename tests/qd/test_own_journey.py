@@ -22,7 +22,7 @@ SIZE = ["--emitters", "1", "--batch-size", "4", "--replicas", "2"]
 def run(*words: str) -> str:
     """What a command prints; on the CPU, in the project's folder, as README has it."""
     done = subprocess.run(
-        [sys.executable, "-m", *words, "--device", "cpu"], cwd=ROOT, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", "faultline", *words, "--device", "cpu"], cwd=ROOT, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -57,14 +57,14 @@ def project():
 @pytest.fixture(scope="module")
 def calibrated(project, home, robot, trot):
     """Scales, measured by a Ray worker, which has none of the dog's files but those it is sent."""
-    return run("qd.studies.calibrate", *robot, *trot, "--terrains", "4", "--replicas", "2", "--workers", "1")
+    return run("calibrate", *robot, *trot, "--terrains", "4", "--replicas", "2", "--workers", "ray:1")
 
 
 @pytest.fixture(scope="module")
 def searched(calibrated, home, robot, trot):
     """A run of two iterations in two processes."""
     path = home / "run"
-    said = run("qd.search", *robot, *trot, *SIZE, "--iterations", "2", "--run-dir", str(path), "--processes", "2")
+    said = run("archive", *robot, *trot, *SIZE, "--iterations", "2", "--run-dir", str(path), "--workers", "2")
     return path, said
 
 
@@ -85,12 +85,12 @@ def test_its_archive_is_that_of_its_own_penalties(searched, home, robot, trot):
     config = json.loads((path / "config.json").read_text())
     assert config["robot_file"] == str(home / "dog.py")
     assert len(config["settings"]["robot_sha256"]) == len(config["settings"]["policy_sha256"]) == 64
-    assert f"make replay ROBOT={home}/dog.py RUN={path} ELITE=0 POLICY={trot[1]}" in said
+    assert f"replay --robot {home}/dog.py --run {path} --elite 0 --policy {trot[1]}" in said
 
 
 def test_an_elite_is_replayed(searched, robot, trot):
     path, _ = searched
-    said = run("faultline", "replay", *robot, *trot, "--run", str(path), "--replicas", "4")
+    said = run("replay", *robot, *trot, "--run", str(path), "--replicas", "4")
     assert "of dog, found in iteration" in said
     assert (path / "elite-0.png").exists()
 
@@ -114,7 +114,7 @@ def test_it_goes_on_only_if_robot_and_controller_are_named_and_are_what_they_wer
     code.write_text(gait.replace("0.35", "0.3"))
     refused("other settings: policy_sha256", robot=dog, policy=policy)
     code.write_text(gait)
-    run("qd.search", *robot, *trot, "--resume", str(path), "--iterations", "3", "--processes", "1")
+    run("archive", *robot, *trot, "--resume", str(path), "--iterations", "3", "--workers", "1")
     assert read_archive(path).iterations == 3
 
 
@@ -139,16 +139,16 @@ def test_a_run_that_is_handed_over_runs_nothing_of_its_own(searched, tmp_path, h
 def test_it_is_trained_and_evaluated(project, calibrated, home, robot):
     sizes = ["--num-envs", "6", "--iterations", "2", "--ppo.hidden-dims", "16", "8", "--ppo.steps-per-env", "4"]
     where = ["--run-dir", str(home / "training"), "--export", str(home / "dog.pt")]
-    run("train.base", *robot, *sizes, *where)
+    run("train", *robot, *sizes, *where)
     record = json.loads((home / "dog.train.json").read_text())
     assert record["robot"] == "dog" and record["iterations"] == 2 and len(record["settings"]["robot_sha256"]) == 64
     # Its own controller from now on, which needs no naming.
     out = home / "rates.json"
-    run("train.evaluate.evaluate", *robot, "--terrains", "2", "--episodes", "1", "--out", str(out))
+    run("evaluate", *robot, "--terrains", "2", "--episodes", "1", "--out", str(out))
     report = json.loads(out.read_text())
     assert (report["robot"], report["policy"]) == ("dog", "dog.pt")
     assert report["hand_crafted"]["goal_rate"] == 0.0  # after two iterations
     tables = ["--policies", f"base=shipped trot={home}/dog_trot.py:Trot", "--sets", "hand_crafted"]
-    run("train.evaluate.evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--run-dir", str(home / "tables"))
+    run("evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--run-dir", str(home / "tables"))
     crossed = json.loads((home / "tables" / "tables.json").read_text())
     assert crossed["robot"] == "dog" and set(crossed["controllers"]) == {"base", "trot"}

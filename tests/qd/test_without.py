@@ -15,7 +15,7 @@ from qd.show.replay import Replay, describe
 from sim.robots.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.recordings import recording_of
-from tests.qd.run.test_cli import TINY, fails, in_a_folder_of_its_own, run_main  # noqa: F401 - a fixture for all of these
+from tests.qd.run.test_arguments import TINY, fails, in_a_folder_of_its_own, run_main  # noqa: F401 - a fixture for all of these
 from tests.qd.test_search import run
 
 KEPT = [0, 1, 3, 5]  # without vel_y and stumble
@@ -60,10 +60,10 @@ def test_penalties_left_out_are_remembered(capsys):
         capsys, *TINY, "--without", "yaw_rate,vel_x,vel_y", "contact_force stumble"
     )
     assert not Path("runs").exists()
-    run_main(*TINY, "--without", "stumble collision", "--intervals", "5", "--run-dir", "a")
+    assert 0 == run_main(*TINY, "--without", "stumble collision", "--intervals", "5", "--run-dir", "a")
     assert "fitness.penalties (" in fails(capsys, "--resume", "a", "--without", "stumble")
-    run_main("--resume", "a", "--iterations", "2")
-    run_main("--resume", "a", "--iterations", "3", "--without", "collision", "stumble")
+    assert 0 == run_main("--resume", "a", "--iterations", "2")
+    assert 0 == run_main("--resume", "a", "--iterations", "3", "--without", "collision", "stumble")
     fitness = json.loads(Path("a/config.json").read_text())["settings"]["fitness"]
     assert fitness["penalties"] == ["yaw_rate", "vel_x", "vel_y", "contact_force"]
     assert fitness["scales"] == [1.0, 2.0, 1.0, 4.0]

@@ -13,10 +13,8 @@ from qd.run.settings import (
     from_settings,
     kept_penalties,
     measured_now,
-    paper,
     policy_spec,
     preset,
-    small,
 )
 from tests.qd import stand_in
 
@@ -34,14 +32,14 @@ def robot(policy_file: Path = Path("missing.pt"), scales=stand_in.SCALES):
 
 
 def test_paper_has_the_papers_numbers():
-    cfg = paper(robot())
+    cfg = preset("paper", robot())
     assert (cfg.scheduler.emitters, cfg.scheduler.batch_size, cfg.replicas, cfg.iterations) == (10, 20, 20, 1000)
     assert cfg.episodes_per_iteration == 4000
     assert (cfg.fitness.alpha, cfg.fitness.lam, cfg.intervals) == (1.0, 2.0, 10)
 
 
 def test_small_crosses_every_terrain_at_least_four_times():
-    cfg = small(robot())
+    cfg = preset("small", robot())
     assert cfg.replicas >= 4
     assert cfg.episodes_per_iteration == 128
 
@@ -52,7 +50,7 @@ def test_unknown_preset():
 
 
 def test_changes_land_where_the_setting_stands():
-    cfg = changed(paper(robot()), {"sigma0": 0.25, "alpha": 0.0, "replicas": 8, "seed": None, "iterations": 5})
+    cfg = changed(preset("paper", robot()), {"sigma0": 0.25, "alpha": 0.0, "replicas": 8, "seed": None, "iterations": 5})
     assert (cfg.scheduler.sigma0, cfg.fitness.alpha, cfg.replicas, cfg.iterations, cfg.seed) == (0.25, 0.0, 8, 5, 0)
     assert cfg.scheduler.emitters == 10
 
@@ -75,11 +73,11 @@ def test_changes_land_where_the_setting_stands():
 )
 def test_values_out_of_range(name, value, message):
     with pytest.raises(ValueError, match=message):
-        changed(paper(robot()), {name: value})
+        changed(preset("paper", robot()), {name: value})
 
 
 def test_settings_survive_json():
-    cfg = changed(small(robot()), {"learning_rate": 0.01, "restart_rule": "basic"})
+    cfg = changed(preset("small", robot()), {"learning_rate": 0.01, "restart_rule": "basic"})
     back = from_settings(json.loads(json.dumps(as_settings(cfg))), 7)
     assert back == dataclasses.replace(cfg, iterations=7)
     assert "iterations" not in as_settings(cfg)
@@ -113,7 +111,7 @@ def test_the_controllers_file_is_part_of_the_settings(tmp_path):
     shipped, own = tmp_path / "anymal.pt", tmp_path / "own.pt"
     shipped.write_bytes(b"a")
     own.write_bytes(b"b")
-    cfg = paper(robot(shipped))
+    cfg = preset("paper", robot(shipped))
     digests = [
         measured_now(changed(cfg, {"policy": policy}), robot(shipped)).policy_sha256
         for policy in (None, "shipped", str(own), "module:callable")
@@ -134,14 +132,14 @@ def test_nothing_left_out_leaves_all():
 
 
 def test_scales_follow_the_penalties_that_are_kept():
-    cfg = measured_now(changed(paper(robot()), {"penalties": ("vel_x", "stumble", "contact_force")}), robot())
+    cfg = measured_now(changed(preset("paper", robot()), {"penalties": ("vel_x", "stumble", "contact_force")}), robot())
     assert cfg.fitness.penalties == ("vel_x", "stumble", "contact_force")
     assert cfg.fitness.scales == (2.0, 1.0, 4.0)
     assert cfg.cells.num_ratios == 3
 
 
 def test_a_penalty_that_the_robot_has_no_more_is_named():
-    cfg = changed(paper(robot()), {"penalties": ("vel_x", "torque")})
+    cfg = changed(preset("paper", robot()), {"penalties": ("vel_x", "torque")})
     with pytest.raises(ValueError, match="no penalty named torque: anymal has yaw_rate, vel_x, vel_y, contact_force"):
         measured_now(cfg, robot())
 

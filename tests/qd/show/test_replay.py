@@ -9,7 +9,6 @@ from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
 from qd.run.directory import RunDirectory, elite_name, folder_for, newest_or_published, newest_run
-from qd.run.settings import as_settings
 from qd.show.elites import Found, find_archive
 from qd.show.replay import Replay, ReplayElite, describe, draw, replay
 from sim.files.command import run_command
@@ -114,15 +113,15 @@ def test_the_drawing_has_all_paths_and_how_they_ended(done):
 def test_a_config_of_another_search_is_refused(tmp_path, change):
     fitness = dataclasses.replace(CFG.fitness, **change)
     run(tmp_path / "run")
-    settings = as_settings(dataclasses.replace(CFG, fitness=fitness))
-    RunDirectory(tmp_path / "run").write_config(settings, 2, {"device": "cpu"})
+    cfg = dataclasses.replace(CFG, fitness=fitness)
+    RunDirectory(tmp_path / "run").write_config(cfg, {"device": "cpu", "sessions": []})
     with pytest.raises(ValueError, match=r"config\.json must have the penalties and scales of its archive, yaw_rate"):
         replay(ReplayElite(run=tmp_path / "run", device="cpu"))
 
 
 def test_no_run_yet(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`make archive ROBOT=anymal`"):
+    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`.*faultline archive --robot anymal`"):
         newest_run(get_robot("anymal"))
     with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/"):
         newest_or_published(get_robot("anymal"))

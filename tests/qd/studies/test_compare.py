@@ -19,7 +19,7 @@ from qd.studies import compare
 from qd.studies.compare import Arguments
 from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
-from tests.qd.run.test_cli import fine_policy
+from tests.qd.run.test_arguments import fine_policy
 from tests.qd.stand_in import open_stand_in
 
 POLICY = "shipped"

@@ -71,7 +71,7 @@ def make_run(root):
     settings = as_settings(dataclasses.replace(small, fitness=fitness))
     origin = {"command": "python <script>alert(1)</script>", "commit": "abc", "device": "CPU", "seed": 0,
               "versions": {"numpy": "2"}, "date": "today"}  # fmt: skip
-    (folder / "config.json").write_bytes(to_json({"settings": settings, "iterations": 4, **origin}))
+    (folder / "config.json").write_bytes(to_json({"settings": settings, "iterations": 4, "sessions": [], **origin}))
     return folder
 
 
