@@ -121,7 +121,9 @@ def test_a_config_of_another_search_is_refused(tmp_path, change):
 
 def test_no_run_yet(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`.*faultline archive --robot anymal`"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no archive of anymal under runs/.*`.*faultline archive --robot anymal`"
+    ):
         newest_run(get_robot("anymal"))
     with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/"):
         newest_or_published(get_robot("anymal"))

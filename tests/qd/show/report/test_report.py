@@ -237,7 +237,9 @@ def test_sections_without_data_name_the_command_that_makes_it(reported, run):
     (run / "metrics.jsonl").unlink()
     (run / "config.json").unlink()
     text = Page(reported()[0].read_bytes()).text
-    assert re.search(r"no metrics\.jsonl beside the archive\. A search writes one: \S*faultline archive --robot anymal", text)
+    assert re.search(
+        r"no metrics\.jsonl .* A search writes one: \S*faultline archive --robot anymal", text
+    )
     assert "no config.json beside the archive" in text
     assert re.search(r"made by \S*faultline evaluate --robot anymal --policies base=shipped C-G=FILE", text)
 
