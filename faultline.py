@@ -18,14 +18,14 @@ COMMANDS: dict[str, dict[str, Command]] = {
     "Find what breaks a controller": {
         "archive": Command("qd.run.arguments:Archive", "search the terrains on which a controller fails"),
         "reevaluate": Command("qd.fresh:Reevaluate", "cross every elite of an archive again in fresh episodes"),
-        "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers: by terrain, or the paper's tables"),
+        "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
         "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
     },
     "Look at it": {
         "replay": Command("qd.show.replay:ReplayElite", "one elite again: numbers, and paths over its terrain"),
-        "view": Command("qd.show.view.arguments:View", "an archive in the browser"),
-        "report": Command("qd.show.report.material:Report", "one page about a run"),
-        "film": Command("qd.show.video:Film", "film the robot on an elite or on a map of your own"),
+        "view": Command("qd.show.view.command:View", "an archive in the browser"),
+        "report": Command("qd.show.report.command:Report", "one page about a run"),
+        "film": Command("qd.show.film:Film", "film the robot on an elite or on a map of your own"),
         "export": Command("qd.show.export:Export", "elites as npz, 16-bit PNG, MJCF and STL"),
     },
     "Train": {

@@ -1,55 +1,52 @@
-"""A controller on a terrain of your own: ``python -m qd.show.cross --terrain hill.png --size 16 8 --scale 0.001``."""
+"""A controller on a terrain of your own: ``faultline cross --terrain hill.png --size 16 8 --scale 0.001``."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from qd.run.cli import run_command
-from qd.run.progress import share_bar
-from qd.show.figures import save_figure
-from qd.show.own_terrain import OwnTerrain, own_seeds, read_own_terrain
-from qd.show.paths_figure import draw_paths
-from qd.show.replay import PENALTY_UNITS
-from qd.show.video import OWN_FOLDER
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.run.directory import RUNS
+from qd.show.elites import robot_named
+from qd.show.figures import PENALTY_UNITS, save_figure
 from qd.workers.evaluator import check_policy, origin_of, resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.command import OnDevice, Who, split_words
 from sim.files.intervals import rate_words, wilson_interval
 from sim.policy.spec import ControllerSpec, who_crossed
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
+OWN_FOLDER = RUNS / "terrains"
+"""Where what is made of a user's own terrains goes."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class CrossCfg:
-    """Cross a heightmap of your own: how often does the controller get over, and what does it cost?
+class Cross(Who, OnDevice):
+    """Cross a height map of your own: how often does the controller get over, and what does it cost?
 
     A map is a grid of heights over a rectangle: an .npz with an array `heights` (rows along y, columns along x, floats
     in metres), or a grayscale .png of 8 or 16 bits seen from above (x to the right, y up) with the metres of a gray
     level. Its size in metres is given here, or as `size_m` in the .npz, or with `scale_m` and `offset_m` in a .json of
-    the same name beside the .png, such as `make export` writes.
+    the same name beside the .png, such as `faultline export` writes.
 
     Robots start near x = 2 m, y = 4 m and walk to x = 14 m, y = 4 m. The middle of the map lies on the middle of the
     16 m x 8 m that they cross: of a larger map the rest is cut off, a smaller one is continued by the height of its
     edge. It is resampled to 0.05 m: linearly, or where it is finer by weighted means.
     """
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     terrain: Path
-    """The heightmap: an .npz or a .png."""
+    """The height map: an .npz or a .png."""
     size: tuple[str, ...] = ()
     """Of the map along x and y [m], such as 16 8; its file's if left out."""
     scale: float | None = None
     """Metres a gray level; its file's if left out."""
     offset: float | None = None
     """Height of gray level 0 [m]; its file's, or 0."""
-    policy: str | None = None
-    """Controller other than the shipped one: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
-    module:callable, or file.py:adapter@FILE for a file that expects another observation."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
     episodes: int = 20
     """Crossings."""
     seed: int = 0
@@ -58,46 +55,98 @@ class CrossCfg:
     """Where to write the numbers, runs/terrains/<map>-<robot>[-<controller>].json; beside it the figure,
     ...-paths.png."""
 
+    def execute(self) -> None:
+        """Crosses the map, prints rates and costs, writes numbers and figure."""
+        cross(self)
 
-def cross(cfg: CrossCfg) -> dict[str, Any]:
-    """The command: reads the map, crosses it, prints rates and costs, writes numbers and figure.
+
+class OwnTerrain(NamedTuple):
+    """A terrain from a file."""
+
+    heights: NDArray[np.float32]
+    """[m], shape (NUM_ROWS, NUM_COLS)."""
+    label: str
+    """The file's name."""
+    fitted: str
+    """What became of the map, in words."""
+
+
+class Mapped(Protocol):
+    """The flags that say how large and how high a map is, as :class:`Cross` has them."""
+
+    @property
+    def size(self) -> tuple[str, ...]:
+        """Two words, or one that holds both; or none."""
+        ...
+
+    @property
+    def scale(self) -> float | None:
+        """Metres a gray level."""
+
+    @property
+    def offset(self) -> float | None:
+        """Height of gray level 0 [m]."""
+
+
+def read_own_terrain(path: Path, args: Mapped) -> OwnTerrain:
+    """The terrain that a height map becomes, by the rules of :mod:`sim.maps.heightmap`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no height map, or a number is missing or out of range.
+    """
+    from sim.maps.heightmap import as_terrain, fitted, read_heightmap
+
+    heightmap = read_heightmap(path, size_m=_size_of(args.size), scale_m=args.scale, offset_m=args.offset)
+    return OwnTerrain(heights=as_terrain(heightmap), label=path.name, fitted=fitted(heightmap))
+
+
+def _size_of(words: Sequence[str]) -> tuple[float, ...] | None:
+    sides = split_words(words)
+    try:
+        return tuple(float(side) for side in sides) or None
+    except ValueError:
+        raise ValueError(f"size must be two lengths in metres such as 16 8, got {' '.join(words)}") from None
+
+
+def cross(cfg: Cross) -> dict[str, Any]:
+    """Reads the map, crosses it, prints rates and costs, writes numbers and figure.
 
     Returns:
         What the JSON has.
 
     Raises:
-        FileNotFoundError: If there is no heightmap.
+        FileNotFoundError: If there is no height map.
         ValueError: If robot, map, device, controller or a number is not as it must be; before anything is crossed.
         OSError: If a file cannot be written.
     """
-    from sim.robots.robot import get_robot
-    from sim.rollout import Rollout
+    from qd.show.crossed import crossed_of
+    from qd.show.crossing_figures import draw_paths
+    from qd.show.recordings import Recordings, on_heights
 
-    robot = get_robot(cfg.robot)
+    robot = robot_named(cfg.robot)
     terrain = read_own_terrain(cfg.terrain, cfg)
-    if cfg.episodes < 1 or cfg.seed < 0:
-        raise ValueError(f"episodes must be at least 1 and seed at least 0, got {cfg.episodes} and {cfg.seed}")
-    device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
+    policy = cfg.policy or str(robot.policy_file)
+    wanted = on_heights(terrain.heights, label=terrain.label, policy=policy, replicas=cfg.episodes, seed=cfg.seed)
+    device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
     who = who_crossed(robot, policy)
     out, figure = _outputs(cfg, who)
     prepare_output(out)
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)
-    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=cfg.episodes, device=device)
-    with share_bar("crossing") as progress:
-        result = rollout.evaluate(
-            terrain.heights[None], own_seeds(cfg.seed), record_paths=True, progress=progress
-        )
-    report = {**origin_of(device, cfg.seed, None), **_about(cfg, robot.name, terrain, policy), **numbers_of(result)}
+    (recording,) = Recordings(robot, device=device).all_of([wanted])
+    origin, about = origin_of(device, cfg.seed, None), _about(cfg, robot.name, terrain, policy)
+    report = {**origin, **about, **numbers_of(recording.result())}
     print(describe(report))
     write_atomically(out, to_json(report))
-    save_figure(figure, draw_paths(terrain.heights, result, f"{who} on {terrain.label}: {_headline(report)}"))
+    crossed = crossed_of(recording, robot.penalties, (1.0,) * len(robot.penalties))
+    save_figure(figure, draw_paths(crossed, f"{who} on {terrain.label}: {_headline(report)}"))
     print(f"Numbers: {out}\nFigure: {figure}")
     return report
 
 
-def _outputs(cfg: CrossCfg, who: str) -> tuple[Path, Path]:
-    """Files of the numbers and of the figure, neither of which may be the map or what says its scale."""
+def _outputs(cfg: Cross, who: str) -> tuple[Path, Path]:
+    """Files of the numbers and of the figure; neither may be the map or the file that says its scale."""
     out = cfg.out or OWN_FOLDER / f"{cfg.terrain.stem}-{who}.json"
     figure = out.with_name(f"{out.stem}-paths.png")
     given = {cfg.terrain.resolve(), cfg.terrain.with_suffix(".json").resolve()}
@@ -108,7 +157,7 @@ def _outputs(cfg: CrossCfg, who: str) -> tuple[Path, Path]:
     return out, figure
 
 
-def _about(cfg: CrossCfg, robot: str, terrain: OwnTerrain, policy: str) -> dict[str, Any]:
+def _about(cfg: Cross, robot: str, terrain: OwnTerrain, policy: str) -> dict[str, Any]:
     from sim.policy.spec import controller_hash
 
     return {
@@ -177,12 +226,3 @@ def describe(report: dict[str, Any]) -> str:
         "  Rates with their 95 % intervals (Wilson). A robot that stands still succeeds: read the goal rate too."
     )
     return "\n".join(lines)
-
-
-def main(cfg: CrossCfg) -> None:
-    """The command."""
-    cross(cfg)
-
-
-if __name__ == "__main__":
-    run_command(CrossCfg, main)

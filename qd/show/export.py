@@ -1,4 +1,4 @@
-"""Elites as files for other programs: ``python -m qd.show.export --elite 0`` or ``--elite all``."""
+"""Elites as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
 import shutil
 import sys
@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.archive import Archive
-from qd.run.cli import run_command
 from qd.run.directory import folder_for
-from qd.show.recordings import archive_of_robot
+from qd.show.elites import find_archive
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.command import chosen_elites, split_words
+from sim.files.command import Which, chosen_elites, split_words
 from sim.files.provenance import provenance
 
 INDEX_FILE = "index.json"
@@ -25,29 +24,29 @@ _AT_ONCE = 32  # terrains rasterised
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportCfg:
+class Export(Which):
     """Write elites of an archive as files that other programs read.
 
     Of each elite: `elite-N.npz` (heights in m, rows along y; genes), `elite-N.png` (16-bit grayscale seen from above;
     scale and offset in `elite-N.json`), `elite-N.xml` (MJCF: a scene of the terrain alone, whose surface is the
-    simulation's, between the nodes too) and `elite-N.stl` (a closed block). `make evaluate TERRAIN=elite-N.npz`, or the
-    .png, crosses it again.
+    simulation's, between the nodes too) and `elite-N.stl` (a closed block). `faultline cross --terrain elite-N.npz`, or
+    with the .png, crosses it again.
     """
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    run: Path | None = None
-    """Run directory or archive.npz; the newest of this robot under runs/, else its published archive."""
-    elite: str = "0"
-    """Number of the elite, 0 the worst; several apart by spaces, or all."""
+    robot: str | None = None
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); that of the run if left out."""
     out: Path | None = None
     """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published."""
     formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
     """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
 
+    def execute(self) -> None:
+        """Writes the files."""
+        export(self)
 
-def export(cfg: ExportCfg) -> list[Path]:
-    """The command.
+
+def export(cfg: Export) -> list[Path]:
+    """Writes the files.
 
     Returns:
         The files, the index last.
@@ -60,7 +59,7 @@ def export(cfg: ExportCfg) -> list[Path]:
     from sim.bank import heights_of
     from sim.maps.terrain_files import check_formats, write_terrain
 
-    found = archive_of_robot(cfg.robot, cfg.run)
+    found = find_archive(cfg.robot, cfg.run)
     elites = chosen_elites(cfg.elite, len(found.archive), found.run)
     formats = list(dict.fromkeys(split_words(cfg.formats)))
     check_formats(formats)
@@ -118,12 +117,3 @@ def _check_room(folder: Path, count: int, formats: list[str]) -> None:
             f"{folder} has room for {free / 1e6:,.0f} MB, but {count} elites as {', '.join(formats)} take about "
             f"{needed / 1e6:,.0f} MB: leave stl out (--formats), or give another --out"
         )
-
-
-def main(cfg: ExportCfg) -> None:
-    """The command."""
-    export(cfg)
-
-
-if __name__ == "__main__":
-    run_command(ExportCfg, main)

@@ -28,6 +28,29 @@ PENALTY_LABELS = {
     "collision": "collisions of\nbase and legs",
 }
 """Penalties as axis labels."""
+PENALTY_UNITS = {
+    "yaw_rate": "rad",
+    "vel_x": "m",
+    "vel_y": "m",
+    "contact_force": "N s",
+    "stumble": "s",
+    "collision": "s",
+}
+"""Units of the raw penalties."""
+_PENALTY_LOOKS = {
+    "yaw_rate": ("#cc79a7", "//"),
+    "vel_x": ("#0072b2", ""),
+    "vel_y": ("#56b4e9", "\\\\"),
+    "contact_force": ("#000000", ""),
+    "stumble": ("#e69f00", ".."),
+    "collision": ("#d55e00", ""),
+}
+_PLAIN = ("#999999", "")  # of a penalty that the figures do not know
+
+
+def look_of(penalty: str) -> tuple[str, str]:
+    """Colour (Okabe and Ito's) and hatch of a penalty, which tells it apart in grey."""
+    return _PENALTY_LOOKS.get(penalty, _PLAIN)
 
 
 def label_of(penalty: str) -> str:

@@ -1,172 +1,261 @@
-"""A recorded crossing as a film: the robot on its terrain, where it is on the map, and what it has cost so far."""
+"""Films of crossings: ``faultline film --elite 0``, without a screen, with a GPU or without."""
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from qd.show.film_panel import Panel
-from qd.show.shot import Shot
-from sim.files.intervals import wilson_interval
-from sim.policy.spec import ControllerSpec
+from qd.run.directory import elite_name, folder_for
+from qd.show.cross import OWN_FOLDER, read_own_terrain
+from qd.show.elites import find_archive, robot_named
+from qd.workers.evaluator import check_policy, resolve_device
+from sim.files.atomic import prepare_output, write_atomically
+from sim.files.command import OnDevice, Which, Who, chosen_elites
+from sim.files.settings import check, setting
+from sim.policy.spec import spec_of, who_crossed
 
 if TYPE_CHECKING:
     from sim.recording.recorder import Recording
-    from sim.recording.renderer import Camera, Renderer
+    from sim.robots.robot import RobotCfg
 
-WIDTH, VIEW_HEIGHT, PANEL_HEIGHT = 1280, 480, 240
-"""Pixels of a film; the panel stands below the view."""
-_BAR = 56  # height of the caption [pixels]
-_SMOOTH_S = 0.8  # over which the camera follows the base
-_HOLD_S = 1.0  # of the last frame
-_ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
-_CLEARANCE = 0.05  # of the line of sight over the ground [m]
-
-Image = NDArray[np.uint8]
+_RECORDING = ".recording.npz"
+_DISTANCE = 4.6  # of the camera, in standing heights of the robot
 
 
-def typical_episode(recording: "Recording", terrain: int, scales: dict[str, float]) -> int:
-    """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties.
+@dataclass(frozen=True, kw_only=True)
+class Film(Who, OnDevice, Which):
+    """Film a robot on elites of an archive, or on a terrain of your own.
 
-    Args:
-        recording: The crossings.
-        terrain: Index of the terrain.
-        scales: What each penalty is divided by.
+    The episodes are those that `faultline replay` shows. Below the robot stand the map with all paths and what the
+    episode has cost so far, each penalty in multiples of its scale. Yellow arrows are contact forces of the feet, red
+    ones those beyond the robot's limit. The recording is kept beside the film, so that it can be filmed again
+    elsewhere. Without --out a film is elite-<number>.mp4 in the run, or of a published one in runs/<robot>-published;
+    with another controller elite-<number>-<its name>.mp4.
     """
-    outcome = recording.outcome[terrain]
-    most = np.bincount(outcome).argmax()
-    candidates = np.flatnonzero(outcome == most)
-    sums = [
-        sum(
-            values[-1]
-            for values in Shot(recording=recording, terrain=terrain, episode=k, scales=scales).penalties.values()
+
+    terrain: Path | None = None
+    """Instead of elites a height map of your own: an .npz or a .png (see `faultline cross --help`)."""
+    size: tuple[str, ...] = ()
+    """Of that map along x and y [m], such as 16 8; its file's if left out."""
+    scale: float | None = None
+    """Metres a gray level of that map."""
+    offset: float | None = None
+    """Height of its gray level 0 [m]."""
+    recording: Path | None = None
+    """Instead of crossing anything, film what was recorded: a .recording.npz that stands beside a film."""
+    out: Path | None = None
+    """File of the film, or with several elites their folder."""
+    replicas: int = setting(20, least=1)
+    """Episodes to run."""
+    replica: int | None = setting(None, least=0)
+    """Which of them to film; of those that end as most do, the one in the middle by its penalties."""
+    ghosts: int = setting(2, least=0)
+    """How many others to show translucent."""
+    seed: int = setting(0, least=0)
+    """Seed of the episodes."""
+    fps: int = setting(25, least=1, most=50)
+    """Pictures a second."""
+    shadows: bool = True
+    """Whether the sun casts shadows; without a GPU they take half of the time."""
+
+    def execute(self) -> None:
+        """Makes the films."""
+        make_films(self)
+
+
+class Order(NamedTuple):
+    """A film to be made of one terrain."""
+
+    recording: "Recording"
+    """Of that terrain alone."""
+    out: Path
+    scales: dict[str, float]
+
+
+def make_films(cfg: Film) -> list[Path]:
+    """Makes the films that are asked for; returns their files.
+
+    Raises:
+        FileNotFoundError: If there is no archive, heightmap or recording.
+        ValueError: If there is no such elite or episode, no OpenGL, or a file, the controller, the robot or a number is
+            not as it must be; all before anything is crossed.
+        OSError: If a file cannot be written.
+    """
+    from sim.recording.renderer import open_context
+
+    check(cfg)
+    if cfg.replica is not None and cfg.replica >= cfg.replicas:
+        raise ValueError(f"replica must be one of 0..{cfg.replicas - 1}, got {cfg.replica}")
+    if sum(given is not None for given in (cfg.run, cfg.terrain, cfg.recording)) > 1:
+        raise ValueError("give one of --run, --terrain and --recording")
+    open_context(64, 64).free()  # before minutes of crossing
+    films = []
+    for order in _orders(cfg):
+        _film(order, cfg)
+        print(f"Film: {order.out}", flush=True)
+        films.append(order.out)
+    return films
+
+
+def _orders(cfg: Film) -> Iterator[Order]:
+    if cfg.recording is not None:
+        yield from _kept_orders(cfg, cfg.recording)
+    elif cfg.terrain is not None:
+        yield _own_order(cfg, cfg.terrain)
+    else:
+        yield from _elite_orders(cfg)
+
+
+def _elite_orders(cfg: Film) -> Iterator[Order]:
+    """Films of elites, whose recordings are written before the first is made."""
+    from qd.show.recordings import Recordings, on_elite
+
+    found = find_archive(cfg.robot, cfg.run)
+    archive, robot = found.archive, found.robot
+    elites = chosen_elites(cfg.elite, len(archive), found.run)
+    policy, searched = found.policy(cfg.policy), spec_of(found.as_searched()[0], robot)
+    if cfg.out is not None and len(elites) == 1 and not cfg.out.is_dir():
+        outs = [cfg.out]
+    else:
+        folder = cfg.out or folder_for(found.run, robot.name)
+        outs = [folder / f"{elite_name(elite, policy, searched)}.mp4" for elite in elites]
+    prepare_output(outs[0])
+    device = resolve_device(cfg.device)
+    check_policy(policy, robot, device)
+    wanted = [
+        on_elite(
+            archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed,
+            label=f"elite {elite} of {len(archive):,} of {found.folder}",
         )
-        for k in candidates.tolist()
+        for elite in elites
+    ]  # fmt: skip
+    scales = dict(zip(archive.penalties, archive.scales, strict=True))
+    orders = [
+        Order(recording, out, scales)
+        for recording, out in zip(Recordings(robot, device=device).all_of(wanted), outs, strict=True)
     ]
-    return int(candidates[np.argsort(sums, kind="stable")[(len(sums) - 1) // 2]])
+    for order in orders:
+        _keep(order)
+    yield from orders
 
 
-def outcome_words(outcome: int) -> str:
-    """How an episode ended, in words."""
-    from kernels.episode import Outcome
+def _own_order(cfg: Film, path: Path) -> Order:
+    from qd.show.recordings import Recordings, on_heights
 
-    return {
-        Outcome.GOAL: "goal reached",
-        Outcome.BASE_COLLISION: "base collision",
-        Outcome.TIME_OUT: "out of time",
-        Outcome.OUT: "left the terrain",
-        Outcome.INVALID: "invalid",
-    }[Outcome(outcome)]
-
-
-def caption(shot: Shot) -> tuple[str, str]:
-    """Two lines: what is shown, and how all recorded episodes of the terrain ended, with 95 % intervals (Wilson)."""
-    from kernels.episode import Outcome
-
-    recording, t, k = shot.recording, shot.terrain, shot.episode
-    first = (
-        f"{recording.robot} on {recording.labels[t]}: episode {recording.replicas[k]}, "
-        f"{outcome_words(recording.outcome[t, k])} after {recording.duration_s[t, k]:.1f} s"
-    )
-    valid = recording.outcome[t] != Outcome.INVALID
-    count = int(valid.sum())
-    hits = {
-        "base collision": recording.outcome[t] == Outcome.BASE_COLLISION,
-        "goal": recording.outcome[t] == Outcome.GOAL,
-        "fallen": recording.fallen[t] & valid,
-    }
-    rates = [f"{name} {_rate(int(flags.sum()), count)}" for name, flags in hits.items()] if count else ["none valid"]
-    of = f"{len(valid)} episode{'s' * (len(valid) != 1)}" + f", {len(valid) - count} invalid" * (count < len(valid))
-    if policy := recording.origin.get("policy"):
-        of += f" with {ControllerSpec.parse(str(policy)).label}"
-    return first, f"{of}: {', '.join(rates)}; in brackets 95 % intervals"
+    robot, terrain = robot_named(cfg.robot), read_own_terrain(path, cfg)
+    print(f"{path}: {terrain.fitted}", flush=True)
+    device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
+    check_policy(policy, robot, device)
+    out = cfg.out or OWN_FOLDER / f"{path.stem}-{who_crossed(robot, policy)}.mp4"
+    prepare_output(out)
+    wanted = on_heights(terrain.heights, label=terrain.label, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
+    (recording,) = Recordings(robot, device=device).all_of([wanted])
+    order = Order(recording, out, _scales_of(robot))
+    _keep(order)
+    return order
 
 
-def _rate(hits: int, count: int) -> str:
-    low, high = wilson_interval(hits, count)
-    return f"{hits / count:.0%} ({100 * low:.0f} to {high:.0%})"
+def _kept_orders(cfg: Film, path: Path) -> Iterator[Order]:
+    from sim.recording.file import read_recording
+    from sim.robots.robot import robot_of
+
+    recording = read_recording(path)
+    robot = robot_of(recording.robot, cfg.robot, path)
+    if recording.joint_names != robot.joint_names:
+        raise ValueError(f"{path} is of other joints than {robot.name} has: give the --robot that was recorded")
+    stem = path.name.removesuffix(_RECORDING).removesuffix(".npz")
+    single = recording.num_terrains == 1
+    for k in range(recording.num_terrains):
+        name = f"{stem}.mp4" if single else f"{stem}-{k}.mp4"
+        out = cfg.out if cfg.out and single and not cfg.out.is_dir() else (cfg.out or path.parent) / name
+        prepare_output(out)
+        yield Order(recording.of_terrain(k), out, _scales_of(robot))
 
 
-def follow(shot: Shot, distance: float) -> list["Camera"]:
-    """A camera a frame: it follows the base smoothly, from as low as the ground nowhere hides the robot.
+def _keep(order: Order) -> None:
+    from sim.recording.file import write_recording
+
+    write_recording(order.out.with_name(order.out.stem + _RECORDING), order.recording)
+
+
+def _scales_of(robot: "RobotCfg") -> dict[str, float]:
+    """The robot's penalty scales; 1 each, and so raw sums, where they were never measured."""
+    try:
+        scales = robot.read_penalty_scales()
+    except ValueError as error:
+        print(f"{error}; penalties are drawn as they are, unscaled", flush=True)
+        scales = (1.0,) * len(robot.penalties)
+    return dict(zip(robot.penalties, scales, strict=True))
+
+
+def _film(order: Order, cfg: Film) -> None:
+    from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, num_pictures, typical_episode
+    from sim.recording.renderer import Renderer
+    from sim.robots.robot import robot_of
+
+    recording = order.recording
+    robot = robot_of(recording.robot, cfg.robot, order.out)
+    replicas = recording.replicas.tolist()
+    if cfg.replica is not None and cfg.replica not in replicas:
+        raise ValueError(f"episode {cfg.replica} was not recorded, expected one of {', '.join(map(str, replicas))}")
+    typical = typical_episode(recording, 0, order.scales)
+    episode = typical if cfg.replica is None else replicas.index(cfg.replica)
+    ghosts = tuple(k for k in range(len(replicas)) if k != episode)[: cfg.ghosts]
+    shot = Shot(recording=recording, terrain=0, episode=episode, ghosts=ghosts, scales=order.scales)
+    cameras = follow(shot, _DISTANCE * robot.default_base_height)
+    heights = recording.heights[0]
+    total = num_pictures(shot, cfg.fps)
+    with (
+        Renderer(robot, heights, width=WIDTH, height=VIEW_HEIGHT, shadows=cfg.shadows) as renderer,
+        tqdm(total=total, desc=f"filming {recording.labels[0]}", unit="picture", file=sys.stderr, disable=None) as bar,
+    ):
+        pictures = frames_of(shot, renderer, cameras, cfg.fps)
+        write_film(order.out, pictures, cfg.fps, progress=bar.update)
+
+
+def write_film(
+    path: Path, pictures: Iterator[NDArray[np.uint8]], fps: int, progress: Callable[[], object] | None = None
+) -> int:
+    """Encodes pictures as an MP4 (H.264) that plays everywhere, atomically.
 
     Args:
-        shot: What the film shows.
-        distance: Of the camera from the base [m].
-    """
-    from sim.mujoco_c.model import surface_heights
-    from sim.recording.renderer import Camera
-
-    recording, t = shot.recording, shot.terrain
-    base = recording.base_position[t, shot.episode, : shot.num_frames].astype(np.float64)
-    width = max(1, round(_SMOOTH_S / recording.dt)) | 1
-    padded = np.pad(base, ((width // 2, width // 2), (0, 0)), mode="edge")
-    sums = np.cumsum(np.vstack([np.zeros(3), padded]), axis=0)
-    targets = (sums[width:] - sums[:-width]) / width
-    along = np.linspace(0.1, 1.0, 19)[:, None]
-    for elevation in _ELEVATIONS:
-        camera = Camera(target=(0.0, 0.0, 0.0), distance=distance, elevation=elevation)
-        azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(elevation)
-        back = -distance * np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
-        sight = targets[:, None] + along * back
-        ground = surface_heights(recording.heights[t].astype(np.float64), sight[..., 0], sight[..., 1])
-        if (sight[..., 2] > ground + _CLEARANCE).all() or elevation == _ELEVATIONS[-1]:
-            break
-    return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
-
-
-def frames_of(shot: Shot, renderer: "Renderer", cameras: Sequence["Camera"], fps: int) -> Iterator[Image]:
-    """The pictures of a film, the last one held for a second.
-
-    Args:
-        shot: What it shows.
-        renderer: Of the robot on the terrain, with images of 1280 x 480 pixels.
-        cameras: One a frame of the recording.
+        path: File to write.
+        pictures: RGB, all of one shape, with even sides.
         fps: Pictures a second.
+        progress: Called after every picture.
 
-    Yields:
-        RGB, shape (720, 1280, 3).
+    Returns:
+        How many pictures there were.
+
+    Raises:
+        OSError: If the film cannot be encoded or written.
     """
-    panel, lines = Panel(shot, WIDTH, PANEL_HEIGHT), caption(shot)
-    recording, t = shot.recording, shot.terrain
-    poses = recording.qpos(t, shot.episode)
-    others = [recording.qpos(t, k) for k in shot.ghosts]
-    picture = np.zeros(0, np.uint8)
-    for frame in shown_frames(shot, fps):
-        ghosts = [other[min(frame, len(other) - 1)] for other in others]
-        force = recording.foot_force[t, shot.episode, frame]
-        view = renderer.render(poses[frame], cameras[frame], ghosts=ghosts, foot_force=force)
-        time_s = frame * recording.dt
-        lettered = _lettered(view, lines, f"{time_s:.1f} s")
-        picture = np.concatenate([lettered, panel.at(time_s, poses[frame, :3])])
-        yield picture
-    for _ in range(round(_HOLD_S * fps)):
-        yield picture
+    import imageio_ffmpeg
 
-
-def shown_frames(shot: Shot, fps: int) -> list[int]:
-    """Frames of the recording that a film shows, real time at ``fps``; its first and its last are among them."""
-    last = shot.num_frames - 1
-    times = np.arange(0.0, last * shot.recording.dt, 1.0 / fps)
-    return [*np.rint(times / shot.recording.dt).astype(int).tolist(), last] if last else [0]
-
-
-def num_pictures(shot: Shot, fps: int) -> int:
-    """How many pictures :func:`frames_of` gives."""
-    return len(shown_frames(shot, fps)) + round(_HOLD_S * fps)
-
-
-def _lettered(view: Image, lines: tuple[str, str], clock: str) -> Image:
-    """A view with the caption on a dark bar at its top, and the time at its bottom."""
-    from PIL import Image as Images
-    from PIL import ImageDraw, ImageFont
-
-    view[:_BAR] = (0.35 * view[:_BAR]).astype(np.uint8)
-    image = Images.fromarray(view)
-    draw = ImageDraw.Draw(image)
-    for row, (line, size) in enumerate(zip(lines, (20, 17), strict=True)):
-        draw.text((12, 4 + 27 * row), line, fill="white", font=ImageFont.load_default(size))
-    place = (view.shape[1] - 12, view.shape[0] - 10)
-    draw.text(place, clock, fill="black", font=ImageFont.load_default(22), anchor="rs")
-    return np.asarray(image)
+    done = 0
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder) / "film.mp4"
+        writer: Any = None
+        try:
+            for picture in pictures:
+                if writer is None:
+                    size = (picture.shape[1], picture.shape[0])
+                    writer = imageio_ffmpeg.write_frames(
+                        str(draft), size, fps=fps, quality=7, macro_block_size=2, ffmpeg_log_level="error"
+                    )
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(picture))
+                done += 1
+                if progress is not None:
+                    progress()
+        finally:
+            if writer is not None:
+                writer.close()
+        write_atomically(path, draft.read_bytes())
+    return done

@@ -1,168 +1,255 @@
-"""Recorded crossings of the elites of a run, or of heights: the episodes of ``make replay``, with every step kept."""
+"""Recorded crossings, kept on disk: what is there is read, what is missing is crossed.
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+The name of a file is the hash of all that its crossings depend on: terrain, seed, number of episodes, controller, robot
+and code. So no file is ever out of date, and what one command recorded the others find.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, read_archive
-from qd.run.directory import directory_of, newest_or_published
-from qd.run.settings import refuse_unnamed_code
-from qd.show.own_terrain import own_seeds
-from qd.show.replay import REPLAY_STREAM, as_searched, check_penalties
+from qd.archive import Archive
+from qd.run.directory import RUNS
+from qd.run.progress import share_bar
 from qd.workers.evaluator import episode_seeds
-from sim.policy.spec import spec_of
+from sim.files.provenance import code_fingerprint
+from sim.policy.spec import controller_hash
 
 if TYPE_CHECKING:
     from sim.recording.recorder import Recording
     from sim.robots.robot import RobotCfg
-    from sim.rollout import RolloutResult
+
+FOLDER = RUNS / "recordings"
+"""Where recordings are kept."""
+_ROOMS = ("kernels", "sim")  # what a crossing is computed by
+_STREAM, _OWN_STREAM = 2, 4  # of the seeds of episodes on elites, and on a user's own terrains
+_AT_ONCE = 32  # terrains crossed side by side on a GPU
+_KEY_LENGTH = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
-    """An archive and where it lies."""
+class Wanted:
+    """Crossings of one terrain by one controller."""
 
-    run: Path
-    """What was given: a run directory or an archive file."""
-    archive: Archive
-    robot: "RobotCfg"
-    """Whose archive it is."""
+    label: str = field(compare=False)
+    """What the terrain is, in words."""
+    terrain: NDArray[np.float32] = field(compare=False)
+    """Genes, shape (64,), or heights [m], shape (nrow, ncol)."""
+    policy: str
+    """The controller."""
+    replicas: int
+    """Episodes."""
+    seed: int = 0
+    """What ``terrain_seed`` was drawn with, for the record."""
+    terrain_seed: int
+    """Seed of the terrain's episodes."""
 
-    @property
-    def folder(self) -> Path:
-        """The directory."""
-        return directory_of(self.run)
-
-
-def archive_of_robot(named: "RobotCfg | str", run: Path | None) -> Found:
-    """The archive of a run, the robot's newest one, else its published one, if none is given.
-
-    Args:
-        named: The robot, as the command line names it or as settings.
-        run: Run directory or archive file.
-
-    Raises:
-        FileNotFoundError: If there is none.
-        ValueError: If it is damaged or of another robot.
-    """
-    from sim.robots.robot import get_robot, robot_of
-
-    run = run or newest_or_published(get_robot(named))
-    archive = read_archive(run)
-    robot = robot_of(archive.robot, named, run)
-    check_penalties(archive, robot, run)
-    return Found(run=run, archive=archive, robot=robot)
+    def __post_init__(self) -> None:
+        if self.replicas < 1 or self.seed < 0:
+            raise ValueError(f"episodes must be at least 1 and seed at least 0, got {self.replicas} and {self.seed}")
 
 
-def policy_of(found: Found, robot: "RobotCfg", given: str | None) -> str:
-    """The controller to cross an archive's terrains with: the one given, or that of the search.
-
-    Raises:
-        ValueError: If the config of the run is not that of its archive.
-    """
-    searched, _ = as_searched(found.run, found.archive)
-    refuse_unnamed_code(searched, given, found.run)
-    return spec_of(given or searched, robot)
-
-
-def record_elites(
-    found: Found,
-    elites: Sequence[int],
-    *,
-    device: str,
-    policy: str | None = None,
-    episodes: int = 20,
-    replicas: Sequence[int] | None = None,
-    seed: int = 0,
-    progress: Callable[[float], None] | None = None,
-) -> tuple["RolloutResult", "Recording"]:
-    """Crosses some elites again, all at once, and records the episodes; those of ``make replay`` with the same numbers.
+def on_elite(
+    archive: Archive, number: int, *, policy: str, replicas: int, seed: int = 0, label: str | None = None
+) -> Wanted:
+    """The crossings of an elite that ``faultline replay`` shows.
 
     Args:
-        found: Their archive.
-        elites: Their numbers.
-        device: Warp device name.
-        policy: Controller other than the one the archive was made with.
-        episodes: Episodes of each.
-        replicas: Which of them to record; all.
-        seed: Of the episodes.
-        progress: Called with the share that is done.
-
-    Returns:
-        As :func:`sim.recording.recorder.record`; a terrain an elite, in the order given.
-
-    Raises:
-        ValueError: If the controller cannot be loaded or does not fit the robot, or a number is out of range.
-    """
-    robot = found.robot
-    return _record(
-        robot,
-        found.archive.genes[list(elites)],
-        np.concatenate([episode_seeds(seed, elite, 1, stream=REPLAY_STREAM) for elite in elites]),
-        policy=policy_of(found, robot, policy),
-        labels=[f"elite {elite} of {len(found.archive):,} of {found.folder}" for elite in elites],
-        device=device, episodes=episodes, replicas=replicas, seed=seed, progress=progress,
-    )  # fmt: skip
-
-
-def record_heights(
-    robot: "RobotCfg",
-    heights: NDArray[np.float32],
-    *,
-    label: str,
-    policy: str,
-    device: str,
-    episodes: int = 20,
-    seed: int = 0,
-    progress: Callable[[float], None] | None = None,
-) -> tuple["RolloutResult", "Recording"]:
-    """Crosses a terrain given by its heights and records the episodes.
-
-    Args:
-        robot: Robot settings.
-        heights: [m], shape (NUM_ROWS, NUM_COLS).
-        label: What the terrain is, in words.
+        archive: That it is of.
+        number: Its number.
         policy: The controller.
-        device: Warp device name.
-        episodes: How many.
-        seed: Of the episodes.
-        progress: Called with the share that is done.
-
-    Returns:
-        As :func:`sim.recording.recorder.record`, of one terrain.
+        replicas: Episodes.
+        seed: Other episodes for another seed.
+        label: What the terrain is, in words.
 
     Raises:
-        ValueError: If the controller cannot be loaded or does not fit the robot, or a number is out of range.
+        ValueError: If a number is out of range.
     """
-    return _record(
-        robot, heights[None], own_seeds(seed), policy=policy, labels=[label], device=device, episodes=episodes,
-        replicas=None, seed=seed, progress=progress,
-    )  # fmt: skip
+    return Wanted(
+        label=label or f"elite {number} of {archive.robot}",
+        terrain=archive.genes[number],
+        policy=policy,
+        replicas=replicas,
+        seed=seed,
+        terrain_seed=int(episode_seeds(max(seed, 0), number, 1, stream=_STREAM)[0]),
+    )
 
 
-def _record(
-    robot: "RobotCfg",
-    terrains: NDArray[np.float32],
-    seeds: NDArray[np.uint32],
-    *,
-    policy: str,
-    labels: Sequence[str],
-    device: str,
-    episodes: int,
-    replicas: Sequence[int] | None,
-    seed: int,
-    progress: Callable[[float], None] | None,
-) -> tuple["RolloutResult", "Recording"]:
-    from sim.recording.recorder import record
-    from sim.rollout import Rollout
+def on_heights(heights: NDArray[np.float32], *, label: str, policy: str, replicas: int, seed: int) -> Wanted:
+    """Crossings of a user's own terrain; arguments and errors as of :func:`on_elite`."""
+    drawn = int(episode_seeds(max(seed, 0), 0, 1, stream=_OWN_STREAM)[0])
+    return Wanted(label=label, terrain=heights, policy=policy, replicas=replicas, seed=seed, terrain_seed=drawn)
 
-    if episodes < 1 or seed < 0:
-        raise ValueError(f"episodes must be at least 1 and seed at least 0, got {episodes} and {seed}")
-    rollout = Rollout(robot, policy, num_terrains=len(terrains), num_replicas=episodes, device=device)
-    return record(
-        rollout, terrains, seeds, policy=policy, replicas=replicas, labels=labels, seed=seed, progress=progress
-    )  # fmt: skip
+
+Cross = Callable[[Sequence[Wanted], Callable[[float], None]], "list[Recording]"]
+"""Crosses terrains that differ in nothing but the terrain and its seed, telling the share that is done."""
+
+
+class Simulation:
+    """Crosses terrains by simulation; a controller is loaded once.
+
+    Args:
+        robot: The robot.
+        device: Warp device name.
+    """
+
+    def __init__(self, robot: "RobotCfg", device: str) -> None:
+        self._robot, self._device = robot, device
+        self._rollouts: dict[tuple[str, int, int], Any] = {}
+
+    def __call__(self, wanted: Sequence[Wanted], progress: Callable[[float], None]) -> "list[Recording]":
+        """Recordings of all, in their order.
+
+        Raises:
+            ValueError: If the controller cannot be loaded or does not fit the robot.
+        """
+        from sim.recording.recorder import record
+        from sim.rollout import Rollout
+
+        first = wanted[0]
+        kind = (first.policy, len(wanted), first.replicas)
+        if kind not in self._rollouts:
+            self._rollouts[kind] = Rollout(
+                self._robot, first.policy, num_terrains=kind[1], num_replicas=kind[2], device=self._device
+            )
+        _, recording = record(
+            self._rollouts[kind],
+            np.stack([one.terrain for one in wanted]),
+            np.array([one.terrain_seed for one in wanted], np.uint32),
+            policy=first.policy,
+            labels=[one.label for one in wanted],
+            seed=first.seed,
+            progress=progress,
+        )
+        return [recording.of_terrain(k) for k in range(len(wanted))]
+
+
+class Recordings:
+    """The recordings of a robot that are kept, and the simulation that makes those that are not.
+
+    Args:
+        robot: The robot.
+        device: Where missing ones are crossed.
+        folder: Where they are kept.
+        published: Folder of recordings that came with the project, whatever code made them.
+        cross: Crosses what is missing; by default a :class:`Simulation`.
+    """
+
+    def __init__(
+        self,
+        robot: "RobotCfg",
+        *,
+        device: str = "cpu",
+        folder: Path = FOLDER,
+        published: Path | None = None,
+        cross: Cross | None = None,
+    ) -> None:
+        from sim.robots.own import robot_digest
+
+        on_gpu = device.startswith("cuda")  # its last bits differ from a CPU's
+        self._robot, self._folder, self._published = robot, folder, published
+        self._code = f"{code_fingerprint(_ROOMS)} {robot_digest(robot)}{' cuda' * on_gpu}"
+        self._at_once = _AT_ONCE if on_gpu else 1
+        self._cross = cross or Simulation(robot, device)
+        self._last: tuple[Wanted, Recording] | None = None
+
+    def read(self, wanted: Wanted) -> "Recording | None":
+        """What is kept of some crossings; None if there is nothing, or it is damaged or of something else.
+
+        Nothing is known of a controller whose code has no file: only its last recording is found.
+        """
+        from sim.recording.file import read_recording
+
+        if self._last is not None:
+            last, recording = self._last
+            if last == wanted and np.array_equal(last.terrain, wanted.terrain):
+                return recording
+        if controller_hash(wanted.policy) is None:
+            return None
+        for file in filter(None, (self.file_of(wanted), self.published_file(wanted))):
+            try:
+                recording = read_recording(file)
+            except (OSError, ValueError):
+                continue
+            if self._is(recording, wanted):
+                return replace(recording, labels=(wanted.label,))
+        return None
+
+    def keep(self, wanted: Wanted, recording: "Recording") -> None:
+        """Keep a recording; where it cannot be written, that is said."""
+        from sim.recording.file import write_recording
+
+        self._last = (wanted, recording)
+        if controller_hash(wanted.policy) is None:
+            return
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_recording(self.file_of(wanted), recording)
+        except OSError as error:  # it can be shown all the same
+            print(f"not kept: {error}", flush=True)
+
+    def all_of(self, wanted: Sequence[Wanted]) -> "list[Recording]":
+        """Recordings of all that is wanted, in its order; what is missing is crossed and kept, batch by batch.
+
+        Raises:
+            ValueError: If a controller cannot be loaded or does not fit the robot.
+        """
+        found = {k: recording for k, one in enumerate(wanted) if (recording := self.read(one)) is not None}
+        missing = [k for k in range(len(wanted)) if k not in found]
+        if not missing:
+            return list(found.values())
+        words = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {wanted[missing[0]].replicas} times each"
+        with share_bar(f"crossing {words}") as progress:
+            done = 0
+            for batch in self._batches(wanted, missing):
+
+                def tell(share: float, done: int = done, size: int = len(batch)) -> None:
+                    progress((done + share * size) / len(missing))
+
+                for k, recording in zip(batch, self._cross([wanted[k] for k in batch], tell), strict=True):
+                    self.keep(wanted[k], recording)
+                    found[k] = recording
+                done += len(batch)
+                progress(done / len(missing))
+        return [found[k] for k in range(len(wanted))]
+
+    def _batches(self, wanted: Sequence[Wanted], missing: Sequence[int]) -> Iterator[list[int]]:
+        """Those that can be crossed side by side; on the CPU one a time, so that what is done is kept."""
+        alike: dict[Any, list[int]] = {}
+        for k in missing:
+            one = wanted[k]
+            alike.setdefault((one.policy, one.replicas, one.seed, one.terrain.shape), []).append(k)
+        for numbers in alike.values():
+            yield from (numbers[k : k + self._at_once] for k in range(0, len(numbers), self._at_once))
+
+    def file_of(self, wanted: Wanted) -> Path:
+        """Where the recording of some crossings is kept; another file with other code or packages."""
+        return self._folder / f"{self._key(wanted, self._code)}.npz"
+
+    def published_file(self, wanted: Wanted) -> Path | None:
+        """Where a published recording of some crossings would be."""
+        return None if self._published is None else self._published / f"{self._key(wanted, '')}.npz"
+
+    def _key(self, wanted: Wanted, code: str) -> str:
+        model = hashlib.sha256(self._robot.model_file.read_bytes()).hexdigest()
+        identity: list[Any] = [self._robot.name, model, controller_hash(wanted.policy), [wanted.terrain_seed]]
+        identity += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), code]
+        return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:_KEY_LENGTH]
+
+    def _is(self, recording: "Recording", wanted: Wanted) -> bool:
+        """Whether a recording is of just these crossings; a file may have been renamed."""
+        terrain = recording.heights if recording.genes is None else recording.genes
+        return (
+            recording.robot == self._robot.name
+            and recording.joint_names == self._robot.joint_names
+            and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
+            and np.array_equal(terrain, wanted.terrain[None])
+            and recording.seeds.tolist() == [wanted.terrain_seed]
+            and np.array_equal(recording.replicas, np.arange(wanted.replicas))
+        )

@@ -1,13 +1,41 @@
-"""What a film shows."""
+"""The pictures of a film: the robot on its terrain, where it is on the map, and what it has cost so far."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.episode import Outcome
+from qd.show.figures import label_of
+from sim.crossing import CrossingCfg
+from sim.files.intervals import rate_words
+from sim.policy.spec import ControllerSpec
+
 if TYPE_CHECKING:
     from sim.recording.recorder import Recording
+    from sim.recording.renderer import Camera, Renderer
+
+WIDTH, VIEW_HEIGHT, PANEL_HEIGHT = 1280, 480, 240
+"""Pixels of a film; the panel stands below the view."""
+_BAR = 56  # height of the caption [pixels]
+_SMOOTH_S = 0.8  # over which the camera follows the base
+_HOLD_S = 1.0  # of the last frame
+_ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
+_CLEARANCE = 0.05  # of the line of sight over the ground [m]
+_DPI = 100
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # apart for every kind of colour blindness
+_FUTURE = 0.25  # how much is left to see of what has not happened yet
+_OUTCOMES = {
+    Outcome.GOAL: "goal reached",
+    Outcome.BASE_COLLISION: "base collision",
+    Outcome.TIME_OUT: "out of time",
+    Outcome.OUT: "left the terrain",
+    Outcome.INVALID: "invalid",
+}
+
+Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,3 +64,208 @@ class Shot:
         sums = self.recording.penalties[self.terrain, self.episode, : self.num_frames].astype(np.float64)
         names = self.recording.penalty_names
         return {name: sums[:, names.index(name)] / scale for name, scale in self.scales.items() if name in names}
+
+
+def typical_episode(recording: "Recording", terrain: int, scales: dict[str, float]) -> int:
+    """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties.
+
+    Args:
+        recording: The crossings.
+        terrain: Index of the terrain.
+        scales: What each penalty is divided by.
+    """
+    outcome = recording.outcome[terrain]
+    most = np.bincount(outcome).argmax()
+    candidates = np.flatnonzero(outcome == most)
+    sums = [
+        sum(
+            values[-1]
+            for values in Shot(recording=recording, terrain=terrain, episode=k, scales=scales).penalties.values()
+        )
+        for k in candidates.tolist()
+    ]
+    return int(candidates[np.argsort(sums, kind="stable")[(len(sums) - 1) // 2]])
+
+
+def caption(shot: Shot) -> tuple[str, str]:
+    """Two lines: what is shown, and how all recorded episodes of the terrain ended, with 95 % intervals (Wilson)."""
+    recording, t, k = shot.recording, shot.terrain, shot.episode
+    first = (
+        f"{recording.robot} on {recording.labels[t]}: episode {recording.replicas[k]}, "
+        f"{_OUTCOMES[Outcome(recording.outcome[t, k])]} after {recording.duration_s[t, k]:.1f} s"
+    )
+    valid = recording.outcome[t] != Outcome.INVALID
+    count = int(valid.sum())
+    hits = {
+        "base collision": recording.outcome[t] == Outcome.BASE_COLLISION,
+        "goal": recording.outcome[t] == Outcome.GOAL,
+        "fallen": recording.fallen[t] & valid,
+    }
+    rates = [f"{name} {rate_words(int(flags.sum()), count, short=True)}" for name, flags in hits.items()]
+    rates = rates if count else ["none valid"]
+    of = f"{len(valid)} episode{'s' * (len(valid) != 1)}" + f", {len(valid) - count} invalid" * (count < len(valid))
+    if policy := recording.origin.get("policy"):
+        of += f" with {ControllerSpec.parse(str(policy)).label}"
+    return first, f"{of}: {', '.join(rates)}; in brackets 95 % intervals"
+
+
+def follow(shot: Shot, distance: float) -> list["Camera"]:
+    """A camera a frame: it follows the base smoothly, from as low as the ground nowhere hides the robot.
+
+    Args:
+        shot: What the film shows.
+        distance: Of the camera from the base [m].
+    """
+    from sim.mujoco_c.model import surface_heights
+    from sim.recording.renderer import Camera
+
+    recording, t = shot.recording, shot.terrain
+    base = recording.base_position[t, shot.episode, : shot.num_frames].astype(np.float64)
+    width = max(1, round(_SMOOTH_S / recording.dt)) | 1
+    padded = np.pad(base, ((width // 2, width // 2), (0, 0)), mode="edge")
+    sums = np.cumsum(np.vstack([np.zeros(3), padded]), axis=0)
+    targets = (sums[width:] - sums[:-width]) / width
+    along = np.linspace(0.1, 1.0, 19)[:, None]
+    for elevation in _ELEVATIONS:
+        camera = Camera(target=(0.0, 0.0, 0.0), distance=distance, elevation=elevation)
+        azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(elevation)
+        back = -distance * np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
+        sight = targets[:, None] + along * back
+        ground = surface_heights(recording.heights[t].astype(np.float64), sight[..., 0], sight[..., 1])
+        if (sight[..., 2] > ground + _CLEARANCE).all() or elevation == _ELEVATIONS[-1]:
+            break
+    return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
+
+
+def frames_of(shot: Shot, renderer: "Renderer", cameras: Sequence["Camera"], fps: int) -> Iterator[Image]:
+    """The pictures of a film, the last one held for a second.
+
+    Args:
+        shot: What it shows.
+        renderer: Of the robot on the terrain, with images of 1280 x 480 pixels.
+        cameras: One a frame of the recording.
+        fps: Pictures a second.
+
+    Yields:
+        RGB, shape (720, 1280, 3).
+    """
+    panel, lines = Panel(shot, WIDTH, PANEL_HEIGHT), caption(shot)
+    recording, t = shot.recording, shot.terrain
+    poses = recording.qpos(t, shot.episode)
+    others = [recording.qpos(t, k) for k in shot.ghosts]
+    picture = np.zeros(0, np.uint8)
+    for frame in shown_frames(shot, fps):
+        ghosts = [other[min(frame, len(other) - 1)] for other in others]
+        force = recording.foot_force[t, shot.episode, frame]
+        view = renderer.render(poses[frame], cameras[frame], ghosts=ghosts, foot_force=force)
+        time_s = frame * recording.dt
+        lettered = _lettered(view, lines, f"{time_s:.1f} s")
+        picture = np.concatenate([lettered, panel.at(time_s, poses[frame, :3])])
+        yield picture
+    for _ in range(round(_HOLD_S * fps)):
+        yield picture
+
+
+def shown_frames(shot: Shot, fps: int) -> list[int]:
+    """Frames of the recording that a film shows, real time at ``fps``; its first and its last are among them."""
+    last = shot.num_frames - 1
+    times = np.arange(0.0, last * shot.recording.dt, 1.0 / fps)
+    return [*np.rint(times / shot.recording.dt).astype(int).tolist(), last] if last else [0]
+
+
+def num_pictures(shot: Shot, fps: int) -> int:
+    """How many pictures :func:`frames_of` gives."""
+    return len(shown_frames(shot, fps)) + round(_HOLD_S * fps)
+
+
+def _lettered(view: Image, lines: tuple[str, str], clock: str) -> Image:
+    """A view with the caption on a dark bar at its top, and the time at its bottom."""
+    from PIL import Image as Images
+    from PIL import ImageDraw, ImageFont
+
+    view[:_BAR] = (0.35 * view[:_BAR]).astype(np.uint8)
+    image = Images.fromarray(view)
+    draw = ImageDraw.Draw(image)
+    for row, (line, size) in enumerate(zip(lines, (20, 17), strict=True)):
+        draw.text((12, 4 + 27 * row), line, fill="white", font=ImageFont.load_default(size))
+    place = (view.shape[1] - 12, view.shape[0] - 10)
+    draw.text(place, clock, fill="black", font=ImageFont.load_default(22), anchor="rs")
+    return np.asarray(image)
+
+
+class Panel:
+    """The lower part of a film, drawn once: the terrain's map with the paths, and the penalties over time.
+
+    Args:
+        shot: What the film shows.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    def __init__(self, shot: Shot, width: int, height: int) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        self._map, self._curves = figure.subplots(1, 2, width_ratios=(1.0, 1.6))
+        _draw_map(self._map, shot)
+        _draw_curves(self._curves, shot)
+        canvas.draw()
+        self._image = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        self._faded = np.rint(255 - _FUTURE * (255.0 - self._image)).astype(np.uint8)
+        self._inside = self._curves.get_window_extent()
+
+    def at(self, time_s: float, position: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """The panel at a moment.
+
+        Args:
+            time_s: Since the start.
+            position: Of the base [m], shape (3,).
+
+        Returns:
+            RGB, shape (height, width, 3).
+        """
+        image, height = self._image.copy(), len(self._image)
+        now = round(self._curves.transData.transform((time_s, 0.0))[0])
+        rows = slice(height - round(self._inside.y1), height - round(self._inside.y0))
+        future = slice(now, round(self._inside.x1))
+        image[rows, future] = self._faded[rows, future]
+        image[rows, now - 1 : now + 1] = 40
+        x, y = self._map.transData.transform(position[:2])
+        row, column = np.ogrid[: image.shape[0], : image.shape[1]]
+        apart = np.hypot(row - (height - y), column - x)
+        image[apart < 7.0] = 255
+        image[apart < 5.0] = (213, 94, 0)
+        return image
+
+
+def _draw_map(axes: Any, shot: Shot) -> None:
+    recording, t = shot.recording, shot.terrain
+    heights = recording.heights[t]
+    extent = (-0.025, 0.05 * heights.shape[1] - 0.025, -0.025, 0.05 * heights.shape[0] - 0.025)
+    axes.imshow(heights, origin="lower", extent=extent, cmap="gray", alpha=0.9)
+    for k in range(recording.num_episodes):
+        path = recording.base_position[t, k, : recording.num_frames[t, k]]
+        style = ("#d55e00", 1.6) if k == shot.episode else ("white", 0.5)
+        axes.plot(path[:, 0], path[:, 1], color=style[0], linewidth=style[1], zorder=2 + (k == shot.episode))
+    axes.plot(*CrossingCfg.goal, marker="*", color="#009e73", markeredgecolor="black", markersize=13, zorder=4)
+    axes.set_xlim(extent[:2])
+    axes.set_ylim(extent[2:])
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+
+
+def _draw_curves(axes: Any, shot: Shot) -> None:
+    times = shot.recording.times_s[: shot.num_frames]
+    for (name, values), color in zip(shot.penalties.items(), _COLORS, strict=False):
+        label = f"{label_of(name)} {values[-1]:.1f}"
+        axes.plot(times, values, color=color, linewidth=1.8, label=label)
+    axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("time [s]")
+    measured = set(shot.scales.values()) != {1.0}
+    axes.set_ylabel(f"penalty so far,\n{'multiples of its scale' if measured else 'raw'}")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)

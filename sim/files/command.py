@@ -123,14 +123,15 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
 
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        defaults = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
-        command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **defaults)
+        defaults: Any = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
+        flags: Any = cls  # a protocol is no type that tyro's annotations take
+        command: _Command = tyro.cli(flags, prog=f"faultline {name}", args=list(argv), **defaults)
         status = command.execute()
         return status if isinstance(status, int) else 0
     except (ValueError, OSError, FloatingPointError, UserError) as error:
         if os.environ.get(_DEBUG):
             raise
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error: {' '.join(filter(None, map(str.strip, str(error).splitlines())))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)

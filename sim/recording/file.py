@@ -1,7 +1,7 @@
 """Recordings on disk: one npz, read as data and checked before anything is made of it.
 
-The file holds the fields of :class:`sim.recording.recorder.Recording` as arrays of those names, ``origin`` as JSON, ``format``
-as its name and version, and of terrains that were given by genes no heights: the reader makes them again.
+The file holds the fields of :class:`sim.recording.recorder.Recording` as arrays of those names, ``origin`` as JSON, and
+``format`` as its name and version. Of terrains given by genes it holds no heights: the reader makes them again.
 """
 
 import io
@@ -66,7 +66,7 @@ def read_recording(path: str | Path) -> Recording:
     """
     path = Path(path)
     if not os.path.isfile(path):
-        raise FileNotFoundError(f"no recording at {path}: `make video` writes one beside its film")
+        raise FileNotFoundError(f"no recording at {path}: `faultline film` writes one beside its film")
     try:
         content = _read(path)
         _check_kinds(content)

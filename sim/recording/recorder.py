@@ -17,7 +17,6 @@ from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.files.provenance import provenance
 from sim.policy.spec import controller_hash
-from sim.robots.robot import RobotCfg
 
 if TYPE_CHECKING:  # who reads a recording has no simulation to wait for
     from sim.rollout import Rollout, RolloutResult
@@ -109,6 +108,26 @@ class Recording:
         genes = None if self.genes is None else self.genes[terrain : terrain + 1]
         return replace(self, num_frames=num_frames, genes=genes, **cut)
 
+    def result(self) -> "RolloutResult":
+        """What came of the recorded episodes; positions are those of the last frame, what they took is not known."""
+        from sim.rollout import RolloutResult
+
+        last = np.maximum(self.num_frames - 1, 0)[..., None, None]
+        penalties, position = (
+            np.take_along_axis(values, last, axis=2)[:, :, 0] for values in (self.penalties, self.base_position)
+        )
+        invalid = (self.outcome == Outcome.INVALID)[..., None]
+        return RolloutResult(
+            penalties=np.where(invalid, np.nan, penalties.astype(np.float64)),
+            penalty_names=self.penalty_names,
+            outcome=self.outcome,
+            fallen=self.fallen,
+            duration_s=self.duration_s,
+            final_position=position,
+            physics_steps=0,
+            wall_s=0.0,
+        )
+
     def qpos(self, terrain: int, episode: int) -> NDArray[np.float64]:
         """MuJoCo's joint coordinates of an episode: position, quaternion w x y z, joints.
 
@@ -125,22 +144,21 @@ class Recording:
 
 
 class _Frames:
-    """Collects the frames of the chosen episodes of every terrain of a rollout."""
+    """Collects the frames of a rollout's episodes."""
 
-    def __init__(self, rollout: "Rollout", chosen: NDArray[np.int64]) -> None:
+    def __init__(self, rollout: "Rollout") -> None:
         self._rollout = rollout
         robot = rollout.robot
-        self._shape = (rollout.num_terrains, len(chosen))
-        self._rows = (np.arange(rollout.num_terrains)[:, None] * rollout.num_replicas + chosen).ravel()
+        self._shape = (rollout.num_terrains, rollout.num_replicas)
         self._feet = [robot.geom_names.index(name) for name in robot.foot_geoms]
         self._columns = [PENALTIES.index(name) for name in robot.penalties]
         self._taken: dict[str, list[NDArray[Any]]] = {name: [] for name in FRAME_ARRAYS}
 
     def take(self) -> None:
         """Add the present state as a frame."""
-        state, rows = self._rollout.state, self._rows
-        joint_q = state.joint_q.numpy()[rows]
-        force = state.geom_force.numpy()[rows][:, self._feet]
+        state = self._rollout.state
+        joint_q = state.joint_q.numpy()
+        force = state.geom_force.numpy()[:, self._feet]
         if not self._taken["foot_force"]:
             force = np.zeros_like(force)  # at the start there was no step yet, and what is there is of another episode
         values = {
@@ -148,8 +166,8 @@ class _Frames:
             "base_quaternion": joint_q[:, [6, 3, 4, 5]],
             "joint_position": joint_q[:, 7:],
             "foot_force": np.clip(force, -_MAX_FORCE, _MAX_FORCE),
-            "penalties": state.penalty_sums.numpy()[rows][:, self._columns],
-            "command": state.command.numpy()[rows],
+            "penalties": state.penalty_sums.numpy()[:, self._columns],
+            "command": state.command.numpy(),
         }
         for name, taken in self._taken.items():
             with np.errstate(over="ignore", invalid="ignore"):  # of an episode that broke
@@ -158,8 +176,8 @@ class _Frames:
     def stacked(self) -> dict[str, Any]:
         """All frames by name once the episodes are over, and how many each episode has."""
         state, decimation = self._rollout.state, self._rollout.robot.decimation
-        control_steps = -(-state.steps.numpy()[self._rows] // decimation)
-        valid = state.outcome.numpy()[self._rows] != Outcome.INVALID
+        control_steps = -(-state.steps.numpy() // decimation)
+        valid = state.outcome.numpy() != Outcome.INVALID
         num_frames = (control_steps + valid).reshape(self._shape).astype(np.int32)
         most = int(num_frames.max())
         absent = np.arange(most) >= num_frames[..., None]
@@ -177,12 +195,11 @@ def record(
     seeds: NDArray[Any],
     *,
     policy: str | Path,
-    replicas: Sequence[int] | None = None,
     labels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> "tuple[RolloutResult, Recording]":
-    """Runs a rollout's episodes and records some of them; the episodes are those that ``rollout.evaluate`` would run.
+    """Runs a rollout's episodes and records them; the episodes are those that ``rollout.evaluate`` would run.
 
     On the host a frame of an episode takes some 110 bytes: 4,000 whole episodes are half a gigabyte.
 
@@ -191,43 +208,34 @@ def record(
         terrains: Genes, shape (T, 64), or heights [m], shape (T, nrow, ncol).
         seeds: One a terrain, shape (T,), uint32.
         policy: What the rollout's controller was loaded from, to name and hash it.
-        replicas: Which of each terrain's episodes to record; all.
         labels: What each terrain is, in words.
         seed: What the seeds were drawn with, for the record.
         progress: As of ``rollout.evaluate``.
 
     Returns:
-        The result of all episodes, and the recording of those chosen.
+        The result, and the recording.
 
     Raises:
-        ValueError: If a shape does not fit, or there is no such episode.
+        ValueError: If a shape does not fit.
     """
-    chosen = np.arange(rollout.num_replicas) if replicas is None else np.asarray(replicas, dtype=np.int64)
-    if chosen.ndim != 1 or not len(chosen) or chosen.min() < 0 or chosen.max() >= rollout.num_replicas:
-        raise ValueError(f"replicas must be some of 0..{rollout.num_replicas - 1}, got {list(replicas or ())}")
-    frames = _Frames(rollout, chosen)
+    frames = _Frames(rollout)
     result = rollout.evaluate(terrains, seeds, before_step=frames.take, progress=progress)
     frames.take()
     heights: Any = rollout.sim.bank.heights.numpy()
     device = rollout.sim.device
+    robot = rollout.robot
     return result, Recording(
-        **_names_of(rollout.robot),
+        robot=robot.name,
+        joint_names=robot.joint_names,
+        foot_names=robot.foot_geoms,
+        penalty_names=robot.penalties,
+        dt=robot.control_dt,
         labels=tuple(labels or (f"terrain {k}" for k in range(rollout.num_terrains))),
         heights=heights.copy(),  # on the CPU numpy() is a view
         genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
         seeds=seeds.astype(np.uint32),
-        replicas=chosen.astype(np.int32),
+        replicas=np.arange(rollout.num_replicas, dtype=np.int32),
         origin={"policy": str(policy), "policy_sha256": controller_hash(str(policy)), **provenance(device, seed)},
-        **{name: getattr(result, name)[:, chosen] for name in ("outcome", "fallen", "duration_s")},
+        **{name: getattr(result, name) for name in ("outcome", "fallen", "duration_s")},
         **frames.stacked(),
     )
-
-
-def _names_of(robot: RobotCfg) -> dict[str, Any]:
-    return {
-        "robot": robot.name,
-        "joint_names": robot.joint_names,
-        "foot_names": robot.foot_geoms,
-        "penalty_names": robot.penalties,
-        "dt": robot.control_dt,
-    }

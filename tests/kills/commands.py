@@ -6,20 +6,19 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from kernels.episode import Outcome
 from qd.fresh import Reevaluate, reevaluate_run
-from qd.show import replay
+from qd.show import recordings, replay
 from qd.studies import calibrate
 from qd.workers import evaluator
-from sim import rollout
 from sim.files import command
 from tests.kills import searches, trainings
 from tests.qd import stand_in
+from tests.qd.recordings import recording_of
 from train.evaluate import evaluate, measures
 
 SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
@@ -46,7 +45,7 @@ class _StandInReevaluate(Reevaluate):
 
 def replay_elite(path: Path) -> None:
     """The worst elite again."""
-    rollout.Rollout = _StandInRollout
+    recordings.Simulation = lambda robot, device: _cross
     argv = ["--run", str(path), "--device", "cpu", "--replicas", "4", "--policy", searches.POLICY]
     sys.exit(command.run_command(replay.ReplayElite, argv, name="replay"))
 
@@ -80,16 +79,14 @@ def as_nobody(command: Callable[[Path], Any], path: Path) -> Any:
     return command(path)
 
 
-class _StandInRollout:
-    def __init__(self, robot: Any, policy: Any, *, num_terrains: int, num_replicas: int, device: str) -> None:
-        self.num_replicas = num_replicas
-        self.sim = SimpleNamespace(bank=SimpleNamespace(heights=SimpleNamespace(numpy=lambda: np.zeros((1, 161, 321)))))
-
-    def evaluate(self, genes: np.ndarray, seeds: np.ndarray, *, record_paths: bool) -> Any:
-        result = stand_in.evaluate(genes, seeds, self.num_replicas)
-        shape = result.invalid.shape
-        extra = {"outcome": np.full(shape, int(Outcome.GOAL)), "final_position": np.zeros((*shape, 3)), "paths": None}
-        return SimpleNamespace(**vars(result), **extra)
+def _cross(wanted: list[recordings.Wanted], progress: Any) -> list[Any]:
+    """Recordings of robots that all arrive."""
+    made = []
+    for one in wanted:
+        result = stand_in.evaluate(one.terrain[None], np.array([one.terrain_seed]), one.replicas)
+        outcomes = [Outcome.GOAL] * one.replicas
+        made.append(recording_of(outcomes, [14.0] * one.replicas, penalties=result.penalties[0]))
+    return made
 
 
 def search_below(limit: int, path: Path, iterations: int) -> None:

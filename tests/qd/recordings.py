@@ -1,9 +1,13 @@
 """Made-up recordings of one terrain: robots walk straight on to where they end."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from kernels.episode import Outcome
+from sim.policy.spec import controller_hash
 from sim.recording.recorder import Recording
+from sim.robots.robot import get_robot
 
 NAMES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 FRAMES = 21
@@ -19,7 +23,7 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0) -> Re
         fallen: Of each episode; nobody.
         seed: Of terrain and episodes.
     """
-    count = len(outcomes)
+    count, joints = len(outcomes), get_robot("anymal").joint_names
     sums = np.ones((count, 6)) if penalties is None else np.asarray(penalties, float)
     share = np.linspace(0.0, 1.0, FRAMES)
     position = np.zeros((1, count, FRAMES, 3), np.float32)
@@ -28,29 +32,33 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0) -> Re
     quaternion = np.zeros((1, count, FRAMES, 4), np.float32)
     quaternion[..., 0] = 1.0
     return Recording(
-        robot="anymal", joint_names=("hip",), foot_names=("foot",), penalty_names=NAMES, dt=0.02, labels=("made up",),
+        robot="anymal", joint_names=joints, foot_names=("foot",), penalty_names=NAMES, dt=0.02, labels=("made up",),
         heights=np.random.default_rng(seed).normal(0.0, 0.2, (1, 161, 321)).astype(np.float32), genes=None,
         seeds=np.array([seed], np.uint32), replicas=np.arange(count, dtype=np.int32),
         outcome=np.array([outcomes], np.uint8), fallen=np.array([[False] * count if fallen is None else fallen]),
         duration_s=np.full((1, count), 0.4, np.float32), num_frames=np.full((1, count), FRAMES, np.int32),
-        base_position=position, base_quaternion=quaternion, joint_position=np.zeros((1, count, FRAMES, 1), np.float32),
+        base_position=position, base_quaternion=quaternion,
+        joint_position=np.zeros((1, count, FRAMES, len(joints)), np.float32),
         foot_force=np.zeros((1, count, FRAMES, 1, 3), np.float32),
         penalties=(sums[None, :, None, :] * share[:, None]).astype(np.float32),
         command=np.zeros((1, count, FRAMES, 3), np.float32), origin={"policy": "made up"},
     )  # fmt: skip
 
 
-def stand_in_recorder(crossed: list):
-    """A maker of what crosses terrains in no time; the labels of what was crossed go into a list."""
+def stand_in_cross(crossed: list):
+    """What crosses terrains in no time; the labels of what was crossed go into a list."""
 
-    def make(place):
-        def cross(wanted, progress):
-            crossed.append(wanted.label)
-            progress(1.0)
+    def cross(wanted, progress):
+        made = []
+        for one in wanted:
+            crossed.append(one.label)
+            number = int(one.label.split()[1])  # elite 3 of anymal
             ends = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT)
-            outcomes = [ends[(wanted.number + k) % 4] for k in range(place.episodes)]
-            return recording_of(outcomes, np.linspace(6.0, 14.0, place.episodes), seed=wanted.number)
+            outcomes = [ends[(number + k) % 4] for k in range(one.replicas)]
+            recording = recording_of(outcomes, np.linspace(6.0, 14.0, one.replicas), seed=one.terrain_seed)
+            origin = {"policy": one.policy, "policy_sha256": controller_hash(one.policy)}
+            made.append(replace(recording, genes=one.terrain[None], labels=(one.label,), origin=origin))
+        progress(1.0)
+        return made
 
-        return cross
-
-    return make
+    return cross

@@ -12,7 +12,7 @@ import pytest
 from qd.archive import read_archive
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.arguments import Archive, job_of
-from qd.show.replay import ReplayCfg, replay
+from qd.show.replay import ReplayElite, replay
 from tests.sim.dogs import write_dog
 
 ROOT = Path(__file__).parents[2]
@@ -21,9 +21,8 @@ SIZE = ["--emitters", "1", "--batch-size", "4", "--replicas", "2"]
 
 def run(*words: str) -> str:
     """What a command prints; on the CPU, in the project's folder, as README has it."""
-    done = subprocess.run(
-        [sys.executable, "-m", "faultline", *words, "--device", "cpu"], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
+    command = [sys.executable, "-m", "faultline", *words, "--device", "cpu"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -126,7 +125,7 @@ def test_a_run_that_is_handed_over_runs_nothing_of_its_own(searched, tmp_path, h
     settings = {**config["settings"], "robot": f"{tmp_path}/evil.py", "policy": f"{tmp_path}/evil.py:act"}
     (tmp_path / "config.json").write_text(json.dumps({**config, "settings": settings}))
     for command in (
-        lambda: replay(ReplayCfg(robot=robot[1], run=tmp_path, device="cpu")),
+        lambda: replay(ReplayElite(robot=robot[1], run=tmp_path, device="cpu")),
         lambda: job_of(Archive(resume=tmp_path, device="cpu")),
         lambda: job_of(Archive(resume=tmp_path, robot=robot[1], device="cpu")),
         lambda: reevaluate_run(Reevaluate(run=tmp_path, device="cpu")),

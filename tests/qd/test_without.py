@@ -6,11 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kernels.episode import Outcome
 from qd.archive import read_archive
 from qd.fitness import FitnessCfg, evaluation_of
+from qd.show.elites import Found
 from qd.show.figures import PENALTY_LABELS, draw_archive
 from qd.show.replay import Replay, describe
+from sim.robots.robot import get_robot
 from tests.qd import stand_in
+from tests.qd.recordings import recording_of
 from tests.qd.run.test_arguments import TINY, fails, in_a_folder_of_its_own, run_main  # noqa: F401 - a fixture for all of these
 from tests.qd.test_search import run
 
@@ -42,17 +46,9 @@ def test_figure_and_replay_show_the_penalties_that_are_kept():
     assert [label.get_text() for label in axes.get_xticklabels()] == [PENALTY_LABELS[k] for k in FITNESS.penalties]
     result = stand_in.evaluate(found.genes[:1], np.zeros(1, np.uint32))
     fresh = evaluation_of(result, found.cells, FITNESS)
-    text = describe(
-        Replay(
-            run=Path("a"),
-            out=Path("a.png"),
-            archive=found,
-            elite=0,
-            heights=np.zeros((2, 2)),
-            result=result,
-            fresh=fresh,
-        )
-    )
+    recording = recording_of([Outcome.GOAL], [14.0])
+    where = Found(run=Path("a"), archive=found, robot=get_robot("anymal"))
+    text = describe(Replay(found=where, out=Path("a.png"), elite=0, recording=recording, fresh=fresh))
     assert all(f"  {name} [" in text for name in FITNESS.penalties)
     assert "stumble" not in text and "vel_y" not in text
 

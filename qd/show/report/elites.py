@@ -1,107 +1,231 @@
-"""The elites of an archive as a report takes them: what is known best of each, and which are worth a look."""
+"""The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
 
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
-
-from qd.archive import Archive
-
-FAILING_BELOW = 0.5
-"""Goal rate below which a controller fails a terrain, as in the evaluation tables."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Elites:
-    """N elites by what fresh episodes say of them, where there are such, else as they were found.
-
-    An elite whose fresh episodes are invalid is left out. Penalties are scaled.
-    """
-
-    penalties: tuple[str, ...]
-    """Names of the P penalties."""
-    fresh: bool
-    """Whether the values are of fresh episodes."""
-    numbers: NDArray[np.int64]
-    """Number of each elite in the archive, shape (N,), ascending."""
-    cell: NDArray[np.int64]
-    """Cell that these episodes fall into, shape (N,); elites whose luck put them apart may share one."""
-    fitness: NDArray[np.float64]
-    """Shape (N,)."""
-    ratios: NDArray[np.float64]
-    """Shape (N, P)."""
-    variation: NDArray[np.float64]
-    """Standard deviation of the penalties over the episodes, summed, as a share of their mean, shape (N,)."""
-    counted: NDArray[np.int64]
-    """Valid episodes, shape (N,)."""
-    goal_rate: NDArray[np.float64]
-    """Share of them that reached the goal, shape (N,)."""
-    collision_rate: NDArray[np.float64]
-    """Share that ended in a base collision, shape (N,)."""
-    fallen_rate: NDArray[np.float64]
-    """Share that ended tilted by more than 60 degrees, shape (N,)."""
-    reproduced: NDArray[np.bool_]
-    """Whether fresh episodes landed in its cell or a neighbour; True where nobody looked; shape (N,)."""
-
-    def __len__(self) -> int:
-        """N."""
-        return len(self.numbers)
-
-    @property
-    def failing(self) -> NDArray[np.bool_]:
-        """Whether under half of the robots reach the goal, shape (N,)."""
-        return self.goal_rate < FAILING_BELOW
-
-    @property
-    def failing_cells(self) -> int:
-        """Different ways to fail: cells that the failing elites fall into."""
-        return len(np.unique(self.cell[self.failing]))
-
-    @property
-    def other_rate(self) -> NDArray[np.float64]:
-        """Share that neither arrived nor collided: out of time or off the terrain, shape (N,)."""
-        return np.clip(1.0 - self.goal_rate - self.collision_rate, 0.0, 1.0)
-
-    def place_of(self, number: int) -> int:
-        """Row of an elite by its number in the archive."""
-        return int(np.searchsorted(self.numbers, number))
+from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
+from qd.show.crossing_figures import draw_crossing, draw_maps
+from qd.show.elites import Elites
+from qd.show.figures import PENALTY_UNITS, label_of
+from qd.show.report.figures import draw_modes
+from qd.show.report.material import Shown
+from qd.show.report.modes import MAX_MODES, TOLERANCE, Mode
+from qd.show.report.page import Absent, Block, Heading, Section, Table, Text, counted, percent, picture
+from sim.files.command import command_line
+from sim.files.intervals import wilson_interval
 
 
-def elites_of(archive: Archive) -> Elites:
-    """The elites of an archive, in its order."""
-    fresh = archive.fresh
-    values = archive if fresh is None else fresh
-    kept = np.flatnonzero(np.ones(len(archive), bool) if fresh is None else fresh.valid)
-    means, stds = (getattr(values, name)[kept].sum(axis=1) for name in ("penalty_mean", "penalty_std"))
-    rates = {name: getattr(values, name)[kept] for name in ("goal_rate", "collision_rate", "fallen_rate")}
-    return Elites(
-        penalties=archive.penalties,
-        fresh=fresh is not None,
-        numbers=kept.astype(np.int64),
-        cell=values.cell[kept],
-        fitness=values.fitness[kept],
-        ratios=values.ratios[kept],
-        variation=stds / np.maximum(means, np.finfo(float).tiny),
-        counted=(values.episodes - values.invalid_episodes)[kept],
-        reproduced=np.ones(len(kept), bool) if fresh is None else fresh.reproduced[kept],
-        **rates,
+def anchor_of(number: int) -> str:
+    """Where an elite is shown in detail."""
+    return f"elite-{number}"
+
+
+def modes_section(shown: Shown) -> Section:
+    """The groups of elites, each with a typical terrain."""
+    modes, elites = shown.modes, shown.elites
+    largest = max(modes.modes, key=lambda mode: len(mode.members))
+    text = (
+        f"The {counted(len(elites), 'elite')} fall into {counted(len(modes.modes), 'mode')} by how the robot "
+        f"struggles and how its crossings end. The largest, mode {largest.number}, has {len(largest.members):,} "
+        f"({percent(len(largest.members) / len(elites))}): {_described(largest)}."
+    )
+    section = Section("Failure modes", "modes", [Text(text), Text(_how(shown))])
+    shows = "Mean shares of the penalties and of the ends of crossings by group; silhouette by number of groups"
+    section.blocks += [picture("modes", draw_modes(elites, modes), shows), _modes_table(shown)]
+    typical = {
+        f"mode {mode.number}: elite {mode.typical}, {mode.ending}": shown.crossed[mode.typical]
+        for mode in modes.modes
+        if mode.typical in shown.crossed
+    }
+    if not typical:
+        return section
+    arrived = [shown.crossed[mode.typical].rates[ARRIVED] for mode in modes.modes]
+    reached = "; ".join(f"mode {mode.number}: {rate}" for mode, rate in zip(modes.modes, arrived, strict=True))
+    section.blocks += [
+        Text(f"A typical terrain of each, the elite nearest to all others of its mode, crossed again. Robots that "
+             f"reached the goal, with 95 % intervals: {reached}."),
+        picture("modes-terrains", draw_maps(typical, f"{shown.material.archive.robot}: a typical terrain of each mode"),
+                "Height map of a typical terrain of each mode with the robots' paths"),
+    ]  # fmt: skip
+    return section
+
+
+def _described(mode: Mode) -> str:
+    return (
+        f"the robot {mode.deed} (goal {percent(mode.goal_rate)}, base collision "
+        f"{percent(mode.collision_rate)}, neither {percent(mode.other_rate)}), and the share that stands out is that "
+        f"of {label_of(mode.marked_by)}"
     )
 
 
-def worst(elites: Elites, count: int) -> list[int]:
-    """Numbers of the failed terrains with the highest fitness, the highest first; if fewer fail, of others after them.
+def _how(shown: Shown) -> str:
+    """How the groups were made."""
+    how = (
+        "Ward's clustering on the shares and on the rates of goal, base collision and fall, all fractions and "
+        f"unweighted; of 2 to {MAX_MODES} groups the most whose mean silhouette is within {TOLERANCE} of the best"
+    )
+    found = shown.modes.silhouettes
+    if not found:
+        return f"{how}. These elites are too few or too equal to be divided."
+    best = max(found, key=lambda count: found[count])
+    taken = len(shown.modes.modes)
+    return (
+        f"{how}: {taken} have {found[taken]:.2f}, the best, {best}, {found[best]:.2f} (1: apart, 0: touching; under "
+        "one half the borders between them are soft)."
+    )
 
-    An elite may have the highest fitness of all and be crossed by every robot, with trouble.
+
+def _modes_table(shown: Shown) -> Table:
+    head = ["mode", "elites", "of all", "goal", "base collision", "neither", "fallen", "fitness",
+            "share that stands out", "typical elite"]  # fmt: skip
+    rows = [
+        [
+            f"{mode.number}: {mode.ending}",
+            f"{len(mode.members):,}",
+            percent(len(mode.members) / len(shown.elites)),
+            *(percent(rate) for rate in (mode.goal_rate, mode.collision_rate, mode.other_rate, mode.fallen_rate)),
+            f"{mode.fitness:.1f}",
+            label_of(mode.marked_by),
+            f"{mode.typical}",
+        ]
+        for mode in shown.modes.modes
+    ]
+    links = [anchor_of(mode.typical) if mode.typical in shown.crossed else "" for mode in shown.modes.modes]
+    return Table(head, rows, links=links)
+
+
+def detail_section(shown: Shown) -> Section:
+    """The worst, the most reproducible and the typical elites, each with figure and numbers."""
+    section = Section("Terrains worth a look", "terrains")
+    if shown.not_crossed:
+        section.blocks.append(Absent(shown.not_crossed))
+        return section
+    stubborn = sum(shown.crossed[number].rates[ARRIVED].hits == 0 for number in shown.worst)
+    text = (
+        f"{choice_told(shown.elites, shown.worst, shown.steady)} Each was crossed {shown.material.cfg.episodes} times "
+        "afresh for this page, by the episodes that `faultline replay --elite N` shows; on "
+        f"{stubborn} of the first {len(shown.worst)} no robot reached the goal. Scaled penalties: 1 is what a common "
+        "one comes to on hard-random terrain."
+    )
+    section.blocks.append(Text(text))
+    for number in shown.numbers:
+        section.blocks += _elite(shown, number)
+    return section
+
+
+def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
+    """Which elites are shown, in a sentence that holds for any number of them.
+
+    Args:
+        elites: All elites.
+        worst: Numbers of the failed ones of highest fitness, and of others after them if too few fail.
+        steady: Numbers of those that vary least.
     """
-    order = np.lexsort((-elites.fitness, ~elites.failing))
-    return elites.numbers[order[:count]].tolist()
+    fails = {number: bool(elites.failing[elites.place_of(number)]) for number in worst}
+    failed, others = ([number for number in worst if fails[number] is kind] for kind in (True, False))
+    parts = []
+    if failed:
+        parts.append(f"terrains on which the controller fails, the highest fitness first ({_list(failed)})")
+    if others:
+        parts.append(f"{'other ' * bool(failed)}terrains of high fitness on which it does not fail ({_list(others)})")
+    parts.append(
+        f"terrains whose penalties vary least between episodes for their size, failed ones first ({_list(steady)})"
+    )
+    return f"Shown are {'; '.join(parts)}; and a typical terrain of each mode."
 
 
-def most_reproducible(elites: Elites, count: int) -> list[int]:
-    """Numbers of the failed terrains whose penalties vary least between episodes, for their size; the steadiest first.
+def _list(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers))
 
-    A terrain on which the controller fails comes before one that it crosses, and one whose fresh episodes landed in its
-    cell or beside it before one where they did not.
-    """
-    order = np.lexsort((elites.variation, ~elites.reproduced, ~elites.failing))
-    return elites.numbers[order[:count]].tolist()
+
+def _elite(shown: Shown, number: int) -> list[Block]:
+    """One elite: why it is shown, what became of it, figure and numbers."""
+    crossed, archive = shown.crossed[number], shown.material.archive
+    place = shown.elites.place_of(number)
+    failed = shown.elites.failing[place]
+    ranked = (("worst failed" if failed else "high fitness", shown.worst), ("most reproducible", shown.steady))
+    roles = [f"{what}, rank {numbers.index(number) + 1}" for what, numbers in ranked if number in numbers]
+    roles += [f"typical of mode {mode.number}" for mode in shown.modes.modes if mode.typical == number]
+    heading = Heading(f"Elite {number}: {'; '.join(roles)}", anchor_of(number))
+    if not len(crossed.chosen):
+        return [heading, Absent("All its episodes were invalid this time: there is nothing to draw.")]
+    title = f"{archive.robot}, elite {number} of {len(archive):,}: {len(crossed.chosen)} crossings"
+    drawn = picture(
+        f"elite-{number}", draw_crossing(crossed, archive.penalties, title),
+        f"Height map of elite {number} with the paths of {len(crossed.chosen)} robots, profile, and penalties",
+    )  # fmt: skip
+    return [heading, Text(_told(shown, crossed, place)), drawn, _penalty_table(shown, crossed), _rate_table(crossed)]
+
+
+def _told(shown: Shown, crossed: Crossed, place: int) -> str:
+    """What became of the robots, in a sentence or two."""
+    elites = shown.elites
+    arrived = crossed.rates[ARRIVED]
+    failures = {label: crossed.rates[label].hits for label in FAILED}
+    others = "; ".join(f"{label} {hits}" for label, hits in failures.items() if hits)
+    text = f"{arrived.hits} of {arrived.count} robots reached the goal"
+    if others:
+        text += f" ({others}), and the middle one of those that did not ended at x = {crossed.failed_at:.1f} m"
+    means = crossed.scaled.mean(axis=0)
+    main = int(means.argmax())
+    count = int(elites.counted[place])
+    episodes = f"fresh episode{'s' * (count != 1)}"
+    if not elites.fresh[place]:
+        episodes = f"episode{'s' * (count != 1)} of the search"
+    return (
+        f"{text}. The largest penalty is {label_of(elites.penalties[main])}, "
+        f"{percent(float(means[main] / max(means.sum(), 1e-12)))} of all. Its fitness is {elites.fitness[place]:.1f} "
+        f"by {count:,} {episodes}, whose penalties have a standard deviation of "
+        f"{percent(float(elites.variation[place]))} of their mean."
+    )
+
+
+def _penalty_table(shown: Shown, crossed: Crossed) -> Table:
+    names, scaled = shown.material.archive.penalties, crossed.scaled
+    total = max(float(scaled.mean(axis=0).sum()), 1e-12)
+    rows = [
+        [
+            label_of(name) + (f" [{PENALTY_UNITS[name]}]" if name in PENALTY_UNITS else ""),
+            f"{raw.mean():.2f}",
+            f"{raw.std():.2f}",
+            f"{own.mean():.2f}",
+            f"{own.std():.2f}",
+            percent(float(own.mean()) / total),
+        ]
+        for name, raw, own in zip(names, crossed.penalties.T, scaled.T, strict=True)
+    ]
+    return Table(["penalty an episode", "mean", "std", "mean, scaled", "std, scaled", "share"], rows)
+
+
+def _rate_table(crossed: Crossed) -> Table:
+    rows = [
+        [label, f"{rate.hits} of {rate.count}", f"{100 * rate.hits / rate.count:.0f} %", rate.limits]
+        for label, rate in crossed.rates.items()
+    ]
+    return Table(["crossings", "", "rate", "95 % interval (Wilson)"], rows)
+
+
+def all_section(shown: Shown) -> Section:
+    """Every elite in a table that can be sorted."""
+    elites, archive = shown.elites, shown.material.archive
+    head = ["elite", "fitness", "mode", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]", "std / mean",
+            "iteration", *(f"{label_of(name)} [%]" for name in elites.penalties)]  # fmt: skip
+    rows, keys = [], []
+    for k, number in enumerate(elites.numbers.tolist()):
+        rate = Rate(elites.hits("goal_rate", k), int(elites.counted[k]))
+        rates = [float(values[k]) for values in (elites.goal_rate, elites.collision_rate, elites.fallen_rate)]
+        goal, collision, fallen = (f"{100 * value:.0f}" for value in rates)
+        mode, found = int(shown.modes.labels[k]), int(archive.iteration[number])
+        shares, fitness, variation = elites.ratios[k].tolist(), elites.fitness[k], elites.variation[k]
+        rows.append(
+            [f"{number}", f"{fitness:.2f}", f"{mode}", goal, rate.limits, collision, fallen, f"{variation:.2f}",
+             f"{found}", *(f"{100 * share:.0f}" for share in shares)]
+        )  # fmt: skip
+        low = wilson_interval(*rate)[0]
+        values = [number, fitness, mode, rates[0], low, *rates[1:], variation, found, *shares]
+        keys.append([f"{value:.5g}" for value in values])
+    links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers.tolist()]
+    again = command_line("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
+    table = Table(head, rows, sortable=True, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
+    text = (
+        f"All {counted(len(rows), 'elite')}, the highest fitness first; a click on a heading sorts. `{again}` crosses "
+        "one again."
+    )
+    return Section("All elites", "all", [Text(text), table])

@@ -1,69 +1,34 @@
-"""What a report is made from: the files of a run and of an evaluation, read and checked before any work."""
+"""What a report is made from: the files of a run and of an evaluation, and what was worked out and crossed for it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from qd.archive import ARCHIVE_FILE, Archive, read_archive
-from qd.run.directory import (
-    CONFIG_FILE,
-    METRICS_FILE,
-    RESULTS,
-    Metrics,
-    RunDirectory,
-    directory_of,
-    folder_for,
-    newest_or_published,
-)
-from qd.run.next_commands import make_command
+from qd.archive import ARCHIVE_FILE, Archive
+from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
+from qd.show.crossed import Crossed
+from qd.show.elites import Elites, find_archive
 from qd.show.figures import summary
-from qd.show.replay import as_searched, check_penalties
-from qd.show.report.tables import read_tables
+from qd.show.report.modes import Modes
+from qd.show.report.tables import Change, Changes, read_tables
 from sim.files.atomic import prepare_output
+from sim.files.command import command_line
 from sim.policy.spec import ControllerSpec, spec_of
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.robot import RobotCfg
+
+if TYPE_CHECKING:
+    from qd.show.report.command import Report
 
 _ORIGIN = ("command", "commit", "device", "versions", "seed", "date")
-
-
-@dataclass(frozen=True, kw_only=True)
-class HtmlReportCfg:
-    """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
-
-    Elites shown are crossed again for it, 20 times each; what was crossed is kept beside the page, so that the same
-    command, stopped or made again, goes on from there.
-    """
-
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    run: Path | None = None
-    """Run directory; the newest of this robot under runs/, or without one results/<robot>/archive."""
-    tables: Path | None = None
-    """File of the evaluation tables; results/<robot>/tables.json if it is there."""
-    out: Path | None = None
-    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published."""
-    policy: str | None = None
-    """Controller other than the one the archive was made with; that one too, if it is code."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
-    elites: int = 5
-    """How many of the worst and of the most reproducible elites to show, beside one of each failure mode."""
-    episodes: int = 20
-    """Crossings of each elite shown."""
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.elites <= 10:
-            raise ValueError(f"elites must be 1 to 10 of each kind, got {self.elites}: each takes a figure and a table")
-        if not 1 <= self.episodes <= 100:
-            raise ValueError(f"episodes must be 1 to 100 of each elite, got {self.episodes}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
     """Everything read; None where there is no such file."""
 
-    cfg: HtmlReportCfg
+    cfg: "Report"
     robot: RobotCfg
     run: Path
     """Directory or archive file that was read."""
@@ -99,18 +64,50 @@ class Material:
         return self.cfg.policy is None and ControllerSpec.parse(self.searched).runs_code
 
 
-def gather(cfg: HtmlReportCfg) -> Material:
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """All that the sections take their numbers from."""
+
+    material: Material
+    elites: Elites
+    modes: Modes
+    worst: list[int]
+    """Numbers of the failed terrains with the highest fitness; if there are fewer, of others after them."""
+    steady: list[int]
+    """Numbers of the most reproducible ones."""
+    crossed: Mapping[int, Crossed] = field(default_factory=dict)
+    """Crossings by the elite's number."""
+    not_crossed: str = ""
+    """Why there are none, if so."""
+    changes: Changes | None = None
+    """Terrains to show before and after fine-tuning; None without tables."""
+    pairs: Mapping[Change, tuple[Crossed, Crossed]] = field(default_factory=dict)
+    """What both controllers make of each."""
+
+    @property
+    def numbers(self) -> list[int]:
+        """Elites to be shown in detail, each once: the worst, the steadiest, and the typical one of each mode."""
+        typical = [mode.typical for mode in self.modes.modes]
+        return list(dict.fromkeys([*self.worst, *self.steady, *typical]))
+
+
+def gather(cfg: "Report") -> Material:
     """Reads what there is and makes sure that the page can be written.
 
     Raises:
         FileNotFoundError: If there is no run or no such tables.
         ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
     """
-    robot = get_robot(cfg.robot)
-    run = cfg.run or newest_or_published(robot)
-    archive = _archive_of(run, robot)
-    searched, _ = as_searched(run, archive)
-    folder = RunDirectory(directory_of(run))
+    _refuse_unbegun(cfg.run)
+    found = find_archive(cfg.robot, cfg.run)
+    archive, robot, run = found.archive, found.robot, found.run
+    if not len(archive):
+        raise ValueError(
+            f"{run} must have elites to report on, got an archive of none after {archive.iterations} iterations: "
+            f"let it go on with `{command_line('archive', resume=run, iterations='N')}`"
+        )
+    searched, _ = found.as_searched()
+    folder = RunDirectory(found.folder)
     search = folder.read_cfg() if (folder.path / CONFIG_FILE).exists() else None
     numbers = folder.read_summary()
     again = numbers.get("reproduced_by")
@@ -136,24 +133,12 @@ def gather(cfg: HtmlReportCfg) -> Material:
     return material
 
 
-def _archive_of(run: Path, robot: RobotCfg) -> Archive:
-    if run.is_dir() and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
+def _refuse_unbegun(run: Path | None) -> None:
+    if run is not None and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
         raise ValueError(
             f"{run} must hold a search that has ended an iteration, got one without {ARCHIVE_FILE}: "
-            f"let it go on with `{make_command('archive', robot=robot.spec, resume=run)}`"
+            f"let it go on with `{command_line('archive', resume=run)}`"
         )
-    archive = read_archive(run)
-    if archive.robot != robot.name:
-        raise ValueError(
-            f"{run} is of robot {archive.robot}, got --robot {robot.spec}: give that robot or another --run"
-        )
-    check_penalties(archive, robot, run)
-    if not len(archive):
-        raise ValueError(
-            f"{run} must have elites to report on, got an archive of none after {archive.iterations} iterations: "
-            f"let it go on with `{make_command('archive', robot=robot.spec, resume=run)} ITERATIONS=N`"
-        )
-    return archive
 
 
 def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
@@ -163,7 +148,7 @@ def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
         return None
     rows = folder.read_metrics()
     if len(rows) < archive.iterations:
-        again = make_command("archive", robot=archive.robot, resume=folder.path)
+        again = command_line("archive", resume=folder.path)
         raise ValueError(
             f"{file} must have a row for each of the archive's {archive.iterations} iterations, got {len(rows)}: the "
             f"run is half-written; `{again}` writes both again"

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.show.report.elites import FAILING_BELOW, Elites
+from qd.fitness import FAILING_GOAL_RATE
+from qd.show.elites import Elites
 
 MAX_MODES = 7
 """Most groups that are tried: as many as colours and markers stay apart."""
@@ -46,7 +47,7 @@ class Mode:
     @property
     def failing(self) -> bool:
         """Whether under half of its robots reach the goal."""
-        return self.goal_rate < FAILING_BELOW
+        return self.goal_rate < FAILING_GOAL_RATE
 
     @property
     def ending(self) -> str:

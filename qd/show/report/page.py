@@ -6,6 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from qd.run.progress import clock
+from qd.show.figures import as_png
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _FOLDER = Path(__file__).parent
 # Nothing may be fetched, whatever else the page says.
@@ -105,6 +112,35 @@ def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
         f"<script>{script}</script>\n</body>\n</html>\n"
     )
     return text.encode("utf-8", errors="backslashreplace")  # a file's name may hold bytes that are no text
+
+
+def picture(name: str, figure: "Figure", shows: str) -> Picture:
+    """A figure as a part of the page.
+
+    Args:
+        name: Of its file, without .png.
+        figure: What to draw.
+        shows: What it shows, for who cannot see it.
+    """
+    return Picture(f"{name}.png", as_png(figure), shows)
+
+
+def percent(share: float) -> str:
+    """A share as people read it: 0 and 100 % only of none and all."""
+    text = f"{100.0 * share:.1f}" if 0.0 < share < 1.0 and not 0.095 <= share < 0.995 else f"{100.0 * share:.0f}"
+    if (text == "0.0" and share > 0.0) or (text == "100.0" and share < 1.0):
+        text = "less than 0.1" if share < 0.5 else "over 99.9"
+    return f"{text} %"
+
+
+def hours(seconds: float) -> str:
+    """A long duration."""
+    return f"{seconds / 3600:,.0f} hours" if seconds > 36_000 else clock(seconds)
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    """A number with its noun: ``1 elite``, ``459 elites``."""
+    return f"{number:,} {one if number == 1 else many or f'{one}s'}"
 
 
 def pictures_of(sections: Sequence[Section]) -> list[Picture]:

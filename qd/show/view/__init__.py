@@ -1,1 +1,1 @@
-"""An archive in the browser: its elites, their terrains, and the robot that crosses them (``python -m qd.show.view``)."""
+"""An archive in the browser: its elites, their terrains, and the robot that crosses them."""

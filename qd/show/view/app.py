@@ -2,21 +2,20 @@
 
 import queue
 import time
+from collections.abc import Callable
 from html import escape
 from typing import Any
 
 import viser
 
-from qd.show.view.arguments import Show
-from qd.show.view.crossings import Crossings, Wanted
-from qd.show.view.elites import elites_of
+from qd.show.recordings import Recordings, Wanted, on_elite
+from qd.show.view.command import Show
 from qd.show.view.meshes import body_meshes
-from qd.show.view.panels import ArchivePanel, CrossingPanel
-from qd.show.view.pictures import Curves
+from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
 from qd.show.view.playing import Crossing, crossing_of, endings, moment_text, paths_of
+from qd.show.view.plots import Curves, axes_of
 from qd.show.view.recorder import Recorder, Report
 from qd.show.view.scene import Scene
-from qd.show.view.state import Clock, Selection
 from sim.bank import heights_of
 from sim.crossing import CrossingCfg
 from sim.recording.recorder import Recording
@@ -39,29 +38,29 @@ class Page(viser.ViserServer):
 class App:
     """What is shown, and what happens when a visitor does something."""
 
-    def __init__(self, show: Show, crossings: Crossings) -> None:
+    def __init__(self, show: Show, recordings: Recordings) -> None:
         """Open the page and show an elite.
 
         Args:
             show: What to show.
-            crossings: Recordings that are there.
+            recordings: Those that are kept.
 
         Raises:
             ValueError: If the robot's file cannot be shown.
         """
-        self._show, self._crossings = show, crossings
+        self._show, self._recordings = show, recordings
         self._archive = show.found.archive
         self._skeleton = Skeleton(show.robot)
-        self._elites = elites_of(self._archive)
-        self._selection, self._clock = Selection(self._elites), Clock()
+        self._axes = axes_of(self._archive)
+        self._selection, self._clock = Selection(self._axes), Clock()
         self._controller = next(iter(show.controllers), None)
         self._replica = 0
         self._recording: Recording | None = None
         self._crossing: Crossing | None = None
         self._curves: Curves | None = None
-        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._asked: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]] = queue.SimpleQueue()
         self.page = Page(host=show.cfg.host, port=show.cfg.port, label="faultline", verbose=False)
-        self._recorder = Recorder(show.robot, lambda report: self.emit("report", report))
+        self._recorder = Recorder(show.robot, lambda report: self.post(self.show_report, report))
         self._open()
 
     def _open(self) -> None:
@@ -69,16 +68,16 @@ class App:
         gui.configure_theme(show_logo=False, show_share_button=False)
         bodies, num_feet = body_meshes(self._skeleton, show.robot), len(show.robot.foot_geoms)
         self._scene = Scene(self.page, bodies, num_feet, CrossingCfg())
-        title = f"{show.robot.name} · {show.found.folder} · {len(self._elites):,} elites"
-        self._list = ArchivePanel(self.page, self._elites, title, self.emit)
-        self._panel = CrossingPanel(self.page, list(show.controllers), show.cfg.replicas, self.emit)
-        self._selection.pick(show.cfg.elite)
+        title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
+        self._list = ArchivePanel(self.page, self._axes, title, self)
+        self._panel = CrossingPanel(self.page, list(show.controllers), show.cfg.replicas, self)
+        self._selection.pick(show.elite)
         self._list.show(self._selection)
         self._show_elite()
 
-    def emit(self, name: str, value: Any) -> None:
-        """Have something done by the loop; from any thread."""
-        self._events.put((name, value))
+    def post(self, act: Callable[..., None], *args: Any) -> None:
+        """Have one of the methods below called by the loop; from any thread."""
+        self._asked.put((act, args))
 
     def close(self) -> None:
         """End the recording processes and the page."""
@@ -89,7 +88,7 @@ class App:
         """Serve until interrupted."""
         last = told = time.perf_counter()
         while True:
-            self.handle_events(wait_s=_FRAME_S if self._clock.playing else 1.0)
+            self.do_asked(wait_s=_FRAME_S if self._clock.playing else 1.0)
             now = time.perf_counter()
             if self._clock.playing and self._crossing is not None:
                 self._clock.tick(now - last)
@@ -99,93 +98,108 @@ class App:
                     self._show_moment()
             last = now
 
-    def handle_events(self, wait_s: float) -> None:
+    def do_asked(self, wait_s: float) -> None:
         """Do what was asked for, or wait for it; while playing, the whole time.
 
         Of several settings of one control, as dragging makes, only the last one counts.
         """
         until = time.perf_counter() + wait_s
-        found: dict[Any, tuple[str, Any]] = {}
+        only_last = (self.seek, self.choose_replica, self.show_report)
+        found: dict[Any, tuple[Callable[..., None], tuple[Any, ...]]] = {}
         while (left := until - time.perf_counter()) > 0.0:
             try:
-                name, value = self._events.get(timeout=left)
+                act, args = self._asked.get(timeout=left)
             except queue.Empty:
                 break
-            repeats = name in ("seek", "replica", "report", "brush")
-            key = (name, value[0] if name == "brush" else None) if repeats else object()
+            key: Any = act if act in only_last else (act, args[0]) if act == self.brush else object()
             found.pop(key, None)
-            found[key] = (name, value)
-            if not self._clock.playing and self._events.empty():
+            found[key] = (act, args)
+            if not self._clock.playing and self._asked.empty():
                 break
-        for name, value in found.values():
-            getattr(self, f"_on_{name}")(value)
+        for act, args in found.values():
+            act(*args)
 
-    def _on_brush(self, value: tuple[str, float, float]) -> None:
-        self._selection.brush(*value)
+    def brush(self, axis: str, low: float, high: float) -> None:
+        """List the elites in a range of an axis."""
+        self._selection.brush(axis, low, high)
         self._list.show(self._selection)
 
-    def _on_clear(self, _: None) -> None:
+    def clear(self) -> None:
+        """Free all axes."""
         self._selection.clear()
         self._list.show(self._selection)
 
-    def _on_turn(self, pages: int) -> None:
+    def turn(self, pages: int) -> None:
+        """Turn the list by some pages."""
         self._selection.turn(pages)
         self._list.show(self._selection)
 
-    def _on_line(self, line: int) -> None:
+    def pick_line(self, line: int) -> None:
+        """Show the elite on a line of the list."""
         listed = self._selection.listed
         if line < len(listed):  # else the list was drawn anew while the click was on its way
-            self._on_pick(listed[line])
+            self.pick(listed[line])
 
-    def _on_step(self, by: int) -> None:
-        self._on_pick(self._selection.step(by))
+    def step(self, by: int) -> None:
+        """Show the next (1) or previous (-1) elite of the list."""
+        self.pick(self._selection.step(by))
 
-    def _on_pick(self, number: int) -> None:
-        if not 0 <= number < len(self._elites):  # a number field can be typed into
+    def pick(self, number: int) -> None:
+        """Show an elite."""
+        if not 0 <= number < len(self._archive):  # a number field can be typed into
             return
-        changed = self._selection.pick(int(number))
+        changed = self._selection.pick(number)
         self._list.show(self._selection)
         if changed:
             self._show_elite()
 
-    def _on_controller(self, name: str) -> None:
+    def choose_controller(self, name: str) -> None:
+        """Show the crossings of another controller."""
         if name in self._show.controllers and name != self._controller:
             self._controller = name
             self._show_crossings()
 
-    def _on_replica(self, replica: int) -> None:
-        self._replica = min(max(int(replica), 0), self._show.cfg.replicas - 1)
+    def choose_replica(self, replica: int) -> None:
+        """Show another episode, counted from 0."""
+        self._replica = min(max(replica, 0), self._show.cfg.replicas - 1)
         if self._recording is not None:
             self._show_episode()
 
-    def _on_play(self, _: None) -> None:
+    def play(self) -> None:
+        """Play or pause."""
         if self._crossing is not None:
             self._clock.toggle()
             self._show_moment()
 
-    def _on_seek(self, time_s: float) -> None:
+    def seek(self, time_s: float) -> None:
+        """Show a time [s]."""
         if self._crossing is not None:
             self._clock.seek(time_s)
             self._show_frame()
             self._show_moment()
 
-    def _on_speed(self, speed: float) -> None:
+    def set_speed(self, speed: float) -> None:
+        """Play so many simulated seconds in a real one."""
         self._clock.speed = speed
 
-    def _on_follow(self, follow: bool) -> None:
+    def set_follow(self, follow: bool) -> None:
+        """Let the camera follow the robot, or stay."""
         self._scene.set_follow(follow)
 
-    def _on_forces(self, shown: bool) -> None:
+    def set_forces(self, shown: bool) -> None:
+        """Show or hide the forces of the feet."""
         self._scene.show_forces = shown
         if self._crossing is not None:
             self._show_frame()
 
-    def _on_paths(self, shown: bool) -> None:
+    def set_paths(self, shown: bool) -> None:
+        """Show or hide the ways of all episodes."""
         self._scene.set_show_paths(shown)
 
-    def _on_report(self, report: Report) -> None:
+    def show_report(self, report: Report) -> None:
+        """Say how a recording goes on, keep it, and show it if it is still wanted."""
         if report.recording is not None:
-            self._keep(report.wanted, report.recording)
+            self._recordings.keep(report.wanted, report.recording)
         if report.wanted != self._wanted():
             return
         if report.recording is not None:
@@ -193,32 +207,20 @@ class App:
         elif report.failed:
             self._panel.show_status(f"No crossing: {escape(report.text)}")
         else:
-            text = f"Recording {report.wanted.replicas} episodes of {report.wanted.controller}: {report.text} …"
+            text = f"Recording {report.wanted.replicas} episodes of {self._controller}: {report.text} …"
             self._panel.show_status(text, report.share)
-
-    def _keep(self, wanted: Wanted, recording: Recording) -> None:
-        try:
-            self._crossings.write(wanted, recording)
-        except OSError as error:  # it can be shown all the same
-            print(f"not kept: {error}", flush=True)
 
     def _wanted(self) -> Wanted | None:
         """The crossings that are to be shown; None without a controller."""
         if self._controller is None:
             return None
-        elite, cfg = self._selection.picked, self._show.cfg
-        return Wanted(
-            elite=elite,
-            controller=self._controller,
-            policy=self._show.controllers[self._controller],
-            replicas=cfg.replicas,
-            genes=self._archive.genes[elite : elite + 1],
-        )
+        policy, replicas = self._show.controllers[self._controller], self._show.cfg.replicas
+        return on_elite(self._archive, self._selection.picked, policy=policy, replicas=replicas)
 
     def _show_elite(self) -> None:
         elite = self._selection.picked
         self._scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1])[0])
-        self._panel.show_elite(self._elites.details(elite))
+        self._panel.show_elite(self._axes.details(elite))
         self._show_crossings()
 
     def _show_crossings(self) -> None:
@@ -229,14 +231,14 @@ class App:
         self._panel.show_controls(self._clock, self._replica, enabled=False)
         self._panel.show_moment("", "")
         wanted = self._wanted()
-        recording = None if wanted is None else self._crossings.read(wanted)
+        recording = None if wanted is None else self._recordings.read(wanted)
         self._recorder.record(None if recording is not None else wanted)
         if recording is not None:
             self._show_recording(recording)
         elif wanted is None:
             self._panel.show_status(f"No crossing: {escape(self._show.note)}")
         else:
-            self._panel.show_status(f"Recording {wanted.replicas} episodes of {wanted.controller} …", 0.0)
+            self._panel.show_status(f"Recording {wanted.replicas} episodes of {self._controller} …", 0.0)
 
     def _show_recording(self, recording: Recording) -> None:
         self._recording = recording
@@ -256,7 +258,7 @@ class App:
             self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
         else:
             self._clock.load(crossing.duration_s)
-            self._curves = Curves(crossing.times_s, crossing.penalties, self._elites.labels)
+            self._curves = Curves(crossing.times_s, crossing.penalties, self._axes.labels)
             ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
             self._panel.show_status(f"{ended} {all_of_them}")
             self._show_frame()
@@ -271,5 +273,5 @@ class App:
         crossing, curves = self._crossing, self._curves
         if crossing is not None and curves is not None:
             frame = self._clock.frame(crossing.dt, crossing.num_frames)
-            self._panel.show_moment(curves.at(self._clock.time_s), moment_text(crossing, frame, self._elites.labels))
+            self._panel.show_moment(curves.at(self._clock.time_s), moment_text(crossing, frame, self._axes.labels))
         self._panel.show_time(self._clock)

@@ -1,4 +1,4 @@
-"""What is to be seen, as triangles: a terrain coloured by height, and a robot's bodies."""
+"""What is to be seen, as triangles: a terrain coloured by height, a robot's bodies, and arrows."""
 
 from dataclasses import dataclass
 

@@ -1,38 +1,177 @@
-"""The panels of the page: the archive left, the crossing right. They tell what a visitor does, and do nothing of it."""
+"""The panels of the page, the archive left and the crossing right, and what they stand at.
+
+They hand on what a visitor does to the :class:`qd.show.view.app.App`, which does it in its loop.
+"""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
-from qd.show.view.elites import Elites
-from qd.show.view.pictures import axes_svg
-from qd.show.view.state import PAGE, Clock, Selection
+from qd.show.view.plots import Axes, axes_svg
 
-Emit = Callable[[str, Any], None]
-"""Called with what a visitor did, and its value."""
+if TYPE_CHECKING:
+    from qd.show.view.app import App
 
+PAGE = 8
+"""Lines of the list at once."""
 SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
 _WIDTH = 380  # of a panel [pixels]: between two of them a window of 1,400 shows the terrain from start to goal
 _PICKED, _OTHER = (213, 94, 0), (73, 80, 87)
 _CONTROL_DT = 0.02  # step of the time slider [s]
 
 
+class Selection:
+    """Which elites are in the brushed ranges, and which of them is picked."""
+
+    def __init__(self, axes: Axes) -> None:
+        """Nothing brushed, the worst elite picked.
+
+        Args:
+            axes: Of at least one elite.
+        """
+        self._axes = axes
+        self._ranges: dict[str, tuple[float, float]] = {}
+        self.kept: NDArray[np.int64] = axes.within({})
+        """Numbers of the elites in all ranges, worst first."""
+        self.picked = 0
+        """Number of the elite that is shown; it stays when a range leaves it out."""
+        self.page = 0
+        """Page of the list, from 0."""
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Brushed ranges by axis; an axis that is open at both ends has none."""
+        return dict(self._ranges)
+
+    @property
+    def num_pages(self) -> int:
+        """Pages of the list, at least 1."""
+        return max(1, -(-len(self.kept) // PAGE))
+
+    @property
+    def listed(self) -> list[int]:
+        """Numbers of the elites on the page."""
+        return self.kept[self.page * PAGE : (self.page + 1) * PAGE].tolist()
+
+    def brush(self, name: str, low: float, high: float) -> None:
+        """Keep elites in a range of an axis alone, ends included; the axis's full range frees it.
+
+        Raises:
+            ValueError: If the upper end is below the lower one.
+        """
+        if high < low:
+            raise ValueError(f"a range must go from low to high, got {low} to {high}")
+        axis = self._axes.axis(name)
+        half = 0.5 * axis.step
+        if low <= axis.low + half and high >= axis.high - half:
+            self._ranges.pop(name, None)
+        else:
+            self._ranges[name] = (low, high)
+        self._keep()
+
+    def clear(self) -> None:
+        """Free all axes."""
+        self._ranges.clear()
+        self._keep()
+
+    def _keep(self) -> None:
+        self.kept = self._axes.within(self._ranges)
+        self.page = 0
+
+    def turn(self, pages: int) -> None:
+        """Turn the list by some pages, no further than its ends."""
+        self.page = int(np.clip(self.page + pages, 0, self.num_pages - 1))
+
+    def pick(self, number: int) -> bool:
+        """Show an elite, and the page of the list it is on if it is in the ranges.
+
+        Returns:
+            Whether it is another one than before.
+
+        Raises:
+            ValueError: If there is no such elite.
+        """
+        if not 0 <= number < len(self._axes.elites):
+            raise ValueError(f"there is no elite {number}: expected 0 to {len(self._axes.elites) - 1}")
+        place = np.searchsorted(self.kept, number)
+        if place < len(self.kept) and self.kept[place] == number:
+            self.page = int(place) // PAGE
+        changed = number != self.picked
+        self.picked = number
+        return changed
+
+    def step(self, by: int) -> int:
+        """Number of the next (1) or previous (-1) elite in the ranges; the picked one if there is none."""
+        if by > 0:
+            later = self.kept[self.kept > self.picked]
+            return int(later[0]) if len(later) else self.picked
+        earlier = self.kept[self.kept < self.picked]
+        return int(earlier[-1]) if len(earlier) else self.picked
+
+
+@dataclass(kw_only=True)
+class Clock:
+    """Time within a crossing, run by real time."""
+
+    duration_s: float = 0.0
+    """Length of the crossing [s]."""
+    time_s: float = 0.0
+    """Shown time [s]."""
+    speed: float = 1.0
+    """Simulated seconds in a real one."""
+    playing: bool = False
+
+    def load(self, duration_s: float) -> None:
+        """Begin another crossing; playing goes on."""
+        self.duration_s = duration_s
+        self.time_s = 0.0
+
+    def seek(self, time_s: float) -> None:
+        """Show a time, no further than the ends."""
+        self.time_s = float(np.clip(time_s, 0.0, self.duration_s))
+
+    def toggle(self) -> None:
+        """Play or pause; at its end a crossing begins anew."""
+        self.playing = not self.playing
+        if self.playing and self.time_s >= self.duration_s:
+            self.time_s = 0.0
+
+    def tick(self, real_s: float) -> bool:
+        """Let real time go by [s]; at its end a crossing stops.
+
+        Returns:
+            Whether the shown time changed.
+        """
+        if not self.playing:
+            return False
+        before = self.time_s
+        self.seek(before + self.speed * real_s)
+        self.playing = self.time_s < self.duration_s
+        return self.time_s != before
+
+    def frame(self, dt: float, num_frames: int) -> int:
+        """Frame of the shown time among ``num_frames`` that are ``dt`` [s] apart."""
+        return int(np.clip(round(self.time_s / dt), 0, num_frames - 1))
+
+
 class ArchivePanel:
     """The parallel axes, their ranges, and the list of the elites."""
 
-    def __init__(self, server: viser.ViserServer, elites: Elites, title: str, emit: Emit) -> None:
+    def __init__(self, server: viser.ViserServer, axes: Axes, title: str, app: "App") -> None:
         """Lay it out.
 
         Args:
             server: The page.
-            elites: All of them.
+            axes: The elites.
             title: What archive it is.
-            emit: Told of ``brush`` (axis, low, high), ``clear``, ``turn`` (pages), ``line`` (of the list), ``step``
-                (-1 or 1) and ``pick`` (number).
+            app: Does what a visitor asks for.
         """
-        self._elites, self._emit, self._gui = elites, emit, server.gui
+        self._axes, self._app, self._gui = axes, app, server.gui
         self._panel = server.gui.add_panel()
         self._panel.dock_left()
         self._panel.set_width(_WIDTH)
@@ -45,52 +184,48 @@ class ArchivePanel:
             with tabs.add_tab("Worst first"):
                 self._add_list()
             with tabs.add_tab("Ranges"):
-                self._sliders = {axis.name: self._add_slider(axis.name) for axis in elites.axes}
-                self._on_click("Free all axes", "clear", None)
+                self._sliders = {axis.name: self._add_slider(axis.name) for axis in axes.axes}
+                self._add_button("Free all axes", app.clear)
 
     def _add_list(self) -> None:
         self._gui.add_markdown("Elite: fitness · base collision · goal reached, with 95 % intervals")
-        self._lines = [self._on_click("", "line", k) for k in range(PAGE)]
+        self._lines = [self._add_button("", self._app.pick_line, k) for k in range(PAGE)]
         pages = self._gui.add_button_group("Page", ("first", "previous", "next", "last"))
-        turns = {"first": -len(self._elites), "previous": -1, "next": 1, "last": len(self._elites)}
-        pages.on_click(lambda event: self._emit("turn", turns[event.target.value]))
+        turns = {"first": -len(self._axes.elites), "previous": -1, "next": 1, "last": len(self._axes.elites)}
+        pages.on_click(lambda event: self._app.post(self._app.turn, turns[event.target.value]))
         steps = self._gui.add_button_group("Elite", ("worse", "milder"))
-        steps.on_click(lambda event: self._emit("step", -1 if event.target.value == "worse" else 1))
-        self._number = self._gui.add_number("Number", 0, min=0, max=len(self._elites) - 1, step=1)
-        self._number.on_update(lambda event: self._tell(event, "pick", event.target.value))
+        steps.on_click(lambda event: self._app.post(self._app.step, -1 if event.target.value == "worse" else 1))
+        self._number = self._gui.add_number("Number", 0, min=0, max=len(self._axes.elites) - 1, step=1)
+        _on_visit(self._number, lambda value: self._app.post(self._app.pick, int(value)))
 
-    def _on_click(self, label: str, name: str, value: Any) -> Any:
+    def _add_button(self, label: str, act: Callable[..., None], *args: int) -> Any:
         button = self._gui.add_button(label)
-        button.on_click(lambda event: self._emit(name, value))
+        button.on_click(lambda event: self._app.post(act, *args))
         return button
 
     def _add_slider(self, name: str) -> Any:
-        axis = self._elites.axis(name)
+        axis = self._axes.axis(name)
         slider = self._gui.add_multi_slider(
             axis.label, min=axis.low, max=axis.high, step=axis.step, initial_value=(axis.low, axis.high)
         )
-        slider.on_update(lambda event: self._tell(event, "brush", (name, *event.target.value)))
+        _on_visit(slider, lambda value: self._app.post(self._app.brush, name, *value))
         return slider
-
-    def _tell(self, event: Any, name: str, value: Any) -> None:
-        if event.client is not None:  # a visitor did it, not this program
-            self._emit(name, value)
 
     def show(self, selection: Selection) -> None:
         """Draw plot and list anew."""
         kept, listed = selection.kept, selection.listed
-        self._plot.content = axes_svg(self._elites, kept, selection.ranges, selection.picked)
+        self._plot.content = axes_svg(self._axes, kept, selection.ranges, selection.picked)
         pages = f" · page {selection.page + 1} of {selection.num_pages}" if len(kept) else ""
-        self._count.content = f"**{len(kept):,}** of {len(self._elites):,} elites in the ranges{pages}"
+        self._count.content = f"**{len(kept):,}** of {len(self._axes.elites):,} elites in the ranges{pages}"
         for k, button in enumerate(self._lines):
             there = k < len(listed)
             button.visible = there
             if there:
-                button.label = self._elites.line(listed[k])
+                button.label = self._axes.line(listed[k])
                 button.color = _PICKED if listed[k] == selection.picked else _OTHER
         self._number.value = selection.picked
         for name, slider in self._sliders.items():
-            axis = self._elites.axis(name)
+            axis = self._axes.axis(name)
             if name not in selection.ranges and slider.value != (axis.low, axis.high):
                 slider.value = (axis.low, axis.high)
 
@@ -98,45 +233,42 @@ class ArchivePanel:
 class CrossingPanel:
     """The picked elite, and the controls of its crossing."""
 
-    def __init__(self, server: viser.ViserServer, controllers: Sequence[str], replicas: int, emit: Emit) -> None:
+    def __init__(self, server: viser.ViserServer, controllers: Sequence[str], replicas: int, app: "App") -> None:
         """Lay it out.
 
         Args:
             server: The page.
             controllers: Their names.
             replicas: Episodes of each elite.
-            emit: Told of ``controller`` (name), ``replica`` (number from 0), ``play``, ``seek`` [s], ``speed``,
-                ``follow``, ``forces`` and ``paths`` (flags).
+            app: Does what a visitor asks for.
         """
-        gui, self._emit = server.gui, emit
+        gui = server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_WIDTH)
         self._details = gui.add_markdown("")
         self._controller = gui.add_dropdown("Controller", tuple(controllers) or ("none",), disabled=not controllers)
-        self._told(self._controller, "controller", str)
+        _on_visit(self._controller, lambda name: app.post(app.choose_controller, str(name)))
         self._replica = gui.add_slider("Episode", min=1, max=max(replicas, 2), step=1, initial_value=1)
         self._replica.disabled = replicas == 1
-        self._told(self._replica, "replica", lambda value: value - 1)
+        _on_visit(self._replica, lambda value: app.post(app.choose_replica, int(value) - 1))
         self._status = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
-        self._play.on_click(lambda event: emit("play", None))
+        self._play.on_click(lambda event: app.post(app.play))
         self._time = gui.add_slider("Time [s]", min=0.0, max=20.0, step=_CONTROL_DT, initial_value=0.0)
-        self._told(self._time, "seek", float)
+        _on_visit(self._time, lambda value: app.post(app.seek, float(value)))
         self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 x")
-        self._told(self._speed, "speed", SPEEDS.__getitem__)
-        for label, name, initial in (
-            ("Follow", "follow", False),
-            ("Foot forces (1 m: 1,000 N)", "forces", True),
-            ("All ways", "paths", True),
-        ):
-            self._told(gui.add_checkbox(label, initial), name, bool)
+        _on_visit(self._speed, lambda value: app.post(app.set_speed, SPEEDS[value]))
+        switches = (
+            ("Follow", app.set_follow, False),
+            ("Foot forces (1 m: 1,000 N)", app.set_forces, True),
+            ("All ways", app.set_paths, True),
+        )
+        for label, switch, initial in switches:
+            box = gui.add_checkbox(label, initial)
+            _on_visit(box, lambda value, switch=switch: app.post(switch, bool(value)))
         self._curves = gui.add_html("")
         self._numbers = gui.add_markdown("")
-
-    def _told(self, handle: Any, name: str, convert: Callable[[Any], Any]) -> None:
-        """Tells what a visitor sets a control to, and not what this program does."""
-        handle.on_update(lambda event: event.client and self._emit(name, convert(event.target.value)))
 
     def show_elite(self, details: str) -> None:
         """Say what the archive knows of the picked elite, as Markdown."""
@@ -169,3 +301,8 @@ class CrossingPanel:
         """Show the penalties up to a time, as SVG, and the numbers of the moment, as Markdown."""
         self._curves.content = curves
         self._numbers.content = numbers
+
+
+def _on_visit(handle: Any, act: Callable[[Any], None]) -> None:
+    """Acts on the value that a visitor sets a control to, and not on what this program sets."""
+    handle.on_update(lambda event: act(event.target.value) if event.client is not None else None)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 
 from kernels.episode import Outcome
-from qd.show.endings import ENDINGS
+from qd.show.crossed import ENDINGS
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 

@@ -5,12 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from qd.workers.process import EvaluatorError, WorkerProcess
 
 if TYPE_CHECKING:  # they import torch, which a process takes with its simulation
-    from qd.show.view.crossings import Wanted
+    from qd.show.recordings import Wanted
     from sim.recording.recorder import Recording
     from sim.robots.robot import RobotCfg
 
@@ -122,7 +123,7 @@ class Recorder:
 
     def _recorded(self, wanted: "Wanted", cfg: RecorderCfg) -> Report:
         worker = self._worker(wanted, cfg)
-        worker.send(wanted.genes, wanted.seeds)
+        worker.send(wanted.terrain[None], np.array([wanted.terrain_seed], np.uint32))
         while True:
             message, value = worker.receive()
             if message == "result":

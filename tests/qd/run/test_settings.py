@@ -50,7 +50,8 @@ def test_unknown_preset():
 
 
 def test_changes_land_where_the_setting_stands():
-    cfg = changed(preset("paper", robot()), {"sigma0": 0.25, "alpha": 0.0, "replicas": 8, "seed": None, "iterations": 5})
+    changes = {"sigma0": 0.25, "alpha": 0.0, "replicas": 8, "seed": None, "iterations": 5}
+    cfg = changed(preset("paper", robot()), changes)
     assert (cfg.scheduler.sigma0, cfg.fitness.alpha, cfg.replicas, cfg.iterations, cfg.seed) == (0.25, 0.0, 8, 5, 0)
     assert cfg.scheduler.emitters == 10
 

@@ -85,6 +85,7 @@ def test_summary_by_hand():
     assert numbers == {
         "seed": 9,
         "robot": "anymal",
+        "space": "super_gaussian",
         "iterations": 7,
         "terrains_evaluated": 40,
         "episodes": 160,

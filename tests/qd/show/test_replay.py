@@ -1,6 +1,5 @@
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +9,12 @@ from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
 from qd.run.directory import RunDirectory, elite_name, folder_for, newest_or_published, newest_run
-from qd.run.settings import as_settings
-from qd.show.recordings import archive_of_robot
-from qd.show.replay import Replay, ReplayCfg, describe, draw, replay
+from qd.show.elites import Found, find_archive
+from qd.show.replay import Replay, ReplayElite, describe, draw, replay
+from sim.files.command import run_command
 from sim.robots.robot import get_robot
 from tests.qd import stand_in
-from tests.qd.stand_in import make_result
+from tests.qd.recordings import FRAMES, recording_of
 from tests.qd.test_archive import fresh_values, small_archive
 from tests.qd.test_search import CFG, run
 
@@ -36,16 +35,13 @@ def done(tmp_path):
         fallen_rate=np.array([0.0]),
     )
     # raw sums of four episodes; scales .5 and 2 make them (4, 8), a ratio of 1/3
-    result = make_result([[[2.0, 16.0]] * 4], base_collision=[[True, False, False, False]])
-    fresh = evaluation_of(result, cells, FitnessCfg(penalties=archive.penalties, scales=archive.scales))
-    paths = np.full((1, 4, 30, 3), np.nan)
-    paths[0, :, :20, 0] = np.linspace(2, 10, 20)
-    paths[0, :, :20, 1] = 4 + np.arange(4)[:, None] / 10
-    outcome = np.array([[Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]])
-    shown = SimpleNamespace(**vars(result), outcome=outcome, paths=paths, final_position=paths[:, :, 19])
-    heights = np.random.default_rng(0).normal(size=(161, 321)).astype(np.float32)
-    out = tmp_path / "elite-0.png"
-    return Replay(run=tmp_path, out=out, archive=archive, elite=0, heights=heights, result=shown, fresh=fresh)  # pyright: ignore
+    sums = np.tile([2.0, 16.0, 0.0, 0.0, 0.0, 0.0], (4, 1))
+    outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.GOAL]
+    recording = recording_of(outcomes, [5.0, 14.0, 14.0, 14.0], penalties=sums)
+    fitness = FitnessCfg(penalties=archive.penalties, scales=archive.scales)
+    fresh = evaluation_of(recording.result(), cells, fitness)
+    found = Found(run=tmp_path, archive=archive, robot=get_robot("anymal"))
+    return Replay(found=found, out=tmp_path / "elite-0.png", elite=0, recording=recording, fresh=fresh)
 
 
 def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
@@ -65,8 +61,9 @@ def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
 
 
 def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
-    fresh = dataclasses.replace(fresh_values(done.archive), invalid_episodes=np.array([8]))
-    corrected = dataclasses.replace(done, archive=dataclasses.replace(done.archive, fresh=fresh))
+    fresh = dataclasses.replace(fresh_values(done.found.archive), invalid_episodes=np.array([8]))
+    archive = dataclasses.replace(done.found.archive, fresh=fresh)
+    corrected = dataclasses.replace(done, found=dataclasses.replace(done.found, archive=archive))
     lines = [" ".join(line.split()) for line in describe(corrected).splitlines()]
     assert lines[1:3] == ["found (4 episodes) corrected (40 episodes) now (4 episodes)", "fitness 3.25 1.62 10.50"]
     assert "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
@@ -101,8 +98,9 @@ def test_of_an_invalid_terrain_no_rate_is_known(done):
 
 
 def test_the_drawing_has_all_paths_and_how_they_ended(done):
-    axes = draw(done).axes[0]
-    paths = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == 30]
+    outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]
+    axes = draw(dataclasses.replace(done, recording=recording_of(outcomes, [5.0, 14.0, 14.0, 9.0]))).axes[0]
+    paths = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == FRAMES]
     assert len(paths) == 4
     image = axes.images[0]
     assert image.get_array().shape == (161, 321)
@@ -111,25 +109,21 @@ def test_the_drawing_has_all_paths_and_how_they_ended(done):
     assert labels == ["reached the goal (2)", "base collision (1)", "out of time (1)"]
 
 
-def test_without_paths_the_ends_are_drawn(done):
-    result = SimpleNamespace(**{**vars(done.result), "paths": None})
-    axes = draw(dataclasses.replace(done, result=result)).axes[0]
-    assert len(axes.collections) == 3
-
-
 @pytest.mark.parametrize("change", [{"scales": (9.0,) * 6}, {"penalties": stand_in.PENALTIES[::-1]}])
 def test_a_config_of_another_search_is_refused(tmp_path, change):
     fitness = dataclasses.replace(CFG.fitness, **change)
     run(tmp_path / "run")
-    settings = as_settings(dataclasses.replace(CFG, fitness=fitness))
-    RunDirectory(tmp_path / "run").write_config(settings, 2, {"device": "cpu"})
+    cfg = dataclasses.replace(CFG, fitness=fitness)
+    RunDirectory(tmp_path / "run").write_config(cfg, {"device": "cpu", "sessions": []})
     with pytest.raises(ValueError, match=r"config\.json must have the penalties and scales of its archive, yaw_rate"):
-        replay(ReplayCfg(run=tmp_path / "run", device="cpu"))
+        replay(ReplayElite(run=tmp_path / "run", device="cpu"))
 
 
 def test_no_run_yet(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/.*`make archive ROBOT=anymal`"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no archive of anymal under runs/.*`.*faultline archive --robot anymal`"
+    ):
         newest_run(get_robot("anymal"))
     with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/"):
         newest_or_published(get_robot("anymal"))
@@ -154,14 +148,15 @@ def test_the_published_run_is_taken_where_there_is_none_and_nothing_is_written_i
 
 
 @pytest.mark.parametrize("changes", [{"replicas": 0}, {"seed": -1}])
-def test_numbers_of_no_episodes_are_refused(changes):
-    with pytest.raises(ValueError, match="replicas must be at least 1 and seed at least 0, got"):
-        replay(ReplayCfg(**changes))
+def test_numbers_of_no_episodes_are_refused(tmp_path, changes):
+    write_archive(tmp_path / "archive.npz", small_archive())
+    with pytest.raises(ValueError, match="episodes must be at least 1 and seed at least 0, got"):
+        replay(ReplayElite(run=tmp_path, **changes))
 
 
 def test_an_archive_of_penalties_that_the_robot_lacks_is_refused(tmp_path):
     write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), penalties=("yaw_rate", "<b>")))
-    for refused in (lambda: replay(ReplayCfg(run=tmp_path)), lambda: archive_of_robot("anymal", tmp_path)):
+    for refused in (lambda: replay(ReplayElite(run=tmp_path)), lambda: find_archive("anymal", tmp_path)):
         with pytest.raises(ValueError, match="penalties that robot anymal does not have: <b>; expected some of yaw_"):
             refused()
 
@@ -171,4 +166,26 @@ def test_a_place_for_the_figure_is_looked_for_before_the_crossing(tmp_path, monk
     run(tmp_path / "run")
     monkeypatch.setattr("sim.rollout.Rollout", None)  # crossing anything would fail with another error
     with pytest.raises(ValueError, match=r"out must be a file named \*\.png|cannot write to /proc/nowhere"):
-        replay(ReplayCfg(run=tmp_path / "run", device="cpu", out=Path(out)))
+        replay(ReplayElite(run=tmp_path / "run", device="cpu", out=Path(out)))
+
+
+def test_an_elite_or_a_run_that_is_not_there_is_named(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    write_archive(tmp_path / "archive.npz", small_archive())
+
+    def refused(*argv):
+        assert run_command(ReplayElite, argv, name="replay") == 2
+        return capsys.readouterr().err
+
+    assert "archive.npz has no elite 3" in refused("--run", "archive.npz", "--elite", "3")
+    assert "archive.npz has no elite -1" in refused("--run", "archive.npz", "--elite", "-1")
+    assert "one elite here, got 'all'" in refused("--run", "archive.npz", "--elite", "all")
+    assert "no archive of anymal under runs/" in refused()
+    assert "no archive at elsewhere" in refused("--run", "elsewhere")
+    assert "is of anymal, got --robot cassie" in refused("--run", "archive.npz", "--robot", "cassie")
+
+
+def test_a_run_says_which_robot_it_is_of(tmp_path):
+    penalties = ("yaw_rate", "vel_x")
+    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), robot="cassie", penalties=penalties))
+    assert find_archive(None, tmp_path).robot.name == "cassie"

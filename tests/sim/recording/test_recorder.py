@@ -98,19 +98,6 @@ def test_feet_that_push_are_on_the_ground(recording, anymal):
     assert gaps.min() > -0.01 and gaps.max() > 0.02
 
 
-def test_of_all_episodes_some_may_be_recorded(rollout, recording, anymal):
-    terrains = np.stack([spike(), SLOPE])
-    result, some = record(rollout, terrains, SEEDS, policy=anymal.policy_file, replicas=[3, 1])
-    assert result.outcome.shape == (2, 4) and some.outcome.shape == (2, 2)
-    assert some.replicas.tolist() == [3, 1] and some.labels == ("terrain 0", "terrain 1")
-    if rollout.sim.device == "cpu":
-        for name in (*FRAME_ARRAYS, "outcome", "duration_s", "num_frames"):
-            np.testing.assert_array_equal(getattr(some, name), getattr(recording, name)[:, [3, 1]])
-    for wrong in ([4], [-1], []):
-        with pytest.raises(ValueError, match=r"replicas must be some of 0\.\.3"):
-            record(rollout, terrains, SEEDS, policy=anymal.policy_file, replicas=wrong)
-
-
 def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
     def break_one(share):
         values = np.array(rollout.sim.joint_q.numpy())
@@ -145,7 +132,7 @@ def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
 
 def test_terrains_given_by_genes_are_kept_as_genes(rollout, anymal, tmp_path):
     genes = SUPER_GAUSSIAN.uniform_random(2, 3)
-    _, recording = record(rollout, genes, SEEDS, policy=anymal.policy_file, replicas=[0])
+    _, recording = record(rollout, genes, SEEDS, policy=anymal.policy_file)
     write_recording(tmp_path / "a.npz", recording)
     with np.load(tmp_path / "a.npz") as content:
         assert "heights" not in content

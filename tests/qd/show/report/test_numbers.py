@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.show.report.elite_sections import choice_told
-from qd.show.report.elites import elites_of, most_reproducible, worst
+from qd.show.crossed import crossed_of, penalties_by_place
+from qd.show.elites import elites_of
+from qd.show.report.elites import choice_told
 from qd.show.report.modes import MAX_MODES, find_modes, silhouette
-from qd.show.report.outcomes import crossed_of, penalties_by_place
-from qd.show.report.shown import percent
+from qd.show.report.page import percent
 from tests.qd.recordings import NAMES, recording_of
 from tests.qd.test_archive import fresh_values, small_archive
 
@@ -37,11 +37,11 @@ def grouped_archive(sizes=(6, 9, 5)):
 def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid():
     archive = small_archive(4)
     found = elites_of(archive)
-    assert not found.fresh and found.numbers.tolist() == [0, 1, 2, 3]
+    assert not found.fresh.any() and found.numbers.tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(found.goal_rate, archive.goal_rate)
     fresh = dataclasses.replace(fresh_values(archive), invalid_episodes=np.array([0, 40, 8, 0]))
-    corrected = elites_of(dataclasses.replace(archive, fresh=fresh))
-    assert corrected.fresh and corrected.numbers.tolist() == [0, 2, 3]
+    corrected = elites_of(dataclasses.replace(archive, fresh=fresh), judged=True)
+    assert corrected.fresh.all() and corrected.numbers.tolist() == [0, 2, 3]
     assert corrected.counted.tolist() == [40, 32, 40]
     np.testing.assert_array_equal(corrected.fitness, archive.fitness[[0, 2, 3]] / 2)
     assert [corrected.place_of(number) for number in (0, 2, 3)] == [0, 1, 2]
@@ -70,12 +70,12 @@ def test_the_worst_and_the_steadiest_by_hand():
         goal_rate=np.array([0.0, 0.4, 0.0, 0.9]),
     )
     # the robots cross number 3, whose fitness is second
-    assert worst(elites_of(archive), 3) == [1, 2, 0]
-    assert worst(elites_of(archive), 4) == [1, 2, 0, 3]
+    assert elites_of(archive).worst(3) == [1, 2, 0]
+    assert elites_of(archive).worst(4) == [1, 2, 0, 3]
     # the last is the steadiest of all, but the robots cross it
-    assert most_reproducible(elites_of(archive), 4) == [0, 2, 1, 3]
+    assert elites_of(archive).most_reproducible(4) == [0, 2, 1, 3]
     fresh = dataclasses.replace(fresh_values(archive), reproduced=np.array([False, True, True, True]))
-    assert most_reproducible(elites_of(dataclasses.replace(archive, fresh=fresh)), 4) == [2, 1, 0, 3]
+    assert elites_of(dataclasses.replace(archive, fresh=fresh)).most_reproducible(4) == [2, 1, 0, 3]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_the_worst_and_the_steadiest_by_hand():
 )
 def test_which_elites_are_shown_is_told_truly(goal_rates, chosen, told):
     elites = elites_of(dataclasses.replace(small_archive(len(goal_rates)), goal_rate=np.array(goal_rates)))
-    assert (worst(elites, len(chosen[0])), most_reproducible(elites, 1)) == chosen
+    assert (elites.worst(len(chosen[0])), elites.most_reproducible(1)) == chosen
     sentence = choice_told(elites, *chosen)
     assert told in sentence
     assert sentence.endswith(f"failed ones first ({chosen[1][0]}); and a typical terrain of each mode.")
@@ -146,7 +146,7 @@ def test_crossings_in_numbers_by_hand():
     crossed = crossed_of(recording, ("vel_x", "stumble"), (2.0, 4.0))
     assert crossed.chosen.tolist() == [0, 1, 2]
     assert crossed.scaled.tolist() == [[0.5, 1.0], [3.5, 2.5], [6.5, 4.0]]
-    assert str(crossed.rates["reached the goal"]) == "1 of 3 (33 %; 6 to 79 %)"
+    assert str(crossed.rates["reached the goal"]) == "1 of 3 (33%, 6 to 79%)"
     hits = {label: rate.hits for label, rate in crossed.rates.items()}
     assert hits == {"reached the goal": 1, "base collision": 2, "out of time": 0, "left the terrain": 0, "fallen": 1}
     np.testing.assert_allclose(crossed.ends[:, 0], [14.0, 5.0, 7.0])

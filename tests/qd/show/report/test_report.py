@@ -11,19 +11,20 @@ import pytest
 from matplotlib.figure import Figure
 
 from qd.archive import write_archive
-from qd.run.cli import Interrupted
 from qd.run.settings import as_settings, preset
+from qd.show.elites import elites_of
 from qd.show.figures import as_png, new_figure, summary
-from qd.show.report import __main__ as command
-from qd.show.report.elites import elites_of
-from qd.show.report.material import HtmlReportCfg, gather
+from qd.show.report import command
+from qd.show.report.command import Report
+from qd.show.report.material import gather
 from qd.show.report.page import Absent, Facts, Heading, Section, Table, Text, render
 from sim.files.atomic import to_json
+from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
-from tests.qd.recordings import stand_in_recorder
+from tests.qd.recordings import stand_in_cross
+from tests.qd.show.report.test_numbers import grouped_archive
 from tests.qd.show.test_figures import rows
 from tests.qd.test_archive import fresh_values
-from tests.qd.test_html_report_numbers import grouped_archive
 
 DOT = bytes.fromhex("89504e470d0a1a0a")
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -70,7 +71,7 @@ def make_run(root):
     settings = as_settings(dataclasses.replace(small, fitness=fitness))
     origin = {"command": "python <script>alert(1)</script>", "commit": "abc", "device": "CPU", "seed": 0,
               "versions": {"numpy": "2"}, "date": "today"}  # fmt: skip
-    (folder / "config.json").write_bytes(to_json({"settings": settings, "iterations": 4, **origin}))
+    (folder / "config.json").write_bytes(to_json({"settings": settings, "iterations": 4, "sessions": [], **origin}))
     return folder
 
 
@@ -80,9 +81,9 @@ def reporter(run, patch):
     patch.setattr(command, "check_policy", lambda policy, robot, device: None)
 
     def make(**changes):
-        cfg = HtmlReportCfg(**{"run": run, "device": "cpu", "episodes": 4, "elites": 1, **changes})
+        cfg = Report(**{"run": run, "device": "cpu", "episodes": 4, "elites": 1, **changes})
         crossed = []
-        return command.html_report(cfg, make_recorder=stand_in_recorder(crossed)), crossed
+        return command.html_report(cfg, cross=stand_in_cross(crossed)), crossed
 
     return make
 
@@ -130,7 +131,7 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
 
 def test_the_sentences_have_the_numbers_of_the_files(whole):
     text = Page(whole[0].read_bytes()).text
-    archive = gather(HtmlReportCfg(run=whole[0].parent)).archive
+    archive = gather(Report(run=whole[0].parent)).archive
     elites, numbers = elites_of(archive), summary(archive, rows(4), gpus=0, origin={})
     failing = int((archive.fresh.goal_rate < 0.5).sum())
     assert f"The controller fails on {failing} of {len(archive)} elites judged (by 40 fresh episodes each" in text
@@ -211,27 +212,24 @@ def test_crossings_are_kept_and_a_stopped_report_goes_on(reported, run, monkeypa
     first, crossed = reported()
     before = first.read_bytes()
     assert crossed and reported()[1] == [] and first.read_bytes() == before
-    kept = sorted((run / "report-recordings").iterdir())
+    kept = sorted((run.parent / "runs" / "recordings").iterdir())
     assert len(kept) == len(crossed)
     kept[0].write_bytes(kept[0].read_bytes()[:100])  # damaged: crossed again
     kept[1].unlink()
     assert len(reported()[1]) == 2
     assert len(reported(episodes=3)[1]) == len(crossed)  # other crossings
 
-    def dying(place):
-        cross, done = stand_in_recorder([])(place), []
+    cross, done = stand_in_cross([]), []
 
-        def cross_two(wanted, progress):
-            if len(done) == 2:
-                raise KeyboardInterrupt
-            done.append(wanted)
-            return cross(wanted, progress)
+    def dying(wanted, progress):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.extend(wanted)
+        return cross(wanted, progress)
 
-        return cross_two
-
-    cfg = HtmlReportCfg(run=run, device="cpu", episodes=5, elites=2)
+    cfg = Report(run=run, device="cpu", episodes=5, elites=2)
     with pytest.raises(Interrupted, match=r"what was crossed is kept\. The same command goes on"):
-        command.html_report(cfg, make_recorder=dying)
+        command.html_report(cfg, cross=dying)
     assert len(reported(episodes=5)[1]) == len(crossed) - 2
 
 
@@ -239,9 +237,11 @@ def test_sections_without_data_name_the_command_that_makes_it(reported, run):
     (run / "metrics.jsonl").unlink()
     (run / "config.json").unlink()
     text = Page(reported()[0].read_bytes()).text
-    assert "there is no metrics.jsonl beside the archive. A search writes one: make archive ROBOT=anymal" in text
+    assert re.search(
+        r"no metrics\.jsonl .* A search writes one: \S*faultline archive --robot anymal", text
+    )
     assert "no config.json beside the archive" in text
-    assert "They are made by make evaluate ROBOT=anymal POLICIES='base=shipped C-G=FILE'" in text
+    assert re.search(r"made by \S*faultline evaluate --robot anymal --policies base=shipped C-G=FILE", text)
 
 
 @pytest.mark.parametrize("count", [1, 2, 11])
@@ -261,7 +261,7 @@ def test_code_that_only_the_run_names_is_not_run(reported, run):
     (run / "config.json").write_bytes(to_json(config))
     out, crossed = reported()
     assert crossed == []
-    assert "name it with POLICY=tests.sim.policies:stand" in Page(out.read_bytes()).text
+    assert "name it with --policy tests.sim.policies:stand" in Page(out.read_bytes()).text
     assert reported(policy="tests.sim.policies:stand")[1]
 
 
@@ -284,20 +284,20 @@ def test_bad_input_is_refused_before_any_work(reported, run, tmp_path, monkeypat
         assert not list(tmp_path.rglob("*.html")) and not list(tmp_path.rglob("report-*"))
 
     refused(ValueError, "unknown robot 'spot': expected one of anymal", robot="spot")
-    refused(ValueError, "is of robot anymal, got --robot cassie", robot="cassie")
+    refused(ValueError, "is of anymal, got --robot cassie", robot="cassie")
     refused(FileNotFoundError, "no archive at", run=tmp_path / "nothing")
-    refused(FileNotFoundError, "no tables at .*make evaluate", tables=tmp_path / "nothing.json")
+    refused(FileNotFoundError, "no tables at .*faultline evaluate", tables=tmp_path / "nothing.json")
     refused(ValueError, r"out must be a file named \*\.html, got", out=tmp_path / "folder")
     (tmp_path / "blocked").write_text("a file")
     refused(ValueError, "cannot write to .*blocked", out=tmp_path / "blocked" / "report.html")
     (tmp_path / "damaged.json").write_text("{")
     refused(ValueError, "must be a JSON file", tables=tmp_path / "damaged.json")
-    refused(ValueError, "must be 1 to 10 of each kind, got 0", elites=0)
+    refused(ValueError, "elites must be at least 1 and at most 10, got 0", elites=0)
     whole = (run / "archive.npz").read_bytes()
     (run / "archive.npz").write_bytes(whole[: len(whole) // 2])
     refused(ValueError, "must be the archive of a search, but it is damaged")
     (run / "archive.npz").unlink()
-    refused(ValueError, r"got one without archive\.npz: let it go on with `make archive ROBOT=anymal RESUME=")
+    refused(ValueError, r"got one without archive\.npz: let it go on with `.*faultline archive --resume ")
     (run / "archive.npz").write_bytes(whole)
     lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (run / "metrics.jsonl").write_text("".join(lines[:2]))
@@ -307,7 +307,7 @@ def test_bad_input_is_refused_before_any_work(reported, run, tmp_path, monkeypat
     refused(ValueError, "must have elites to report on, got an archive of none after 4 iterations")
     other = dataclasses.replace(grouped_archive()[0], iterations=4, penalties=("yaw_rate", "<b>"))
     write_archive(run / "archive.npz", other)
-    refused(ValueError, "by penalties that robot anymal does not have: <b>; expected some of yaw_rate, vel_x")
+    refused(ValueError, "penalties that robot anymal does not have: <b>")
 
 
 def test_a_page_is_whole_or_as_it_was(reported, run, monkeypatch):
@@ -328,6 +328,6 @@ def test_published_results_are_not_written_to(monkeypatch, tmp_path, run):
     published = tmp_path / "results" / "anymal" / "archive"
     published.parent.mkdir(parents=True)
     run.rename(published)
-    material = gather(HtmlReportCfg())
+    material = gather(Report())
     assert str(material.run) == "results/anymal/archive"
     assert str(material.out) == "runs/anymal-published/report.html"

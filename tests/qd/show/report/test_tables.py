@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from qd.show.report.changes import changes_of
-from qd.show.report.table_figures import draw_tables
-from qd.show.report.table_sections import fates, most_mended
-from qd.show.report.tables import by_kind, read_tables
+from qd.show.report.evaluation import fates, most_mended
+from qd.show.report.figures import draw_tables
+from qd.show.report.tables import by_kind, changes_of, read_tables
 from sim.files.atomic import to_json
 from sim.robots.robot import get_robot
-from tests.qd.show.test_report import DOT, Page, make_run, reporter
+from tests.qd.show.report.test_report import DOT, Page, make_run, reporter
 from tests.train.results import GOAL, LATE, result_of
 from train.evaluate.measures import measure
 from train.evaluate.sets import TerrainSet
@@ -73,12 +72,15 @@ def test_tables_and_the_same_terrain_before_and_after(reported, tables):
     assert "Of 4 elites held out of training C-G mends 1 of 2 that base fails; newly broken are 1 by C-G." in first
     for number, kind in ((7, "mended by"), (5, "newly broken by"), (9, "still failing with")):
         assert f"Elite {number}: {kind} C-G" in text
-    one = "1 of 4 (25 %; 5 to 70 %) reach the goal (base collision 1, out of time 1, left the terrain 1; the middle"
+    one = "1 of 4 (25%, 5 to 70%) reach the goal (base collision 1, out of time 1, left the terrain 1; the middle"
     assert f"Mended by the tables. Crossed again from the same starts: with base {one}" in text
     assert f"numbered as in {out.parent}: the worst of those mended" in text
-    assert f"make view ROBOT=anymal RUN={out.parent} ELITE=7 POLICIES='base={tables.parent}/base.pt C-G=" in text
-    assert [label for label in crossed if "with" in label] == [
-        f"elite {number} with {who}" for number in (7, 5, 9) for who in ("base", "C-G")
+    assert (
+        f"faultline view --robot anymal --run {out.parent} --elite 7 --policies base={tables.parent}/base.pt C-G="
+        in text
+    )
+    assert [label for label in crossed if "with" in label] == [  # of one controller after the other
+        f"elite {number} with {who}" for who in ("base", "C-G") for number in (7, 5, 9)
     ]
     assert (out.parent / "report-figures" / "change-7.png").exists()
     assert (out.parent / "report-figures" / "tables.png").exists()
@@ -190,20 +192,14 @@ def test_without_what_they_need_terrains_before_and_after_are_left_out(reported,
     ("changes", "message"),
     [
         ({"robot": "cassie"}, "is of robot cassie, got --robot anymal"),
-        ({"controllers": {"base": "x.pt", "C-G": "y.pt"}}, "its controllers are not such"),
-        (
-            {"differences": {"generated": {"base -> C-G": {"compared": 4, "mended": {"count": 1}}}}},
-            "its differences are",
-        ),
-        ({"goal": {}}, "its parts are not such"),
-        ({"goal": {"generated": {"base": "x", "C-G": 1.0}}}, "its goal of generated holds something else than numbers"),
-        ({"goal": {"generated": {"base": 1.0}}}, "its goal of generated is not of its controllers"),
-        ({"goal": {"<b>": {"base": 1.0}}}, "its goal of <b> has no values, intervals or number"),
-        ({"over_seeds": {"goal": {"generated": {"C-G": 1.0}}}}, "its means over seeds are not such"),
-        (
-            {"over_seeds": {"goal": {"generated": {"C-G": {"mean": "<b>", "interval": None}}}}},
-            "its means over seeds are not such",
-        ),
+        ({"controllers": {"base": "x.pt", "C-G": "y.pt"}}, "its controllers"),
+        ({"differences": {"generated": {"base -> C-G": {"compared": 4, "mended": {"count": 1}}}}}, "its differences"),
+        ({"goal": {}}, "its goal"),
+        ({"goal": {"generated": {"base": "x", "C-G": 1.0}}}, "its goal"),
+        ({"goal": {"generated": {"base": 1.0}}}, "its goal"),
+        ({"goal": {"<b>": {"base": 1.0}}}, "its goal"),
+        ({"over_seeds": {"goal": {"generated": {"C-G": 1.0}}}}, "its means over seeds"),
+        ({"over_seeds": {"goal": {"generated": {"C-G": {"mean": "<b>", "interval": None}}}}}, "its means over seeds"),
     ],
 )
 def test_tables_that_are_none_are_refused(reported, run, tables, changes, message):

@@ -13,9 +13,9 @@ import pytest
 
 from qd.archive import read_archive
 from qd.run.directory import RESULTS
+from qd.show.recordings import Recordings
 from qd.show.view.app import App
-from qd.show.view.arguments import ViewCfg, show_of
-from qd.show.view.crossings import Crossings
+from qd.show.view.command import View, show_of
 from qd.show.view.recorder import Report
 
 ROOT = Path(__file__).parents[4]
@@ -34,24 +34,24 @@ def free_port() -> int:
 @pytest.fixture(scope="module")
 def show(anymal):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return show_of(ViewCfg(run=ARCHIVE, port=free_port(), policies=policies))
+    return show_of(View(run=ARCHIVE, port=free_port(), policies=policies))
 
 
 @pytest.fixture
 def app(show, tmp_path, monkeypatch):
     """The viewer as it opens; what it would record is kept in ``app.asked``."""
-    app = App(show, Crossings(show.robot, cache=tmp_path, published=show.published))
+    app = App(show, Recordings(show.robot, folder=tmp_path, published=show.published))
     app.asked = []
     monkeypatch.setattr(app._recorder, "record", app.asked.append)
     yield app
     app.close()
 
 
-def done(app, *events):
+def done(app, *asked):
     """What visitors do, done by the loop."""
-    for name, value in events:
-        app.emit(name, value)
-        app.handle_events(wait_s=0.2)
+    for act, *args in asked:
+        app.post(act, *args)
+        app.do_asked(wait_s=0.2)
 
 
 def status(app) -> str:
@@ -62,7 +62,7 @@ def test_the_worst_elite_is_there_with_its_crossing(app):
     assert "Elite 0" in app._panel._details.content
     assert status(app).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
     assert app._scene._robot.visible and not app._panel._play.disabled
-    worst = app._elites.axis("fitness").values[0]
+    worst = app._axes.axis("fitness").values[0]
     assert app._list._lines[0].label.startswith(f"0: {worst:.1f} ")
     assert app._clock.duration_s == pytest.approx(20.0)
 
@@ -72,7 +72,7 @@ def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
     folder.mkdir()
     (folder / "archive.npz").write_bytes((ARCHIVE / "archive.npz").read_bytes())
     odd = show_of(dataclasses.replace(show.cfg, run=folder, port=free_port()))
-    app = App(odd, Crossings(odd.robot, cache=tmp_path / "cache"))
+    app = App(odd, Recordings(odd.robot, folder=tmp_path / "cache"))
     try:
         assert "a`&lt;img src=x onerror=alert(1)&gt;" in app._list._title.content
     finally:
@@ -94,9 +94,9 @@ def test_penalties_are_called_alike_on_axes_curves_and_in_numbers(app):
 
 def test_opening_waits_for_no_simulation():
     command = (
-        "import sys, pathlib; from qd.show.view.arguments import ViewCfg, show_of;"
-        "show_of(ViewCfg(run=pathlib.Path(sys.argv[1])));"
-        "import qd.show.view.app, qd.show.view.crossings; print('newton' in sys.modules)"
+        "import sys, pathlib; from qd.show.view.command import View, show_of;"
+        "show_of(View(run=pathlib.Path(sys.argv[1])));"
+        "import qd.show.view.app; print('newton' in sys.modules)"
     )
     archive = str(ARCHIVE)
     done = subprocess.run(
@@ -108,78 +108,80 @@ def test_opening_waits_for_no_simulation():
 def test_a_pick_shows_its_terrain_within_a_second(app):
     for number in (171, 0, 171, 0):  # without a recording and with one
         began = time.perf_counter()
-        done(app, ("pick", number))
+        done(app, (app.pick, number))
         assert time.perf_counter() - began < PICK_LIMIT_S
         assert f"Elite {number}" in app._panel._details.content
     assert "All 20: 19 out of time, 1 base collision" in status(app)
 
 
 def test_the_list_follows_the_ranges(app):
-    done(app, ("brush", ("goal_rate", 0.9, 1.0)))
-    assert (app._elites.axis("goal_rate").values[app._selection.kept] >= 0.9).all()
-    assert 0 < len(app._selection.kept) < len(app._elites)
+    done(app, (app.brush, "goal_rate", 0.9, 1.0))
+    assert (app._axes.axis("goal_rate").values[app._selection.kept] >= 0.9).all()
+    assert 0 < len(app._selection.kept) < len(app._archive)
     first = int(app._selection.kept[0])
     assert app._list._lines[0].label.startswith(f"{first}: ")
-    done(app, ("line", 0))
+    done(app, (app.pick_line, 0))
     assert app._selection.picked == first and app._list._number.value == first
-    done(app, ("clear", None), ("step", 1))
+    done(app, (app.clear,), (app.step, 1))
     assert app._selection.picked == first + 1
-    assert len(app._selection.kept) == len(app._elites)
+    assert len(app._selection.kept) == len(app._archive)
 
 
 def test_playing_and_dragging_move_the_robot(app):
     before = app._scene._bodies[0].position.copy()
-    done(app, ("seek", 5.0))
+    done(app, (app.seek, 5.0))
     assert app._scene._bodies[0].position[0] > before[0] + 1.0
     assert app._panel._time.value == 5.0
-    done(app, ("play", None))
+    done(app, (app.play,))
     assert app._clock.playing and app._panel._play.label == "Pause"
-    done(app, ("play", None), ("speed", 0.25), ("follow", True), ("forces", False), ("paths", False))
+    done(
+        app, (app.play,), (app.set_speed, 0.25), (app.set_follow, True), (app.set_forces, False), (app.set_paths, False)
+    )
     assert not app._clock.playing and app._clock.speed == 0.25
     assert not any(arrow.visible for arrow in app._scene._forces) and not app._scene._paths.visible
     pushing = app._crossing.force_newtons >= 100.0
     frame = int(np.flatnonzero(pushing.any(axis=1))[0])
-    done(app, ("forces", True), ("seek", 0.02 * frame))
+    done(app, (app.set_forces, True), (app.seek, 0.02 * frame))
     seen = np.array([arrow.visible for arrow in app._scene._forces])
     assert seen.any() and seen[pushing[frame]].all()
 
 
 def test_episodes_are_stepped_through(app):
-    done(app, ("seek", 5.0), ("replica", 16))
+    done(app, (app.seek, 5.0), (app.choose_replica, 16))
     assert status(app).startswith("Episode 17: base collision")
     assert app._clock.time_s == 0.0 and app._clock.duration_s < 20.0
-    done(app, ("replica", 99))  # typed into the field
+    done(app, (app.choose_replica, 99))  # typed into the field
     assert status(app).startswith("Episode 20:")
 
 
 def test_another_controller_has_its_own_crossing(app):
-    done(app, ("controller", "other"))  # it is the same file
+    done(app, (app.choose_controller, "other"))  # it is the same file
     assert status(app).startswith("Episode 1: out of time")
     assert app.asked[-1] is None
 
 
 def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(app):
     recording = app._recording
-    done(app, ("pick", 7))
+    done(app, (app.pick, 7))
     wanted = app.asked[-1]
-    assert (wanted.elite, wanted.replicas) == (7, 20)
+    assert (wanted.label, wanted.replicas) == ("elite 7 of anymal", 20)
     assert not app._scene._robot.visible and app._panel._play.disabled
-    done(app, ("report", Report(wanted=wanted, text="crossing", share=0.4)))
+    done(app, (app.show_report, Report(wanted=wanted, text="crossing", share=0.4)))
     assert status(app) == "Recording 20 episodes of base: crossing …" and app._panel._progress.value == 40.0
-    other = dataclasses.replace(wanted, elite=8)
-    done(app, ("report", Report(wanted=other, text="no", failed=True)))
+    other = dataclasses.replace(wanted, terrain_seed=8)
+    done(app, (app.show_report, Report(wanted=other, text="no", failed=True)))
     assert "crossing" in status(app)  # of what is not shown nothing is said
-    done(app, ("report", Report(wanted=wanted, text="it <broke>", failed=True)))
+    done(app, (app.show_report, Report(wanted=wanted, text="it <broke>", failed=True)))
     assert status(app) == "No crossing: it &lt;broke&gt;"
-    done(app, ("report", Report(wanted=wanted, text="recorded", recording=recording)))
+    done(app, (app.show_report, Report(wanted=wanted, text="recorded", recording=recording)))
     assert status(app).startswith("Episode 1: out of time") and app._scene._robot.visible
 
 
 def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
     bare = dataclasses.replace(show, controllers={}, note="it is <lost>")
-    app = App(bare, Crossings(show.robot, cache=tmp_path))
+    app = App(bare, Recordings(show.robot, folder=tmp_path))
     try:
-        done(app, ("pick", 3), ("play", None), ("seek", 1.0), ("replica", 2), ("follow", True))
+        done(app, (app.pick, 3), (app.play,), (app.seek, 1.0), (app.choose_replica, 2), (app.set_follow, True))
         assert status(app) == "No crossing: it is &lt;lost&gt;" and "Elite 3" in app._panel._details.content
     finally:
         app.close()
@@ -187,7 +189,7 @@ def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
 
 def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
     port = free_port()
-    command = [sys.executable, "-m", "qd.show.view", "--run", str(ARCHIVE), "--port", str(port)]
+    command = [sys.executable, "-m", "faultline", "view", "--run", str(ARCHIVE), "--port", str(port)]
     command += ["--cache", str(tmp_path)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
@@ -207,7 +209,7 @@ def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
 
 
 def test_bad_input_is_one_line():
-    command = [sys.executable, "-m", "qd.show.view", "--run", "nowhere", "--port", str(free_port())]
+    command = [sys.executable, "-m", "faultline", "view", "--run", "nowhere", "--port", str(free_port())]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert ended.returncode == 2
     assert [line for line in ended.stderr.splitlines() if "Warp" not in line] == [
@@ -217,7 +219,7 @@ def test_bad_input_is_one_line():
 
 def test_the_help_says_what_to_do():
     ended = subprocess.run(
-        [sys.executable, "-m", "qd.show.view", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+        [sys.executable, "-m", "faultline", "view", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert ended.returncode == 0
     for word in ("Ranges", "Worst first", "ssh -L", "Ctrl-C", "--policies", "--host"):

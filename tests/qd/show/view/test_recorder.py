@@ -5,14 +5,14 @@ import time
 import numpy as np
 import pytest
 
-from qd.show.view.crossings import Wanted
+from qd.show.recordings import Wanted
 from qd.show.view.recorder import Recorder
 from tests.qd.show.view.instant import build
 
 
 def wish(number, policy="fast"):
-    genes = np.full((1, 64), number, np.float32)
-    return Wanted(elite=number, controller=policy, policy=policy, replicas=1, genes=genes)
+    genes = np.full(64, number, np.float32)
+    return Wanted(label="", terrain=genes, policy=policy, replicas=1, terrain_seed=number)
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_of_several_wishes_the_last_one_counts(recorder, reports):
     recorder.record(wish(5))
     recorder.record(None)
     time.sleep(0.5)
-    assert all(report.wanted.elite == 5 for report in iter_now(reports))
+    assert all(report.wanted.terrain_seed == 5 for report in iter_now(reports))
 
 
 def iter_now(reports):

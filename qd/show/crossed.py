@@ -1,40 +1,52 @@
 """Recorded crossings in numbers: how they ended, what they cost, and where."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.show.endings import ENDINGS
-from sim.files.intervals import wilson_interval
+from sim.files.intervals import rate_words, wilson_interval
 from sim.recording.recorder import Recording
 
-ENDS = {outcome: ending.words for outcome, ending in ENDINGS.items()}
-"""How a valid episode may end."""
+
+class Ending(NamedTuple):
+    """A way to end, in words and in looks that the colour-blind tell apart."""
+
+    words: str
+    color: str
+    """As ``#rrggbb`` (Okabe and Ito's)."""
+    marker: str
+    """Matplotlib's, where the episode ended."""
+    line: str
+    """Matplotlib's, of the path to it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rate:
+ENDINGS = {
+    Outcome.GOAL: Ending("reached the goal", "#009e73", "o", "-"),
+    Outcome.BASE_COLLISION: Ending("base collision", "#d55e00", "X", "--"),
+    Outcome.TIME_OUT: Ending("out of time", "#0072b2", "s", "-."),
+    Outcome.OUT: Ending("left the terrain", "#cc79a7", "^", ":"),
+}
+"""How a valid episode may end, the good way first."""
+ARRIVED, *FAILED = (ending.words for ending in ENDINGS.values())
+"""The good way in words, and the others."""
+
+
+class Rate(NamedTuple):
     """Hits among episodes."""
 
     hits: int
     count: int
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % Wilson interval; anything possible without an episode."""
-        return wilson_interval(self.hits, self.count) if self.count else (0.0, 1.0)
-
     def __str__(self) -> str:
-        if not self.count:
-            return "no valid episode"
-        return f"{self.hits} of {self.count} ({100 * self.hits / self.count:.0f} %; {self.limits})"
+        return rate_words(self.hits, self.count)
 
     @property
     def limits(self) -> str:
-        """The interval in words: ``0 to 16 %``."""
-        return "{:.0f} to {:.0f} %".format(*(100.0 * limit for limit in self.interval))
+        """The 95 % Wilson interval in words: ``0 to 16 %``; anything possible without an episode."""
+        return "{:.0f} to {:.0f} %".format(*(100.0 * limit for limit in wilson_interval(self.hits, self.count)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +62,7 @@ class Crossed:
     scales: NDArray[np.float64]
     """Shape (P,)."""
     rates: dict[str, Rate]
-    """By :data:`ENDS`, and ``fallen``."""
+    """By the words of :data:`ENDINGS`, and ``fallen``."""
 
     @property
     def ends(self) -> NDArray[np.float64]:
@@ -93,13 +105,14 @@ def crossed_of(recording: Recording, penalties: tuple[str, ...], scales: tuple[f
     chosen = np.flatnonzero(outcome != Outcome.INVALID)
     columns = [recording.penalty_names.index(name) for name in penalties]
     last = recording.num_frames[0, chosen] - 1
-    hits = {label: outcome[chosen] == end for end, label in ENDS.items()} | {"fallen": recording.fallen[0, chosen]}
+    hits = {ending.words: outcome[chosen] == end for end, ending in ENDINGS.items()}
+    hits["fallen"] = recording.fallen[0, chosen]
     return Crossed(
         recording=recording,
         chosen=chosen,
         penalties=recording.penalties[0, chosen, last][:, columns].astype(np.float64),
         scales=np.asarray(scales, dtype=np.float64),
-        rates={label: Rate(hits=int(hit.sum()), count=len(chosen)) for label, hit in hits.items()},
+        rates={label: Rate(int(hit.sum()), len(chosen)) for label, hit in hits.items()},
     )
 
 

@@ -1,12 +1,16 @@
-"""Plots of the page as SVG: the archive on parallel axes, and the penalties of a crossing over its time."""
+"""Plots of the page as SVG: the elites on parallel axes, and the penalties of a crossing over its time."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.show.view.elites import Axis, Elites
+from qd.archive import Archive
+from qd.show.elites import Elites, elites_of
+from qd.show.figures import label_of
+from sim.files.intervals import rate_words
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#666666")
 """Of curves, one a penalty; readable by most colour-blind people."""
@@ -15,29 +19,120 @@ _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
 _WIDTH, _HEIGHT = 460, 350
 _TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 16
 _CURVES_HEIGHT, _MARGIN = 170, 24
+_RATES = {"collision_rate": "base collision", "goal_rate": "goal reached", "fallen_rate": "fallen"}
+_RATE_STEP, _FITNESS_STEP = 0.01, 0.1
 
 
-def axes_svg(
-    elites: Elites, kept: NDArray[np.int64], ranges: dict[str, tuple[float, float]], picked: int | None
-) -> str:
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """One quantity of every elite."""
+
+    name: str
+    """Key of the axis: a penalty, ``fitness`` or a rate."""
+    label: str
+    """In words, one line."""
+    values: NDArray[np.float64]
+    """Shape (num_elites,)."""
+    low: float
+    """Lower end, a multiple of ``step`` not above any value."""
+    high: float
+    """Upper end, above ``low`` and not below any value."""
+    step: float
+    """What ranges are set in."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axes:
+    """All elites of an archive on axes: ratios in the archive's order, fitness, rates."""
+
+    archive: Archive
+    elites: Elites
+    axes: tuple[Axis, ...]
+
+    def axis(self, name: str) -> Axis:
+        """The axis of a name."""
+        return next(axis for axis in self.axes if axis.name == name)
+
+    @property
+    def labels(self) -> list[str]:
+        """The penalties in words, in the archive's order."""
+        return [label_of(name) for name in self.archive.penalties]
+
+    def within(self, ranges: dict[str, tuple[float, float]]) -> NDArray[np.int64]:
+        """Numbers of the elites that lie in all ranges, limits included, worst first.
+
+        Args:
+            ranges: Lower and upper limit by the name of an axis; an axis without one is not looked at.
+        """
+        kept = np.ones(len(self.elites), dtype=bool)
+        for name, (low, high) in ranges.items():
+            axis = self.axis(name)
+            slack = 1e-6 * axis.step  # a slider's decimals are not those of float64
+            kept &= (axis.values >= low - slack) & (axis.values <= high + slack)
+        return np.flatnonzero(kept)
+
+    def rate_text(self, name: str, number: int) -> str:
+        """A rate of an elite with its 95 % interval (Wilson), such as ``45% (31 to 60%)``."""
+        return rate_words(self.elites.hits(name, number), int(self.elites.counted[number]), short=True)
+
+    def line(self, number: int) -> str:
+        """An elite on one line of the list: number, fitness, rates."""
+        collided, goal = (self.rate_text(name, number) for name in ("collision_rate", "goal_rate"))
+        return f"{number}: {self.elites.fitness[number]:.1f} · collision {collided} · goal {goal}"
+
+    def details(self, number: int) -> str:
+        """All that the archive says of an elite, as Markdown."""
+        archive, elites = self.archive, self.elites
+        of = f"{elites.counted[number]} {'fresh' if elites.fresh[number] else 'found'} episodes"
+        lines = [
+            f"**Elite {number}** of {len(elites)} · fitness **{elites.fitness[number]:.2f}** "
+            f"({archive.fitness[number]:.2f} as found in iteration {archive.iteration[number]})",
+            "",
+            f"| as searched | of {of}, 95 % interval |",
+            "|---|---|",
+            *(f"| {label} | {self.rate_text(name, number)} |" for name, label in _RATES.items()),
+        ]
+        return "\n".join(lines)
+
+
+def axes_of(archive: Archive) -> Axes:
+    """The axes of an archive that has elites."""
+    elites = elites_of(archive)
+    axes = [_axis_of(name, label_of(name), elites.ratios[:, k], _RATE_STEP) for k, name in enumerate(archive.penalties)]
+    axes.append(_axis_of("fitness", "fitness", elites.fitness, _FITNESS_STEP))
+    rates = {name: np.asarray(getattr(elites, name)) for name in _RATES}
+    axes += [_axis_of(name, label, rates[name], _RATE_STEP) for name, label in _RATES.items()]
+    return Axes(archive=archive, elites=elites, axes=tuple(axes))
+
+
+def _axis_of(name: str, label: str, values: NDArray[np.float64], step: float) -> Axis:
+    """An axis as long as its values need: 0 to 1 at most for what is a share."""
+    low = float(np.floor(values.min() / step + 1e-9)) * step
+    high = float(np.ceil(values.max() / step - 1e-9)) * step
+    if high <= low:
+        high = low + step
+    return Axis(name=name, label=label, values=values, low=round(low, 6), high=round(high, 6), step=step)
+
+
+def axes_svg(axes: Axes, kept: NDArray[np.int64], ranges: dict[str, tuple[float, float]], picked: int | None) -> str:
     """The archive on parallel axes: a line an elite, grey outside the ranges, the picked one on top.
 
     Args:
-        elites: All of them.
+        axes: Of all elites.
         kept: Numbers of those in the ranges.
         ranges: Range of each brushed axis.
         picked: Number of the picked elite, if any.
     """
-    x = np.linspace(_LEFT, _WIDTH - _RIGHT, len(elites.axes))
-    y = np.stack([_height_of(axis, axis.values) for axis in elites.axes], axis=1)
-    dropped = np.setdiff1d(np.arange(len(elites)), kept)
+    x = np.linspace(_LEFT, _WIDTH - _RIGHT, len(axes.axes))
+    y = np.stack([_height_of(axis, axis.values) for axis in axes.axes], axis=1)
+    dropped = np.setdiff1d(np.arange(len(axes.elites)), kept)
     parts = [_lines(x, y[dropped], _GREY, 0.6, 0.6)]
     # Equally many a shade, so that the worst stand out whatever the range of fitness.
     for shade, numbers in zip(_SHADES, reversed(np.array_split(kept, len(_SHADES))), strict=True):
         parts.append(_lines(x, y[numbers], shade, 0.8, 0.75))
     if picked is not None:
         parts.append(_lines(x, y[[picked]], _PICKED, 2.5, 1.0))
-    parts += [_axis(axis, float(place), ranges.get(axis.name)) for axis, place in zip(elites.axes, x, strict=True)]
+    parts += [_axis(axis, float(place), ranges.get(axis.name)) for axis, place in zip(axes.axes, x, strict=True)]
     return _svg(_HEIGHT, parts)
 
 

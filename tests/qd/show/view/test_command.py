@@ -10,9 +10,8 @@ import tyro
 
 from qd.archive import read_archive, write_archive
 from qd.run.directory import RESULTS
-from qd.show.view.arguments import ViewCfg, check_port, show_of
+from qd.show.view.command import View, check_port, show_of
 from tests.qd.test_archive import small_archive
-from tests.test_makefile import command_of
 
 ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
 
@@ -20,11 +19,11 @@ ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
 def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypatch, anymal):
     (tmp_path / "results").symlink_to(RESULTS.resolve())
     monkeypatch.chdir(tmp_path)
-    show = show_of(ViewCfg())
+    show = show_of(View())
     assert show.found.run == RESULTS / "anymal" / "archive"
     assert show.controllers == {"as searched": str(anymal.policy_file)}
     write_archive(make_folder(tmp_path / "runs" / "mine") / "archive.npz", small_archive())
-    assert show_of(ViewCfg()).found.run == Path("runs/mine")
+    assert show_of(View()).found.run == Path("runs/mine")
 
 
 def make_folder(path):
@@ -33,7 +32,7 @@ def make_folder(path):
 
 
 def test_controllers_are_named_and_tried(tmp_path, anymal):
-    cfg = ViewCfg(run=ARCHIVE, policies=(f"base=shipped tuned={anymal.policy_file}",))
+    cfg = View(run=ARCHIVE, policies=(f"base=shipped tuned={anymal.policy_file}",))
     assert list(show_of(cfg).controllers) == ["base", "tuned"]
     with pytest.raises(ValueError, match="no such file"):
         show_of(dataclasses.replace(cfg, policies=("base=shipped", f"tuned={tmp_path / 'none.pt'}")))
@@ -43,8 +42,8 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_lost(tmp_path):
     shutil.copytree(ARCHIVE, tmp_path / "run")
     config = tmp_path / "run" / "config.json"
     config.write_text(config.read_text().replace('"policy": "shipped"', '"policy": "/gone/policy.pt"'))
-    show = show_of(ViewCfg(run=tmp_path / "run"))
-    assert show.controllers == {} and "/gone/policy.pt" in show.note and "POLICIES" in show.note
+    show = show_of(View(run=tmp_path / "run"))
+    assert show.controllers == {} and "/gone/policy.pt" in show.note and "--policies" in show.note
 
 
 @pytest.mark.parametrize(
@@ -53,21 +52,23 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_lost(tmp_path):
         ({"robot": "spot"}, "unknown robot 'spot': expected one of anymal, cassie"),
         ({"run": Path("nowhere")}, r"no archive at nowhere/?.*: give a run directory"),
         ({"robot": "cassie", "run": ARCHIVE}, "anymal"),
-        ({"elite": 5000}, rf"has no elite 5000: expected 0 to {len(read_archive(ARCHIVE)) - 1}"),
-        ({"elite": -1}, "has no elite -1"),
-        ({"replicas": 0}, "replicas must lie in 1..100, got 0"),
+        ({"elite": "5000"}, rf"has no elite 5000: expected .* 0 to {len(read_archive(ARCHIVE)) - 1}"),
+        ({"elite": "-1"}, "has no elite -1"),
+        ({"elite": "0 1"}, "one elite here, got '0 1'"),
+        ({"cache": Path(__file__) / "cache"}, "cannot write to .*test_command"),
+        ({"replicas": 0}, "replicas must be at least 1 and at most 100, got 0"),
         ({"policies": ("shipped",)}, "policies must be NAME=FILE each"),
     ],
 )
 def test_what_is_wrong_is_said_before_a_page_opens(changes, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
-        show_of(ViewCfg(**{"run": ARCHIVE} | changes))
+        show_of(View(**{"run": ARCHIVE} | changes))
 
 
 def test_a_run_without_elites_is_refused(tmp_path):
     write_archive(tmp_path / "archive.npz", small_archive().rows(np.array([], dtype=int)))
     with pytest.raises(ValueError, match="has no elites yet"):
-        show_of(ViewCfg(run=tmp_path))
+        show_of(View(run=tmp_path))
 
 
 def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path):
@@ -76,11 +77,11 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path):
     settings = json.loads(config.read_text())
     settings["settings"] |= {"policy": "tests.sim.policies:stand", "policy_sha256": None}
     config.write_text(json.dumps(settings))
-    show = show_of(ViewCfg(run=tmp_path / "run"))
+    show = show_of(View(run=tmp_path / "run"))
     assert show.controllers == {}
-    assert "tests.sim.policies:stand is code" in show.note and "name a controller with POLICIES" in show.note
-    assert "--policy" not in show.note  # which this command does not have
-    named = show_of(ViewCfg(run=tmp_path / "run", policies=("mine=tests.sim.policies:stand",)))
+    assert "tests.sim.policies:stand is code" in show.note and "name a controller with --policies" in show.note
+    assert "--policy " not in show.note  # which this command does not have
+    named = show_of(View(run=tmp_path / "run", policies=("mine=tests.sim.policies:stand",)))
     assert named.controllers == {"mine": "tests.sim.policies:stand"}
 
 
@@ -90,10 +91,10 @@ def test_a_half_written_run_is_refused(tmp_path, name):
     file = tmp_path / "run" / name
     file.write_bytes(file.read_bytes()[:300])
     with pytest.raises(ValueError, match=name):
-        show_of(ViewCfg(run=tmp_path / "run"))
+        show_of(View(run=tmp_path / "run"))
     (tmp_path / "run" / "archive.npz").unlink()
     with pytest.raises(FileNotFoundError, match="no archive at"):
-        show_of(ViewCfg(run=tmp_path / "run"))
+        show_of(View(run=tmp_path / "run"))
 
 
 def test_a_port_in_use_is_named_with_a_free_one():
@@ -101,9 +102,9 @@ def test_a_port_in_use_is_named_with_a_free_one():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=rf"port {port} of 127.0.0.1 is in use .* take PORT=\d+") as caught:
+        with pytest.raises(ValueError, match=rf"port {port} of 127.0.0.1 is in use .* take --port \d+") as caught:
             check_port("127.0.0.1", port)
-        free = int(str(caught.value).partition("PORT=")[2].partition(",")[0])
+        free = int(str(caught.value).partition("--port ")[2].partition(",")[0])
         assert free > port
         check_port("127.0.0.1", free)
     check_port("127.0.0.1", port)
@@ -118,9 +119,20 @@ def test_what_cannot_be_listened_at_is_refused(host, port, message):
         check_port(host, port)
 
 
-def test_make_hands_all_over():
-    command = command_of("view", ROBOT="cassie", RUN="a b", POLICIES="base=shipped x=y.pt", PORT="9000", ELITE="3")
-    assert command[:3] == [".venv/bin/python", "-m", "qd.show.view"]
-    expected = ViewCfg(robot="cassie", run=Path("a b"), policies=("base=shipped x=y.pt",), port=9000, elite=3)
-    assert tyro.cli(ViewCfg, args=command[3:]) == expected
-    assert ViewCfg().host == "127.0.0.1"  # nobody else's business unless asked for
+def test_flags_are_handed_over():
+    words = [
+        "--robot",
+        "cassie",
+        "--run",
+        "a b",
+        "--policies",
+        "base=shipped",
+        "x=y.pt",
+        "--port",
+        "9000",
+        "--elite",
+        "3",
+    ]
+    expected = View(robot="cassie", run=Path("a b"), policies=("base=shipped", "x=y.pt"), port=9000, elite="3")
+    assert tyro.cli(View, args=words) == expected
+    assert View().host == "127.0.0.1"  # nobody else's business unless asked for

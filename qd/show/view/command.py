@@ -1,15 +1,18 @@
-"""What a command line of the viewer means; whatever a user may have got wrong is found before a page opens."""
+"""``faultline view``: what is shown, and the page that shows it; what a user may have got wrong is found before."""
 
 import errno
 import socket
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from qd.run.directory import RESULTS
-from qd.show.recordings import Found, archive_of_robot, policy_of
-from qd.show.replay import as_searched
+from qd.run.directory import RESULTS, RUNS
+from qd.show.elites import Found, find_archive
 from qd.workers.evaluator import check_policy
+from sim.files.atomic import prepare_output
+from sim.files.command import Which
+from sim.files.settings import check, setting
 from sim.policy.spec import ControllerSpec
 
 if TYPE_CHECKING:
@@ -17,13 +20,12 @@ if TYPE_CHECKING:
 
 SEARCHED = "as searched"
 """What the page calls the controller of the search, if no other is named."""
-_CACHE = Path("runs") / "view-cache"
 _LOOK_AHEAD = 50
 """Ports looked at for a free one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewCfg:
+class View(Which):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
     Left, the archive on parallel axes. Under "Ranges" drag the ends of an axis: elites outside turn grey and leave the
@@ -36,74 +38,110 @@ class ViewCfg:
     open the page at home.
     """
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the Python file of your own."""
-    run: Path | None = None
-    """Run directory; the newest of this robot under runs/, or if there is none the published one under results/."""
+    robot: str | None = None
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); that of the run if left out."""
     policies: tuple[str, ...] = ()
     """Controllers to choose from, each NAME=FILE, NAME=module:callable or NAME=shipped, such as base=shipped
     C-G=runs/tuned/policy.pt; the one the archive was made with if none is given."""
-    elite: int = 0
-    """Which elite to show first; 0 is the worst for the robot."""
-    replicas: int = 20
+    replicas: int = setting(20, least=1, most=100)
     """Episodes of each elite, from different starts; fewer are recorded sooner."""
     port: int = 8080
     """Where the page is served."""
     host: str = "127.0.0.1"
     """Whom to serve it to: this machine alone, as whoever reaches the page may use it, without a password. 0.0.0.0
     serves it to the network."""
-    cache: Path = _CACHE
-    """Where recordings made here are kept."""
+    cache: Path = RUNS / "recordings"
+    """Where recordings are kept."""
+
+    def execute(self) -> None:
+        """Serves the page until Ctrl-C."""
+        serve(self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Show:
-    """What is to be shown, looked at and found to be there."""
+    """What is to be shown, and is there."""
 
-    cfg: ViewCfg
+    cfg: View
     found: Found
-    robot: "RobotCfg"
+    elite: int
+    """Which to show first."""
     controllers: dict[str, str]
     """What each controller is loaded from, by its name; empty if that of the search is lost."""
     note: str
     """Why there is no controller; empty if there is one."""
-    published: Path
-    """Folder of the recordings that come with the project."""
+
+    @property
+    def robot(self) -> "RobotCfg":
+        """Whose archive it is."""
+        return self.found.robot
+
+    @property
+    def published(self) -> Path:
+        """Folder of the recordings that come with the project."""
+        return RESULTS / self.robot.name / "view"
 
 
-def show_of(cfg: ViewCfg) -> Show:
+def serve(cfg: View) -> None:
+    """Serves the page until Ctrl-C.
+
+    Raises:
+        FileNotFoundError: If there is no archive.
+        ValueError: If anything else is not as it must be.
+    """
+    began = time.perf_counter()
+    check_port(cfg.host, cfg.port)
+    show = show_of(cfg)
+    from qd.show.recordings import Recordings
+    from qd.show.view.app import App
+
+    app = App(show, Recordings(show.robot, folder=cfg.cache, published=show.published))
+    try:
+        took, count = time.perf_counter() - began, len(show.found.archive)
+        print(f"{show.found.run}: {count:,} elites of {show.robot.name}, ready after {took:.1f} s.")
+        print(f"Open http://{cfg.host}:{cfg.port} in a browser; Ctrl-C ends.", flush=True)
+        app.run()
+    except KeyboardInterrupt:
+        print("\nStopped.")
+    finally:
+        app.close()
+
+
+def show_of(cfg: View) -> Show:
     """What a command line asks to see.
 
     Raises:
         FileNotFoundError: If there is no archive.
         ValueError: If robot, archive, controllers or a number are not as they must be.
     """
-    from sim.policy.spec import controllers_of
-
-    found = archive_of_robot(cfg.robot, cfg.run)
-    robot = found.robot
+    check(cfg)
+    found = find_archive(cfg.robot, cfg.run)
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: let its search go on, or give another --run")
-    if not 0 <= cfg.elite < len(found.archive):
-        raise ValueError(f"{found.run} has no elite {cfg.elite}: expected 0 to {len(found.archive) - 1}")
-    if not 1 <= cfg.replicas <= 100:
-        raise ValueError(f"replicas must lie in 1..100, got {cfg.replicas}")
-    note = ""
+    elite = found.one(cfg.elite)
+    prepare_output(cfg.cache / "recording.npz")
+    controllers, note = _controllers_of(cfg, found)
+    return Show(cfg=cfg, found=found, elite=elite, controllers=controllers, note=note)
+
+
+def _controllers_of(cfg: View, found: Found) -> tuple[dict[str, str], str]:
+    """The controllers by name, and why there are none; terrains can be looked at without."""
+    from sim.policy.spec import controllers_of
+
     if any(map(str.strip, cfg.policies)):
-        controllers = controllers_of(cfg.policies, robot)
+        controllers = controllers_of(cfg.policies, found.robot)
         for policy in controllers.values():
-            check_policy(policy, robot, "cpu")
-    else:
-        searched, _ = as_searched(found.run, found.archive)
-        try:  # without a controller the terrains can be looked at all the same
-            if ControllerSpec.parse(searched).runs_code:
-                raise ValueError(f"the search's controller {searched} is code, and what a run names is never run")
-            controllers = {SEARCHED: policy_of(found, robot, None)}
-            check_policy(controllers[SEARCHED], robot, "cpu")
-        except ValueError as error:
-            controllers, note = {}, f"{error}; name a controller with POLICIES to see crossings"
-    published = RESULTS / robot.name / "view"
-    return Show(cfg=cfg, found=found, robot=robot, controllers=controllers, note=note, published=published)
+            check_policy(policy, found.robot, "cpu")
+        return controllers, ""
+    searched, _ = found.as_searched()
+    try:
+        if ControllerSpec.parse(searched).runs_code:
+            raise ValueError(f"the search's controller {searched} is code, and what a run names is never run")
+        policy = found.policy(None)
+        check_policy(policy, found.robot, "cpu")
+    except ValueError as error:
+        return {}, f"{error}; name a controller with --policies to see crossings"
+    return {SEARCHED: policy}, ""
 
 
 def check_port(host: str, port: int) -> None:
@@ -118,7 +156,7 @@ def check_port(host: str, port: int) -> None:
     if reason is not None and reason.errno == errno.EADDRINUSE:
         others = range(port + 1, min(port + 1 + _LOOK_AHEAD, 65536))
         free = next((other for other in others if _trouble(host, other) is None), None)
-        remedy = "close that program" if free is None else f"take PORT={free}, which is free"
+        remedy = "close that program" if free is None else f"take --port {free}, which is free"
         raise ValueError(f"port {port} of {host} is in use by another program: {remedy}")
     if reason is not None:
         raise ValueError(

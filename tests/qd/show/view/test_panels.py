@@ -3,13 +3,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qd.show.view.elites import elites_of
-from qd.show.view.state import PAGE, Clock, Selection
+from qd.show.view.panels import PAGE, Clock, Selection
+from qd.show.view.plots import axes_of
 from tests.qd.test_archive import fresh_values, small_archive
 
 
 @pytest.fixture
-def elites():
+def axes():
     """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
     numbers = np.arange(20)
     archive = dataclasses.replace(
@@ -19,12 +19,12 @@ def elites():
         fitness=10.0 - numbers,
         episodes=np.full(20, 20),
     )
-    return elites_of(archive)
+    return axes_of(archive)
 
 
 @pytest.fixture
-def selection(elites):
-    return Selection(elites)
+def selection(axes):
+    return Selection(axes)
 
 
 def test_ranges_keep_what_lies_in_all_of_them(selection):
@@ -80,21 +80,21 @@ def test_numbers_of_fresh_episodes_come_first():
     fresh = dataclasses.replace(
         fresh, collision_rate=np.array([0.5, 0.25, 0.0]), invalid_episodes=np.array([0, 0, 39]), fitness=np.zeros(3)
     )
-    elites = elites_of(dataclasses.replace(archive, fresh=fresh))
-    assert elites.fresh.tolist() == [True, True, False]
-    assert elites.counted.tolist() == [40, 40, 4]
-    assert elites.axis("collision_rate").values.tolist() == [0.5, 0.25, 1.0]
-    assert elites.axis("fitness").values.tolist() == [0.0, 0.0, archive.fitness[2]]
+    axes = axes_of(dataclasses.replace(archive, fresh=fresh))
+    assert axes.elites.fresh.tolist() == [True, True, False]
+    assert axes.elites.counted.tolist() == [40, 40, 4]
+    assert axes.axis("collision_rate").values.tolist() == [0.5, 0.25, 1.0]
+    assert axes.axis("fitness").values.tolist() == [0.0, 0.0, archive.fitness[2]]
     # Wilson, z^2 = 3.8415, of 20 of 40: .5 +- 1.96 sqrt(.25/40 + 3.8415/6400) / 1.0960 = .5 +- .148
-    assert elites.rate_text("collision_rate", 0) == "50 % (35-65)"
-    assert "collision 50 % (35-65)" in elites.line(0) and "of 40 fresh episodes" in elites.details(0)
-    assert "of 4 found episodes" in elites.details(2)
+    assert axes.rate_text("collision_rate", 0) == "50% (35 to 65%)"
+    assert "collision 50% (35 to 65%)" in axes.line(0) and "of 40 fresh episodes" in axes.details(0)
+    assert "of 4 found episodes" in axes.details(2)
 
 
-def test_an_axis_reaches_over_all_values_in_whole_steps(elites):
-    axis = elites.axis("goal_rate")
+def test_an_axis_reaches_over_all_values_in_whole_steps(axes):
+    axis = axes.axis("goal_rate")
     assert (axis.low, axis.high) == (0.0, 0.95)
-    same = elites_of(dataclasses.replace(small_archive(1), fitness=np.array([1.0]), goal_rate=np.array([0.5])))
+    same = axes_of(dataclasses.replace(small_archive(1), fitness=np.array([1.0]), goal_rate=np.array([0.5])))
     for axis in same.axes:  # of one elite too
         assert axis.low <= axis.values[0] <= axis.high and axis.high > axis.low
 

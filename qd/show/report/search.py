@@ -4,15 +4,16 @@ from typing import Any
 
 import numpy as np
 
+from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
-from qd.run.next_commands import make_command
 from qd.run.progress import clock
+from qd.show.elites import Elites
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
-from qd.show.report.elites import FAILING_BELOW, Elites
+from qd.show.report.evaluation import fates, most_mended
 from qd.show.report.figures import draw_pairs
-from qd.show.report.page import Absent, Block, Facts, Section, Table, Text
-from qd.show.report.shown import Shown, counted, hours, percent, picture
-from qd.show.report.table_sections import fates, most_mended
+from qd.show.report.material import Shown
+from qd.show.report.page import Absent, Block, Facts, Section, Table, Text, counted, hours, percent, picture
+from sim.files.command import command_line
 from sim.files.intervals import bootstrap_interval
 from sim.policy.spec import SHIPPED, ControllerSpec
 
@@ -26,7 +27,7 @@ def outcome_section(shown: Shown) -> Section:
     failing, ways = int(elites.failing.sum()), elites.failing_cells
     basis = (
         f"by {int(elites.counted.max(initial=0))} fresh episodes each, free of the luck that made them elites"
-        if elites.fresh
+        if elites.fresh.any()
         else "by the episodes that found them, which flatter themselves"
     )
     tables = _tables_of_these(shown)
@@ -55,7 +56,7 @@ def outcome_section(shown: Shown) -> Section:
     explained = (
         f"A cell is a combination of shares of the penalties, each in {archive.intervals} intervals; terrains in "
         "different cells make the robot struggle differently. A terrain counts as failed if under "
-        f"{percent(FAILING_BELOW)} of the robots reach the goal. The rates are means over terrains"
+        f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal. The rates are means over terrains"
         f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
     told = (_common(shown), text, _others(tables) if tables else "", explained)
@@ -129,7 +130,7 @@ def curves_section(shown: Shown) -> Section:
     if not rows:
         section.blocks.append(
             Absent("The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:",
-                   make_command("archive", robot=shown.material.robot.spec))
+                   command_line("archive", robot=shown.material.robot.spec))
         )  # fmt: skip
         return section
     first, last = rows[0], rows[-1]
@@ -193,7 +194,7 @@ def pairs_section(shown: Shown) -> Section:
     if len(elites) < 3 or len(elites.penalties) < 2:
         section.blocks.append(
             Absent(f"The projections are left out: they need 3 elites, and there are {len(elites)}. A longer search "
-                   "finds more:", make_command("archive", resume=shown.material.run, iterations="N"))
+                   "finds more:", command_line("archive", resume=shown.material.run, iterations="N"))
         )  # fmt: skip
         return section
     text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode (next chapter)."
@@ -226,7 +227,7 @@ def origin_section(shown: Shown) -> Section:
     if not origin:
         section.blocks.append(
             Absent("The search is not on record: there is no config.json beside the archive. A search writes one:",
-                   make_command("archive", robot=shown.material.robot.spec))
+                   command_line("archive", robot=shown.material.robot.spec))
         )  # fmt: skip
         return section
     rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]

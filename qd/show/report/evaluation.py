@@ -2,16 +2,14 @@
 
 from typing import Any
 
-from qd.run.next_commands import make_command
-from qd.show.report.changes import Change, Changes
-from qd.show.report.outcomes import ENDS, Crossed
-from qd.show.report.page import Absent, Block, Heading, Section, Table, Text
-from qd.show.report.shown import Shown, counted, percent, picture
-from qd.show.report.table_figures import draw_tables
-from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, by_kind
-from qd.show.report.terrain_figures import draw_maps
+from qd.show.crossed import ARRIVED, FAILED, Crossed
+from qd.show.crossing_figures import draw_maps
+from qd.show.report.figures import draw_tables
+from qd.show.report.material import Shown
+from qd.show.report.page import Absent, Block, Heading, Section, Table, Text, counted, percent, picture
+from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, Change, Changes, by_kind
+from sim.files.command import command_line
 
-_ARRIVED = next(iter(ENDS.values()))
 _TRAINED_ON = {
     "C-HC": "hand-crafted terrains alone",
     "C-HR": "hand-crafted and hard-random ones",
@@ -83,10 +81,10 @@ def fates(tables: dict[str, Any]) -> str:
 def _command(shown: Shown) -> str:
     """What makes the tables."""
     material = shown.material
-    return make_command(
+    return command_line(
         "evaluate",
         robot=material.robot.spec,
-        policies="base=shipped C-G=FILE",
+        policies=["base=shipped", "C-G=FILE"],
         archive=material.run,
         out=material.tables_file,
     )
@@ -176,8 +174,8 @@ def _introduced(shown: Shown, changes: Changes) -> str:
     """Who crosses what, and how to see it move."""
     change, policies = changes.chosen[0], changes.policies or {}
     files = " and ".join(f"{who} ({policy})" for who, policy in policies.items())
-    view = make_command("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
-                        policies=" ".join(f"{who}={policy}" for who, policy in policies.items()))  # fmt: skip
+    view = command_line("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
+                        policies=[f"{who}={policy}" for who, policy in policies.items()])  # fmt: skip
     return (
         f"{files} on elites held out of training, numbered as in {changes.run}: the worst of those mended, of those "
         f"newly broken and of those still failing, as far as there are such. `{view}` shows them walk."
@@ -190,7 +188,7 @@ def _change(shown: Shown, change: Change, crossed: tuple[Crossed, Crossed]) -> l
     far = ", among the third farthest from all that was trained on" if change.far else ""
     told = "; with ".join(f"{who} {_ended(one)}" for who, one in zip(names, crossed, strict=True))
     text = f"{change.kind.capitalize()} by the tables{far}. Crossed again from the same starts: with {told}."
-    rates = [one.rates[_ARRIVED] for one in crossed]
+    rates = [one.rates[ARRIVED] for one in crossed]
     maps = {f"{who}: {rate.hits} of {rate.count} reach the goal": one
             for who, rate, one in zip(names, rates, crossed, strict=True)}  # fmt: skip
     title = f"{shown.material.archive.robot}, elite {change.number}: {change.before} and {change.after}"
@@ -202,9 +200,9 @@ def _change(shown: Shown, change: Change, crossed: tuple[Crossed, Crossed]) -> l
 
 def _ended(crossed: Crossed) -> str:
     """How many reached the goal, and what the others ended in."""
-    arrived, at = crossed.rates[_ARRIVED], crossed.failed_at
+    arrived, at = crossed.rates[ARRIVED], crossed.failed_at
     if at is None:
         return f"{arrived} reach the goal"
-    others = [f"{label} {crossed.rates[label].hits}" for label in list(ENDS.values())[1:] if crossed.rates[label].hits]
+    others = [f"{label} {crossed.rates[label].hits}" for label in FAILED if crossed.rates[label].hits]
     who = "the other one" if arrived.count - arrived.hits == 1 else "the middle one of the others"
     return f"{arrived} reach the goal ({', '.join(others)}; {who} ends at x = {at:.1f} m)"

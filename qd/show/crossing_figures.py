@@ -5,17 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.show.endings import ENDINGS
-from qd.show.figures import PENALTY_LABELS, new_figure
-from qd.show.report.figures import look_of
-from qd.show.report.outcomes import ENDS, Crossed, penalties_by_place
+from qd.show.crossed import ENDINGS, Crossed, penalties_by_place
+from qd.show.figures import PENALTY_LABELS, look_of, new_figure
+from sim.crossing import CrossingCfg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
-_START, _GOAL = (2.0, 4.0), (14.0, 4.0)
 _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
 
@@ -46,6 +44,18 @@ def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> "
     return figure
 
 
+def draw_paths(crossed: Crossed, title: str) -> "Figure":
+    """One terrain from above with the robots' paths, and marks where they ended, by how."""
+    figure = new_figure(11.0, 6.2)
+    axes = figure.subplots()
+    figure.colorbar(draw_map(axes, crossed), ax=axes, label="height [m]", shrink=0.7)
+    axes.set_title(title)
+    axes.set_xlabel("x [m]")
+    axes.set_xlim(*_x_limits([crossed]))
+    figure.legend(*_legend(axes), loc="outside lower center", ncols=6, frameon=False, handlelength=3)
+    return figure
+
+
 def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None = None) -> Any:
     """The height map with every path, its end marked by how it ended; returns the image.
 
@@ -68,11 +78,17 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
             axes.plot(*crossed.path(int(k))[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
         if len(chosen):
             places = crossed.ends[chosen]
-            looks = {"color": end.color, "marker": end.marker, "s": 55, "edgecolors": "white", "zorder": 3}
+            looks: dict[str, Any] = {
+                "color": end.color,
+                "marker": end.marker,
+                "s": 55,
+                "edgecolors": "white",
+                "zorder": 3,
+            }
             axes.scatter(*places[:, :2].T, label=f"{end.words} ({len(chosen)})", **looks)
     white = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
-    axes.plot(*_START, marker=">", markersize=11, label="start", **white)
-    axes.plot(*_GOAL, marker="*", markersize=16, label="goal", **white)
+    axes.plot(*CrossingCfg.start, marker=">", markersize=11, label="start", **white)
+    axes.plot(*CrossingCfg.goal, marker="*", markersize=16, label="goal", **white)
     axes.set_ylabel("y [m]")
     axes.set_aspect("equal")
     return image
@@ -82,13 +98,14 @@ def _legend(axes: "Axes") -> tuple[list[Any], list[str]]:
     """Markers with the lines of the paths that lead to them."""
     from matplotlib.lines import Line2D
 
-    lines = {end.words: (end.color, end.marker, end.line) for end in ENDINGS.values()}
+    lines = {end.words: end for end in ENDINGS.values()}
     handles, labels = axes.get_legend_handles_labels()
     shown = []
     for handle, label in zip(handles, labels, strict=True):
-        colour, marker, line = lines.get(label.rpartition(" (")[0], ("", "", ""))
-        style = {"color": colour, "marker": marker, "linestyle": line, "markeredgecolor": "white", "markersize": 9}
-        shown.append(Line2D([], [], **style) if colour else handle)
+        if end := lines.get(label.rpartition(" (")[0]):
+            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line}
+            handle = Line2D([], [], **looks, markeredgecolor="white", markersize=9)
+        shown.append(handle)
     return shown, labels
 
 
@@ -175,5 +192,5 @@ def _common_legend(panels: Sequence["Axes"]) -> tuple[list[Any], list[str]]:
     for axes in panels:
         for handle, label in zip(*_legend(axes), strict=True):
             entries.setdefault(label.rpartition(" (")[0] or label, handle)
-    order = [label for label in (*ENDS.values(), "start", "goal") if label in entries]
+    order = [label for label in (*(end.words for end in ENDINGS.values()), "start", "goal") if label in entries]
     return [entries[label] for label in order], order

@@ -1,0 +1,185 @@
+"""``faultline report``: one page about a run, with its figures beside it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from qd.workers.evaluator import check_policy, resolve_device
+from sim.files.atomic import write_atomically
+from sim.files.command import OnDevice, Who, command_line, naming_what_is_next
+from sim.files.settings import check, setting
+from sim.policy.spec import controller_hash, spec_of
+
+if TYPE_CHECKING:
+    from qd.archive import Archive
+    from qd.show.crossed import Crossed
+    from qd.show.recordings import Cross, Recordings, Wanted
+    from qd.show.report.material import Material, Shown
+    from qd.show.report.tables import Change, Changes
+
+MAX_BYTES = 15_000_000
+"""Most that a page may weigh."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Who, OnDevice):
+    """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
+
+    Elites shown are crossed again for it, 20 times each. The crossings are kept under runs/recordings: the same
+    command, stopped or made again, goes on from there.
+    """
+
+    run: Path | None = None
+    """Run directory; the newest of this robot under runs/, else its published archive."""
+    tables: Path | None = None
+    """File of the evaluation tables; results/<robot>/tables.json if it is there."""
+    out: Path | None = None
+    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published."""
+    elites: int = setting(5, least=1, most=10)
+    """How many of the worst and of the most reproducible elites to show, beside one of each failure mode."""
+    episodes: int = setting(20, least=1, most=100)
+    """Crossings of each elite shown."""
+
+    def execute(self) -> None:
+        """Writes the page."""
+        html_report(self)
+
+
+def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
+    """Writes the page; returns its file.
+
+    Args:
+        cfg: What to report on.
+        cross: Crosses terrains; by default the simulation.
+
+    Raises:
+        FileNotFoundError: If there is no run, or no tables where they were said to be.
+        ValueError: If something is not as it must be; raised before any long work.
+        Interrupted: On Ctrl-C; what was crossed is kept.
+    """
+    from qd.show.elites import elites_of
+    from qd.show.report.material import Shown, gather
+    from qd.show.report.modes import find_modes
+
+    check(cfg)
+    material = gather(cfg)
+    elites = elites_of(material.archive, judged=True)
+    if not len(elites):
+        raise ValueError(
+            f"{material.run} must have elites to report on, got {len(material.archive)} whose fresh episodes are all "
+            f"invalid: let its search go on with `{command_line('archive', resume=material.run, iterations='N')}`"
+        )
+    shown = Shown(
+        material=material,
+        elites=elites,
+        modes=find_modes(elites),
+        worst=elites.worst(cfg.elites),
+        steady=elites.most_reproducible(cfg.elites),
+    )
+    with naming_what_is_next("what was crossed is kept", lambda: "The same command goes on"):
+        shown = _with_crossings(shown, cross)
+    return _write(shown)
+
+
+def _with_crossings(shown: "Shown", cross: "Cross | None") -> "Shown":
+    """Crosses the elites to be shown, and the terrains to be shown before and after."""
+    from qd.show.recordings import Recordings
+    from qd.show.report.tables import Changes, changes_of
+
+    material = shown.material
+    device = resolve_device(material.cfg.device)
+    if reason := _uncrossable(material, device):
+        changes = None if material.tables is None else Changes(reason="The controller of the search cannot be loaded.")
+        return replace(shown, changes=changes, not_crossed=reason)
+    recordings = Recordings(material.robot, device=device, cross=cross)
+    wanted = [_wanted(material, material.archive, number, material.policy) for number in shown.numbers]
+    crossed = dict(zip(shown.numbers, _crossed(material, recordings, wanted), strict=True))
+    if material.tables is None:
+        return replace(shown, crossed=crossed)
+    changes = changes_of(material.tables, material.tables_file, material.robot)
+    return replace(shown, crossed=crossed, changes=changes, pairs=_pairs(material, changes, recordings))
+
+
+def _uncrossable(material: "Material", device: str) -> str:
+    """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
+    if material.is_unnamed_code:
+        return (
+            f"Left out: the run was searched with the controller {material.searched}, which is code, and no code runs "
+            f"that the command line does not name: name it with --policy {material.searched}"
+        )
+    try:
+        check_policy(material.policy, material.robot, device)
+    except ValueError as error:
+        if material.cfg.policy is not None:
+            raise
+        return f"Left out: the controller of the search cannot be loaded: {error}. Name one with --policy"
+    return ""
+
+
+def _wanted(material: "Material", archive: "Archive", number: int, policy: str, by: str = "") -> "Wanted":
+    from qd.show.recordings import on_elite
+
+    label = f"elite {number} with {by}" if by else None
+    return on_elite(archive, number, policy=policy, replicas=material.cfg.episodes, label=label)
+
+
+def _crossed(material: "Material", recordings: "Recordings", wanted: "Sequence[Wanted]") -> "list[Crossed]":
+    from qd.show.crossed import crossed_of
+
+    penalties, scales = material.archive.penalties, material.archive.scales
+    return [crossed_of(recording, penalties, scales) for recording in recordings.all_of(wanted)]
+
+
+def _pairs(
+    material: "Material", changes: "Changes", recordings: "Recordings"
+) -> "dict[Change, tuple[Crossed, Crossed]]":
+    """What the two controllers of each change make of its terrain."""
+    if changes.archive is None or changes.policies is None:
+        return {}
+    wanted = [
+        _wanted(material, changes.archive, change.number, spec_of(changes.policies[who], material.robot), who)
+        for change in changes.chosen
+        for who in (change.before, change.after)
+    ]
+    found = _crossed(material, recordings, wanted)
+    return dict(zip(changes.chosen, zip(found[::2], found[1::2], strict=True), strict=True))
+
+
+def _lead(material: "Material") -> str:
+    """What stands under the title; a controller that is no longer the one searched is named here."""
+    lead = f"Made from {material.run} by faultline, which searches terrains that break a legged robot's controller."
+    search = material.search
+    if material.cfg.policy is not None:
+        return f"{lead} The crossings shown are of another controller than was searched: {material.policy}."
+    if search is not None and search.policy_sha256 not in (None, controller_hash(material.policy)):
+        return f"{lead} The controller's file has changed since the search: the crossings shown are of the present one."
+    return lead
+
+
+def _write(shown: "Shown") -> Path:
+    """Writes figures and page, the page last: it is whole or as it was."""
+    from qd.show.report import elites, evaluation, search
+    from qd.show.report.page import counted, pictures_of, render
+
+    material = shown.material
+    makers = (
+        search.outcome_section, search.curves_section, search.archive_section, search.pairs_section,
+        elites.modes_section, elites.detail_section, evaluation.tables_section, evaluation.before_after_section,
+        elites.all_section, search.origin_section,
+    )  # fmt: skip
+    sections = [section for make in makers if (section := make(shown)) is not None]
+    page = render(f"How {material.archive.robot} breaks: a search's report", _lead(material), sections)
+    if len(page) > MAX_BYTES:
+        raise ValueError(
+            f"the page would have {len(page):,} bytes, at most {MAX_BYTES:,} are allowed: show fewer --elites"
+        )
+    figures = material.out.with_name(f"{material.out.stem}-figures")
+    figures.mkdir(exist_ok=True)
+    pictures = pictures_of(sections)
+    for picture in pictures:
+        write_atomically(figures / picture.name, picture.png)
+    write_atomically(material.out, page)
+    print(f"{counted(len(pictures), 'figure')} under {figures}")
+    print(f"Report: {material.out} ({len(page) / 1e6:.1f} MB; opens in a browser, without a network)")
+    return material.out
