@@ -110,7 +110,7 @@ def test_an_offender_is_caught(path, source):
         ("kernels/a.py", "import numpy as np\nimport warp as wp\nfrom kernels.contact import collide"),
         ("sim/a.py", "import newton\nimport torch\nimport warp\nfrom . import robot\nfrom kernels import contact"),
         ("qd/a.py", "from ribs.archives import GridArchive\nfrom sim.rollout import Rollout\nfrom .space import Space"),
-        ("train/a.py", "import torch\nfrom qd import archive\nfrom qd.workers.evaluator import evaluate\nimport rsl_rl"),
+        ("train/a.py", "import torch, rsl_rl\nfrom qd import archive\nfrom qd.workers.evaluator import evaluate"),
         ("qd/show/view/a.py", "import viser\nfrom sim.robots.skeleton import Skeleton"),
         ("sim/a.py", "x = 1\n" * 500),
     ],
