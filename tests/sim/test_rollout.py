@@ -293,10 +293,10 @@ def test_evaluate_in_one_call(anymal, device):
 @pytest.mark.parametrize(
     ("terrains", "seeds", "message"),
     [
-        (np.zeros((4, 63)), np.arange(4), r"\(4, 64\), got \(4, 63\)"),
-        (np.zeros((3, 64)), np.arange(4), r"\(4, 64\), got \(3, 64\)"),
+        (np.zeros((4, 63)), np.arange(4), r"64\), got \(4, 63\)"),
+        (np.zeros((3, 64)), np.arange(4), "4 terrains.*got 3"),
         (np.zeros((4, 161, 320)), np.arange(4), r"\(4, 161, 321\).*got \(4, 161, 320\)"),
-        (np.full((4, 64), np.nan), np.arange(4), "finite, got 256"),
+        (np.full((4, 64), np.nan), np.arange(4), "finite"),
         (np.zeros((4, 64)), np.arange(3), r"\(4,\).*got \(3,\)"),
     ],
 )
