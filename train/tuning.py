@@ -15,7 +15,6 @@ from sim.robots.training import RewardCfg
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import Start, read_start
-from train.ppo.ppo import CapturedPPO
 from train.ppo.run import (
     POLICY,
     Job,
@@ -70,11 +69,9 @@ class FineTuning(Training):
         if iteration // self.mix.cfg.swap_every > self.mix.swap:
             self.task.exchange(self.mix.next(self.task.counts()))
             self.learner.begin_again()
-        alg = self.learner.alg
-        assert isinstance(alg, CapturedPPO)
-        alg.let_actor_learn(iteration >= self._alone)
+        self.learner.alg.let_actor_learn(iteration >= self._alone)
         if iteration == self._alone:
-            alg.begin_actor()
+            self.learner.alg.begin_actor()
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the learner, the terrains among it."""
@@ -131,8 +128,6 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     crosses = flags.task == "crossing"
     task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards)
     check_training(flags, task, ppo, robot=robot, num_envs=num_envs)
-    if not ppo.captured:
-        raise ValueError("rsl_rl's own PPO cannot let the critic learn alone at first: leave --ppo.captured on")
     mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
     if num_envs < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {num_envs}")

@@ -4,13 +4,13 @@ import io
 import signal
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from qd.run.settings import differences
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
 from sim.files.command import command_line
 from sim.files.provenance import provenance
@@ -137,15 +137,6 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
     return run_dir
 
 
-def claimed(run_dir: Path) -> AbstractContextManager[None]:
-    """Keeps other trainings out of a run directory for the duration of a ``with`` block.
-
-    Raises:
-        ValueError: On entering it, if another training works in the directory.
-    """
-    return locked(run_dir, f"another training works in {run_dir}: let it end, or name another --run-dir")
-
-
 # Going on with a run ---------------------------------------------------------------------------------------------
 
 
@@ -218,19 +209,7 @@ def check_resumed(flags: TrainingFlags, saved: dict[str, Any], settings: dict[st
     """
     if saved["iter"] > settings["iterations"]:
         raise ValueError(f"{flags.resume} has done {saved['iter']} iterations already: give at least as many in all")
-    return changes(saved["extra"]["settings"], settings)
-
-
-def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
-    """What differs between two nested settings, one line each."""
-    found = []
-    for key in sorted(before.keys() | after.keys()):
-        old, new = before.get(key), after.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            found += changes(old, new, f"{prefix}{key}.")
-        elif old != new:
-            found.append(f"{prefix}{key} {old} -> {new}")
-    return found
+    return differences(saved["extra"]["settings"], settings)
 
 
 # The training itself ---------------------------------------------------------------------------------------------
@@ -343,10 +322,11 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
     """
     run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
     go_on = f"Go on with: {command_line(job.command, robot=job.robot.spec, resume=run_dir)}"
-    with StopRequest() as stop, claimed(run_dir):
+    busy = f"another training works in {run_dir}: let it end, or name another --run-dir"
+    with StopRequest() as stop, locked(run_dir, busy):
         training = begin()
-        flags = {key: value for key, value in asdict(job.flags).items() if value is not None}
-        write_atomically(run_dir / CONFIG, to_json({**_plain(flags), "device": job.device}))
+        flags = asdict(job.flags, dict_factory=_given)
+        write_atomically(run_dir / CONFIG, to_json({**flags, "device": job.device}))
         try:
             training.iterate(stop)
             training.finish()
@@ -363,8 +343,6 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
     return 130 if stop.requested else 0
 
 
-def _plain(value: Any) -> Any:
-    """Settings as JSON has them: paths as text."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return str(value) if isinstance(value, Path) else value
+def _given(flags: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Flags as JSON has them: those that were left out are absent, paths are text."""
+    return {name: str(value) if isinstance(value, Path) else value for name, value in flags if value is not None}

@@ -18,7 +18,7 @@ from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
 from train.evaluate.crossings import KeptCrossings, cross_all
-from train.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, size_of
+from train.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, evaluator_of
 from train.evaluate.sets import make_sets, split_elites
 
 PROTOTYPE = "tests.sim.policies:stretch"
@@ -184,8 +184,9 @@ def test_controllers_are_named():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the sizes of a machine without a GPU")
 def test_sizes(capsys):
     def size(**given):
-        chosen = size_of(Evaluate(device="cpu", **given))
-        return chosen.terrains, chosen.episodes
+        flags = Evaluate(device="cpu", **given)
+        chosen = evaluator_of(flags, get_robot(flags.robot or "anymal"))
+        return chosen.num_terrains, chosen.num_replicas
 
     assert size(sets=("hard_random",)) == (24, 4)
     assert "24 terrains x 4 episodes a set instead of 300 x 20" in capsys.readouterr().out
