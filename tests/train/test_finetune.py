@@ -154,9 +154,7 @@ def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
     careful = replace(ROBOT.training.rewards, termination=-100.0, tracking_ang_vel=2.0)
     assert finetune(config(places, run_dir=run, rewards=careful)) == 0
     assert job_of(resumed(run)).task.rewards == careful
-    with pytest.raises(
-        ValueError, match=r"termination \(-100.0 there, -1.0 wanted\); .*ang_vel \(2.0 there, 0.5 wanted\)"
-    ):
+    with pytest.raises(ValueError, match=r"termination \(-100.0 there, -1.0 wanted\).*2.0 there, 0.5 wanted"):
         job_of(resumed(run, rewards=replace(careful, termination=-1.0, tracking_ang_vel=0.5)))
 
 

@@ -107,7 +107,7 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     from train.evaluate.measures import VELOCITY_FROM_S, base_rates
     from train.evaluate.show import print_rates
 
-    robot = get_robot(flags.robot or "anymal")
+    robot = get_robot(flags.robot)
     policy = str(flags.policy or robot.policy_file)
     evaluator = replace(evaluator_of(flags, robot), policy=policy, penalties_from_s=VELOCITY_FROM_S)
     out = flags.out or Path("runs") / f"{who_crossed(robot, policy)}-rates.json"
@@ -142,18 +142,17 @@ class _Plan:
 
 def _plan_of(flags: Evaluate) -> _Plan:
     from sim.robots.robot import get_robot
-    from train.evaluate.sets import FROM_ARCHIVE, SETS, check_held_out, check_names, make_sets, split_elites
+    from train.evaluate.sets import FROM_ARCHIVE, SETS, check_held_out, make_sets, split_elites
     from train.evaluate.tables import check_seeds
 
     if flags.policy is not None:
         raise ValueError(f"tables are of named controllers: give --policies NAME={flags.policy} instead of --policy")
-    robot = get_robot(flags.robot or "anymal")
+    robot = get_robot(flags.robot)
     evaluator = replace(evaluator_of(flags, robot), reward=True)
     controllers = controllers_of(flags.policies, robot)
     archive = None if flags.archive is None else read_archive(flags.archive)
     split = None if archive is None else split_elites(archive, robot.name, flags.split_seed)
     names = split_words(flags.sets) or [name for name in SETS if archive is not None or name not in FROM_ARCHIVE]
-    check_names(names, has_archive=archive is not None)
     run_dir = flags.run_dir or Path("runs") / f"{robot.name}-tables"
     kept, out = run_dir / "crossings", flags.out or run_dir / "tables.json"
     if out.suffix != ".json":
@@ -196,29 +195,24 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: "Open" = open_evaluator)
         FileNotFoundError: If there is no archive; likewise.
         EvaluatorError: If a worker is lost; what was crossed is kept.
     """
-    from sim.robots.own import robot_digest
-    from train.evaluate.crossings import KeptCrossings, cross_all
+    from train.evaluate.crossings import cross_all
     from train.evaluate.measures import measure
     from train.evaluate.show import print_tables, write_figure
     from train.evaluate.tables import make_tables
 
     plan = _plan_of(flags)
-    robot, device, episodes = plan.robot, plan.evaluator.device, plan.evaluator.num_replicas
-    kept = KeptCrossings(
-        plan.kept, robot=robot.name, robot_sha256=robot_digest(robot), episodes=episodes, device=device
-    )
 
     def tables() -> dict[str, Any]:
-        results = cross_all(plan.controllers, plan.sets, plan.evaluator, kept, open_evaluator=open_evaluator)
+        results = cross_all(plan.controllers, plan.sets, plan.evaluator, plan.kept, open_evaluator=open_evaluator)
         crossed = {name: {who: measure(one, plan.scales) for who, one in row.items()} for name, row in results.items()}
         about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in plan.controllers.items()}
         return {
-            **origin_of(device, flags.seed, flags.workers),
-            "robot": robot.name,
-            "episodes": episodes,
+            **origin_of(plan.evaluator.device, flags.seed, flags.workers),
+            "robot": plan.robot.name,
+            "episodes": plan.evaluator.num_replicas,
             "controllers": about,
             **plan.archive,
-            **make_tables(crossed, plan.sets, robot, flags.seed),
+            **make_tables(crossed, plan.sets, plan.robot, flags.seed),
         }
 
     report = publish(plan.out, tables, print_tables)
