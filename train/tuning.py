@@ -41,8 +41,11 @@ class TuningJob(Job):
     start: Start | None
     """Networks it begins with; none where it goes on from a checkpoint."""
     mix: Mix
-    critic_iterations: int
-    """Iterations at first in which the critic learns alone."""
+
+    @property
+    def critic_iterations(self) -> int:
+        """Iterations at first in which the critic learns alone."""
+        return self.settings["critic_iterations"]
 
     @property
     def trained_on(self) -> list[str]:
@@ -105,11 +108,7 @@ class FineTuning(Training):
 
 
 def job_of(flags: Finetune, began: float) -> TuningJob:
-    """What a command line asks for, checked.
-
-    Args:
-        flags: The command line.
-        began: When the command began, on the clock of :func:`time.monotonic` [s].
+    """What a command line asks for, checked; the command ``began`` then on the clock of :func:`time.monotonic` [s].
 
     Raises:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
@@ -152,8 +151,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         command="finetune", flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations,
         task=task, ppo=ppo, settings=settings, saved=saved, began=began,
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
-        start=start, critic_iterations=size["critic_iterations"],
-        mix=Mix(cfg=mix_cfg, genes=genes, crosses=crosses, seed=flags.seed, device=device),
+        start=start, mix=Mix(cfg=mix_cfg, genes=genes, crosses=crosses, seed=flags.seed, device=device),
     )  # fmt: skip
 
 

@@ -182,12 +182,9 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
 
 
 def base_rates(evaluate: Evaluate, count: int, seed: int) -> dict[str, Any]:
-    """What ``base.json`` says of one controller on ``hand_crafted``, ``hard_random`` and ``flat``.
+    """What ``base.json`` says of one controller on ``count`` terrains each, hand-crafted, hard-random and flat.
 
-    Args:
-        evaluate: Crosses terrains; its penalties count from :data:`VELOCITY_FROM_S` on.
-        count: Terrains a set.
-        seed: Draws the test sets.
+    Penalties of ``evaluate`` must count from :data:`VELOCITY_FROM_S` on; the seed draws the test sets.
     """
     sets = {name: plain_set(name, count, seed) for name in ("hand_crafted", "hard_random", "flat")}
     results = {}

@@ -233,9 +233,6 @@ def marks_of(genes: NDArray[np.float32]) -> list[str]:
 def recorded_marks(policy: str) -> set[str]:
     """Marks of the elites that a controller was trained on; none where neither its file nor a record beside it has any.
 
-    Args:
-        policy: A controller as :class:`sim.policy.spec.ControllerSpec` takes it.
-
     Raises:
         ValueError: If the marks are damaged.
     """
@@ -272,8 +269,8 @@ def check_held_out(controllers: Mapping[str, str], genes: NDArray[np.float32], s
 
     Args:
         controllers: Policy of each controller by its name.
-        genes: Elites that are to be crossed, shape (T, 64).
-        split_seed: Of the split that held them out.
+        genes: Elites that are to be crossed, shape (T, 64), held out by the split of ``split_seed``.
+        split_seed: For the message.
 
     Raises:
         ValueError: If one of the controllers was trained on some of them, as far as its record says; naming it.

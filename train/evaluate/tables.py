@@ -37,12 +37,6 @@ Crossed = Mapping[str, Mapping[str, Measured]]
 def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCfg, seed: int) -> dict[str, Any]:
     """Everything that ``tables.json`` says of crossings, as JSON values.
 
-    Args:
-        crossed: What each controller made of each set.
-        sets: The sets.
-        robot: Robot settings.
-        seed: Of the bootstrap.
-
     Returns:
         ``success``, ``goal``, ``fallen`` (fractions), ``reward`` (sum over 20 s): set -> controller -> mean;
         ``penalties``: set -> controller -> penalty -> mean, scaled; ``intervals``: the same five with [lower, upper];
@@ -83,7 +77,7 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
     Args:
         row: What each controller made of T terrains.
         numbers: Number of each terrain, shape (T,).
-        seed: Of the bootstrap.
+        seed: Of the bootstrap over terrains.
 
     Returns:
         ``crossed`` and ``never_crossed``: their ``count``, ``share`` with ``interval``, numbers as ``terrains``, and
@@ -141,13 +135,7 @@ def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], se
 
 
 def differences(crossed: dict[str, Measured], numbers: NDArray[np.int64], seed: int) -> dict[str, Any]:
-    """:func:`difference` of every two controllers, the earlier named one first, under ``first -> second``.
-
-    Args:
-        crossed: What each controller made of the same T terrains.
-        numbers: Number of each terrain, shape (T,).
-        seed: Of the bootstrap over terrains.
-    """
+    """:func:`difference` of every two controllers, the earlier named one first, under ``first -> second``."""
     return {
         f"{first} -> {second}": difference(crossed[first], crossed[second], numbers, seed)
         for first, second in combinations(crossed, 2)
@@ -200,7 +188,7 @@ def over_seeds(tables: dict[str, Any], measures: Iterable[str]) -> dict[str, Any
 
     Args:
         tables: Measure -> set -> controller -> value.
-        measures: Which of them.
+        measures: Some of its measures.
 
     Returns:
         Measure -> set -> kind -> ``mean``, 95 % t ``interval`` over controllers and their ``values``; empty where no

@@ -209,19 +209,13 @@ class Learner:
         return {key: value.detach().cpu().clone() for key, value in self.alg.get_policy().state_dict().items()}
 
     def save(self, path: Path, extra: dict[str, Any]) -> None:
-        """Write a checkpoint, whole or not at all.
-
-        Args:
-            path: File to write.
-            extra: Plain numbers, strings, lists and dicts to come back from :func:`read_checkpoint`.
-        """
+        """Write a checkpoint, whole or not at all; ``extra`` is plain data that comes back from a read."""
         task = self.env.task
         content = {
             **self.alg.save(),
             "format": CHECKPOINT_FORMAT,
             "robot": task.robot.name,
             "iter": self.iteration,
-            "infos": None,
             "levels": task.levels.to(torch.uint8),
             "counter": int(task.counter.item()),
             "rng_cpu": torch.get_rng_state(),
@@ -287,14 +281,7 @@ class Learner:
 
 
 def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
-    """Read a checkpoint as data only (no code in it is run).
-
-    Args:
-        path: File written by :meth:`Learner.save`.
-        robot: Name of the robot it must be of.
-
-    Returns:
-        Its content, tensors on the CPU.
+    """Content of a checkpoint that :meth:`Learner.save` wrote, tensors on the CPU; no code in it is run.
 
     Raises:
         ValueError: If the file is absent, truncated, foreign or of another robot.
@@ -345,10 +332,6 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
 
     A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
     such a file is left: its own normaliser is another.
-
-    Args:
-        path: The checkpoint.
-        robot: Whose controller it is.
 
     Raises:
         ValueError: If it is no such file, of another robot, or its standard deviation or critic cannot be trained on.

@@ -55,19 +55,18 @@ class Progress:
         Args:
             run_dir: Where TensorBoard's file goes.
             learner: What is trained.
-            iterations: Iterations in all.
-            rows: Rows over all iterations.
+            iterations: In all.
+            rows: Over all iterations.
             about: Provenance and ``settings`` of this piece.
             saved: :meth:`state` of the pieces before.
         """
         self._learner = learner
         self.iterations = iterations
         self._every = max(1, iterations // rows)
-        self._curve: list[dict[str, Any]] = list(saved["curve"]) if saved else []
-        self._pieces: list[dict[str, Any]] = list(saved["pieces"]) if saved else []
-        self._env_steps = int(saved["env_steps"]) if saved else 0
-        self._wall_s = float(saved["wall_s"]) if saved else 0.0
-        self._pieces.append({**about, "from_iteration": learner.iteration})
+        before = saved or {"curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
+        self._curve: list[dict[str, Any]] = list(before["curve"])
+        self._pieces = [*before["pieces"], {**about, "from_iteration": learner.iteration}]
+        self._env_steps, self._wall_s = before["env_steps"], before["wall_s"]
         self._about = about
         self._run_dir = run_dir
         threading.excepthook = _without_traceback

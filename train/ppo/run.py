@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from qd.run.settings import differences
-from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
+from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import built, problems
@@ -104,11 +104,7 @@ def check_training(flags: TrainingFlags, task: TaskCfg, ppo: PpoCfg, *, robot: R
 
 
 def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
-    """The run directory, made and fit to be written to.
-
-    Args:
-        flags: Say where to write, which run to go on from, and where else the controller goes.
-        name: Of a new directory under runs/, before the date.
+    """The run directory, made and fit to be written to; a new one is called after ``name`` and the date.
 
     Raises:
         ValueError: If it holds another run, one of the places cannot be written to, or the controller has another name.
@@ -126,14 +122,8 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
     config = run_dir / CONFIG
     if config.exists() and "settings" in read_json(config):
         raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
-    folders = {run_dir, export.parent if export else run_dir}
-    try:
-        for folder in folders:
-            folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"cannot write to {error.filename}: {error.strerror}; name another place") from error
-    for folder in folders:
-        check_writable(folder)
+    for file in (config, *([export] if export else [])):
+        prepare_output(file)
     return run_dir
 
 
@@ -141,12 +131,7 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
 
 
 def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
-    """The checkpoint of a training run, with the progress it had made.
-
-    Args:
-        run: Its directory.
-        robot: Name of the robot it must be of.
-        finetuning: Whether it must be a fine-tuning, else the training of a base controller.
+    """The checkpoint of a run of this robot, with the progress it had made: a fine-tuning, or the training of a base.
 
     Raises:
         ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is of the other kind.
@@ -197,12 +182,7 @@ def settings_of(run: Path, saved: dict[str, Any], kinds: dict[str, type]) -> dic
 
 
 def check_resumed(flags: TrainingFlags, saved: dict[str, Any], settings: dict[str, Any]) -> list[str]:
-    """How the settings of a run that goes on differ from those it was begun with, one line each.
-
-    Args:
-        flags: Name the run.
-        saved: Its checkpoint.
-        settings: Those of now.
+    """How the present settings of a run that goes on differ from those it was begun with, one line each.
 
     Raises:
         ValueError: If it has done more iterations already than they ask for.
@@ -229,13 +209,7 @@ class Training:
     """What record and checkpoint say beside the progress; of a fine-tuning the elites it was trained on."""
 
     def __init__(self, job: Job, *, tiles: Tiles | None = None, random_ages: bool = True) -> None:
-        """Begin, or go on from the checkpoint of the job.
-
-        Args:
-            job: What is asked for.
-            tiles: The terrains; those of the curriculum if left out.
-            random_ages: As :class:`train.ppo.learner.Learner` takes it.
-        """
+        """Begin, or go on from the checkpoint of the job, on ``tiles`` or else on those of the curriculum."""
         self.job, self.extra = job, {}
         seed, rank = job.flags.seed, Ranks.of_environment().rank
         self.task = CommandTask(
@@ -244,10 +218,13 @@ class Training:
         self.learner = Learner(CommandVecEnv(self.task), job.ppo, seed=seed, random_ages=random_ages)
         if job.saved is not None:
             self.learner.resume(job.saved)
-        about = {**provenance(job.device, seed), "settings": job.settings}
-        before = job.saved and job.saved["extra"]
         self.progress = Progress(
-            job.run_dir, self.learner, job.iterations, rows=job.flags.rows, about=about, saved=before
+            job.run_dir,
+            self.learner,
+            job.iterations,
+            rows=job.flags.rows,
+            about={**provenance(job.device, seed), "settings": job.settings},
+            saved=job.saved and job.saved["extra"],
         )
 
     def before_iteration(self) -> None:
@@ -309,11 +286,7 @@ def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
 
 
 def run_training(job: Job, begin: Callable[[], Training]) -> int:
-    """Trains as a job says, and says how to go on; returns the exit status: 0, or 130 after Ctrl-C.
-
-    Args:
-        job: What is asked for.
-        begin: Makes the training.
+    """Trains what ``begin`` makes of a job, and says how to go on; returns the exit status: 0, or 130 after Ctrl-C.
 
     Raises:
         ValueError: If the run is another training's, or its checkpoint does not fit.
