@@ -27,7 +27,8 @@ TILE_TYPES = ("slope", "rough_slope", "stairs_up", "stairs_down", "obstacles")
 
 _SIDE = NUM_ROWS  # nodes along one side of the feature square
 _FIRST_COL = (NUM_COLS - _SIDE) // 2  # column at x = 4 m
-_TILE_SHARES_PERCENT = np.array([10, 10, 35, 25, 20])
+TILE_SHARES_PERCENT = np.array([10, 10, 35, 25, 20])
+"""How often legged_gym's curriculum has each of :data:`TILE_TYPES`."""
 
 # Centimetres as integers: 0.31 m treads fall on nodes exactly, with no rounding at a riser.
 _NODES_CM = 5 * np.arange(_SIDE)
@@ -201,7 +202,7 @@ def training_tiles(num_levels: int, num_columns: int, seed: Seed) -> tuple[np.nd
     _check_positive(num_levels=num_levels, num_columns=num_columns)
     if num_levels > NUM_LEVELS:
         raise ValueError(f"num_levels must be at most {NUM_LEVELS}, got {num_levels}: levels are 0..{NUM_LEVELS - 1}")
-    ends = np.cumsum(_TILE_SHARES_PERCENT) * num_columns
+    ends = np.cumsum(TILE_SHARES_PERCENT) * num_columns
     types = np.searchsorted(ends, 100 * np.arange(num_columns), side="right")
     heights = np.empty((num_levels * num_columns, NUM_ROWS, NUM_COLS), np.float32)
     for i, rng in enumerate(np.random.default_rng(seed).spawn(len(heights))):

@@ -15,7 +15,6 @@ from sim.robots.training import RewardCfg
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import Start, read_start
-from train.ppo.ppo import CapturedPPO
 from train.ppo.run import (
     POLICY,
     Job,
@@ -42,8 +41,11 @@ class TuningJob(Job):
     start: Start | None
     """Networks it begins with; none where it goes on from a checkpoint."""
     mix: Mix
-    critic_iterations: int
-    """Iterations at first in which the critic learns alone."""
+
+    @property
+    def critic_iterations(self) -> int:
+        """Iterations at first in which the critic learns alone."""
+        return self.settings["critic_iterations"]
 
     @property
     def trained_on(self) -> list[str]:
@@ -70,11 +72,9 @@ class FineTuning(Training):
         if iteration // self.mix.cfg.swap_every > self.mix.swap:
             self.task.exchange(self.mix.next(self.task.counts()))
             self.learner.begin_again()
-        alg = self.learner.alg
-        assert isinstance(alg, CapturedPPO)
-        alg.let_actor_learn(iteration >= self._alone)
+        self.learner.alg.let_actor_learn(iteration >= self._alone)
         if iteration == self._alone:
-            alg.begin_actor()
+            self.learner.alg.begin_actor()
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the learner, the terrains among it."""
@@ -108,11 +108,7 @@ class FineTuning(Training):
 
 
 def job_of(flags: Finetune, began: float) -> TuningJob:
-    """What a command line asks for, checked.
-
-    Args:
-        flags: The command line.
-        began: When the command began, on the clock of :func:`time.monotonic` [s].
+    """What a command line asks for, checked; the command ``began`` then on the clock of :func:`time.monotonic` [s].
 
     Raises:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
@@ -131,8 +127,6 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     crosses = flags.task == "crossing"
     task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards)
     check_training(flags, task, ppo, robot=robot, num_envs=num_envs)
-    if not ppo.captured:
-        raise ValueError("rsl_rl's own PPO cannot let the critic learn alone at first: leave --ppo.captured on")
     mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
     if num_envs < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {num_envs}")
@@ -157,8 +151,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         command="finetune", flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations,
         task=task, ppo=ppo, settings=settings, saved=saved, began=began,
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
-        start=start, critic_iterations=size["critic_iterations"],
-        mix=Mix(cfg=mix_cfg, genes=genes, crosses=crosses, seed=flags.seed, device=device),
+        start=start, mix=Mix(cfg=mix_cfg, genes=genes, crosses=crosses, seed=flags.seed, device=device),
     )  # fmt: skip
 
 

@@ -9,13 +9,14 @@ import pytest
 import torch
 import tyro
 
+from sim.files.atomic import locked
 from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import Train
 from train.ppo.cfg import PpoCfg
-from train.ppo.run import StopRequest, claimed
+from train.ppo.run import StopRequest
 from train.task.cfg import TaskCfg
 
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
@@ -86,7 +87,7 @@ def test_a_resumed_run_goes_on_as_it_was_begun(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "6 robots on cpu, 2 iterations" in said
     assert [line for line in said.splitlines() if "Changed since" in line] == [
-        "Changed since the checkpoint: task.friction (0.7, 0.8) -> (0.6, 0.9)"
+        "Changed since the checkpoint: task.friction ([0.7, 0.8] there, [0.6, 0.9] wanted)"
     ]
 
 
@@ -145,7 +146,7 @@ def test_a_fine_tuning_is_left_to_its_own_command(finished, tmp_path):
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):
     before = (finished / "checkpoint.pt").read_bytes()
-    with claimed(finished), pytest.raises(ValueError, match="another training works in"):
+    with locked(finished, "busy"), pytest.raises(ValueError, match="another training works in"):
         config(None, resume=finished, iterations=3).execute()
     assert (finished / "checkpoint.pt").read_bytes() == before
 
@@ -153,7 +154,7 @@ def test_a_run_directory_takes_one_training_at_a_time(finished):
 def test_changed_settings_are_named(finished, tmp_path, capsys):
     ppo = replace(PPO, entropy=0.5)
     config(tmp_path / "changed", resume=finished, iterations=2, ppo=ppo).execute()
-    assert "Changed since the checkpoint: ppo.entropy 0.01 -> 0.5\n" in capsys.readouterr().out
+    assert "Changed since the checkpoint: ppo.entropy (0.01 there, 0.5 wanted)\n" in capsys.readouterr().out
 
 
 def test_out_of_time_saves_and_says_how_to_go_on(finished, tmp_path, capsys):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from qd.archive import write_archive
+from sim.files.atomic import locked
 from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
@@ -19,7 +20,8 @@ from train import tuning
 from train.finetune import Finetune
 from train.ppo.cfg import PpoCfg
 from train.ppo.learner import read_checkpoint
-from train.ppo.run import CommandTask, claimed, read_saved
+from train.ppo.ppo import CapturedPPO
+from train.ppo.run import CommandTask, read_saved
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
@@ -152,7 +154,7 @@ def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
     careful = replace(ROBOT.training.rewards, termination=-100.0, tracking_ang_vel=2.0)
     assert finetune(config(places, run_dir=run, rewards=careful)) == 0
     assert job_of(resumed(run)).task.rewards == careful
-    with pytest.raises(ValueError, match=r"termination -100.0 -> -1.0; task.rewards.tracking_ang_vel 2.0 -> 0.5"):
+    with pytest.raises(ValueError, match=r"termination \(-100.0 there, -1.0 wanted\).*2.0 there, 0.5 wanted"):
         job_of(resumed(run, rewards=replace(careful, termination=-1.0, tracking_ang_vel=0.5)))
 
 
@@ -232,7 +234,7 @@ def test_resume_needs_neither_the_first_controller_nor_the_archives_place(places
     assert finetune(resumed(run, iterations=2, archive=moved)) == 0
     assert finetune(resumed(run, iterations=3)) == 0  # it remembers where they lie now
     write_archive(moved, make_archive(10, seed=1))  # as many others
-    with pytest.raises(ValueError, match=r"archive.elites_sha256 \w+ -> \w+.*put an archive that has changed back"):
+    with pytest.raises(ValueError, match=r"archive.elites_sha256 \(.*put an archive that has changed back"):
         finetune(resumed(run, iterations=4))
 
 
@@ -258,16 +260,16 @@ def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):
     before = (finished / "checkpoint.pt").read_bytes()
-    with claimed(finished), pytest.raises(ValueError, match="another training works in"):
+    with locked(finished, "busy"), pytest.raises(ValueError, match="another training works in"):
         finetune(resumed(finished, iterations=4))
     assert (finished / "checkpoint.pt").read_bytes() == before
 
 
 def test_a_resume_of_other_settings_is_refused(finished, places):
     before = (finished / "checkpoint.pt").read_bytes()
-    with pytest.raises(ValueError, match=r"was begun with other settings .*mix.swap_every 2 -> 3"):
+    with pytest.raises(ValueError, match=r"was begun with other settings .*mix.swap_every \(2 there, 3 wanted\)"):
         finetune(resumed(finished, swap_every=3))
-    with pytest.raises(ValueError, match=r"was begun with other settings .*seed 0 -> 5"):
+    with pytest.raises(ValueError, match=r"was begun with other settings .*seed \(0 there, 5 wanted\)"):
         finetune(resumed(finished, seed=5))
     assert (finished / "checkpoint.pt").read_bytes() == before
 
@@ -276,7 +278,7 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
     run = places / "nan"
     finetune(config(places, run_dir=run, iterations=2))
     kept = (run / "checkpoint.pt").read_bytes()
-    monkeypatch.setattr(tuning.CapturedPPO, "update", lambda alg: {"value": float("nan")})
+    monkeypatch.setattr(CapturedPPO, "update", lambda alg: {"value": float("nan")})
     with pytest.raises(FloatingPointError, match=r"losses are not finite.*the last checkpoint is kept in"):
         finetune(resumed(run, iterations=3))
     assert (run / "checkpoint.pt").read_bytes() == kept
@@ -319,7 +321,6 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
         (["--save-every-s", "-1"], "save_every_s must be at least 0, got -1.0"),
         (["--seed", "-1"], "seed must be at least 0, got -1"),
         (["--resume", "{dir}/nowhere"], "no checkpoint at"),
-        (["--ppo.no-captured"], "leave --ppo.captured on"),
     ],
 )
 def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeypatch, capsys):

@@ -87,7 +87,7 @@ def test_a_run_of_another_robot_is_saved_and_resumed(tmp_path, capsys):
     assert config(tmp_path / "run").execute() == 0
     assert config(None, resume=tmp_path / "run", iterations=3).execute() == 0
     assert [line for line in capsys.readouterr().out.splitlines() if "Changed since" in line] == [
-        "Changed since the checkpoint: iterations 2 -> 3"
+        "Changed since the checkpoint: iterations (2 there, 3 wanted)"
     ]
     record = json.loads((tmp_path / "run" / "policy.train.json").read_text())
     assert (record["robot"], record["iterations"]) == ("cassie", 3)

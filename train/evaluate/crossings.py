@@ -25,6 +25,8 @@ from qd.workers.evaluator import Evaluate, EvaluatorCfg
 from sim.files.atomic import check_zip, write_atomically
 from sim.files.provenance import code_fingerprint
 from sim.policy.spec import controller_hash
+from sim.robots.own import robot_digest
+from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
 from train.evaluate.measures import terrain_rates
 from train.evaluate.sets import TerrainSet
@@ -50,18 +52,15 @@ class KeptCrossings:
 
     Args:
         folder: Where they are kept; made when the first is written.
-        robot: Name of the robot.
-        robot_sha256: Hash of a robot that is not shipped (:func:`sim.robots.own.robot_digest`).
-        episodes: Episodes a terrain.
-        device: Warp device name; crossings of a CPU and of a GPU differ in their last bits.
+        evaluator: What crosses: its robot, episodes a terrain and kind of device count. Crossings of a CPU and of a
+            GPU differ in their last bits.
     """
 
-    def __init__(
-        self, folder: Path, *, robot: str, robot_sha256: str | None = None, episodes: int, device: str
-    ) -> None:
-        self.folder, self._episodes = folder, episodes
-        kind = "cuda" if device.startswith("cuda") else "cpu"
-        self._common = [robot if robot_sha256 is None else robot_sha256, episodes, kind, code_fingerprint(_ROOMS)]
+    def __init__(self, folder: Path, evaluator: EvaluatorCfg) -> None:
+        self.folder, self._episodes = folder, evaluator.num_replicas
+        robot = get_robot(evaluator.robot)
+        kind = "cuda" if evaluator.device.startswith("cuda") else "cpu"
+        self._common = [robot_digest(robot) or robot.name, self._episodes, kind, code_fingerprint(_ROOMS)]
 
     def file(self, policy: str, terrains: TerrainSet) -> Path:
         """Where the crossings of one controller on one set are kept."""
@@ -117,7 +116,7 @@ def cross_all(
     controllers: Mapping[str, str],
     sets: Mapping[str, TerrainSet],
     evaluator: EvaluatorCfg,
-    kept: KeptCrossings,
+    folder: Path,
     *,
     open_evaluator: Open,
 ) -> dict[str, dict[str, RolloutResult]]:
@@ -126,8 +125,8 @@ def cross_all(
     Args:
         controllers: Policy of each controller by its name.
         sets: Sets by name; of ``generated`` and ``generated_far`` the second is taken from the first.
-        evaluator: Where to cross, with what reward and how many episodes; its policy and terrains are not looked at.
-        kept: Where crossings are kept, one file a controller and set, as soon as they are done.
+        evaluator: Where to cross, with what reward and how many episodes; its policy and terrains do not count.
+        folder: Where crossings are kept, one file a controller and set, as soon as they are done.
         open_evaluator: Opens what crosses terrains.
 
     Returns:
@@ -138,7 +137,7 @@ def cross_all(
         EvaluatorError: If a worker is lost.
     """
     whole = {name: chosen for name, chosen in sets.items() if name != "generated_far" or "generated" not in sets}
-    found = {}
+    kept, found = KeptCrossings(folder, evaluator), {}
     for who, policy in controllers.items():
         for name in whole:
             if (result := kept.read(policy, whole[name])) is not None:
@@ -146,7 +145,7 @@ def cross_all(
     todo = {who: [name for name in whole if (who, name) not in found] for who in controllers}
     if found:
         count = len(controllers) * len(whole)
-        print(f"{len(found)} of {count} crossings of a set are kept from before in {kept.folder}", flush=True)
+        print(f"{len(found)} of {count} crossings of a set are kept from before in {folder}", flush=True)
     episodes = evaluator.num_replicas * sum(len(whole[name]) for names in todo.values() for name in names)
     with tqdm(total=episodes, file=sys.stderr, dynamic_ncols=True, bar_format=_FORMAT, disable=None) as bar:
         for who, names in todo.items():

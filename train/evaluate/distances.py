@@ -47,7 +47,7 @@ def distances(flags: Distances) -> dict[str, Any]:
     from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, split_elites
 
     check(flags)
-    robot = get_robot(flags.robot or "anymal").name
+    robot = get_robot(flags.robot).name
     archive = read_archive(flags.archive or Path("results") / robot / "archive")
     split = split_elites(archive, robot, flags.split_seed)
     count = flags.terrains or paper_terrains(robot)

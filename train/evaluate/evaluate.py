@@ -4,7 +4,7 @@ The terrains are drawn from seeds used nowhere else: not in training, calibratio
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,43 +73,28 @@ class Evaluate(Who, Where):
             evaluate_tables(self)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Size:
-    """How much is crossed, by what, where."""
-
-    robot: "RobotCfg"
-    device: str
-    """Warp device name."""
-    terrains: int
-    """Terrains a set."""
-    episodes: int
-    """Episodes a terrain."""
-
-
-def size_of(flags: Evaluate) -> Size:
-    """How much is crossed; says so where it is less than on a GPU.
+def evaluator_of(flags: Evaluate, robot: "RobotCfg") -> EvaluatorCfg:
+    """How much is crossed, where; says so where it is less than on a GPU. The controller is still to be named.
 
     Raises:
-        ValueError: If robot or device is unknown, or a number is out of range.
+        ValueError: If the device is unknown, or a number is out of range.
     """
-    from sim.robots.robot import get_robot
     from train.evaluate.sets import paper_terrains
 
-    robot = get_robot(flags.robot or "anymal")
     check(flags)
     device = resolve_device(flags.device, flags.workers)
     full = (paper_terrains(robot.name), _FULL[1]) if flags.makes_tables else _FULL
     terrains, episodes = full if device.startswith("cuda") else _SMALL
     if not device.startswith("cuda") and flags.terrains is None and flags.episodes is None:
         print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {full[0]} x {full[1]}.")
-    return Size(robot=robot, device=device, terrains=flags.terrains or terrains, episodes=flags.episodes or episodes)
-
-
-def _evaluator_of(size: Size, flags: Evaluate, policy: str, **changes: Any) -> EvaluatorCfg:
     return EvaluatorCfg(
-        robot=size.robot, policy=policy, num_terrains=size.terrains, num_replicas=size.episodes, device=size.device,
-        workers=flags.workers, **changes,
-    )  # fmt: skip
+        robot=robot,
+        policy="",
+        num_terrains=flags.terrains or terrains,
+        num_replicas=flags.episodes or episodes,
+        device=device,
+        workers=flags.workers,
+    )
 
 
 def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
@@ -118,20 +103,21 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     Raises:
         ValueError: If something asked for cannot be had; raised before any long work.
     """
+    from sim.robots.robot import get_robot
     from train.evaluate.measures import VELOCITY_FROM_S, base_rates
     from train.evaluate.show import print_rates
 
-    size = size_of(flags)
-    robot = size.robot
+    robot = get_robot(flags.robot)
     policy = str(flags.policy or robot.policy_file)
+    evaluator = replace(evaluator_of(flags, robot), policy=policy, penalties_from_s=VELOCITY_FROM_S)
     out = flags.out or Path("runs") / f"{who_crossed(robot, policy)}-rates.json"
 
     def measure() -> dict[str, Any]:
-        check_policy(policy, robot, size.device)
-        with open_evaluator(_evaluator_of(size, flags, policy, penalties_from_s=VELOCITY_FROM_S)) as crossings:
-            rates = base_rates(crossings, size.terrains, flags.seed)
+        check_policy(policy, robot, evaluator.device)
+        with open_evaluator(evaluator) as evaluate:
+            rates = base_rates(evaluate, evaluator.num_terrains, flags.seed)
         about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
-        return {**origin_of(size.device, flags.seed, flags.workers), **about, **rates}
+        return {**origin_of(evaluator.device, flags.seed, flags.workers), **about, **rates}
 
     return publish(out, measure, print_rates)
 
@@ -140,7 +126,9 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
 class _Plan:
     """Tables that can be made: everything a user may have got wrong has been checked."""
 
-    size: Size
+    robot: "RobotCfg"
+    evaluator: EvaluatorCfg
+    """All but the controller."""
     scales: tuple[float, ...]
     controllers: dict[str, str]
     sets: "dict[str, TerrainSet]"
@@ -153,18 +141,18 @@ class _Plan:
 
 
 def _plan_of(flags: Evaluate) -> _Plan:
-    from train.evaluate.sets import FROM_ARCHIVE, SETS, check_held_out, check_names, make_sets, split_elites
+    from sim.robots.robot import get_robot
+    from train.evaluate.sets import FROM_ARCHIVE, SETS, check_held_out, make_sets, split_elites
     from train.evaluate.tables import check_seeds
 
     if flags.policy is not None:
         raise ValueError(f"tables are of named controllers: give --policies NAME={flags.policy} instead of --policy")
-    size = size_of(flags)
-    robot = size.robot
+    robot = get_robot(flags.robot)
+    evaluator = replace(evaluator_of(flags, robot), reward=True)
     controllers = controllers_of(flags.policies, robot)
     archive = None if flags.archive is None else read_archive(flags.archive)
     split = None if archive is None else split_elites(archive, robot.name, flags.split_seed)
     names = split_words(flags.sets) or [name for name in SETS if archive is not None or name not in FROM_ARCHIVE]
-    check_names(names, has_archive=archive is not None)
     run_dir = flags.run_dir or Path("runs") / f"{robot.name}-tables"
     kept, out = run_dir / "crossings", flags.out or run_dir / "tables.json"
     if out.suffix != ".json":
@@ -173,15 +161,15 @@ def _plan_of(flags: Evaluate) -> _Plan:
         prepare_output(file)
     scales = robot.read_penalty_scales()
     for policy in controllers.values():
-        check_policy(policy, robot, size.device)
+        check_policy(policy, robot, evaluator.device)
     check_seeds(controllers)
-    sets = make_sets(names, size.terrains, flags.seed, archive=archive, split=split)
+    sets = make_sets(names, evaluator.num_terrains, flags.seed, archive=archive, split=split)
     for name in FROM_ARCHIVE:
         if name in sets:
             check_held_out(controllers, sets[name].terrains, flags.split_seed)
     return _Plan(
-        size=size, scales=scales, controllers=controllers, sets=sets, archive=_about(flags, archive, split),
-        kept=kept, out=out,
+        robot=robot, evaluator=evaluator, scales=scales, controllers=controllers, sets=sets,
+        archive=_about(flags, archive, split), kept=kept, out=out,
     )  # fmt: skip
 
 
@@ -207,30 +195,24 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: "Open" = open_evaluator)
         FileNotFoundError: If there is no archive; likewise.
         EvaluatorError: If a worker is lost; what was crossed is kept.
     """
-    from sim.robots.own import robot_digest
-    from train.evaluate.crossings import KeptCrossings, cross_all
+    from train.evaluate.crossings import cross_all
     from train.evaluate.measures import measure
     from train.evaluate.show import print_tables, write_figure
     from train.evaluate.tables import make_tables
 
     plan = _plan_of(flags)
-    size, robot = plan.size, plan.size.robot
-    kept = KeptCrossings(
-        plan.kept, robot=robot.name, robot_sha256=robot_digest(robot), episodes=size.episodes, device=size.device
-    )
 
     def tables() -> dict[str, Any]:
-        evaluator = _evaluator_of(size, flags, "", reward=True)
-        results = cross_all(plan.controllers, plan.sets, evaluator, kept, open_evaluator=open_evaluator)
+        results = cross_all(plan.controllers, plan.sets, plan.evaluator, plan.kept, open_evaluator=open_evaluator)
         crossed = {name: {who: measure(one, plan.scales) for who, one in row.items()} for name, row in results.items()}
         about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in plan.controllers.items()}
         return {
-            **origin_of(size.device, flags.seed, flags.workers),
-            "robot": robot.name,
-            "episodes": size.episodes,
+            **origin_of(plan.evaluator.device, flags.seed, flags.workers),
+            "robot": plan.robot.name,
+            "episodes": plan.evaluator.num_replicas,
             "controllers": about,
             **plan.archive,
-            **make_tables(crossed, plan.sets, robot, flags.seed),
+            **make_tables(crossed, plan.sets, plan.robot, flags.seed),
         }
 
     report = publish(plan.out, tables, print_tables)

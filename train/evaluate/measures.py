@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from kernels.episode import Outcome
 from qd.fitness import MAX_INVALID_SHARE
+from qd.run.progress import share_bar
 from qd.workers.evaluator import Evaluate
 from sim.files.intervals import bootstrap_interval
 from sim.rollout import RolloutResult
@@ -182,25 +182,18 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
 
 
 def base_rates(evaluate: Evaluate, count: int, seed: int) -> dict[str, Any]:
-    """What ``base.json`` says of one controller on ``hand_crafted``, ``hard_random`` and ``flat``.
+    """What ``base.json`` says of one controller on ``count`` terrains each, hand-crafted, hard-random and flat.
 
-    Args:
-        evaluate: Crosses terrains; its penalties count from :data:`VELOCITY_FROM_S` on.
-        count: Terrains a set.
-        seed: Draws the test sets.
+    Penalties of ``evaluate`` must count from :data:`VELOCITY_FROM_S` on; the seed draws the test sets.
     """
     sets = {name: plain_set(name, count, seed) for name in ("hand_crafted", "hard_random", "flat")}
     results = {}
     for name, chosen in sets.items():
-        with tqdm(desc=name, total=100, unit="%", disable=None) as bar:
-
-            def show(share: float, bar: tqdm = bar) -> None:
-                bar.update(round(100 * share) - bar.n)
-
+        with share_bar(name) as show:
             results[name] = evaluate(chosen.terrains, chosen.seeds, show)
-    types, levels = sets["hand_crafted"].types, sets["hand_crafted"].levels
+    hand_crafted = sets["hand_crafted"]
     return {
-        "hand_crafted": summarise(results["hand_crafted"], seed, types=types, levels=levels),
+        "hand_crafted": summarise(results["hand_crafted"], seed, types=hand_crafted.types, levels=hand_crafted.levels),
         "hard_random": summarise(results["hard_random"], seed),
         "flat": velocity_error(results["flat"], seed),
     }

@@ -4,7 +4,7 @@ The paper is Esquerre-Pourtere, Kim and Park (arXiv 2506.01362). Its rewards are
 weights of its two added penalties are not published, so that they compare among its controllers, not with ours.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,10 +110,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def numbers_of(results: Path) -> str:
-    """The Markdown of everything published.
-
-    Args:
-        results: A directory with one a robot.
+    """The Markdown of everything published in the folders of robots under ``results``.
 
     Raises:
         ValueError: If there is none, or a file is damaged or lacks a number.
@@ -133,17 +130,11 @@ def _robot(folder: Path, robot: str) -> str:
         ("ablation.json", _ablation),
     ):
         path = folder / file
-        if path.exists():
-            parts.append(_section(section, path, robot))
+        try:
+            parts += [section(read_json(path), robot)] if path.exists() else []
+        except (KeyError, TypeError, IndexError) as error:
+            raise ValueError(f"{path} lacks a number ({type(error).__name__}: {error}): make it again") from error
     return "\n\n".join(parts)
-
-
-def _section(section: Callable[[dict[str, Any], str], str], path: Path, robot: str) -> str:
-    content = read_json(path)
-    try:
-        return section(content, robot)
-    except (KeyError, TypeError, IndexError) as error:
-        raise ValueError(f"{path} lacks a number ({type(error).__name__}: {error}): make it again") from error
 
 
 def _archive(found: dict[str, Any], robot: str) -> str:
@@ -162,7 +153,7 @@ def _archive(found: dict[str, Any], robot: str) -> str:
         (
             "with / without a base collision (ours: in the fresh episodes)",
             f"{found['with_collision']:,} / {found['without_collision']:,}",
-            _of(paper),
+            f"{paper['with_collision']} / {paper['without_collision']}" if "with_collision" in paper else _NONE,
         ),
         ("mean fitness", f"{found['mean_fitness']:.1f}", f"about {paper['fitness']}" if "fitness" in paper else _NONE),
         ("QD score", f"{found['qd_score']:,.0f}", _NONE),
@@ -170,10 +161,6 @@ def _archive(found: dict[str, Any], robot: str) -> str:
         ("search time", f"{found['wall_s'] / 60:.0f} min on {_gpus(found['gpus'])}", "about 8 h on two RTX 3070 Ti"),
     ]
     return table(("archive", "ours", "paper"), rows)
-
-
-def _of(paper: dict[str, Any]) -> str:
-    return f"{paper['with_collision']} / {paper['without_collision']}" if "with_collision" in paper else _NONE
 
 
 def _count(value: float | None) -> str:
@@ -222,12 +209,9 @@ def _distances(found: dict[str, Any], robot: str) -> str:
 
 def _ablation(found: dict[str, Any], robot: str) -> str:
     """Mean STD of the elites with and without it in the fitness; the paper shows its curves without numbers."""
-    rows = [
-        (f"{iteration:,}", *(_std(found, name, k) for name in ("alpha_1", "alpha_0")))
-        for k, iteration in enumerate(found["iterations"])
+    curves = [
+        [value_words(*point, ".2f") for point in zip(found["mean_std"][name], found["intervals"][name], strict=True)]
+        for name in ("alpha_1", "alpha_0")
     ]
+    rows = list(zip(map("{:,}".format, found["iterations"]), *curves, strict=True))
     return table(("iteration", "mean STD, alpha 1 (95 %)", "mean STD, alpha 0 (95 %)"), rows)
-
-
-def _std(found: dict[str, Any], name: str, k: int) -> str:
-    return value_words(found["mean_std"][name][k], found["intervals"][name][k], ".2f")

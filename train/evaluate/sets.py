@@ -92,10 +92,10 @@ def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
     Args:
         archive: The elites.
         robot: Name of the robot that is trained and evaluated.
-        seed: Of the draw; training and evaluation must name the same one.
+        seed: Of the draw, from 0 on; training and evaluation must name the same one.
 
     Raises:
-        ValueError: If the archive is of another robot, has fewer than 5 elites, or the seed is negative.
+        ValueError: If the archive is of another robot, or has fewer than 5 elites.
     """
     if archive.robot != robot:
         raise ValueError(
@@ -107,8 +107,6 @@ def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
             f"an archive to be split into training and test terrains needs at least {_MIN_ELITES} elites, got "
             f"{len(archive)}: let its search go on (faultline archive --resume RUN --iterations N)"
         )
-    if seed < 0:
-        raise ValueError(f"the seed of the split must not be negative, got {seed}")
     num_train, num_test = PAPER_TRAINING_ELITES, paper_terrains(robot)
     if len(archive) < num_train + num_test:
         num_test = round(_HELD_OUT_SHARE * len(archive))
@@ -131,13 +129,7 @@ def set_rng(name: str, seed: int) -> np.random.Generator:
 
 
 def plain_set(name: str, count: int, seed: int) -> TerrainSet:
-    """A set that needs no archive: ``hand_crafted``, ``hard_random`` or ``flat``.
-
-    Args:
-        name: Which.
-        count: Number of terrains.
-        seed: Of the draw.
-    """
+    """``count`` terrains of a set that needs no archive: ``hand_crafted``, ``hard_random`` or ``flat``."""
     rng = set_rng(name, seed)
     types = levels = None
     if name == "hand_crafted":
@@ -157,14 +149,7 @@ def plain_set(name: str, count: int, seed: int) -> TerrainSet:
 
 
 def generated_set(archive: Archive, split: EliteSplit, count: int, seed: int) -> TerrainSet:
-    """Held-out elites: the first ``count`` drawn, all of them where there are no more.
-
-    Args:
-        archive: The elites.
-        split: Which are held out.
-        count: Most terrains.
-        seed: Of the episodes.
-    """
+    """Held-out elites: the first ``count`` drawn, or all of them; ``seed`` is that of their episodes."""
     seeds = set_rng("generated", seed).integers(2**32, size=len(split.test), dtype=np.uint32)
     rows = split.test[:count]
     return TerrainSet(name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows)
@@ -222,7 +207,14 @@ def make_sets(
     Raises:
         ValueError: If a name is unknown or given twice, or a set is made of elites and there are none.
     """
-    check_names(names, has_archive=archive is not None and split is not None)
+    unknown = [name for name in names if name not in SETS]
+    if unknown or not names:
+        raise ValueError(f"sets must be some of {', '.join(SETS)}, got {', '.join(unknown) or 'none'}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"each set may be named once, got {', '.join(names)}")
+    missing = [name for name in names if name in FROM_ARCHIVE and archive is None]
+    if missing:
+        raise ValueError(f"set {', '.join(missing)} is made of elites: give the run that found them (--archive RUN)")
     sets = {name: plain_set(name, count, seed) for name in names if name not in FROM_ARCHIVE}
     if archive is not None and split is not None:
         sets["generated"] = whole = generated_set(archive, split, count, seed)
@@ -232,37 +224,14 @@ def make_sets(
     return {name: sets[name] for name in SETS if name in names}
 
 
-def check_names(names: Sequence[str], *, has_archive: bool) -> None:
-    """Refuse names that are no sets, or sets that cannot be had.
-
-    Raises:
-        ValueError: If a name is unknown or given twice, or a set is made of elites and there is no archive.
-    """
-    unknown = [name for name in names if name not in SETS]
-    if unknown or not names:
-        raise ValueError(f"sets must be some of {', '.join(SETS)}, got {', '.join(unknown) or 'none'}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"each set may be named once, got {', '.join(names)}")
-    missing = [name for name in names if name in FROM_ARCHIVE and not has_archive]
-    if missing:
-        raise ValueError(f"set {', '.join(missing)} is made of elites: give the run that found them (--archive RUN)")
-
-
 def marks_of(genes: NDArray[np.float32]) -> list[str]:
-    """A short mark of each elite that depends on its genes alone.
-
-    Args:
-        genes: Shape (E, 64).
-    """
+    """A short mark of each elite that depends on its genes, shape (E, 64), alone."""
     rows = np.ascontiguousarray(genes, np.float32)
     return [hashlib.sha256(row.tobytes()).hexdigest()[:_MARK_LENGTH] for row in rows]
 
 
 def recorded_marks(policy: str) -> set[str]:
     """Marks of the elites that a controller was trained on; none where neither its file nor a record beside it has any.
-
-    Args:
-        policy: A controller as :class:`sim.policy.spec.ControllerSpec` takes it.
 
     Raises:
         ValueError: If the marks are damaged.
@@ -300,8 +269,8 @@ def check_held_out(controllers: Mapping[str, str], genes: NDArray[np.float32], s
 
     Args:
         controllers: Policy of each controller by its name.
-        genes: Elites that are to be crossed, shape (T, 64).
-        split_seed: Of the split that held them out.
+        genes: Elites that are to be crossed, shape (T, 64), held out by the split of ``split_seed``.
+        split_seed: For the message.
 
     Raises:
         ValueError: If one of the controllers was trained on some of them, as far as its record says; naming it.

@@ -38,11 +38,7 @@ _PAPER_LABEL = "of that name in the paper"
 
 
 def print_rates(report: dict[str, Any]) -> None:
-    """Prints the rates of one controller.
-
-    Args:
-        report: As ``base.json`` has it.
-    """
+    """Prints the rates of one controller, as ``base.json`` has them."""
     print(f"{'':<24}{'success':>24}{'goal':>24}{'fallen':>8}{'terrains':>10}")
     for name in ("hand_crafted", "hard_random"):
         rows = {name: report[name]}
@@ -64,11 +60,7 @@ def published_value(report: dict[str, Any], measure: str, name: str, who: str) -
 
 
 def print_tables(report: dict[str, Any]) -> None:
-    """Print every set with every controller, what became of terrains between controllers, and what nobody crossed.
-
-    Args:
-        report: As ``tables.json`` has it.
-    """
+    """Prints ``tables.json``: every set with every controller, what became of terrains, and what nobody crossed."""
     wide = 2 + max(12, *(len(who) for row in report["success"].values() for who in row))
     for name in report["success"]:
         _print_set(report, name, wide)
@@ -148,32 +140,20 @@ def _print_over_seeds(found: dict[str, Any]) -> None:
     print("\nmean over the controllers of a kind, and its 95 % t interval over them")
     for name in next(iter(found.values())):
         for kind in found[next(iter(found))][name]:
-            cells = (f"{measure} {_mean_words(rows[name][kind])}" for measure, rows in found.items())
-            print(f"  {name}, {kind}: " + ", ".join(cells))
-
-
-def _mean_words(summary: dict[str, Any]) -> str:
-    return value_words(summary["mean"], summary["interval"])
+            each = {measure: rows[name][kind] for measure, rows in found.items()}
+            words = (f"{measure} {value_words(one['mean'], one['interval'])}" for measure, one in each.items())
+            print(f"  {name}, {kind}: " + ", ".join(words))
 
 
 def write_figure(path: Path, report: dict[str, Any]) -> None:
-    """Draw the tables and write them as PNG, atomically.
-
-    Args:
-        path: File to write.
-        report: As ``tables.json`` has it.
-    """
+    """Draws the tables, as ``tables.json`` has them, and writes them as PNG, atomically."""
     buffer = io.BytesIO()
     draw_tables(report).savefig(buffer, format="png", dpi=150)
     write_atomically(path, buffer.getvalue())
 
 
 def draw_tables(report: dict[str, Any]) -> "Figure":
-    """Success, goal rate and reward of every controller by set with 95 % intervals, and what became of terrains.
-
-    Args:
-        report: As ``tables.json`` has it.
-    """
+    """Success, goal rate and reward of every controller by set with 95 % intervals, and what became of terrains."""
     from matplotlib.figure import Figure
 
     pairs = _pairs_from_first(report)
@@ -187,20 +167,12 @@ def draw_tables(report: dict[str, Any]) -> "Figure":
     sizes = "; ".join(f"{_on_one_line(name)}: {count}" for name, count in report["terrains"].items())
     title = f"{report['robot']}: {report['episodes']} episodes on each terrain, 95 % intervals over terrains"
     figure.suptitle(f"{title}\nterrains: {sizes}", fontsize=11)
-    figure.legend(handles=_legend(panels[0]), loc="outside lower center", ncols=8, frameon=False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
+    if _PAPER_LABEL in entries:  # once, and last
+        entries[_PAPER_LABEL] = entries.pop(_PAPER_LABEL)
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=8, frameon=False)
     return figure
-
-
-def _legend(axes: "Axes") -> list[Any]:
-    """The controllers of a panel, and what a hollow diamond is if there is one."""
-    from matplotlib.lines import Line2D
-
-    handles, labels = axes.get_legend_handles_labels()
-    ours = [handle for handle, label in zip(handles, labels, strict=True) if label != _PAPER_LABEL]
-    if _PAPER_LABEL in labels:
-        style = {"marker": "D", "markersize": 9, "markerfacecolor": "none", "color": "0.4", "linestyle": ""}
-        ours.append(Line2D([], [], label=_PAPER_LABEL, **style))
-    return ours
 
 
 def _on_one_line(name: str) -> str:
@@ -222,22 +194,18 @@ def _draw_measure(axes: "Axes", report: dict[str, Any], measure: str, factor: fl
         limits = factor * np.array([report["intervals"][measure][names[place]][who] for place in there]).reshape(-1, 2)
         lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)  # equal limits may be off by rounding
         places = np.array(there) + shift
-        label = _label(kind_of(who), controllers) if who in kinds else ""
+        seeds = [kind_of(other) for other in controllers].count(kind_of(who))
+        label = kind_of(who) + (f" ({seeds} seeds)" if seeds > 1 else "") if who in kinds else ""
         axes.errorbar(places, values, lengths, linestyle="", marker=marker, color=colour, capsize=3, label=label)
         paper = [published_value(report, measure, name, who) for name in names]
         known = [place for place, value in enumerate(paper) if value is not None]
         if known:
             heights = [factor * value for value in paper if value is not None]
-            style = {"markersize": 10, "markerfacecolor": "none", "color": colour}
+            style = {"markersize": 10, "markerfacecolor": "none", "color": "0.4"}
             axes.plot(np.array(known) + shift, heights, "D", label=_PAPER_LABEL, **style)
     axes.set_xticks(range(len(names)), [SET_LABELS[name] for name in names])
     axes.set_xlim(-0.5, len(names) - 0.5)
     axes.grid(axis="y", alpha=0.3)
-
-
-def _label(kind: str, controllers: Sequence[str]) -> str:
-    seeds = [kind_of(who) for who in controllers].count(kind)
-    return kind if seeds == 1 else f"{kind} ({seeds} seeds)"
 
 
 def _pairs_from_first(report: dict[str, Any]) -> list[str]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.fitness import FAILING_GOAL_RATE
 from sim.files.intervals import MAX_T_VALUES, paired_interval, t_interval, wilson_interval
 from sim.policy.spec import MARK, controller_hash, firsts, kind_of
 from sim.robots.robot import RobotCfg
@@ -25,8 +26,6 @@ from train.evaluate.measures import MEASURES, Measured
 from train.evaluate.publish import published
 from train.evaluate.sets import FROM_ARCHIVE, TerrainSet
 
-FAILING_BELOW = 0.5
-"""Goal rate below which a controller fails a terrain."""
 KINDS = ("mended", "still_failing", "newly_broken", "fine")
 """What may have become of a terrain."""
 RATES = ("success", "goal", "fallen")
@@ -37,12 +36,6 @@ Crossed = Mapping[str, Mapping[str, Measured]]
 
 def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCfg, seed: int) -> dict[str, Any]:
     """Everything that ``tables.json`` says of crossings, as JSON values.
-
-    Args:
-        crossed: What each controller made of each set.
-        sets: The sets.
-        robot: Robot settings.
-        seed: Of the bootstrap.
 
     Returns:
         ``success``, ``goal``, ``fallen`` (fractions), ``reward`` (sum over 20 s): set -> controller -> mean;
@@ -84,7 +77,7 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
     Args:
         row: What each controller made of T terrains.
         numbers: Number of each terrain, shape (T,).
-        seed: Of the bootstrap.
+        seed: Of the bootstrap over terrains.
 
     Returns:
         ``crossed`` and ``never_crossed``: their ``count``, ``share`` with ``interval``, numbers as ``terrains``, and
@@ -95,12 +88,8 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
     ever = np.any([one.goals > 0 for one in row.values()], axis=0)
     found = {}
     for name, member in (("crossed", ever & judged), ("never_crossed", ~ever & judged)):
-        shares = member[judged].astype(float)
         found[name] = {
-            "count": int(member.sum()),
-            "share": _mean(shares),
-            "interval": _interval(shares, seed),
-            "terrains": np.sort(numbers[member]).tolist(),
+            **_counted(member, judged, numbers, seed),
             **{key: {who: _mean(one.values[key][member]) for who, one in row.items()} for key in MEASURES},
             "intervals": {
                 key: {who: _interval(one.values[key][member], seed) for who, one in row.items()} for key in MEASURES
@@ -124,14 +113,15 @@ def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], se
         how many are ``clear``; and ``gain``: measure -> mean difference with its interval, terrain by terrain.
     """
     both = before.valid & after.valid
-    fails = [np.where(both, one.values["goal"] < FAILING_BELOW, False) for one in (before, after)]
+    fails = [np.where(both, one.values["goal"] < FAILING_GOAL_RATE, False) for one in (before, after)]
     members = {
         "mended": fails[0] & ~fails[1],
         "still_failing": fails[0] & fails[1],
         "newly_broken": ~fails[0] & fails[1],
         "fine": ~fails[0] & ~fails[1] & both,
     }
-    apart = _goal_rates_apart(before, after)
+    limits = [_wilson_limits(one) for one in (before, after)]
+    apart = (limits[0][:, 1] < limits[1][:, 0]) | (limits[1][:, 1] < limits[0][:, 0])
     found: dict[str, Any] = {"compared": int(both.sum())}
     for kind, member in members.items():
         found[kind] = _counted(member, both, numbers, seed)
@@ -145,13 +135,7 @@ def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], se
 
 
 def differences(crossed: dict[str, Measured], numbers: NDArray[np.int64], seed: int) -> dict[str, Any]:
-    """:func:`difference` of every two controllers, the earlier named one first, under ``first -> second``.
-
-    Args:
-        crossed: What each controller made of the same T terrains.
-        numbers: Number of each terrain, shape (T,).
-        seed: Of the bootstrap over terrains.
-    """
+    """:func:`difference` of every two controllers, the earlier named one first, under ``first -> second``."""
     return {
         f"{first} -> {second}": difference(crossed[first], crossed[second], numbers, seed)
         for first, second in combinations(crossed, 2)
@@ -170,16 +154,10 @@ def _counted(
     }
 
 
-def _goal_rates_apart(before: Measured, after: Measured) -> NDArray[np.bool_]:
-    """Whether the Wilson intervals of two controllers' goal rates on a terrain do not overlap, shape (T,)."""
-    limits = [_wilson_limits(one) for one in (before, after)]
-    return (limits[0][:, 1] < limits[1][:, 0]) | (limits[1][:, 1] < limits[0][:, 0])
-
-
 def _wilson_limits(one: Measured) -> NDArray[np.float64]:
     """Interval of the goal rate on each terrain, shape (T, 2); anything possible on an invalid one."""
     counts = zip(one.goals.tolist(), one.episodes.tolist(), strict=True)
-    return np.array([wilson_interval(goals, episodes) if episodes else (0.0, 1.0) for goals, episodes in counts])
+    return np.array([wilson_interval(goals, episodes) for goals, episodes in counts])
 
 
 def check_seeds(controllers: Mapping[str, str]) -> None:
@@ -210,7 +188,7 @@ def over_seeds(tables: dict[str, Any], measures: Iterable[str]) -> dict[str, Any
 
     Args:
         tables: Measure -> set -> controller -> value.
-        measures: Which of them.
+        measures: Some of its measures.
 
     Returns:
         Measure -> set -> kind -> ``mean``, 95 % t ``interval`` over controllers and their ``values``; empty where no
@@ -254,14 +232,10 @@ def _by_controller(crossed: Crossed, of: Callable[[Measured], Any]) -> dict[str,
     return {name: {who: of(one) for who, one in row.items()} for name, row in crossed.items()}
 
 
-def _valid(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return values[~np.isnan(values)]
-
-
 def _mean(values: NDArray[np.float64]) -> float | None:
-    kept = _valid(values)
+    kept = values[~np.isnan(values)]
     return float(kept.mean()) if len(kept) else None
 
 
 def _interval(values: NDArray[np.float64], seed: int) -> list[float] | None:
-    return paired_interval(_valid(values), seed)
+    return paired_interval(values[~np.isnan(values)], seed)

@@ -36,8 +36,6 @@ class PpoCfg(PaceCfg):
     """Lambda of generalised advantage estimation."""
     clip: float = setting(0.2, above=0.0)
     """Clip range of the probability ratio and of the value."""
-    captured: bool = True
-    """Update with one captured graph a minibatch; rsl_rl's own PPO otherwise: the same numbers, slower on CUDA."""
 
     @classmethod
     def of(cls, robot: "RobotCfg") -> "PpoCfg":

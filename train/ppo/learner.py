@@ -103,11 +103,7 @@ class Runner(OnPolicyRunner):
         ranks = Ranks.of_environment()
         self.is_distributed, self.gpu_world_size = True, ranks.size
         self.gpu_local_rank, self.gpu_global_rank = ranks.local_rank, ranks.rank
-        self.cfg["multi_gpu"] = {
-            "global_rank": ranks.rank,
-            "local_rank": ranks.local_rank,
-            "world_size": ranks.size,
-        }
+        self.cfg["multi_gpu"] = {"global_rank": ranks.rank, "local_rank": ranks.local_rank, "world_size": ranks.size}
         distributed.init_process_group("gloo")  # rsl_rl's own choice is NCCL, which CPUs do not have
 
 
@@ -150,7 +146,7 @@ class Learner:
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
             self.runner = Runner(env, runner_settings(cfg), log_dir=None, device=str(env.device))
-        self.alg = self.runner.alg
+        self.alg: CapturedPPO = self.runner.alg  # pyright: ignore[reportAttributeAccessIssue] - as its settings say
         if self.ranks.size > 1:
             self.alg.broadcast_parameters()
             self._draw_apart(seed)
@@ -173,10 +169,7 @@ class Learner:
             return
         final = self.iteration >= (1.0 - cfg.final_share) * iterations
         desired_kl, entropy = (cfg.final_kl, cfg.final_entropy) if final else (cfg.desired_kl, cfg.entropy)
-        if isinstance(self.alg, CapturedPPO):
-            self.alg.set_pace(desired_kl, entropy)
-        else:
-            self.alg.desired_kl, self.alg.entropy_coef = desired_kl, entropy
+        self.alg.set_pace(desired_kl, entropy)
 
     def iterate(self) -> Iteration:
         """Collect ``steps_per_env`` control steps of every environment, then update the networks.
@@ -209,26 +202,20 @@ class Learner:
     @property
     def noise_std(self) -> float:
         """Mean standard deviation of the actions."""
-        return float(self.actor_state()["distribution.std_param"].mean())
+        return float(self.actor_state()[_STD].mean())
 
-    def actor_state(self) -> dict[str, torch.Tensor]:
+    def actor_state(self) -> State:
         """The actor under rsl_rl's keys, on the CPU."""
         return {key: value.detach().cpu().clone() for key, value in self.alg.get_policy().state_dict().items()}
 
     def save(self, path: Path, extra: dict[str, Any]) -> None:
-        """Write a checkpoint, whole or not at all.
-
-        Args:
-            path: File to write.
-            extra: Plain numbers, strings, lists and dicts to come back from :func:`read_checkpoint`.
-        """
+        """Write a checkpoint, whole or not at all; ``extra`` is plain data that comes back from a read."""
         task = self.env.task
         content = {
             **self.alg.save(),
             "format": CHECKPOINT_FORMAT,
             "robot": task.robot.name,
             "iter": self.iteration,
-            "infos": None,
             "levels": task.levels.to(torch.uint8),
             "counter": int(task.counter.item()),
             "rng_cpu": torch.get_rng_state(),
@@ -239,25 +226,17 @@ class Learner:
         torch.save(content, buffer)
         write_atomically(path, buffer.getvalue())
 
-    def start_from(self, actor: dict[str, torch.Tensor], critic: dict[str, torch.Tensor] | None) -> None:
-        """Begin with a trained actor, and its critic where it is known.
+    def start_from(self, actor: State, critic: State | None) -> None:
+        """Begin with a trained actor, and its critic where it is known, as :func:`read_start` gives them.
 
         Args:
             actor: State under rsl_rl's keys; without a standard deviation of the actions, the configured one is kept.
             critic: Likewise.
-
-        Raises:
-            ValueError: If one has other shapes than the networks.
         """
-        own = self.alg.get_policy().state_dict()
-        known = {"distribution.std_param": own["distribution.std_param"], **actor}
-        for name, network, state in (("actor", self.alg.get_policy(), known), ("critic", self.alg.critic, critic)):
-            try:
-                if state is not None:
-                    network.load_state_dict(state)
-            except Exception as error:  # torch answers states that do not fit with many types
-                reason = " ".join(str(error).split())
-                raise ValueError(f"the controller's {name} does not fit the training's networks: {reason}") from error
+        policy = self.alg.get_policy()
+        policy.load_state_dict({_STD: policy.state_dict()[_STD], **actor})
+        if critic is not None:
+            self.alg.critic.load_state_dict(critic)
 
     def begin_again(self) -> None:
         """Go on from the environment as it is now: to be called between iterations when its episodes began anew."""
@@ -302,14 +281,7 @@ class Learner:
 
 
 def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
-    """Read a checkpoint as data only (no code in it is run).
-
-    Args:
-        path: File written by :meth:`Learner.save`.
-        robot: Name of the robot it must be of.
-
-    Returns:
-        Its content, tensors on the CPU.
+    """Content of a checkpoint that :meth:`Learner.save` wrote, tensors on the CPU; no code in it is run.
 
     Raises:
         ValueError: If the file is absent, truncated, foreign or of another robot.
@@ -339,14 +311,10 @@ def check_entries(content: dict[str, Any], expected: dict[str, tuple[type, ...]]
     Raises:
         ValueError: If one is absent or of another type.
     """
-    wrong = {
-        name: type(content.get(name)).__name__
-        for name, kinds in expected.items()
-        if type(content.get(name)) not in kinds
-    }
+    found = [(name, kinds[0].__name__, type(content.get(name))) for name, kinds in expected.items()]
+    wrong = [f"{name} must be {kind}, got {got.__name__}" for name, kind, got in found if got not in expected[name]]
     if wrong:
-        found = ", ".join(f"{name} must be {expected[name][0].__name__}, got {got}" for name, got in wrong.items())
-        raise ValueError(f"{path} is a damaged checkpoint: {found}; put a copy of it back")
+        raise ValueError(f"{path} is a damaged checkpoint: {', '.join(wrong)}; put a copy of it back")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,10 +332,6 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
 
     A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
     such a file is left: its own normaliser is another.
-
-    Args:
-        path: The checkpoint.
-        robot: Whose controller it is.
 
     Raises:
         ValueError: If it is no such file, of another robot, or its standard deviation or critic cannot be trained on.

@@ -22,7 +22,7 @@ def runner_settings(cfg: PpoCfg) -> dict[str, Any]:
         "check_for_nan": False,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "algorithm": {
-            "class_name": CapturedPPO if cfg.captured else "PPO",
+            "class_name": CapturedPPO,
             "num_learning_epochs": cfg.epochs,
             "num_mini_batches": cfg.mini_batches,
             "learning_rate": cfg.learning_rate,

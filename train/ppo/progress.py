@@ -11,7 +11,9 @@ from torch.utils.tensorboard import FileWriter
 from torch.utils.tensorboard.summary import scalar
 
 from kernels.rewards import REWARDS
+from qd.run.progress import clock
 from sim.files.atomic import unwritable
+from sim.files.intervals import value_words
 from train.ppo.learner import Iteration, Learner
 
 _ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out")
@@ -21,15 +23,6 @@ _HEADER = (
     f"{'iteration':>12} {'env-steps':>10} {'steps/s':>9} {'collect':>8} {'learn':>8} {'reward':>7} {'length':>7} "
     f"{'falls':>6} {'goal':>6} {'v err':>6} {'w err':>6} {'level':>6} {'std':>5} {'rate':>8} {'ETA':>7}"
 )
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
 
 
 class Progress:
@@ -55,19 +48,18 @@ class Progress:
         Args:
             run_dir: Where TensorBoard's file goes.
             learner: What is trained.
-            iterations: Iterations in all.
-            rows: Rows over all iterations.
+            iterations: In all.
+            rows: Over all iterations.
             about: Provenance and ``settings`` of this piece.
             saved: :meth:`state` of the pieces before.
         """
         self._learner = learner
         self.iterations = iterations
         self._every = max(1, iterations // rows)
-        self._curve: list[dict[str, Any]] = list(saved["curve"]) if saved else []
-        self._pieces: list[dict[str, Any]] = list(saved["pieces"]) if saved else []
-        self._env_steps = int(saved["env_steps"]) if saved else 0
-        self._wall_s = float(saved["wall_s"]) if saved else 0.0
-        self._pieces.append({**about, "from_iteration": learner.iteration})
+        before = saved or {"curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
+        self._curve: list[dict[str, Any]] = list(before["curve"])
+        self._pieces = [*before["pieces"], {**about, "from_iteration": learner.iteration}]
+        self._env_steps, self._wall_s = before["env_steps"], before["wall_s"]
         self._about = about
         self._run_dir = run_dir
         threading.excepthook = _without_traceback
@@ -155,14 +147,14 @@ class Progress:
 
     def _print(self, row: dict[str, Any]) -> None:
         left = (self.iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
+        forms = {"reward": ".2f", "length_s": ".1f", "fall_rate": ".3f", "goal_rate": ".3f"}
+        reward, length, falls, goals = (value_words(row[name], None, form) for name, form in forms.items())
         print(
             f"{row['iteration']:>6}/{self.iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
-            f"{row['env_steps_per_s']:>9,.0f} "
-            f"{row['collection_s'] * 1e3:>6.0f}ms {row['learning_s'] * 1e3:>6.0f}ms {_number(row['reward'], '.2f'):>7} "
-            f"{_number(row['length_s'], '.1f'):>6}s {_number(row['fall_rate'], '.3f'):>6} "
-            f"{_number(row['goal_rate'], '.3f'):>6} {row['lin_vel_error']:>6.3f} {row['yaw_rate_error']:>6.3f} "
-            f"{row['level']:>6.2f} {row['noise_std']:>5.2f} {row['learning_rate']:>8.1e} "
-            f"{_clock(left):>7}",
+            f"{row['env_steps_per_s']:>9,.0f} {row['collection_s'] * 1e3:>6.0f}ms {row['learning_s'] * 1e3:>6.0f}ms "
+            f"{reward:>7} {length:>6}s {falls:>6} {goals:>6} {row['lin_vel_error']:>6.3f} "
+            f"{row['yaw_rate_error']:>6.3f} {row['level']:>6.2f} {row['noise_std']:>5.2f} "
+            f"{row['learning_rate']:>8.1e} {clock(left):>7}",
             flush=True,
         )
         if row["ends"]["invalid"] or row["overflows"]:

@@ -4,14 +4,14 @@ import io
 import signal
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
+from qd.run.settings import differences
+from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import built, problems
@@ -104,11 +104,7 @@ def check_training(flags: TrainingFlags, task: TaskCfg, ppo: PpoCfg, *, robot: R
 
 
 def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
-    """The run directory, made and fit to be written to.
-
-    Args:
-        flags: Say where to write, which run to go on from, and where else the controller goes.
-        name: Of a new directory under runs/, before the date.
+    """The run directory, made and fit to be written to; a new one is called after ``name`` and the date.
 
     Raises:
         ValueError: If it holds another run, one of the places cannot be written to, or the controller has another name.
@@ -126,36 +122,16 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
     config = run_dir / CONFIG
     if config.exists() and "settings" in read_json(config):
         raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
-    folders = {run_dir, export.parent if export else run_dir}
-    try:
-        for folder in folders:
-            folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"cannot write to {error.filename}: {error.strerror}; name another place") from error
-    for folder in folders:
-        check_writable(folder)
+    for file in (config, *([export] if export else [])):
+        prepare_output(file)
     return run_dir
-
-
-def claimed(run_dir: Path) -> AbstractContextManager[None]:
-    """Keeps other trainings out of a run directory for the duration of a ``with`` block.
-
-    Raises:
-        ValueError: On entering it, if another training works in the directory.
-    """
-    return locked(run_dir, f"another training works in {run_dir}: let it end, or name another --run-dir")
 
 
 # Going on with a run ---------------------------------------------------------------------------------------------
 
 
 def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
-    """The checkpoint of a training run, with the progress it had made.
-
-    Args:
-        run: Its directory.
-        robot: Name of the robot it must be of.
-        finetuning: Whether it must be a fine-tuning, else the training of a base controller.
+    """The checkpoint of a run of this robot, with the progress it had made: a fine-tuning, or the training of a base.
 
     Raises:
         ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is of the other kind.
@@ -206,31 +182,14 @@ def settings_of(run: Path, saved: dict[str, Any], kinds: dict[str, type]) -> dic
 
 
 def check_resumed(flags: TrainingFlags, saved: dict[str, Any], settings: dict[str, Any]) -> list[str]:
-    """How the settings of a run that goes on differ from those it was begun with, one line each.
-
-    Args:
-        flags: Name the run.
-        saved: Its checkpoint.
-        settings: Those of now.
+    """How the present settings of a run that goes on differ from those it was begun with, one line each.
 
     Raises:
         ValueError: If it has done more iterations already than they ask for.
     """
     if saved["iter"] > settings["iterations"]:
         raise ValueError(f"{flags.resume} has done {saved['iter']} iterations already: give at least as many in all")
-    return changes(saved["extra"]["settings"], settings)
-
-
-def changes(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
-    """What differs between two nested settings, one line each."""
-    found = []
-    for key in sorted(before.keys() | after.keys()):
-        old, new = before.get(key), after.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            found += changes(old, new, f"{prefix}{key}.")
-        elif old != new:
-            found.append(f"{prefix}{key} {old} -> {new}")
-    return found
+    return differences(saved["extra"]["settings"], settings)
 
 
 # The training itself ---------------------------------------------------------------------------------------------
@@ -250,13 +209,7 @@ class Training:
     """What record and checkpoint say beside the progress; of a fine-tuning the elites it was trained on."""
 
     def __init__(self, job: Job, *, tiles: Tiles | None = None, random_ages: bool = True) -> None:
-        """Begin, or go on from the checkpoint of the job.
-
-        Args:
-            job: What is asked for.
-            tiles: The terrains; those of the curriculum if left out.
-            random_ages: As :class:`train.ppo.learner.Learner` takes it.
-        """
+        """Begin, or go on from the checkpoint of the job, on ``tiles`` or else on those of the curriculum."""
         self.job, self.extra = job, {}
         seed, rank = job.flags.seed, Ranks.of_environment().rank
         self.task = CommandTask(
@@ -265,10 +218,13 @@ class Training:
         self.learner = Learner(CommandVecEnv(self.task), job.ppo, seed=seed, random_ages=random_ages)
         if job.saved is not None:
             self.learner.resume(job.saved)
-        about = {**provenance(job.device, seed), "settings": job.settings}
-        before = job.saved and job.saved["extra"]
         self.progress = Progress(
-            job.run_dir, self.learner, job.iterations, rows=job.flags.rows, about=about, saved=before
+            job.run_dir,
+            self.learner,
+            job.iterations,
+            rows=job.flags.rows,
+            about={**provenance(job.device, seed), "settings": job.settings},
+            saved=job.saved and job.saved["extra"],
         )
 
     def before_iteration(self) -> None:
@@ -330,11 +286,7 @@ def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
 
 
 def run_training(job: Job, begin: Callable[[], Training]) -> int:
-    """Trains as a job says, and says how to go on; returns the exit status: 0, or 130 after Ctrl-C.
-
-    Args:
-        job: What is asked for.
-        begin: Makes the training.
+    """Trains what ``begin`` makes of a job, and says how to go on; returns the exit status: 0, or 130 after Ctrl-C.
 
     Raises:
         ValueError: If the run is another training's, or its checkpoint does not fit.
@@ -343,10 +295,11 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
     """
     run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
     go_on = f"Go on with: {command_line(job.command, robot=job.robot.spec, resume=run_dir)}"
-    with StopRequest() as stop, claimed(run_dir):
+    busy = f"another training works in {run_dir}: let it end, or name another --run-dir"
+    with StopRequest() as stop, locked(run_dir, busy):
         training = begin()
-        flags = {key: value for key, value in asdict(job.flags).items() if value is not None}
-        write_atomically(run_dir / CONFIG, to_json({**_plain(flags), "device": job.device}))
+        flags = asdict(job.flags, dict_factory=_given)
+        write_atomically(run_dir / CONFIG, to_json({**flags, "device": job.device}))
         try:
             training.iterate(stop)
             training.finish()
@@ -363,8 +316,6 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
     return 130 if stop.requested else 0
 
 
-def _plain(value: Any) -> Any:
-    """Settings as JSON has them: paths as text."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return str(value) if isinstance(value, Path) else value
+def _given(flags: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Flags as JSON has them: those that were left out are absent, paths are text."""
+    return {name: str(value) if isinstance(value, Path) else value for name, value in flags if value is not None}

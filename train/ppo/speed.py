@@ -38,7 +38,7 @@ class TrainSpeed(OfRobot, OnDevice):
         from sim.simulation import resolve_device
 
         check(self)
-        robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device)
+        robot, device = get_robot(self.robot), resolve_device(self.device)
 
         def measure() -> dict[str, Any]:
             size = {"iterations": self.iterations, "device": device, "seed": self.seed}

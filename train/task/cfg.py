@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from sim.files.settings import problems, setting
 from sim.robots.training import TrainingCfg
+from sim.terrain import NUM_LEVELS
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -35,7 +36,7 @@ class CurriculumCfg:
     """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
     noise_columns: int = setting(2, least=0)
     """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
-    max_first_level: int = setting(5, least=0)
+    max_first_level: int = setting(5, least=0, most=NUM_LEVELS - 1)
     """Robots begin on levels 0 to this, drawn uniformly."""
 
 

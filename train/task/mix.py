@@ -14,6 +14,7 @@ from sim.terrain import (
     NUM_COLS,
     NUM_LEVELS,
     NUM_ROWS,
+    TILE_SHARES_PERCENT,
     TILE_TYPES,
     hand_crafted_crossings,
     training_tile,
@@ -26,7 +27,6 @@ of the kind that it is named after."""
 DRAWS = ("uniform", "failing")
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
-_TILE_SHARES = (0.1, 0.1, 0.35, 0.25, 0.2)  # legged_gym's, of TILE_TYPES
 _LEAST_WEIGHT = 0.1  # of a terrain that is always crossed, beside 1 more for one that never is
 
 
@@ -159,7 +159,7 @@ class Mix:
         if self.crosses:
             heights, types, _ = hand_crafted_crossings(count, rng)
             return heights, tuple(CROSSING_TYPES[kind] for kind in types)
-        kinds = rng.choice(len(TILE_TYPES), size=count, p=_TILE_SHARES)
+        kinds = rng.choice(len(TILE_TYPES), size=count, p=TILE_SHARES_PERCENT / 100)
         levels = rng.integers(NUM_LEVELS, size=count)
         inverted = rng.integers(2, size=count)
         tiles = [

@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pytest
 
+from qd.workers.evaluator import EvaluatorCfg
 from sim.policy.spec import controller_hash
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 from train.evaluate.crossings import KeptCrossings, take_terrains
@@ -23,7 +24,8 @@ def policy(tmp_path):
 
 
 def keeper(tmp_path, **changes):
-    return KeptCrossings(tmp_path / "crossings", **{"robot": "anymal", "episodes": 2, "device": "cpu"} | changes)
+    values = {"robot": "anymal", "policy": "", "num_terrains": 3, "num_replicas": 2, "device": "cpu"} | changes
+    return KeptCrossings(tmp_path / "crossings", EvaluatorCfg(**values))
 
 
 def same(one, other):
@@ -47,7 +49,7 @@ def test_whatever_changes_the_numbers_is_looked_at(tmp_path, policy, monkeypatch
     keeper(tmp_path).write(policy, TERRAINS, RESULT)
     others = [
         keeper(tmp_path, robot="cassie"),
-        keeper(tmp_path, episodes=3),
+        keeper(tmp_path, num_replicas=3),
         keeper(tmp_path, device="cuda:0"),
     ]
     assert all(other.read(policy, TERRAINS) is None for other in others)

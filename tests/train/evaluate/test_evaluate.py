@@ -17,8 +17,8 @@ from sim.policy.spec import controllers_of
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
-from train.evaluate.crossings import KeptCrossings, cross_all
-from train.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, size_of
+from train.evaluate.crossings import cross_all
+from train.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, evaluator_of
 from train.evaluate.sets import make_sets, split_elites
 
 PROTOTYPE = "tests.sim.policies:stretch"
@@ -150,9 +150,9 @@ def test_one_controller_more_crosses_alone(tmp_path):
 def test_sets_of_other_sizes_have_simulations_of_their_own(tmp_path):
     found = make_archive(5)  # one elite is held out
     sets = make_sets(["hard_random", "generated"], 3, 0, archive=found, split=split_elites(found, "anymal"))
-    crossings, kept = Crossings(), KeptCrossings(tmp_path, robot="anymal", episodes=2, device="cpu")
+    crossings = Crossings()
     evaluator = EvaluatorCfg(robot="anymal", policy="", num_terrains=9, num_replicas=2, reward=True)
-    results = cross_all({"base": STANDER}, sets, evaluator, kept, open_evaluator=crossings.open)
+    results = cross_all({"base": STANDER}, sets, evaluator, tmp_path, open_evaluator=crossings.open)
     assert [cfg.num_terrains for cfg in crossings.opened] == [3, 1]
     assert results["generated"]["base"].outcome.shape == (1, 2)
 
@@ -164,7 +164,7 @@ def test_the_far_set_is_part_of_the_generated_one_and_the_same_alone(tmp_path):
     rewards = []
     for names in (["generated", "generated_far"], ["generated_far"]):
         sets = make_sets(names, 6, 0, archive=found, split=split)
-        kept = KeptCrossings(tmp_path / str(len(names)), robot="anymal", episodes=4, device="cpu")
+        kept = tmp_path / str(len(names))
         crossings = Crossings()
         results = cross_all({"base": PROTOTYPE}, sets, evaluator, kept, open_evaluator=crossings.open)
         assert len(crossings.sets) == 1
@@ -184,8 +184,9 @@ def test_controllers_are_named():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the sizes of a machine without a GPU")
 def test_sizes(capsys):
     def size(**given):
-        chosen = size_of(Evaluate(device="cpu", **given))
-        return chosen.terrains, chosen.episodes
+        flags = Evaluate(device="cpu", **given)
+        chosen = evaluator_of(flags, get_robot(flags.robot))
+        return chosen.num_terrains, chosen.num_replicas
 
     assert size(sets=("hard_random",)) == (24, 4)
     assert "24 terrains x 4 episodes a set instead of 300 x 20" in capsys.readouterr().out

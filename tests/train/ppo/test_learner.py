@@ -84,17 +84,13 @@ def test_a_full_size_checkpoint_is_small(shared_task, tmp_path):
     assert (tmp_path / "c.pt").stat().st_size < 8e6
 
 
-@pytest.mark.parametrize("captured", [True, False])
-def test_the_last_share_of_the_iterations_has_its_own_pace(shared_task, captured, monkeypatch):
-    cfg = replace(CFG, final_share=0.26, final_kl=0.004, final_entropy=0.0, captured=captured)
+def test_the_last_share_of_the_iterations_has_its_own_pace(shared_task, monkeypatch):
+    cfg = replace(CFG, final_share=0.26, final_kl=0.004, final_entropy=0.0)
     learner = Learner(CommandVecEnv(shared_task), cfg, seed=0)
     paces = []
-    if captured:
-        monkeypatch.setattr(learner.alg, "set_pace", lambda *pace: paces.append(pace))
+    monkeypatch.setattr(learner.alg, "set_pace", lambda *pace: paces.append(pace))
     for learner.iteration in range(100):
         learner.set_pace(100)
-        if not captured:
-            paces.append((learner.alg.desired_kl, learner.alg.entropy_coef))
     assert paces == [(cfg.desired_kl, cfg.entropy)] * 74 + [(0.004, 0.0)] * 26
 
 

@@ -113,11 +113,6 @@ def test_settings_are_fresh() -> None:
     assert runner_settings(PpoCfg())["actor"]["hidden_dims"] == [512, 256, 128]
 
 
-def test_rsl_rls_own_ppo_can_be_chosen() -> None:
-    settings = runner_settings(PpoCfg(hidden_dims=(16, 8), captured=False))
-    assert type(OnPolicyRunner(DummyEnv(), settings, log_dir=None, device="cpu").alg) is PPO
-
-
 def test_unsupported_features_are_refused() -> None:
     settings = runner_settings(CFG)
     settings["algorithm"]["normalize_advantage_per_mini_batch"] = True

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sim.files.settings import check
 from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, training_tiles
 from train.task.curriculum import CurriculumCfg, first_levels, make_tiles
 
@@ -56,5 +57,5 @@ def test_first_levels_are_uniform():
 def test_bad_settings_are_refused():
     with pytest.raises(ValueError, match="at least one column"):
         make_tiles(CurriculumCfg(num_columns=0, noise_columns=0), seed=0)
-    with pytest.raises(ValueError, match=r"max_first_level must be in 0\.\.9, got 10"):
-        first_levels(1, CurriculumCfg(max_first_level=10), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="max_first_level must be at least 0 and at most 9, got 10"):
+        check(CurriculumCfg(max_first_level=10))

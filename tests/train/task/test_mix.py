@@ -163,7 +163,7 @@ def test_a_state_of_something_else_is_refused(damage):
         ({"draw": "lucky"}, "draw must be one of uniform, failing, got 'lucky'"),
         ({"draw": "failing", "mix": "hard-random"}, "draw failing chooses among elites, of which"),
         ({"swap_every": 0}, "swap_every must be at least 1, got 0"),
-        ({"terrains": 1}, "terrains must be at least 2 for mix generated.* got 1"),
+        ({"terrains": 1}, "terrains must be at least 2 for mix generated, .* got 1"),
         ({"elites": ELITES[:0]}, "needs elites to train on, got none"),
     ],
 )
