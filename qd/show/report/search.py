@@ -173,8 +173,8 @@ def archive_section(shown: Shown) -> Section:
     widest = int(np.argmax(filled))
     spread_text = (
         f"Of the {archive.intervals} intervals of each share the search filled {min(filled)} to {max(filled)}, most of "
-        f"{label_of(archive.penalties[widest])}; in {int(archive.collided.sum()):,} of "
-        f"{counted(len(archive), 'elite')} the base collides in at least one episode."
+        f"{label_of(archive.penalties[widest])}; {int(archive.collided.sum()):,} of "
+        f"{counted(len(archive), 'elite')} had a base collision in the episodes that found them."
     )
     return Section(
         "The archive",
