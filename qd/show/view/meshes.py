@@ -49,8 +49,15 @@ def terrain_mesh(heights: NDArray[np.floating]) -> trimesh.Trimesh:
 
 
 def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: NDArray[np.integer]) -> trimesh.Trimesh:
-    """Triangles with a colour (sRGB) a vertex, and normals that round the edges."""
+    """Triangles with a colour (sRGB) a vertex."""
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=in_linear_light(colors), process=False)
+    return _joined([mesh])
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """All in one, with normals that round the edges."""
+    mesh = trimesh.util.concatenate(meshes)
+    assert isinstance(mesh, trimesh.Trimesh)
     _ = mesh.vertex_normals  # computed now, an export has them
     return mesh
 
@@ -88,7 +95,7 @@ def arrow_mesh() -> trimesh.Trimesh:
     """An arrow along z, 1 m long when it is not scaled."""
     shaft = trimesh.creation.cylinder(radius=0.02, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=_SEGMENTS)
     head = trimesh.creation.cone(radius=0.05, height=0.25, sections=_SEGMENTS)
-    return trimesh.util.concatenate([shaft, head.apply_translation([0.0, 0.0, 0.75])])
+    return _joined([shaft, head.apply_translation([0.0, 0.0, 0.75])])
 
 
 def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
@@ -112,7 +119,7 @@ def body_meshes(skeleton: Skeleton, robot: RobotCfg) -> list[trimesh.Trimesh | N
     if not any(geom.kind == "mesh" for geom in skeleton.geoms):
         for body, end in _bones(skeleton, robot):
             parts[body].append(_bone(end, _bone_radius(skeleton, robot)))
-    return [trimesh.util.concatenate(meshes) if meshes else None for meshes in parts]
+    return [_joined(meshes) if meshes else None for meshes in parts]
 
 
 def _color_of(name: str, robot: RobotCfg) -> Color:
