@@ -108,11 +108,8 @@ class Archive(Evaluation):
 
     @property
     def collided(self) -> NDArray[np.bool_]:
-        """Whether an elite has a base collision among its fresh episodes, or without valid ones its own, shape (N,)."""
-        rate = self.collision_rate
-        if self.fresh is not None:
-            rate = np.where(self.fresh.valid, self.fresh.collision_rate, rate)
-        return rate > 0.0
+        """Whether any of the episodes that found an elite had a base collision, as the paper counts, shape (N,)."""
+        return self.collision_rate > 0.0
 
     def has_elites_of(self, other: "Archive") -> bool:
         """Whether the elites and all that was found of them are another's too, in whatever order."""

@@ -44,8 +44,6 @@ class RolloutResult:
     physics_steps: int
     """Physics steps run until the last episode ended."""
     wall_s: float
-    paths: np.ndarray | None = None
-    """Base position at every control step [m], NaN after the end; (T, R, steps, 3) float32, or None."""
     reward: np.ndarray | None = None
     """Training reward summed to the end of the time, (T, R) float64, NaN where invalid; None unless asked for."""
 
@@ -212,7 +210,6 @@ class Rollout:
         terrains: np.ndarray,
         seeds: np.ndarray,
         *,
-        record_paths: bool = False,
         before_step: Callable[[], None] | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> RolloutResult:
@@ -223,7 +220,6 @@ class Rollout:
         Args:
             terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
             seeds: One seed a terrain, shape (num_terrains,), uint32.
-            record_paths: Keep the base's position at every control step.
             before_step: Called before every control step, to look at :attr:`state` (:mod:`sim.recording.recorder`).
             progress: Called at every poll with the share done of the most control steps.
 
@@ -232,17 +228,8 @@ class Rollout:
         """
         began = time.perf_counter()
         self.begin(terrains, seeds)
-        paths: list[np.ndarray] | None = [] if record_paths else None
-
-        def look() -> None:
-            if paths is not None:
-                running = self._episode.outcome.numpy() == Outcome.RUNNING
-                paths.append(np.where(running[:, None], self.sim.joint_q.numpy()[:, :3], np.nan))
-            if before_step is not None:
-                before_step()
-
-        control_steps = self._run(progress, look)
-        return self._collect(control_steps, began, paths)
+        control_steps = self._run(progress, before_step)
+        return self._collect(control_steps, began)
 
     @property
     def state(self) -> RolloutState:
@@ -270,11 +257,12 @@ class Rollout:
         self._policy()
         self.sim.launch(self._graph)
 
-    def _run(self, progress: Callable[[float], None] | None, look: Callable[[], None]) -> int:
+    def _run(self, progress: Callable[[float], None] | None, before_step: Callable[[], None] | None) -> int:
         most = round(self.cfg.max_duration_s / self.robot.control_dt)
         poll = max(1, round(self.cfg.poll_every_s / self.robot.control_dt))
         for step in range(1, most + 1):
-            look()
+            if before_step is not None:
+                before_step()
             self.control_step()
             if step % poll == 0 or step == most:
                 running_count = int(self._stepped.num_running.numpy()[0])
@@ -284,7 +272,7 @@ class Rollout:
                     return step
         return most
 
-    def _collect(self, control_steps: int, began: float, paths: list[np.ndarray] | None) -> RolloutResult:
+    def _collect(self, control_steps: int, began: float) -> RolloutResult:
         shape = (self.num_terrains, self.num_replicas)
         outcome = self._episode.outcome.numpy().astype(np.uint8).reshape(shape)
         pose = self._episode.final_pose.numpy().reshape(*shape, 7).copy()  # on the CPU numpy() is a view
@@ -306,7 +294,6 @@ class Rollout:
             final_position=pose[..., :3],
             physics_steps=control_steps * self.robot.decimation,
             wall_s=time.perf_counter() - began,
-            paths=None if paths is None else np.stack(paths, axis=1).reshape(*shape, -1, 3).astype(np.float32),
             reward=reward,
         )
 

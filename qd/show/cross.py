@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,19 @@ OWN_FOLDER = RUNS / "terrains"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cross(Who, OnDevice):
+class Mapped:
+    """How large and how high a height map is."""
+
+    size: tuple[str, ...] = ()
+    """Of the map along x and y [m], such as 16 8; its file's if left out."""
+    scale: float | None = None
+    """Metres a gray level of the map; its file's if left out."""
+    offset: float | None = None
+    """Height of its gray level 0 [m]; its file's, or 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cross(Who, OnDevice, Mapped):
     """Cross a height map of your own: how often does the controller get over, and what does it cost?
 
     A map is a grid of heights over a rectangle: an .npz with an array `heights` (rows along y, columns along x, floats
@@ -41,12 +53,6 @@ class Cross(Who, OnDevice):
 
     terrain: Path
     """The height map: an .npz or a .png."""
-    size: tuple[str, ...] = ()
-    """Of the map along x and y [m], such as 16 8; its file's if left out."""
-    scale: float | None = None
-    """Metres a gray level; its file's if left out."""
-    offset: float | None = None
-    """Height of gray level 0 [m]; its file's, or 0."""
     episodes: int = 20
     """Crossings."""
     seed: int = 0
@@ -69,23 +75,6 @@ class OwnTerrain(NamedTuple):
     """The file's name."""
     fitted: str
     """What became of the map, in words."""
-
-
-class Mapped(Protocol):
-    """The flags that say how large and how high a map is, as :class:`Cross` has them."""
-
-    @property
-    def size(self) -> tuple[str, ...]:
-        """Two words, or one that holds both; or none."""
-        ...
-
-    @property
-    def scale(self) -> float | None:
-        """Metres a gray level."""
-
-    @property
-    def offset(self) -> float | None:
-        """Height of gray level 0 [m]."""
 
 
 def read_own_terrain(path: Path, args: Mapped) -> OwnTerrain:

@@ -221,7 +221,7 @@ def draw_spread(archive: Archive) -> "Figure":
     figure = new_figure(1.9 * len(counts) + 0.8, 3.2)
     collided = int(archive.collided.sum())
     figure.suptitle(
-        f"{_title(archive)}: in {collided:,} of {len(archive):,} elites the base collides in at least one episode"
+        f"{_title(archive)}: {collided:,} of {len(archive):,} elites had a base collision when they were found"
     )
     width, lows = 1.0 / archive.intervals, np.arange(archive.intervals) / archive.intervals
     panels = figure.subplots(1, len(counts), sharey=True)

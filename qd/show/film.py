@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.run.directory import elite_name, folder_for
-from qd.show.cross import OWN_FOLDER, read_own_terrain
+from qd.show.cross import OWN_FOLDER, Mapped, read_own_terrain
 from qd.show.elites import find_archive, robot_named
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import prepare_output, write_atomically
@@ -29,7 +29,7 @@ _DISTANCE = 4.6  # of the camera, in standing heights of the robot
 
 
 @dataclass(frozen=True, kw_only=True)
-class Film(Who, OnDevice, Which):
+class Film(Who, OnDevice, Which, Mapped):
     """Film a robot on elites of an archive, or on a terrain of your own.
 
     The episodes are those that `faultline replay` shows. Below the robot stand the map with all paths and what the
@@ -41,12 +41,6 @@ class Film(Who, OnDevice, Which):
 
     terrain: Path | None = None
     """Instead of elites a height map of your own: an .npz or a .png (see `faultline cross --help`)."""
-    size: tuple[str, ...] = ()
-    """Of that map along x and y [m], such as 16 8; its file's if left out."""
-    scale: float | None = None
-    """Metres a gray level of that map."""
-    offset: float | None = None
-    """Height of its gray level 0 [m]."""
     recording: Path | None = None
     """Instead of crossing anything, film what was recorded: a .recording.npz that stands beside a film."""
     out: Path | None = None

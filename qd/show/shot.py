@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
+from qd.show.crossed import ENDINGS
 from qd.show.figures import label_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
@@ -27,13 +28,7 @@ _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 _DPI = 100
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # apart for every kind of colour blindness
 _FUTURE = 0.25  # how much is left to see of what has not happened yet
-_OUTCOMES = {
-    Outcome.GOAL: "goal reached",
-    Outcome.BASE_COLLISION: "base collision",
-    Outcome.TIME_OUT: "out of time",
-    Outcome.OUT: "left the terrain",
-    Outcome.INVALID: "invalid",
-}
+_OUTCOMES = {Outcome.INVALID: "invalid", **{outcome: ending.words for outcome, ending in ENDINGS.items()}}
 
 Image = NDArray[np.uint8]
 

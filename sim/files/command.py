@@ -149,7 +149,16 @@ def command_line(name: str, **flags: object) -> str:
         name: The word that calls it.
         flags: Values by field name; None and False are left out, True is a bare flag.
     """
-    words = [_program(), name]
+    return f"{shlex.quote(_program())} {_typed(name, flags)}"
+
+
+def plain_command(name: str, **flags: object) -> str:
+    """The same for a page that may be read on another machine: the program is ``faultline`` there."""
+    return f"faultline {_typed(name, flags)}"
+
+
+def _typed(name: str, flags: dict[str, object]) -> str:
+    words = [name]
     for flag, value in flags.items():
         if value is None or value is False:
             continue

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files.atomic import to_json, write_atomically
-from sim.simulation import GROUND_FRICTION
 from sim.terrain import SPACING
 
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
@@ -105,6 +104,8 @@ def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:
     The geom stands turned by a quarter; x, y and z of the world are the terrain's. Its friction is below every robot's
     own: of two MuJoCo takes the larger.
     """
+    from sim.simulation import GROUND_FRICTION  # who only draws terrains has no simulation to wait for
+
     field = as_hfield(heights)
     root = ET.Element("mujoco", model=name)
     rows, columns = map(str, field.data.shape)

@@ -29,6 +29,12 @@ _HIDDEN_GROUP = 5  # MuJoCo shows groups 0 to 2
 _BONE, _LEAST_BONE = 0.35, 0.02  # radius of a bone in that of limbs and feet, and at least [m]
 
 
+def height_colors(heights: NDArray[np.floating]) -> NDArray[np.float64]:
+    """RGB (0 to 1) of heights [m], blue below 0 and brown above; a last axis of 3 more than theirs."""
+    share = (heights / max(float(np.abs(heights).max()), _LEAST_RANGE))[..., None]
+    return np.where(share < 0, _LEVEL + (_LEVEL - _LOW) * share, _LEVEL + (_HIGH - _LEVEL) * share)
+
+
 def ground_paint(heights: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Colours of a height grid: blue below 0, brown above, a line every metre, steep ground darker.
 
@@ -39,9 +45,7 @@ def ground_paint(heights: NDArray[np.floating]) -> NDArray[np.uint8]:
         RGB, shape (4 (nrow - 1), 4 (ncol - 1), 3), row along y.
     """
     cells = 0.25 * (heights[:-1, :-1] + heights[1:, :-1] + heights[:-1, 1:] + heights[1:, 1:])
-    reach = max(float(np.abs(cells).max()), _LEAST_RANGE)
-    share = np.clip(cells / reach, -1.0, 1.0)[..., None]
-    color = np.where(share < 0, _LEVEL + (_LEVEL - _LOW) * share, _LEVEL + (_HIGH - _LEVEL) * share)
+    color = height_colors(cells)
     rise_y, rise_x = np.gradient(cells, SPACING)
     color *= (0.75 + 0.25 / np.sqrt(1.0 + rise_x**2 + rise_y**2))[..., None]
     paint = color.repeat(_PIXELS, axis=0).repeat(_PIXELS, axis=1)

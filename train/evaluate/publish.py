@@ -151,7 +151,7 @@ def _archive(found: dict[str, Any], robot: str) -> str:
             f"{paper['elites'] / found['reachable_cells']:.1%}" if paper else _NONE,
         ),
         (
-            "with / without a base collision (ours: in the fresh episodes)",
+            "with / without a base collision",
             f"{found['with_collision']:,} / {found['without_collision']:,}",
             f"{paper['with_collision']} / {paper['without_collision']}" if "with_collision" in paper else _NONE,
         ),

@@ -8,7 +8,7 @@ from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
 from qd.show.report.modes import MAX_MODES, TOLERANCE, Mode
 from qd.show.report.page import Absent, Block, Heading, Section, Table, Text, counted, percent, picture
-from sim.files.command import command_line
+from sim.files.command import plain_command
 from sim.files.intervals import wilson_interval
 
 
@@ -222,7 +222,7 @@ def all_section(shown: Shown) -> Section:
         values = [number, fitness, mode, rates[0], low, *rates[1:], variation, found, *shares]
         keys.append([f"{value:.5g}" for value in values])
     links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers.tolist()]
-    again = command_line("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
+    again = plain_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
     table = Table(head, rows, sortable=True, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
     text = (
         f"All {counted(len(rows), 'elite')}, the highest fitness first; a click on a heading sorts. `{again}` crosses "

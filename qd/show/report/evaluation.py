@@ -8,7 +8,7 @@ from qd.show.report.figures import draw_tables
 from qd.show.report.material import Shown
 from qd.show.report.page import Absent, Block, Heading, Section, Table, Text, counted, percent, picture
 from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, Change, Changes, by_kind
-from sim.files.command import command_line
+from sim.files.command import plain_command
 
 _TRAINED_ON = {
     "C-HC": "hand-crafted terrains alone",
@@ -81,7 +81,7 @@ def fates(tables: dict[str, Any]) -> str:
 def _command(shown: Shown) -> str:
     """What makes the tables."""
     material = shown.material
-    return command_line(
+    return plain_command(
         "evaluate",
         robot=material.robot.spec,
         policies=["base=shipped", "C-G=FILE"],
@@ -174,7 +174,7 @@ def _introduced(shown: Shown, changes: Changes) -> str:
     """Who crosses what, and how to see it move."""
     change, policies = changes.chosen[0], changes.policies or {}
     files = " and ".join(f"{who} ({policy})" for who, policy in policies.items())
-    view = command_line("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
+    view = plain_command("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
                         policies=[f"{who}={policy}" for who, policy in policies.items()])  # fmt: skip
     return (
         f"{files} on elites held out of training, numbered as in {changes.run}: the worst of those mended, of those "

@@ -13,7 +13,7 @@ from qd.show.report.evaluation import fates, most_mended
 from qd.show.report.figures import draw_pairs
 from qd.show.report.material import Shown
 from qd.show.report.page import Absent, Block, Facts, Section, Table, Text, counted, hours, percent, picture
-from sim.files.command import command_line
+from sim.files.command import plain_command
 from sim.files.intervals import bootstrap_interval
 from sim.policy.spec import SHIPPED, ControllerSpec
 
@@ -130,7 +130,7 @@ def curves_section(shown: Shown) -> Section:
     if not rows:
         section.blocks.append(
             Absent("The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:",
-                   command_line("archive", robot=shown.material.robot.spec))
+                   plain_command("archive", robot=shown.material.robot.spec))
         )  # fmt: skip
         return section
     first, last = rows[0], rows[-1]
@@ -173,8 +173,8 @@ def archive_section(shown: Shown) -> Section:
     widest = int(np.argmax(filled))
     spread_text = (
         f"Of the {archive.intervals} intervals of each share the search filled {min(filled)} to {max(filled)}, most of "
-        f"{label_of(archive.penalties[widest])}; in {int(archive.collided.sum()):,} of "
-        f"{counted(len(archive), 'elite')} the base collides in at least one episode."
+        f"{label_of(archive.penalties[widest])}; {int(archive.collided.sum()):,} of "
+        f"{counted(len(archive), 'elite')} had a base collision in the episodes that found them."
     )
     return Section(
         "The archive",
@@ -194,7 +194,7 @@ def pairs_section(shown: Shown) -> Section:
     if len(elites) < 3 or len(elites.penalties) < 2:
         section.blocks.append(
             Absent(f"The projections are left out: they need 3 elites, and there are {len(elites)}. A longer search "
-                   "finds more:", command_line("archive", resume=shown.material.run, iterations="N"))
+                   "finds more:", plain_command("archive", resume=shown.material.run, iterations="N"))
         )  # fmt: skip
         return section
     text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode (next chapter)."
@@ -227,7 +227,7 @@ def origin_section(shown: Shown) -> Section:
     if not origin:
         section.blocks.append(
             Absent("The search is not on record: there is no config.json beside the archive. A search writes one:",
-                   command_line("archive", robot=shown.material.robot.spec))
+                   plain_command("archive", robot=shown.material.robot.spec))
         )  # fmt: skip
         return section
     rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]

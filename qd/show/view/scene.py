@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import trimesh
 import viser
 from numpy.typing import NDArray
 
-from qd.show.view.meshes import Color, Mesh, arrow_mesh, arrow_pose, in_linear_light, terrain_mesh
+from qd.show.view.meshes import Color, arrow_mesh, arrow_pose, in_linear_light, terrain_mesh
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.terrain import SPACING
@@ -28,7 +29,7 @@ class Scene:
     """What stands in the 3-D view."""
 
     def __init__(
-        self, server: viser.ViserServer, bodies: Sequence[Mesh | None], num_feet: int, cfg: CrossingCfg
+        self, server: viser.ViserServer, bodies: Sequence[trimesh.Trimesh | None], num_feet: int, cfg: CrossingCfg
     ) -> None:
         """Put the robot there, unseen.
 
@@ -45,7 +46,7 @@ class Scene:
         server.initial_camera.position, server.initial_camera.look_at = _CAMERA, _LOOK_AT
         self._robot = scene.add_frame("/robot", show_axes=False, visible=False)
         self._bodies = [
-            None if mesh is None else scene.add_mesh_trimesh(f"/robot/{k}", mesh.as_trimesh(), receive_shadow=False)
+            None if mesh is None else scene.add_mesh_trimesh(f"/robot/{k}", mesh, receive_shadow=False)
             for k, mesh in enumerate(bodies)
         ]
         # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
@@ -67,7 +68,7 @@ class Scene:
         """
         with self._server.atomic():
             self.hide_crossing()
-            mesh = terrain_mesh(heights).as_trimesh()
+            mesh = terrain_mesh(heights)
             self._server.scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=False)
             self._mark("start", self._cfg.start, _START_COLOR, heights)
             self._mark("goal", self._cfg.goal, _GOAL_COLOR, heights)
@@ -148,7 +149,7 @@ class Scene:
 
     def _add_arrow(self, name: str, color: Color) -> Any:
         """An arrow that is not to be seen yet."""
-        mesh, add = arrow_mesh(color), self._server.scene.add_mesh_simple
+        mesh, add = arrow_mesh(), self._server.scene.add_mesh_simple
         return add(name, mesh.vertices, mesh.faces, color=color, cast_shadow=False, receive_shadow=False, visible=False)
 
     def _go_along(self, base: Points) -> None:

@@ -121,7 +121,7 @@ def test_summary_with_fresh_values_by_hand():
         collision_rate=np.array([0.0, 0.5, 0.0]),
         invalid_episodes=np.array([0, 0, 11]),
     )
-    archive = dataclasses.replace(archive, fresh=fresh, collision_rate=np.zeros(3))
+    archive = dataclasses.replace(archive, fresh=fresh, collision_rate=np.array([0.5, 0.0, 0.1]))
     numbers = summary(archive, rows(4), gpus=1, origin={})
     assert (numbers["reevaluated"], numbers["elites_reproduced"]) == (3, 2)
     # the third is invalid; the first two share a cell, of which the fitter stays, 5 above -20 by 25
@@ -129,7 +129,7 @@ def test_summary_with_fresh_values_by_hand():
     assert (numbers["corrected_qd_score"], numbers["corrected_mean_fitness"]) == (25.0, 3.0)
     assert numbers["mean_std"] == 2.0  # of 1 + 2 and .5 + .5
     assert numbers["mean_std_interval"] == [1.0, 3.0]
-    assert (numbers["with_collision"], numbers["without_collision"]) == (1, 2)
+    assert (numbers["with_collision"], numbers["without_collision"]) == (2, 1)  # as found
 
 
 def test_archive_figure_shows_the_fresh_values_that_are_valid():
@@ -158,7 +158,7 @@ def test_spread_by_hand():
     assert [bar.get_height() for bar in without][:3] == [1, 0, 1]
     assert [(bar.get_y(), bar.get_height()) for bar in collides][:3] == [(1, 1), (0, 1), (1, 0)]
     assert [round(bar.get_x(), 6) for bar in collides][:3] == [0.0, 0.1, 0.2]
-    assert figure.get_suptitle().endswith("in 2 of 4 elites the base collides in at least one episode")
+    assert figure.get_suptitle().endswith("2 of 4 elites had a base collision when they were found")
     # a collision bit puts a second copy of the 10 cells behind the first
     bit = dataclasses.replace(archive, collision_bit=True, cell=np.array([0, 10, 11, 2]))
     assert np.array_equal(spread(bit), counts)

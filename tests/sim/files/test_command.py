@@ -15,6 +15,7 @@ from sim.files.command import (
     chosen_elites,
     command_line,
     naming_what_is_next,
+    plain_command,
     publish,
     run_command,
 )
@@ -98,6 +99,7 @@ def test_a_command_line_can_be_typed(monkeypatch):
     assert command_line("replay", **flags) == "/opt/bin/faultline replay --run 'runs/a b' --elite 0 1 --reward"
     monkeypatch.setattr("sim.files.command.shutil.which", lambda name: "/opt/bin/faultline")
     assert command_line("view", workers="ray:4") == "faultline view --workers ray:4"
+    assert plain_command("view", elite=3) == "faultline view --elite 3"
 
 
 def test_a_report_is_shown_and_written(tmp_path, capsys):

@@ -141,7 +141,7 @@ def test_the_sentences_have_the_numbers_of_the_files(whole):
     assert "the archive grew from 5 to 20 elites, half of them found by iteration 2" in text
     assert "QD score, the sum of fitness above -20, rose from 20 to 80" in text
     assert "The 20 elites fall into 3 modes" in text
-    assert f"in {int(archive.collided.sum())} of 20 elites the base collides" in text
+    assert f"{int(archive.collided.sum())} of 20 elites had a base collision" in text
     # of elite 0 four made-up crossings end each in its own way, at x = 6, 8.7, 11.3 and 14, the first at the goal
     at = np.median(np.linspace(6.0, 14.0, 4)[1:])
     assert (

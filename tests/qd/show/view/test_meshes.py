@@ -39,12 +39,13 @@ def outside(geom, points):
 @pytest.mark.parametrize("kind", SIZES)
 def test_the_vertices_of_a_shape_lie_on_it(kind):
     geom = make_geom(kind, SIZES[kind])
-    mesh = geom_mesh(geom, (1, 2, 3))
-    vertices = mesh.vertices.astype(np.float64)
+    mesh = geom_mesh(geom, (0, 20, 255))
+    vertices = np.float64(np.float32(mesh.vertices))  # a ray along an edge misses it
     vertices = vertices[np.linalg.norm(vertices - geom.position, axis=1) > 1e-6]  # not the middle of a lid
     assert np.abs(outside(geom, vertices)).max() < 1e-5
-    assert mesh.as_trimesh().is_watertight and mesh.as_trimesh().volume > 0.0  # faces look outward
-    assert mesh.colors.tolist() == [[1, 2, 3, 255]] * len(mesh.vertices)
+    assert mesh.is_watertight and mesh.volume > 0.0  # faces look outward
+    # of 255, sRGB 20 is (.0784 + .055 over 1.055) ** 2.4 = .0070 of the light
+    assert mesh.visual.vertex_colors.tolist() == [[0, 2, 255, 255]] * len(mesh.vertices)
 
 
 def test_every_shape_of_a_robot_is_part_of_its_body(robot):
@@ -65,7 +66,7 @@ def test_bones_hold_the_robot_together(robot):
     world = []
     for k, mesh in enumerate(body_meshes(skeleton, robot)):
         if mesh is not None:
-            world.append(positions[0, k] + rotated(quaternions[0, k], mesh.vertices.astype(float)))
+            world.append(positions[0, k] + rotated(quaternions[0, k], mesh.vertices))
     clouds = [trimesh.bounds.corners(np.stack([points.min(axis=0), points.max(axis=0)])) for points in world]
     for k, corners in enumerate(clouds):  # the box round each part overlaps that of another one
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -77,7 +78,7 @@ def test_the_terrain_is_the_surface_of_the_physics():
     rng = np.random.default_rng(5)
     heights = rng.normal(size=(5, 7)).astype(np.float32)
     mesh = terrain_mesh(heights)
-    triangles = mesh.vertices.astype(float)[mesh.faces.astype(int)]
+    triangles = mesh.vertices[mesh.faces]
     assert len(triangles) == 2 * 4 * 6
     weights = rng.dirichlet(np.ones(3), size=(len(triangles), 5))
     points = np.einsum("tkc,tcd->tkd", weights, triangles).reshape(-1, 3)
@@ -91,24 +92,24 @@ def test_the_terrain_is_the_surface_of_the_physics():
 def test_low_ground_is_blue_and_high_ground_red():
     heights = np.zeros((21, 21), np.float32)
     heights[5, 5], heights[15, 15] = -1.0, 1.0
-    colors = terrain_mesh(heights).colors.reshape(21, 21, 4).astype(int)
+    colors = terrain_mesh(heights).visual.vertex_colors.reshape(21, 21, 4).astype(int)
     low, level, high = colors[5, 5], colors[10, 10], colors[15, 15]
     assert low[2] > low[0] and high[0] > high[2] and abs(level[0] - level[2]) < 30
-    flat = terrain_mesh(np.full((21, 21), 0.01, np.float32)).colors[25].astype(int)
+    flat = terrain_mesh(np.full((21, 21), 0.01, np.float32)).visual.vertex_colors[25].astype(int)
     assert np.abs(flat - level).max() < 10  # a centimetre is no mountain
 
 
 def test_colours_are_exported_in_linear_light():
     mesh = geom_mesh(make_geom("box", SIZES["box"]), (0, 188, 255))
     # sRGB 188 is ((188/255 + .055) / 1.055)^2.4 = .5029 of the light, 128 of 255
-    assert mesh.as_trimesh().visual.vertex_colors[0].tolist() == [0, 128, 255, 255]
+    assert mesh.visual.vertex_colors[0].tolist() == [0, 128, 255, 255]
 
 
 @pytest.mark.parametrize("way", [(0.3, -0.4, 1.2), (0.0, 0.0, 2.0), (0.0, 0.0, -0.5), (1.0, 0.0, 0.0)])
 def test_an_arrow_points_from_its_beginning_to_its_end(way):
     begin = np.array([1.0, 2.0, 3.0])
     quaternion, length = arrow_pose(begin, begin + way)
-    vertices = arrow_mesh((9, 9, 9)).vertices.astype(float)
+    vertices = arrow_mesh().vertices
     tip = vertices[np.argmax(vertices[:, 2])]
     np.testing.assert_allclose(tip, [0.0, 0.0, 1.0], atol=1e-6)
     assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
