@@ -277,7 +277,7 @@ def summarise(pairs: Sequence[Pair], seed: int) -> dict[str, Any]:
             "ours": float(ours.mean()),
             "mujoco_c": float(plain.mean()),
             "bias": float((plain - ours).mean()),
-            "bias_interval": bootstrap_interval(plain - ours, np.random.default_rng(seed)),
+            "bias_interval": bootstrap_interval(plain - ours, seed),
         }
     return {**totals, "invalid": invalid, "left_out": left_out, "terrains": rows}
 

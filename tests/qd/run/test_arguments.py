@@ -66,8 +66,7 @@ def fails(capsys, *argv: str) -> str:
 
 def test_unknown_robot_and_preset(capsys):
     assert fails(capsys, "--robot", "dog") == (
-        "unknown robot 'dog': expected one of anymal, cassie, or a Python file that sets ROBOT (README, Bring your own "
-        "robot)"
+        "unknown robot 'dog': expected one of anymal, cassie, or a Python file that sets ROBOT (docs/own-robot.md)"
     )
     assert fails(capsys, "--robot", "dog.py") == "dog.py: no such file"
     assert fails(capsys, "--space", "blocks", *TINY) == "unknown terrain space 'blocks': expected one of super_gaussian"
