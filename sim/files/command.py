@@ -213,11 +213,6 @@ def publish(
 ) -> dict[str, Any]:
     """Measures, shows and writes a report, which is returned; where to write is tried before the work.
 
-    Args:
-        out: File to write; None for none.
-        measure: Makes the report.
-        show: Prints it.
-
     Raises:
         ValueError: If the file cannot be written to.
     """
