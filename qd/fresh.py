@@ -173,7 +173,7 @@ def numbers_of(again: FreshValues, cells: Cells, *, sampled: bool = False) -> di
         "reevaluated": len(again.reproduced),
         "reproduced": int(again.reproduced.sum()),
         "mean_std": float(std.mean()) if len(std) else None,
-        "mean_std_interval": bootstrap_interval(std, np.random.default_rng(0)),
+        "mean_std_interval": bootstrap_interval(std, 0),
         "corrected_mean_fitness": float(again.fitness[again.valid].mean()) if len(std) else None,
     }
     if sampled:

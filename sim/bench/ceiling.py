@@ -25,13 +25,13 @@ SPECIALS_PER_STEP = 4 * 4
 
 
 @wp.kernel
-def _do_nothing_kernel(out: wp.array[float]):
+def do_nothing(out: wp.array[float]):
     """Grid (1,)."""
     out[0] = 0.0
 
 
 @wp.kernel
-def _multiply_add_kernel(steps: int, factor: float, addend: float, out: wp.array[float]):
+def multiply_add(steps: int, factor: float, addend: float, out: wp.array[float]):
     """Grid (num_threads,): eight independent chains, so that none waits for the result before."""
     i = wp.tid()
     a = float(i)
@@ -56,7 +56,7 @@ def _multiply_add_kernel(steps: int, factor: float, addend: float, out: wp.array
 
 
 @wp.kernel
-def _exponentials_kernel(steps: int, out: wp.array[float]):
+def exponentials(steps: int, out: wp.array[float]):
     """Grid (num_threads,): four independent chains."""
     i = wp.tid()
     a = float(i) * 1.0e-6
@@ -72,35 +72,6 @@ def _exponentials_kernel(steps: int, out: wp.array[float]):
     out[i] = a + b + c + d
 
 
-def do_nothing(out: Any) -> None:
-    """Launch one thread that writes one number: what a launch costs.
-
-    Args:
-        out: Shape (1,) or longer; its first entry becomes 0.
-    """
-    wp.launch(_do_nothing_kernel, dim=1, outputs=[out], device=out.device)
-
-
-def multiply_add(steps: int, out: Any) -> None:
-    """Let every thread do ``steps`` x :data:`FLOPS_PER_STEP` flops in registers.
-
-    Args:
-        steps: Length of the work.
-        out: One result a thread, shape (num_threads,).
-    """
-    wp.launch(_multiply_add_kernel, dim=out.shape[0], inputs=[steps, 0.999, 0.001], outputs=[out], device=out.device)
-
-
-def exponentials(steps: int, out: Any) -> None:
-    """Let every thread compute ``steps`` x :data:`SPECIALS_PER_STEP` exponentials.
-
-    Args:
-        steps: Length of the work.
-        out: One result a thread, shape (num_threads,).
-    """
-    wp.launch(_exponentials_kernel, dim=out.shape[0], inputs=[steps], outputs=[out], device=out.device)
-
-
 BOUND_SHARE = 0.25
 """A kernel that reaches this share of a ceiling is bound by it."""
 LAUNCH_SHARE = 0.5
@@ -112,21 +83,6 @@ BOUND_BY_RULE = (
     "instructions beyond the work counted"
 )
 _STEPS = 64
-
-
-@dataclass(frozen=True, kw_only=True)
-class Share:
-    """How near a kernel comes to the ceilings; 1 is at the ceiling."""
-
-    ceiling_share: float
-    """The largest of the next three."""
-    bandwidth_share: float
-    arithmetic_share: float
-    special_share: float
-    launch_share: float
-    """Time of an empty launch by the kernel's own; no ceiling, but what a small kernel cannot get under."""
-    bound_by: str
-    """memory, arithmetic, special functions, launch or latency (:data:`BOUND_BY_RULE`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +102,15 @@ class Ceiling:
         """Rate of the fastest copy of at least ``moved`` bytes."""
         return max([rate for size, rate in self.copies.items() if size >= moved] or [self.copies[max(self.copies)]])
 
-    def judge(self, work: Work, seconds: float) -> Share:
-        """How near work done in ``seconds`` comes to the ceilings."""
+    def judge(self, work: Work, seconds: float) -> dict[str, Any]:
+        """How near work done in ``seconds`` comes to the ceilings; a share of 1 is at the ceiling.
+
+        Returns:
+            ``bandwidth_share``, ``arithmetic_share`` and ``special_share``, the largest of them as ``ceiling_share``;
+            ``launch_share``, the time of an empty launch by the kernel's own, which is no ceiling, but what a small
+            kernel cannot get under; and ``bound_by``: memory, arithmetic, special functions, launch or latency
+            (:data:`BOUND_BY_RULE`).
+        """
         shares = {
             "memory": work.bytes / self.bytes_per_s(work.bytes) / seconds,
             "arithmetic": work.flops / self.flops_per_s / seconds,
@@ -156,14 +119,14 @@ class Ceiling:
         launch_share = self.launch_s / seconds
         nearest = max(shares, key=lambda name: shares[name])
         bound_by = "launch" if launch_share >= LAUNCH_SHARE else "latency"
-        return Share(
-            ceiling_share=shares[nearest],
-            bandwidth_share=shares["memory"],
-            arithmetic_share=shares["arithmetic"],
-            special_share=shares["special functions"],
-            launch_share=launch_share,
-            bound_by=nearest if shares[nearest] >= BOUND_SHARE else bound_by,
-        )
+        return {
+            "ceiling_share": shares[nearest],
+            "bandwidth_share": shares["memory"],
+            "arithmetic_share": shares["arithmetic"],
+            "special_share": shares["special functions"],
+            "launch_share": launch_share,
+            "bound_by": nearest if shares[nearest] >= BOUND_SHARE else bound_by,
+        }
 
 
 def _copy_sizes(device: str) -> list[int]:
@@ -171,23 +134,23 @@ def _copy_sizes(device: str) -> list[int]:
     return [1 << k for k in (range(20, 33) if device.startswith("cuda") else range(14, 27))]
 
 
-def measure_ceiling(device: str, timing: TimingCfg) -> Ceiling:
-    """Measure the best rates of a device, all in turns.
+def launch(kernel: Any, out: Any, *inputs: float) -> None:
+    """Launches one of the kernels above, one thread an entry of ``out``."""
+    wp.launch(kernel, dim=out.shape[0], inputs=inputs, outputs=[out], device=out.device)
 
-    Args:
-        device: Warp device name; torch works on its stream already.
-        timing: How long.
-    """
+
+def measure_ceiling(device: str, timing: TimingCfg) -> Ceiling:
+    """Measures the best rates of a device, all in turns; torch works on Warp's stream already."""
     threads = 1 << 20 if device.startswith("cuda") else 64
     out: Any = wp.zeros(threads, dtype=float, device=device)
     launches = {
-        "nothing": partial(do_nothing, out),
-        "flops": partial(multiply_add, _STEPS, out),
-        "specials": partial(exponentials, _STEPS, out),
+        "nothing": partial(launch, do_nothing, out[:1]),
+        "flops": partial(launch, multiply_add, out, _STEPS, 0.999, 0.001),
+        "specials": partial(launch, exponentials, out, _STEPS),
     }
     variants = {
-        name: fit_launches(partial(repeat_warp, launch, device=device), device, timing)
-        for name, launch in launches.items()
+        name: fit_launches(partial(repeat_warp, work, device=device), device, timing)
+        for name, work in launches.items()
     }
     where = wp.to_torch(out).device
     for size in _copy_sizes(device):

@@ -59,7 +59,7 @@ def _area(u: Array, v: Array) -> Array:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def _under(corners: Array, point: Array) -> Array:
+def under(corners: Array, point: Array) -> Array:
     """Barycentric weights (num, 3) of the vertical through ``point`` in each triangle."""
     a, b, c = corners[:, 0, :2], corners[:, 1, :2], corners[:, 2, :2]
     q = np.float64(point)
@@ -70,17 +70,9 @@ def _under(corners: Array, point: Array) -> Array:
 def surface_height(grid: Array, spacing: float, x: float, y: float) -> float:
     """Height of the triangulated surface at one (x, y)."""
     corners = triangles(grid, spacing, x, y, 0.0)
-    weights = _under(corners, (x, y))
+    weights = under(corners, (x, y))
     k = np.argmax(weights.min(axis=1))
     return float(weights[k] @ corners[k, :, 2])
-
-
-def surface_normal(grid: Array, spacing: float, x: float, y: float) -> Array:
-    """Upward unit normal of the triangle at one (x, y)."""
-    corners = triangles(grid, spacing, x, y, 0.0)
-    a, b, c = corners[np.argmax(_under(corners, (x, y)).min(axis=1))]
-    normal = np.cross(b - a, c - a)
-    return normal / np.linalg.norm(normal)
 
 
 def _nearest_on_segments(p: Array, start: Array, end: Array) -> Array:
@@ -202,20 +194,3 @@ def goal_command(
     to_goal = np.float64(goal) - position
     error = (np.arctan2(to_goal[1], to_goal[0]) - yaw + np.pi) % (2 * np.pi) - np.pi
     return np.array([speed * np.cos(error), speed * np.sin(error), np.clip(gain * error, -limit, limit)])
-
-
-def outcome(
-    q: Array, qd: Array, base_force: float, overflow: int, steps: int, max_steps: int,
-    goal: tuple[float, float] = (14.0, 4.0),
-) -> str:  # fmt: skip
-    """Name of how an episode stands after a step (definitions: a crossing)."""
-    state = np.concatenate([q, qd])
-    if not np.isfinite(state).all() or np.abs(qd).max() > 100 or overflow & ~(512 | 1024):
-        return "INVALID"
-    if base_force > 1:
-        return "BASE_COLLISION"
-    if np.hypot(*(np.asarray(goal) - q[:2])) < 0.5:
-        return "GOAL"
-    if abs(q[1] - 4) > 6 or q[0] < -2 or q[0] > 18:
-        return "OUT"
-    return "TIME_OUT" if steps >= max_steps else "RUNNING"

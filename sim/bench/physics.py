@@ -250,14 +250,6 @@ def time_control_step(scene: Scene) -> float:
     return _time(lambda: [rollout.control_step() for _ in range(steps)], rollout.sim.device) / steps
 
 
-def _build_heightfield(sim: Simulation) -> tuple[HeightfieldSimulation | None, str | None]:
-    """The simulation to compare with, or why there is none; a failure of the solver's collision stops nothing."""
-    try:
-        return HeightfieldSimulation(sim), None
-    except Exception as error:
-        return None, f"{type(error).__name__}: {error}"[:300]
-
-
 def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of the whole step, and the physics rates with either collision.
 
@@ -269,7 +261,12 @@ def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[
     sim = scene.rollout.sim
     seconds = sorted(time_control_step(scene) for _ in range(3))[1]
     segments = record_segments(scene.rollout, scene.genes, scene.seeds)
-    other, failure = _build_heightfield(sim) if heightfield else (None, "not asked for")
+    other, failure = None, None if heightfield else "not asked for"
+    if heightfield:
+        try:
+            other = HeightfieldSimulation(sim)
+        except Exception as error:  # a failure of the solver's collision stops nothing
+            failure = f"{type(error).__name__}: {error}"[:300]
     collision = measure_collision(sim, other, segments, rounds=rounds)
     bare_s = sim.num_envs * scene.robot.decimation / collision["physics_steps_per_s"]
     row = {

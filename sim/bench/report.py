@@ -64,13 +64,6 @@ def _time_cold(case: Case, device: str, timing: TimingCfg) -> float:
 def measure_case(case: Case, ceiling: Ceiling, device: str, timing: TimingCfg, *, compiled: bool) -> dict[str, Any]:
     """One row of the results.
 
-    Args:
-        case: The kernel.
-        ceiling: What the device can do.
-        device: Warp device name.
-        timing: How long.
-        compiled: Whether to compile the counterpart too.
-
     Raises:
         OutputError: If an output of any variant is not what the oracle says.
     """
@@ -94,7 +87,7 @@ def measure_case(case: Case, ceiling: Ceiling, device: str, timing: TimingCfg, *
         "torch_compile_ms": None if by_compile is None else by_compile * 1e3,
         "speedup": seconds["torch"] / seconds["ours"],
         "speedup_compile": None if by_compile is None else by_compile / seconds["ours"],
-        **asdict(ceiling.judge(case.work, seconds["ours"])),
+        **ceiling.judge(case.work, seconds["ours"]),
         "ours_cold_ms": None if cold is None else cold * 1e3,
         "per_control_step": case.per_control_step,
         "part_of": case.part_of,
@@ -138,11 +131,6 @@ def add_shares(rows: list[dict[str, Any]], step_ms: float) -> float:
 
 def measure(robot: RobotCfg, cfg: Bench, device: str) -> dict[str, Any]:
     """Checks and times everything.
-
-    Args:
-        robot: Robot settings.
-        cfg: Options of the command.
-        device: Warp device name.
 
     Returns:
         The results file without its provenance.

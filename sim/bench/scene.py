@@ -84,12 +84,7 @@ def _build_rollout(robot: RobotCfg, cfg: SceneCfg, device: str) -> Rollout:
 
 
 def build_scene(robot: RobotCfg, cfg: SceneCfg, device: str) -> Scene:
-    """Build the simulation and let the robots walk.
-
-    Args:
-        robot: Robot settings; its shipped controller walks.
-        cfg: Sizes.
-        device: Warp device name.
+    """Builds the simulation and lets the robots walk, by their shipped controller.
 
     Raises:
         ValueError: If fewer than half of the robots still stand on something: nothing would be worth timing.

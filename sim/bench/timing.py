@@ -8,6 +8,8 @@ from typing import Any
 import torch
 import warp as wp
 
+from sim.files.settings import check, setting
+
 MAX_LAUNCHES = 200
 
 
@@ -15,14 +17,13 @@ MAX_LAUNCHES = 200
 class TimingCfg:
     """How long to time."""
 
-    rounds: int = 20
+    rounds: int = setting(20, least=1)
     """Replays of each variant, in turns; the median counts."""
-    replay_s: float = 2e-3
+    replay_s: float = setting(2e-3, above=0)
     """Wanted length of one replay [s]: as many launches as that takes, at most 200."""
 
     def __post_init__(self) -> None:
-        if self.rounds < 1 or not self.replay_s > 0.0:
-            raise ValueError(f"rounds and replay_s must be positive, got {self.rounds} and {self.replay_s}")
+        check(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,11 +19,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     """Replaces a file in one step that survives a kill and a power cut.
 
     The temporary file has a fixed name beside the target, so that what a kill leaves behind is overwritten by the next
-    write instead of piling up.
-
-    Args:
-        path: File to write; its folder exists.
-        data: The whole content.
+    write instead of piling up. The folder exists.
 
     Raises:
         OSError: If the file cannot be written, as on a full disk; the old file, or the new one, is then whole.

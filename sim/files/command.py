@@ -9,7 +9,7 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,38 +143,42 @@ def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:
 
 
 def command_line(name: str, **flags: object) -> str:
-    """A command as one types it here: ``faultline replay --run runs/x --elite 0``.
+    """A command that runs as it stands, typed in the present folder: ``faultline replay --run runs/x --elite 0``.
 
     Args:
         name: The word that calls it.
         flags: Values by field name; None and False are left out, True is a bare flag.
     """
-    return f"{shlex.quote(_program())} {_typed(name, flags)}"
+    return shlex.join([*_program(), name, *_words(flags)])
 
 
 def plain_command(name: str, **flags: object) -> str:
-    """The same for a page that may be read on another machine: the program is ``faultline`` there."""
-    return f"faultline {_typed(name, flags)}"
+    """:func:`command_line` for a file that others read: ``faultline`` without where it is installed here."""
+    return shlex.join(["faultline", name, *_words(flags)])
 
 
-def _typed(name: str, flags: dict[str, object]) -> str:
-    words = [name]
-    for flag, value in flags.items():
-        if value is None or value is False:
-            continue
-        words.append(f"--{flag.replace('_', '-')}")
-        if value is not True:
-            words += map(str, value) if isinstance(value, list | tuple) else [str(value)]
-    return shlex.join(words)
+def _words(flags: Mapping[str, object]) -> Iterator[str]:
+    for field, value in flags.items():
+        flag = f"--{field.replace('_', '-')}"
+        if value is True:
+            yield flag
+        elif isinstance(value, list | tuple):
+            yield from (flag, *map(str, value))
+        elif str(value).startswith("-"):  # would be taken for a flag
+            yield f"{flag}={value}"
+        elif value is not None and value is not False:
+            yield from (flag, str(value))
 
 
-def _program() -> str:
-    """How ``faultline`` is called on this machine: as it was called, or beside the interpreter that runs."""
-    called = Path(sys.argv[0])
+def _program() -> list[str]:
+    """How ``faultline`` is called on this machine: as it was, beside the interpreter that runs, or as a module."""
+    called, beside = Path(sys.argv[0]), Path(sys.executable).with_name("faultline")
+    found = shutil.which("faultline")
+    if found is not None and found in (str(called), str(beside)):
+        return ["faultline"]
     if called.name == "faultline":
-        return "faultline" if shutil.which("faultline") == str(called) else str(called)
-    beside = Path(sys.executable).with_name("faultline")
-    return os.path.relpath(beside) if beside.exists() and not shutil.which("faultline") else "faultline"
+        return [str(called)]
+    return [os.path.relpath(beside)] if beside.exists() else [sys.executable, "-m", "faultline"]
 
 
 def split_words(values: Sequence[str]) -> list[str]:
@@ -208,11 +212,6 @@ def publish(
     out: Path | None, measure: Callable[[], dict[str, Any]], show: Callable[[dict[str, Any]], None]
 ) -> dict[str, Any]:
     """Measures, shows and writes a report, which is returned; where to write is tried before the work.
-
-    Args:
-        out: File to write; None for none.
-        measure: Makes the report.
-        show: Prints it.
 
     Raises:
         ValueError: If the file cannot be written to.

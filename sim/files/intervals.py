@@ -52,15 +52,7 @@ def rate_words(hits: int, count: int, *, short: bool = False) -> str:
     return words if short else f"{hits} of {count} ({words.replace(' (', ', ')}"
 
 
-def bootstrap_interval(values: NDArray[np.floating], rng: np.random.Generator) -> list[float] | None:
-    """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains; None without any."""
-    if len(values) == 0:
-        return None
-    means = values[rng.integers(len(values), size=(_BOOTSTRAP_DRAWS, len(values)))].mean(axis=1)
-    return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
-
-
-@lru_cache(maxsize=4)  # of a few sizes of sets, some 25 MB each
+@lru_cache(maxsize=3)  # of a few sizes of sets, 80 kB a terrain
 def _resamples(count: int, seed: int) -> NDArray[np.float64]:
     """How often each of ``count`` terrains is drawn in each resample, shape (draws, count)."""
     drawn = np.random.default_rng(seed).integers(count, size=(_BOOTSTRAP_DRAWS, count))
@@ -68,12 +60,10 @@ def _resamples(count: int, seed: int) -> NDArray[np.float64]:
     return np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape).astype(np.float64)
 
 
-def paired_interval(values: NDArray[np.floating], seed: int) -> list[float] | None:
-    """:func:`bootstrap_interval` with the same resamples for all values of equally many terrains, and a tenth the time.
+def bootstrap_interval(values: NDArray[np.floating], seed: int) -> list[float] | None:
+    """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains; None without any.
 
-    Args:
-        values: One a terrain, shape (num_terrains,).
-        seed: Of the resamples.
+    One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
     """
     if len(values) == 0:
         return None

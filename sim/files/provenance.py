@@ -18,12 +18,7 @@ _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxrunti
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:
-    """Command, commit, device, versions, seed and date of the running program.
-
-    Args:
-        device: Warp device name.
-        seed: Seed of the run.
-    """
+    """Command, commit, device, versions, seed and date of the running program."""
     return {
         "command": _command(),
         "commit": os.environ.get("FAULTLINE_COMMIT") or _output(["git", "rev-parse", "HEAD"]),
@@ -40,11 +35,7 @@ def versions() -> dict[str, str | None]:
 
 
 def code_fingerprint(rooms: Sequence[str]) -> str:
-    """SHA-256 of the sources and robot files of rooms and of all package versions: two that agree compute the same.
-
-    Args:
-        rooms: Top-level folders.
-    """
+    """SHA-256 of the sources and robot files of rooms and of all package versions: equal ones compute the same."""
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
     for room in rooms:
         for path in sorted((_ROOT / room).rglob("*")):

@@ -23,7 +23,7 @@ from sim.files.atomic import to_json, write_atomically
 from sim.terrain import SPACING
 
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
-_FLAT_EXTENT = 1e-3  # of flat ground, where data are all 0: a size may not be
+_LEAST_EXTENT = 1e-3  # of flat ground, whose range is 0 where a size or scale may not be [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ def as_hfield(heights: NDArray[np.floating], *, margin: int = 0, thickness: floa
         thickness: Of the ground below its lowest point [m].
     """
     grid = np.pad(np.asarray(heights, dtype=np.float64), margin, mode="edge")
-    lowest, extent = float(grid.min()), float(np.ptp(grid)) or _FLAT_EXTENT
+    lowest, extent = float(grid.min()), float(np.ptp(grid)) or _LEAST_EXTENT
     half_y, half_x = (0.5 * SPACING * (count - 1) for count in grid.shape)
     centre_y, centre_x = (0.5 * SPACING * (count - 1) for count in heights.shape)
     return Hfield(
@@ -62,7 +62,6 @@ def as_hfield(heights: NDArray[np.floating], *, margin: int = 0, thickness: floa
 Heights = NDArray[np.floating]
 
 _MAX_GRAY = 65_535
-_LEAST_EXTENT = 1e-3  # of the range of a PNG [m], or flat ground would have no scale
 _STL_HEADER = 80
 _BASE_BELOW = 0.5  # depth of the block under the lowest point of an STL [m]
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -17,6 +17,7 @@ from sim.bank import TerrainBank
 from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
 from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
+from sim.files.npz import read_arrays
 from sim.files.provenance import provenance
 from sim.files.settings import check
 from sim.mujoco_c.crossing import draw_starts, run_plain
@@ -40,25 +41,16 @@ def read_pool(path: Path) -> NDArray[np.float32]:
         ValueError: If the file holds none.
     """
     try:
-        with np.load(path, allow_pickle=False) as content:
-            genes = content["genes"]
+        genes = read_arrays(path, ["genes"])["genes"]
     except Exception as error:  # a damaged zip archive can fail with anything
         raise ValueError(f"--genes {path}: expected an .npz file with an array 'genes', got: {error}") from error
-    if genes.ndim == 2 and genes.dtype.kind == "f":
+    try:
+        if not len(genes) or genes.dtype.kind != "f":
+            raise ValueError(f"they must be floats, one row a terrain, got {genes.dtype} of shape {genes.shape}")
         with np.errstate(over="ignore"):
-            genes = genes.astype(np.float32)
-    if (
-        genes.ndim != 2
-        or genes.shape[1] != SUPER_GAUSSIAN.num_genes
-        or not len(genes)
-        or genes.dtype.kind != "f"
-        or not np.isfinite(genes).all()
-    ):
-        raise ValueError(
-            f"--genes {path}: 'genes' must be finite floats of shape (num_terrains, 64), got {genes.dtype} of shape "
-            f"{genes.shape}"
-        )
-    return genes
+            return SUPER_GAUSSIAN.validate(genes.astype(np.float32))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"--genes {path}: 'genes': {error}") from None
 
 
 def success_rates(result: RolloutResult) -> NDArray[np.float64]:
@@ -243,10 +235,6 @@ def _compare(pair: Pair, kind: str) -> dict[str, Any]:
 def summarise(pairs: Sequence[Pair], seed: int) -> dict[str, Any]:
     """Rates side by side, a row a terrain, and the bias of the mean: MuJoCo C's rate minus ours.
 
-    Args:
-        pairs: One a terrain.
-        seed: Of the bootstrap over terrains.
-
     Raises:
         ValueError: If no terrain has a valid episode in both; one that has none is left out and named.
     """
@@ -277,7 +265,7 @@ def summarise(pairs: Sequence[Pair], seed: int) -> dict[str, Any]:
             "ours": float(ours.mean()),
             "mujoco_c": float(plain.mean()),
             "bias": float((plain - ours).mean()),
-            "bias_interval": bootstrap_interval(plain - ours, np.random.default_rng(seed)),
+            "bias_interval": bootstrap_interval(plain - ours, seed),
         }
     return {**totals, "invalid": invalid, "left_out": left_out, "terrains": rows}
 

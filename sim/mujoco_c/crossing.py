@@ -6,9 +6,9 @@ import signal
 import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -250,6 +250,10 @@ def _cross_chunk(heights: NDArray[np.float32], starts: Starts, time_constant_s: 
     return cross(_worker["robot"], _worker["policy"], heights, starts, time_constant_s=time_constant_s)
 
 
+def _chunks(rows: Array) -> list[Array]:
+    return [rows[k : k + _CHUNK] for k in range(0, len(rows), _CHUNK)]
+
+
 def run_plain(
     robot: RobotCfg,
     policy: str,
@@ -270,28 +274,22 @@ def run_plain(
         time_constant_s: Contact time constant [s]; that of the robot's file if None.
     """
     context = multiprocessing.get_context("spawn")
-    parts: list[list[PlainCrossings | None]] = []
     pool = ProcessPoolExecutor(
         processes, mp_context=context, initializer=_start_worker, initargs=(robot, policy, os.getpid())
     )
     try:
-        place: dict[Future[PlainCrossings], tuple[int, int]] = {}
-        for terrain, start in enumerate(starts):
-            chunks = [slice(k, k + _CHUNK) for k in range(0, len(start.qpos), _CHUNK)]
-            parts.append([None] * len(chunks))
-            for k, rows in enumerate(chunks):
-                chunk = replace(start, qpos=start.qpos[rows], qvel=start.qvel[rows])
-                place[pool.submit(_cross_chunk, heights[terrain], chunk, time_constant_s)] = terrain, k
-        waiting = set(place)
+        parts = [
+            [
+                pool.submit(_cross_chunk, grid, Starts(qpos=qpos, qvel=qvel), time_constant_s)
+                for qpos, qvel in zip(_chunks(start.qpos), _chunks(start.qvel), strict=True)
+            ]
+            for grid, start in zip(heights, starts, strict=True)
+        ]
         with tqdm(desc="plain MuJoCo", total=sum(len(s.qpos) for s in starts), unit="episode", disable=None) as bar:
-            while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    terrain, k = place[future]
-                    parts[terrain][k] = future.result()
-                    bar.update(len(future.result().outcome))
+            for done in as_completed([part for terrain in parts for part in terrain]):
+                bar.update(len(done.result().outcome))
     except BrokenProcessPool as error:
         raise OSError(f"a process of plain MuJoCo died: {error}") from None
     finally:
         pool.shutdown(cancel_futures=True)
-    return [join([part for part in terrain if part is not None]) for terrain in parts]
+    return [join([part.result() for part in terrain]) for terrain in parts]

@@ -33,10 +33,7 @@ class OnnxPolicy:
         self._input, self._output = session.get_inputs()[0].name, session.get_outputs()[0].name
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
-        """Actions, shape (num_envs, num_joints), on the device of the observations.
-
-        Args:
-            observation: Shape (num_envs, observation_size).
+        """Actions (num_envs, num_joints) on the device of the observations (num_envs, observation_size).
 
         Raises:
             Exception: One of onnxruntime's own, if the graph does not take these rows.

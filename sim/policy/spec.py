@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
-_NAMED = re.compile(
-    r"(?P<place>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?",
-    re.DOTALL,
-)
+_NAMED = re.compile(r"(?P<place>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,9 +150,6 @@ def find_named(place: str, name: str) -> Any:
         found = getattr(found, part)
     return found
 
-
-if TYPE_CHECKING:
-    from sim.robots.robot import RobotCfg
 
 MARK = "@"
 """Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""

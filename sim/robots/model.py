@@ -283,15 +283,9 @@ def _joint_problems(builder: newton.ModelBuilder, joints: Sequence[str]) -> list
 
 
 def drive_problems(builder: newton.ModelBuilder, root: ET.Element, joints: Sequence[str]) -> list[str]:
-    """Drives and joints that MuJoCo would move otherwise than the simulation, one line each.
-
-    Args:
-        builder: The robot.
-        root: Of its file.
-        joints: Names of its joints.
-    """
-    attributes = {name: builder.custom_attributes[f"mujoco:{name}"].values for name in _ATTRIBUTES}
-    sources, biases, gears, targets = (_listed(attributes[name]) for name in _ATTRIBUTES[:4])
+    """Drives and joints that MuJoCo would move otherwise than the simulation, one line each; ``root`` is the file's."""
+    attributes: dict[str, Any] = {name: builder.custom_attributes[f"mujoco:{name}"].values for name in _ATTRIBUTES}
+    sources, biases, gears, targets = (list(attributes[name] or ()) for name in _ATTRIBUTES[:4])
     direct = newton.solvers.SolverMuJoCo.CtrlSource.CTRL_DIRECT
     driven = [int(target[0]) for target, source in zip(targets, sources, strict=True) if source != direct]
     refs: Any = attributes["dof_ref"] or {}
@@ -309,10 +303,6 @@ def drive_problems(builder: newton.ModelBuilder, root: ET.Element, joints: Seque
         for what, names in found.items()
         if names
     ]
-
-
-def _listed(values: Any) -> list[Any]:
-    return list(values or ())
 
 
 _ATTRIBUTES = ("ctrl_source", "actuator_biasprm", "actuator_gear", "actuator_trnid", "dof_ref")

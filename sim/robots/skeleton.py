@@ -23,9 +23,6 @@ def robot_spec(robot: RobotCfg) -> Any:
     Shapes without a name are named as the simulation names them: those of a URDF by their link, those of an MJCF that
     touch anything ``<body>_geom_<k>``.
 
-    Args:
-        robot: Robot settings.
-
     Raises:
         ValueError: If MuJoCo cannot read the file, or finds other joints.
     """
@@ -81,7 +78,6 @@ def _urdf_spec(root: ET.Element) -> Any:
     return spec
 
 
-_mj: Any = mujoco  # its types are not written down
 _KINDS = {
     int(getattr(_mj.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
     for kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
@@ -117,9 +113,6 @@ class Skeleton:
 
     def __init__(self, robot: RobotCfg) -> None:
         """Read the robot's file.
-
-        Args:
-            robot: Robot settings.
 
         Raises:
             ValueError: If MuJoCo cannot read the file, or its joints are not a free one and the robot's.

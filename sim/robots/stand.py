@@ -55,14 +55,7 @@ class Standing:
 
 
 def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32, seed: int = 0) -> Standing:
-    """Stands one robot on flat ground and drops others.
-
-    Args:
-        robot: Robot settings.
-        device: Warp device name.
-        seconds: How long [s].
-        drops: How many are dropped.
-        seed: Draws their poses and terrains.
+    """Stands one robot on flat ground for ``seconds`` and drops ``drops`` others in drawn poses on drawn terrains.
 
     Raises:
         ValueError: If settings and model do not agree.

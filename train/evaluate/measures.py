@@ -148,9 +148,8 @@ def summarise(
     rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
     everywhere = np.ones(len(result.outcome), bool)
     summary = _group(rates, everywhere)
-    rng = np.random.default_rng(seed)
     for name, values in rates.items():
-        summary[f"{name}_interval"] = bootstrap_interval(values[~np.isnan(values)], rng)
+        summary[f"{name}_interval"] = bootstrap_interval(values[~np.isnan(values)], seed)
     summary["episodes"] = int(result.outcome.size)
     summary["outcomes"] = count_outcomes(result)
     summary["invalid_terrains"] = int(np.isnan(rates["success_rate"]).sum())
@@ -175,7 +174,7 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
     per_terrain = np.array([row[use].mean() for row, use in zip(error, usable, strict=True) if use.any()])
     return {
         "vx_error_mean": float(error[usable].mean()) if usable.any() else None,
-        "vx_error_interval": bootstrap_interval(per_terrain, np.random.default_rng(seed)),
+        "vx_error_interval": bootstrap_interval(per_terrain, seed),
         "episodes": int(usable.sum()),
         "goal_rate": float(result.reached_goal.mean()),
     }

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.fitness import FAILING_GOAL_RATE
-from sim.files.intervals import MAX_T_VALUES, paired_interval, t_interval, wilson_interval
+from sim.files.intervals import MAX_T_VALUES, bootstrap_interval, t_interval, wilson_interval
 from sim.policy.spec import MARK, controller_hash, firsts, kind_of
 from sim.robots.robot import RobotCfg
 from train.evaluate.measures import MEASURES, Measured
@@ -129,7 +129,7 @@ def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], se
             found[kind]["clear"] = int((member & apart).sum())
     gains = {name: (after.values[name] - before.values[name])[both] for name in MEASURES}
     found["gain"] = {
-        name: {"mean": _mean(gain), "interval": paired_interval(gain, seed)} for name, gain in gains.items()
+        name: {"mean": _mean(gain), "interval": bootstrap_interval(gain, seed)} for name, gain in gains.items()
     }
     return found
 
@@ -149,7 +149,7 @@ def _counted(
     return {
         "count": int(member.sum()),
         "share": _mean(shares),
-        "interval": paired_interval(shares, seed),
+        "interval": bootstrap_interval(shares, seed),
         "terrains": np.sort(numbers[member]).tolist(),
     }
 
@@ -238,4 +238,4 @@ def _mean(values: NDArray[np.float64]) -> float | None:
 
 
 def _interval(values: NDArray[np.float64], seed: int) -> list[float] | None:
-    return paired_interval(values[~np.isnan(values)], seed)
+    return bootstrap_interval(values[~np.isnan(values)], seed)

@@ -16,7 +16,7 @@ _TRAINED_ON = {
     "C-G": "hand-crafted ones and elites",
     "C-F": "hand-crafted ones and elites, drawn by how often it fails them",
 }
-"""What controllers are trained further on that are named as the paper and the README name them."""
+"""What controllers are trained further on that are named as the paper and docs/results-anymal.md name them."""
 
 
 def tables_section(shown: Shown) -> Section:

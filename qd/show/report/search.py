@@ -95,7 +95,7 @@ def _common(shown: Shown) -> str:
 def _rate(rates: np.ndarray) -> str:
     """Mean over terrains with its interval; of few terrains without, since resampling them says too little."""
     mean = percent(float(rates.mean()))
-    limits = bootstrap_interval(rates, np.random.default_rng(0)) if len(rates) >= _MIN_TERRAINS else None
+    limits = bootstrap_interval(rates, 0) if len(rates) >= _MIN_TERRAINS else None
     return mean if limits is None else f"{mean} ({percent(limits[0])} to {percent(limits[1])})"
 
 

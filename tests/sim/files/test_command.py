@@ -99,7 +99,18 @@ def test_a_command_line_can_be_typed(monkeypatch):
     assert command_line("replay", **flags) == "/opt/bin/faultline replay --run 'runs/a b' --elite 0 1 --reward"
     monkeypatch.setattr("sim.files.command.shutil.which", lambda name: "/opt/bin/faultline")
     assert command_line("view", workers="ray:4") == "faultline view --workers ray:4"
-    assert plain_command("view", elite=3) == "faultline view --elite 3"
+    assert command_line("view", run=Path("-x"), seed=-1) == "faultline view --run=-x --seed=-1"
+
+
+def test_a_command_line_is_called_as_on_this_machine(tmp_path, monkeypatch):
+    monkeypatch.setattr("sim.files.command.shutil.which", lambda name: None)
+    monkeypatch.setattr(sys, "argv", ["pytest"])
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    assert command_line("view") == f"{tmp_path}/python -m faultline view"
+    (tmp_path / "faultline").touch()
+    monkeypatch.chdir(tmp_path.parent)
+    assert command_line("view", elite=1) == f"{tmp_path.name}/faultline view --elite 1"
+    assert plain_command("view", elite=1) == "faultline view --elite 1"
 
 
 def test_a_report_is_shown_and_written(tmp_path, capsys):

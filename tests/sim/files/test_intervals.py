@@ -5,7 +5,6 @@ import pytest
 
 from sim.files.intervals import (
     bootstrap_interval,
-    paired_interval,
     rate_words,
     t_interval,
     value_words,
@@ -35,15 +34,6 @@ def test_more_values_than_quantiles_are_refused():
         t_interval(np.zeros(11))
 
 
-def test_the_interval_from_shared_resamples_is_the_bootstraps():
-    values = np.random.default_rng(1).random(80)
-    expected = bootstrap_interval(values, np.random.default_rng(3))
-    assert paired_interval(values, 3) == pytest.approx(expected, abs=1e-12)
-    assert paired_interval(values, 4) != pytest.approx(expected, abs=1e-6)
-    assert paired_interval(np.ones(7), 0) == [1.0, 1.0]
-    assert paired_interval(np.empty(0), 0) is None
-
-
 def test_wilson_interval_by_hand():
     # 10 of 20: centre 0.5, half width 1.96 sqrt(0.0125 + 0.0480) / (1 + 0.192) = 0.2007 (Wilson 1927).
     np.testing.assert_allclose(wilson_interval(10, 20), [0.2993, 0.7007], atol=1e-4)
@@ -67,7 +57,15 @@ def test_rates_and_values_in_words():
 
 
 def test_bootstrap_interval():
-    low, high = bootstrap_interval(np.array([0.0, 1.0] * 50), np.random.default_rng(0))
+    low, high = bootstrap_interval(np.array([0.0, 1.0] * 50), 0)
     # The mean of 100 draws of 0 or 1: 0.5 +- 1.96 * 0.05.
     np.testing.assert_allclose([low, high], [0.40, 0.60], atol=0.02)
-    assert bootstrap_interval(np.array([]), np.random.default_rng(0)) is None
+    assert bootstrap_interval(np.array([]), 0) is None
+
+
+def test_the_bootstrap_resamples_terrains():
+    values, rng = np.random.default_rng(1).random(80), np.random.default_rng(3)
+    means = [values[rng.integers(80, size=80)].mean() for _ in range(10_000)]
+    assert bootstrap_interval(values, 3) == pytest.approx(np.quantile(means, [0.025, 0.975]).tolist(), abs=1e-12)
+    assert bootstrap_interval(values, 4) != pytest.approx(bootstrap_interval(values, 3), abs=1e-6)
+    assert bootstrap_interval(np.ones(7), 0) == [1.0, 1.0]
