@@ -82,7 +82,8 @@ def act(observation):
 
 def prepare(folder: Path) -> None:
     """What the pages take for granted: robot, controllers, a map, and runs."""
-    shutil.copytree(ROOT / "results", folder / "results")
+    for name in ("results", "docs"):
+        shutil.copytree(ROOT / name, folder / name)
     write_dog(folder / "mine")
     (walk,) = [code for code in code_of("README.md", "python") if "def act" in code]
     (folder / "mine" / "walk.py").write_text(walk)
