@@ -49,7 +49,7 @@ class Speed:
     curve: tuple[int, ...] = (1024, 2048, 4096, 8192, 16384, 32768)
     """Numbers of environments of the curve, multiples of 16; none to leave it out."""
     train_speed: Path | None = None
-    """Output of train.ppo.speed, whose rates are taken over."""
+    """Output of `faultline train-speed`, whose rates are taken over."""
     out: Path | None = None
     """Where to write; printed alone if left out."""
 
@@ -125,12 +125,12 @@ def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[in
 
 
 def training_rates(file: Path | None) -> dict[str, float | None]:
-    """PPO's env-steps a second with learning, as train.ppo.speed wrote them; None where it did not run."""
+    """PPO's env-steps a second with learning, as `faultline train-speed` wrote them; None where it did not run."""
     try:
         rows = read_json(file)["training"] if file else []
         rate = {row["num_envs"]: float(row["train_env_steps_per_s"]) for row in rows}
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file} must be the output of train.ppo.speed, but: {error}: give its --out") from None
+        raise ValueError(f"{file} must be the output of faultline train-speed, but: {error}: give its --out") from None
     return {"train_env_steps_per_s": rate.get(4096), "train_env_steps_per_s_8192": rate.get(8192)}
 
 

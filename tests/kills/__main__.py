@@ -1,7 +1,7 @@
 """Kills searches at random moments, goes on with each until it is done, and says whether all came to the same bits.
 
 ``python -m tests.kills --kills 100 --real`` does so to ``faultline archive`` with the real simulation on the CPU,
-every other time to its main process alone, and writes ``results/<robot>/faults.json``.
+every other time to its main process alone, and writes ``results/<robot>/kills.json``.
 """
 
 import sys
@@ -22,7 +22,7 @@ _ROBOT = "anymal"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FaultsCfg:
+class KillsCfg:
     """Kill searches at random moments and go on with each until it is done."""
 
     kills: int = 100
@@ -36,15 +36,15 @@ class FaultsCfg:
     seed: int = 0
     """Draws the moments."""
     out: Path | None = None
-    """Where to write the numbers; results/<robot>/faults.json with --real, else nowhere."""
+    """Where to write the numbers; results/<robot>/kills.json with --real, else nowhere."""
 
     def execute(self) -> None:
         """Runs the command."""
         main(self)
 
 
-def measure(cfg: FaultsCfg, folder: Path) -> dict[str, Any]:
-    """Everything of ``faults.json``.
+def measure(cfg: KillsCfg, folder: Path) -> dict[str, Any]:
+    """Everything of ``kills.json``.
 
     Raises:
         AssertionError: If something was lost or differs.
@@ -83,9 +83,9 @@ def measure(cfg: FaultsCfg, folder: Path) -> dict[str, Any]:
     }
 
 
-def main(cfg: FaultsCfg) -> None:
+def main(cfg: KillsCfg) -> None:
     """The command."""
-    out = cfg.out or (Path("results") / _ROBOT / "faults.json" if cfg.real else None)
+    out = cfg.out or (Path("results") / _ROBOT / "kills.json" if cfg.real else None)
     if out is not None:
         prepare_output(out)
     with tempfile.TemporaryDirectory() as folder:
@@ -97,4 +97,4 @@ def main(cfg: FaultsCfg) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_command(FaultsCfg, sys.argv[1:], name="kills"))
+    sys.exit(run_command(KillsCfg, sys.argv[1:], name="kills"))
