@@ -406,7 +406,7 @@ def _share_of(worker: _Worker) -> float:
     elif ray.wait([worker.question], timeout=0)[0]:
         question, worker.question = worker.question, None
         try:
-            share = ray.get(question)
+            share: Any = ray.get(question)
             if share != worker.share:
                 worker.share, worker.moved_at = share, time.monotonic()
         except RayError:
