@@ -106,6 +106,11 @@ class Archive(Evaluation):
         """Mean fitness of the elites; 0 without any."""
         return float(self.fitness.mean()) if len(self) else 0.0
 
+    def scores(self) -> dict[str, Any]:
+        """How good the archive is, as metrics have it."""
+        names = ("reachable_coverage", "qd_score", "mean_fitness")
+        return {"elites": len(self), **{name: getattr(self, name) for name in names}}
+
     @property
     def collided(self) -> NDArray[np.bool_]:
         """Whether any of the episodes that found an elite had a base collision, as the paper counts, shape (N,)."""

@@ -1,7 +1,7 @@
 """Fitness: how hard, and how reliably hard, a terrain is for the controller (the paper's fitness equation)."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,19 @@ class Evaluation:
     def valid(self) -> NDArray[np.bool_]:
         """Whether a terrain's numbers mean anything, shape (T,)."""
         return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes
+
+    def means(self) -> dict[str, Any]:
+        """What the terrains were like on the whole, as a row of metrics has it."""
+        return {
+            "terrains": len(self.fitness),
+            "episodes": int(self.episodes.sum()),
+            "invalid_episodes": int(self.invalid_episodes.sum()),
+            "invalid_terrains": int((~self.valid).sum()),
+            **{
+                f"batch_{name}": float(getattr(self, name).mean())
+                for name in ("fitness", "collision_rate", "goal_rate")
+            },
+        }
 
 
 def paper_fitness(

@@ -18,7 +18,7 @@ from qd.archive import Archive, FreshValues
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, FitnessCfg, evaluation_of
 from qd.run.arguments import evaluator_of
-from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, origin_in
+from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, origin_in, write_results
 from qd.run.progress import share_bar
 from qd.run.settings import SearchCfg, file_hash, policy_spec, refuse_unnamed_code
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, open_evaluator, origin_of, resolve_device
@@ -104,17 +104,14 @@ def _held_against(archive: Archive, result: Any, fitness: FitnessCfg) -> FreshVa
     collided = (result.base_collision & ~result.invalid)[:, :_BIT_EPISODES].any(axis=1)
     cell = cells.cell_of(fresh.ratios, collided)
     counted = np.where(fresh.valid, fresh.episodes - fresh.invalid_episodes, 0)  # an invalid terrain says nothing
-    limits = np.array([_interval(*row) for row in zip(fresh.collision_rate, counted.tolist(), strict=True)])
+    hits = np.rint(fresh.collision_rate * counted).astype(int)
+    limits = np.array([wilson_interval(*row) for row in zip(hits.tolist(), counted.tolist(), strict=True)])
     return FreshValues(
         **{**vars(fresh), "cell": cell},
         collision_low=limits[:, 0],
         collision_high=limits[:, 1],
         reproduced=fresh.valid & cells.are_neighbours(archive.cell, cell),
     )
-
-
-def _interval(rate: float, count: int) -> tuple[float, float]:
-    return wilson_interval(round(rate * count), count) if count else (0.0, 1.0)
 
 
 def _nothing(cells: Cells) -> FreshValues:
@@ -220,7 +217,6 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         Interrupted: On Ctrl-C; the run is as it was.
         EvaluatorError: If a worker is lost; likewise.
     """
-    from qd.search import write_results
     from sim.robots.robot import get_robot, robot_of
 
     path = args.run or newest_run(get_robot(args.robot or "anymal"))
@@ -247,7 +243,7 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         if args.policy is not None:
             by |= {"policy": args.policy, "policy_sha256": file_hash(args.policy)}
         with naming_what_is_next("some files may not be written", lambda: again):
-            write_results(run, archive, metrics, {**origin_in(config), "reproduced_by": by})
+            write_results(run, archive, metrics, origin_in(config), reproduced_by=by)
     return archive
 
 

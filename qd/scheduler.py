@@ -15,7 +15,7 @@ from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.run.settings import SchedulerCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, clipped, get_space
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
 
@@ -122,7 +122,7 @@ class Scheduler:
             Clipped genes, shape (emitters * batch_size, num_genes).
         """
         self._asked = np.concatenate([emitter.ask() for emitter in self.emitters])
-        return _clip(self._asked)
+        return clipped(self._asked)
 
     def tell(self, evaluation: Evaluation, iteration: int) -> None:
         """What became of the terrains last asked for.
@@ -199,17 +199,9 @@ class Scheduler:
 
 
 _FIELDS = (
-    "genes",
-    "ratios",
-    "penalty_mean",
-    "penalty_std",
-    "collision_rate",
-    "goal_rate",
-    "fallen_rate",
-    "invalid_episodes",
-    "episodes",
-    "iteration",
-)
+    "genes", "ratios", "penalty_mean", "penalty_std", "collision_rate", "goal_rate", "fallen_rate", "invalid_episodes",
+    "episodes", "iteration",
+)  # fmt: skip
 
 
 def _make_archive(
@@ -231,11 +223,6 @@ def _make_archive(
     )
 
 
-def _clip(genes: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Genes as the terrain has them, in [-1, 1]."""
-    return np.clip(genes, -1.0, 1.0, dtype=np.float32)
-
-
 def _rows(solutions: NDArray[np.float32], evaluation: Evaluation, iteration: int) -> dict[str, NDArray[Any]]:
     """What both archives are told: one row a terrain."""
     taken = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
@@ -243,6 +230,6 @@ def _rows(solutions: NDArray[np.float32], evaluation: Evaluation, iteration: int
         "solution": solutions,
         "objective": evaluation.fitness,
         "measures": evaluation.cell[:, None] + 0.5,
-        "genes": _clip(solutions),
+        "genes": clipped(solutions),
         "iteration": np.full(len(solutions), iteration),
     }

@@ -5,14 +5,13 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import Archive
-from qd.fitness import Evaluation, evaluation_of
+from qd.fitness import evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
 from qd.run.arguments import Job
-from qd.run.directory import CONFIG_FILE, SUMMARY_FILE, Metrics, RunDirectory, archive_of, claimed, reached
-from qd.run.progress import ProgressBar, clock, plan
+from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, reached, write_results
+from qd.run.progress import ProgressBar, plan
 from qd.run.settings import SearchCfg, code_of
 from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, worker_status
-from sim.files.atomic import to_json, write_atomically
 from sim.files.command import command_line, naming_what_is_next
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ def take_in(
         "rollout_s": float(result.wall_s),
         "mean_duration_s": float(result.duration_s.mean()),
     }
-    return found, {"iteration": iteration, **_scores(found), **_batch_row(evaluation), **physics}
+    return found, {"iteration": iteration, **found.scores(), **evaluation.means(), **physics}
 
 
 def _look_again(cfg: SearchCfg, found: Archive, evaluate: Evaluate) -> dict[str, Any]:
@@ -86,27 +85,18 @@ def _look_again(cfg: SearchCfg, found: Archive, evaluate: Evaluate) -> dict[str,
     return numbers_of(again, cfg.cells, sampled=True)
 
 
-def _scores(archive: Archive) -> dict[str, Any]:
-    """How good the archive is."""
-    return {
-        "elites": len(archive),
-        "reachable_coverage": archive.reachable_coverage,
-        "qd_score": archive.qd_score,
-        "mean_fitness": archive.mean_fitness,
-    }
+def begin(cfg: SearchCfg) -> "Scheduler":
+    """A search that has asked for nothing yet."""
+    from qd.scheduler import Scheduler  # pyribs takes two seconds to import
+    from sim.space import get_space
 
-
-def _batch_row(evaluation: Evaluation) -> dict[str, Any]:
-    """What an iteration's own terrains were like."""
-    return {
-        "terrains": len(evaluation.fitness),
-        "episodes": int(evaluation.episodes.sum()),
-        "invalid_episodes": int(evaluation.invalid_episodes.sum()),
-        "invalid_terrains": int((~evaluation.valid).sum()),
-        "batch_fitness": float(evaluation.fitness.mean()),
-        "batch_collision_rate": float(evaluation.collision_rate.mean()),
-        "batch_goal_rate": float(evaluation.goal_rate.mean()),
-    }
+    return Scheduler(
+        cfg.scheduler,
+        space=get_space(cfg.space),
+        num_cells=cfg.cells.num_cells,
+        num_ratios=len(cfg.fitness.penalties),
+        seed=cfg.seed,
+    )
 
 
 def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
@@ -143,11 +133,16 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:
                         search_terrains(cfg, run, search, metrics, evaluate, bar)
-            archive = _write_found(job, run, search, metrics, origin)
+            found = archive_of(cfg, search, len(metrics))
+            archive = found if job.reproduce else run.with_fresh_values(found)
+            write_results(run, archive, metrics, origin)
         if job.reproduce:
             again = f"Go on with:  {job.reevaluate_command}"
             with naming_what_is_next("the archive is saved as found", lambda: again):
-                archive = _write_corrected(job, run, archive, metrics, origin, open_evaluator)
+                archive = corrected(archive, cfg, job.evaluator, open_evaluator, cfg.seed)
+                # The run's numbers are of the machine that searched, the fresh episodes of this one.
+                by = origin_of(job.device, cfg.seed, job.evaluator.workers)
+                write_results(run, archive, metrics, origin, reproduced_by=by)
     worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
     print(f"Next, see the worst terrain:  {worst}")
     return archive
@@ -166,71 +161,3 @@ def _how_to_go_on(job: Job) -> str:
     if not (job.path / CONFIG_FILE).exists():
         return "No iteration is finished: start it again"
     return f"Go on with:  {job.resume_command}"
-
-
-def begin(cfg: SearchCfg) -> "Scheduler":
-    """A search that has asked for nothing yet."""
-    from qd.scheduler import Scheduler  # pyribs takes two seconds to import
-    from sim.space import get_space
-
-    return Scheduler(
-        cfg.scheduler,
-        space=get_space(cfg.space),
-        num_cells=cfg.cells.num_cells,
-        num_ratios=len(cfg.fitness.penalties),
-        seed=cfg.seed,
-    )
-
-
-def _write_found(
-    job: Job, run: RunDirectory, search: "Scheduler", metrics: Metrics, origin: dict[str, Any]
-) -> Archive:
-    """Writes figures and numbers of a search that reached its iterations, with the fresh values that still hold."""
-    found = archive_of(job.cfg, search, len(metrics))
-    archive = found if job.reproduce else run.with_fresh_values(found)
-    by = run.read_summary().get("reproduced_by") if archive.fresh is not None else None
-    write_results(run, archive, metrics, {**origin, "reproduced_by": by})
-    return archive
-
-
-def _write_corrected(
-    job: Job, run: RunDirectory, archive: Archive, metrics: Metrics, origin: dict[str, Any], open_evaluator: Open
-) -> Archive:
-    """Writes the same as 40 fresh episodes of each elite correct it."""
-    archive = corrected(archive, job.cfg, job.evaluator, open_evaluator, job.cfg.seed)
-    # The numbers are those of the machine that searched; the elites may have been evaluated again on another.
-    again = origin_of(job.device, job.cfg.seed, job.evaluator.workers)
-    write_results(run, archive, metrics, {**origin, "reproduced_by": again})
-    return archive
-
-
-def write_results(run: RunDirectory, archive: Archive, metrics: Metrics, origin: dict[str, Any]) -> None:
-    """Writes what a search leaves to look at, and says what it is.
-
-    Args:
-        run: The run directory, claimed.
-        archive: What was found; with fresh values its numbers and figures have them.
-        metrics: One row an iteration.
-        origin: Provenance, with the sessions of the run.
-    """
-    from qd.show.figures import summary, write_figures
-
-    run.write_derived(metrics, archive)
-    origin = {**origin, "sessions": reached(origin["sessions"], len(metrics))}
-    figures = write_figures(run.path, archive, metrics)
-    gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
-    numbers = summary(archive, metrics, gpus=gpus, origin=origin)
-    write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
-    if archive.fresh is None:
-        print(
-            f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
-            f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
-            f"in {clock(numbers['wall_s'])}"
-        )
-        print(f"Figures: {', '.join(map(str, figures))}")
-        return
-    print(
-        f"Corrected by fresh episodes: {numbers['elites_reproduced']:,} of {len(archive):,} elites reproduced, "
-        f"{numbers['corrected_coverage']:.1%} of the reachable cells, QD score {numbers['corrected_qd_score']:.0f}; "
-        f"in {run.path / SUMMARY_FILE} and the figures"
-    )

@@ -92,9 +92,10 @@ class TerrainSpace(Protocol):
             raise ValueError(f"genes must be finite, got NaN or infinity in row {int(np.argmin(finite))}")
         return array
 
-    def clip(self, genes: ArrayLike) -> NDArray[np.float32]:
-        """Genes as the terrain has them: a copy clipped to [-1, 1]; the search itself is unbounded."""
-        return np.clip(np.asarray(genes, dtype=np.float32), -1.0, 1.0)
+
+def clipped(genes: ArrayLike) -> NDArray[np.float32]:
+    """Genes as every space has them: a copy clipped to [-1, 1]; the search itself is unbounded."""
+    return np.clip(np.asarray(genes, dtype=np.float32), -1.0, 1.0)
 
 
 _HEIGHT = PARAMETERS.index("w")
@@ -133,7 +134,7 @@ class SuperGaussian(TerrainSpace):
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Each bump in words."""
-        bumps = self.clip(genes).reshape(self.num_bumps, GENES_PER_BUMP)
+        bumps = clipped(genes).reshape(self.num_bumps, GENES_PER_BUMP)
         return tuple(map(_in_words, LOWER + (bumps + 1.0) / 2.0 * (UPPER - LOWER)))
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:

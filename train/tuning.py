@@ -12,6 +12,7 @@ from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.own import own_hash
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import Start, read_start
@@ -130,7 +131,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
     if num_envs < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {num_envs}")
-    genes, archive = _elites(flags, robot)
+    genes, space, archive = _elites(flags, robot)
     settings = {
         "seed": flags.seed,
         "num_envs": num_envs,
@@ -151,7 +152,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         command="finetune", flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations,
         task=task, ppo=ppo, settings=settings, saved=saved, began=began,
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
-        start=start, mix=Mix(cfg=mix_cfg, genes=genes, crosses=crosses, seed=flags.seed, device=device),
+        start=start, mix=Mix(cfg=mix_cfg, genes=genes, space=space, crosses=crosses, seed=flags.seed, device=device),
     )  # fmt: skip
 
 
@@ -178,12 +179,12 @@ def sizes_of(flags: Finetune, robot: str, *, on_gpu: bool) -> dict[str, int]:
     return {"critic_iterations": min(_CRITIC_ITERATIONS, found["iterations"] // 2), **found}
 
 
-def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, dict[str, Any] | None]:
-    """Genes of the elites to train on, shape (E, 64), and where they are from."""
+def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace, dict[str, Any] | None]:
+    """Genes of the elites to train on, shape (E, num_genes), what they mean, and where they are from."""
     if flags.mix != "generated":
         if flags.archive is not None:
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
-        return np.zeros((0, 64), np.float32), None
+        return np.zeros((0, SUPER_GAUSSIAN.num_genes), np.float32), SUPER_GAUSSIAN, None
     path = flags.archive or Path("results") / robot.name / "archive"
     try:
         archive = read_archive(path)
@@ -191,7 +192,7 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, dict[str, Any
         make = command_line("archive", robot=robot.spec)
         raise ValueError(f"{error}; make one ({make}) and name it with --archive") from error
     rows = split_elites(archive, robot.name, flags.split_seed).train
-    return archive.genes[rows], {
+    return archive.genes[rows], get_space(archive.space), {
         "path": str(path), "archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows),
         "elites_sha256": elites_sha256(archive),
     }  # fmt: skip

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
+from qd.run.progress import clock
 from qd.run.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
 from sim.files.command import command_line
@@ -301,4 +302,47 @@ def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
         collision_bit=cfg.collision_bit,
         iterations=iterations,
         **elites,
+    )
+
+
+def write_results(
+    run: RunDirectory,
+    archive: Archive,
+    metrics: Metrics,
+    origin: dict[str, Any],
+    *,
+    reproduced_by: dict[str, Any] | None = None,
+) -> None:
+    """Writes what a search leaves to look at, and says what it is.
+
+    Args:
+        run: The run directory, claimed.
+        archive: What was found; with fresh values its numbers and figures have them.
+        metrics: One row an iteration.
+        origin: Provenance, with the sessions of the run.
+        reproduced_by: Provenance of the fresh values; left out, what the run's summary says stays.
+    """
+    from qd.show.figures import summary, write_figures
+
+    run.write_derived(metrics, archive)
+    if reproduced_by is None and archive.fresh is not None:
+        reproduced_by = run.read_summary().get("reproduced_by")
+    sessions = reached(origin["sessions"], len(metrics))
+    origin = {**origin, "sessions": sessions, "reproduced_by": reproduced_by}
+    figures = write_figures(run.path, archive, metrics)
+    gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
+    numbers = summary(archive, metrics, gpus=gpus, origin=origin)
+    write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
+    if archive.fresh is None:
+        print(
+            f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
+            f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
+            f"in {clock(numbers['wall_s'])}"
+        )
+        print(f"Figures: {', '.join(map(str, figures))}")
+        return
+    print(
+        f"Corrected by fresh episodes: {numbers['elites_reproduced']:,} of {len(archive):,} elites reproduced, "
+        f"{numbers['corrected_coverage']:.1%} of the reachable cells, QD score {numbers['corrected_qd_score']:.0f}; "
+        f"in {run.path / SUMMARY_FILE} and the figures"
     )

@@ -58,6 +58,7 @@ def export(cfg: Export) -> list[Path]:
     """
     from sim.bank import heights_of
     from sim.maps.terrain_files import check_formats, write_terrain
+    from sim.space import get_space
 
     found = find_archive(cfg.robot, cfg.run)
     elites = chosen_elites(cfg.elite, len(found.archive), found.run)
@@ -69,10 +70,11 @@ def export(cfg: Export) -> list[Path]:
     origin = {"run": str(found.run), **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
     archive, files, index = found.archive, [], []
+    space = get_space(archive.space)
     with tqdm(total=len(elites), desc="exporting", unit="elite", file=sys.stderr, disable=None) as bar:
         for first in range(0, len(elites), _AT_ONCE):
             numbers = elites[first : first + _AT_ONCE]
-            for elite, heights in zip(numbers, heights_of(archive.genes[numbers]), strict=True):
+            for elite, heights in zip(numbers, heights_of(archive.genes[numbers], space), strict=True):
                 about = about_elite(archive, elite)
                 stem = folder / f"elite-{elite}"
                 genes: NDArray[np.float32] = archive.genes[elite]

@@ -49,6 +49,8 @@ class Wanted:
     """What ``terrain_seed`` was drawn with, for the record."""
     terrain_seed: int
     """Seed of the terrain's episodes."""
+    space: str = "super_gaussian"
+    """Terrain space of genes."""
 
     def __post_init__(self) -> None:
         if self.replicas < 1 or self.seed < 0:
@@ -78,6 +80,7 @@ def on_elite(
         replicas=replicas,
         seed=seed,
         terrain_seed=int(episode_seeds(max(seed, 0), number, 1, stream=_STREAM)[0]),
+        space=archive.space,
     )
 
 
@@ -101,7 +104,7 @@ class Simulation:
 
     def __init__(self, robot: "RobotCfg", device: str) -> None:
         self._robot, self._device = robot, device
-        self._rollouts: dict[tuple[str, int, int], Any] = {}
+        self._rollouts: dict[tuple[str, int, int, str], Any] = {}
 
     def __call__(self, wanted: Sequence[Wanted], progress: Callable[[float], None]) -> "list[Recording]":
         """Recordings of all, in their order.
@@ -111,13 +114,15 @@ class Simulation:
         """
         from sim.recording.recorder import record
         from sim.rollout import Rollout
+        from sim.space import get_space
 
         first = wanted[0]
-        kind = (first.policy, len(wanted), first.replicas)
+        kind = (first.policy, len(wanted), first.replicas, first.space)
         if kind not in self._rollouts:
             self._rollouts[kind] = Rollout(
-                self._robot, first.policy, num_terrains=kind[1], num_replicas=kind[2], device=self._device
-            )
+                self._robot, first.policy, num_terrains=kind[1], num_replicas=kind[2], device=self._device,
+                space=get_space(first.space),
+            )  # fmt: skip
         _, recording = record(
             self._rollouts[kind],
             np.stack([one.terrain for one in wanted]),
@@ -224,7 +229,7 @@ class Recordings:
         alike: dict[Any, list[int]] = {}
         for k in missing:
             one = wanted[k]
-            alike.setdefault((one.policy, one.replicas, one.seed, one.terrain.shape), []).append(k)
+            alike.setdefault((one.policy, one.replicas, one.seed, one.space, one.terrain.shape), []).append(k)
         for numbers in alike.values():
             yield from (numbers[k : k + self._at_once] for k in range(0, len(numbers), self._at_once))
 
@@ -244,11 +249,14 @@ class Recordings:
 
     def _is(self, recording: "Recording", wanted: Wanted) -> bool:
         """Whether a recording is of just these crossings; a file may have been renamed."""
+        from sim.recording.recorder import space_in
+
         terrain = recording.heights if recording.genes is None else recording.genes
         return (
             recording.robot == self._robot.name
             and recording.joint_names == self._robot.joint_names
             and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
+            and space_in(recording.origin) == wanted.space
             and np.array_equal(terrain, wanted.terrain[None])
             and recording.seeds.tolist() == [wanted.terrain_seed]
             and np.array_equal(recording.replicas, np.arange(wanted.replicas))

@@ -34,6 +34,8 @@ class Calibrate(Who, Where):
     """Hard-random terrains."""
     replicas: int = setting(20, least=1)
     """Episodes a terrain."""
+    space: str = "super_gaussian"
+    """Terrain space that they are drawn from."""
     seed: int = setting(0, least=0)
     """Draws terrains and starts."""
     out: Path | None = None
@@ -51,7 +53,7 @@ class Calibrate(Who, Where):
         from qd.run.progress import share_bar
         from qd.workers import evaluator as workers
         from sim.robots.robot import get_robot
-        from sim.space import SUPER_GAUSSIAN
+        from sim.space import get_space
 
         check(self)
         robot = get_robot(self.robot or "anymal")
@@ -69,8 +71,9 @@ class Calibrate(Who, Where):
             num_replicas=self.replicas,
             device=device,
             workers=self.workers,
+            space=self.space,
         )
-        genes = SUPER_GAUSSIAN.hard_random(self.terrains, self.seed)
+        genes = get_space(self.space).hard_random(self.terrains, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self.terrains, np.uint32)
 
         def measure() -> dict[str, Any]:

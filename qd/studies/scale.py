@@ -13,7 +13,7 @@ import numpy as np
 
 from qd.run.settings import preset
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device, worker_status
-from sim.files.command import publish, show_json
+from sim.files.command import OfRobot, OnDevice, publish, show_json
 from sim.files.provenance import provenance
 from sim.files.settings import check, setting
 
@@ -21,13 +21,9 @@ _PAPER_ITERATIONS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale:
+class Scale(OfRobot, OnDevice):
     """Time evaluations on hard-random terrains by different numbers of Ray workers, against one process without Ray."""
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
-    device: str | None = None
-    """cpu or cuda; CUDA where there is one."""
     counts: tuple[int, ...] = setting((1, 2, 4), least=1)
     """Numbers of Ray workers to try, rising."""
     terrains: int | None = setting(None, least=1)
@@ -54,9 +50,9 @@ def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
     Raises:
         EvaluatorError: If fewer workers than wanted took part, or one had to be replaced.
     """
-    from sim.space import SUPER_GAUSSIAN
+    from sim.space import get_space
 
-    genes = SUPER_GAUSSIAN.hard_random(cfg.num_terrains, seed)
+    genes = get_space(cfg.space).hard_random(cfg.num_terrains, seed)
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
     with open_evaluator(cfg) as evaluate:
         seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]
@@ -77,7 +73,7 @@ def measure(args: Scale) -> dict[str, Any]:
     check(args)
     if not args.counts or list(args.counts) != sorted(set(args.counts)):
         raise ValueError(f"counts must be numbers of workers that rise, got {args.counts}")
-    robot = get_robot(args.robot)
+    robot = get_robot(args.robot or "anymal")
     resolve_device(args.device, f"ray:{args.counts[-1]}")  # so many must be there
     device = resolve_device(args.device)
     on_gpu = device.startswith("cuda")
@@ -91,6 +87,7 @@ def measure(args: Scale) -> dict[str, Any]:
         num_replicas=replicas,
         device=device,
         workers="1",
+        space=search.space,
     )
     shared = replace(alone, num_terrains=search.scheduler.num_terrains, num_replicas=search.replicas)
     alone_s, shared_alone_s = (time_evaluation(cfg, args.rounds, args.seed) for cfg in (alone, shared))

@@ -18,7 +18,7 @@ from qd.run.settings import SearchCfg, changed, policy_spec, preset, refuse_unna
 from qd.search import begin, search_terrains
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
 from sim.files.atomic import read_json
-from sim.files.command import publish, show_json
+from sim.files.command import OfRobot, OnDevice, publish, show_json
 from sim.files.provenance import provenance
 from sim.files.settings import check, setting
 
@@ -27,19 +27,15 @@ _CURVE_REPLICAS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class Speed:
+class Speed(OfRobot, OnDevice):
     """Time a preset's iteration, the bare physics of the same crossings, and episodes a second over env counts.
 
     The bare rate is that of contacts and solver alone: `walking` in the crossings' own motion, replayed from recorded
     states and joint targets, and `standing` holding the default pose at the start.
     """
 
-    robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py)."""
     preset: str = "paper"
     """Whose iteration is timed."""
-    device: str | None = None
-    """cpu, cuda or cuda:N; CUDA where there is one."""
     run: Path | None = None
     """Time the last iterations of this run, made on this GPU, instead of running a search for it."""
     iterations: int = setting(20, least=1)
@@ -146,13 +142,13 @@ def measure(args: Speed) -> dict[str, Any]:
     check(args)
     if any(count < 1 or count % _CURVE_REPLICAS for count in args.curve):
         raise ValueError(f"curve must be multiples of {_CURVE_REPLICAS}, got {args.curve}")
-    robot, device = get_robot(args.robot), resolve_device(args.device)
+    robot, device = get_robot(args.robot or "anymal"), resolve_device(args.device)
     training = training_rates(args.train_speed)
     if args.run is not None:
         if not device.startswith("cuda"):
             raise ValueError(f"--run needs a CUDA device, got {device}: a run on the CPU has several workers")
         cfg, metrics, terrains = read_iterations(args.run, args.iterations, provenance(device, 0)["device"])
-        robot = robot_of(cfg.robot, args.robot if args.robot.endswith(".py") else None, args.run)
+        robot = robot_of(cfg.robot, args.robot, args.run)
         refuse_unnamed_code(cfg.policy, None, args.run)
     else:
         cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
@@ -163,6 +159,7 @@ def measure(args: Speed) -> dict[str, Any]:
         num_terrains=cfg.scheduler.num_terrains,
         num_replicas=cfg.replicas,
         device=device,
+        space=cfg.space,
         workers="1",  # bare physics is measured in one process too
     )
     if terrains is None:

@@ -16,10 +16,10 @@ import numpy as np
 from qd.archive import Archive
 from qd.fresh import Open, drawn_elites, numbers_of, reevaluate
 from qd.run.arguments import evaluator_of, own_file
-from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, origin_in
+from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, origin_in, write_results
 from qd.run.progress import ProgressBar
 from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, refuse_changes
-from qd.search import MOST_DRAWN, begin, take_in, write_results
+from qd.search import MOST_DRAWN, begin, take_in
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, episode_seeds, origin_of, worker_status
 from qd.workers.shards import taken
 from sim.files.atomic import is_leftover, prepare_output
@@ -132,8 +132,7 @@ def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
                     _lock_step(list(searches.values()), evaluate, sampled=study.sampled)
             for one in searches.values():
                 found = one.run.with_fresh_values(archive_of(one.cfg, one.search, one.done))
-                by = one.run.read_summary().get("reproduced_by") if found.fresh is not None else None
-                write_results(one.run, found, one.metrics, {**one.origin, "reproduced_by": by})
+                write_results(one.run, found, one.metrics, one.origin)
         return {name: one.metrics[: study.runs[name].iterations] for name, one in searches.items()}
 
 

@@ -16,30 +16,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.workers.process import Crosser, EvaluatorError, WorkerProcess
+from qd.workers.process import Crosser, WorkerProcess
+from qd.workers.process import EvaluatorError as EvaluatorError
 from qd.workers.shards import MIN_ROWS, checked_count, merged, taken
 from sim.files.provenance import provenance
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
-
-__all__ = [
-    "Evaluate",
-    "EvaluatorCfg",
-    "EvaluatorError",
-    "WorkerStatus",
-    "Workers",
-    "available_cores",
-    "build_rollout",
-    "check_policy",
-    "episode_seeds",
-    "open_evaluator",
-    "origin_of",
-    "parse_workers",
-    "resolve_device",
-    "worker_status",
-]
 
 _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
 
@@ -266,7 +250,10 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
         return
     if cfg.device.startswith("cuda"):
         crosser = build(cfg, cfg.num_terrains)
-        yield _in_turns(_in_process(crosser), cfg.num_terrains)
+        yield _in_turns(
+            lambda terrains, seeds, progress=None: crosser.evaluate(terrains, seeds, progress=progress),
+            cfg.num_terrains,
+        )
         return
     processes: list[WorkerProcess] = []
     try:
@@ -282,13 +269,6 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
     finally:
         for process in processes:
             process.stop()
-
-
-def _in_process(crosser: Crosser) -> Evaluate:
-    def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
-        return crosser.evaluate(terrains, seeds, progress=progress)
-
-    return evaluate
 
 
 def _over_processes(processes: list[WorkerProcess]) -> Evaluate:

@@ -41,6 +41,7 @@ _POLL_S = 0.25
 _GROW_EVERY_S = 2.0
 _GATHER_S = 60.0  # how long the others are waited for once one worker is there
 _PATIENCE_S = 300.0  # how long the evaluation waits when no worker is there
+_HANG_S = 1800.0  # a busy worker without progress for so long is restarted; building and compiling take minutes
 _MOST_TRIES = 5  # of which three may be bad luck
 
 
@@ -166,6 +167,8 @@ class _Worker:
     shard: _Shard | None = None
     share: float = 0.0
     """Share of the shard that is done."""
+    moved_at: float = 0.0
+    """When the share last changed, by the monotonic clock [s]."""
     question: Any = None
     """The share to come that it was asked for."""
     episodes_per_s: float = 0.0
@@ -264,7 +267,7 @@ class RayWorkers:
             for worker in self._ready:
                 if waiting and worker.task is None:
                     shard = worker.shard = waiting.popleft()
-                    worker.share, worker.question = 0.0, None
+                    worker.share, worker.moved_at, worker.question = 0.0, time.monotonic(), None
                     worker.task = worker.actor.cross.remote(terrains[shard.part], seeds[shard.part], size)
             if self._busy:
                 busy_at = time.monotonic()
@@ -353,7 +356,7 @@ class RayWorkers:
         _tell(f"{worker} {reason}; the others go on without it")
 
     def _failed_shard(self, worker: _Worker, size: int) -> _Shard | None:
-        """Takes a worker's result if it is there; returns the shard if another worker must cross it.
+        """Takes a worker's result if it is there; returns the shard if it failed or hangs and must be crossed again.
 
         Raises:
             ValueError: If the shard was refused five times.
@@ -361,17 +364,20 @@ class RayWorkers:
         """
         shard, replicas, error = worker.shard, self._cfg.num_replicas, None
         assert shard is not None
-        if not ray.wait([worker.task], timeout=0)[0]:
+        there = bool(ray.wait([worker.task], timeout=0)[0])
+        if not there and time.monotonic() - worker.moved_at < _HANG_S:
             return None
+        trouble = f"made no progress for {_HANG_S:g} s"
         try:
-            result, seconds = ray.get(worker.task)
-            flaw = flaw_of(result, size, replicas)
-            if flaw is None:
-                shard.result = taken(result, shard.part.stop - shard.part.start)
-                worker.task, worker.share = None, 0.0
-                worker.episodes_per_s = size * replicas / seconds
-                return None
-            trouble = f"answered with nonsense: {flaw}"
+            if there:
+                result, seconds = ray.get(worker.task)
+                flaw = flaw_of(result, size, replicas)
+                if flaw is None:
+                    shard.result = taken(result, shard.part.stop - shard.part.start)
+                    worker.task, worker.share = None, 0.0
+                    worker.episodes_per_s = size * replicas / seconds
+                    return None
+                trouble = f"answered with nonsense: {flaw}"
         except RayError as raised:
             error, trouble = raised, f"failed: {reason_of(raised)}"
         who = str(worker)
@@ -400,7 +406,9 @@ def _share_of(worker: _Worker) -> float:
     elif ray.wait([worker.question], timeout=0)[0]:
         question, worker.question = worker.question, None
         try:
-            worker.share = ray.get(question)
+            share: Any = ray.get(question)
+            if share != worker.share:
+                worker.share, worker.moved_at = share, time.monotonic()
         except RayError:
             if worker.task is None:
                 worker.wait_for()

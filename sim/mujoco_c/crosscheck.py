@@ -17,7 +17,6 @@ from sim.bank import TerrainBank
 from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
 from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
-from sim.files.npz import read_arrays
 from sim.files.provenance import provenance
 from sim.files.settings import check
 from sim.mujoco_c.crossing import draw_starts, run_plain
@@ -26,7 +25,7 @@ from sim.policy.spec import ControllerSpec
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device
-from sim.space import SUPER_GAUSSIAN
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
@@ -34,21 +33,23 @@ _FINE_DT = 0.001
 _FINE_TIME_CONSTANT_S = 0.003
 
 
-def read_pool(path: Path) -> NDArray[np.float32]:
-    """Genes of a pool, shape (num_terrains, 64).
+def read_pool(path: Path) -> tuple[NDArray[np.float32], TerrainSpace]:
+    """Genes of a pool, shape (num_terrains, num_genes), and the space that its file names, the paper's if none.
 
     Raises:
-        ValueError: If the file holds none.
+        ValueError: If the file holds no genes of a known space.
     """
     try:
-        genes = read_arrays(path, ["genes"])["genes"]
+        with np.load(path, allow_pickle=False) as content:
+            genes = content["genes"]
+            space = get_space(str(content["space"])) if "space" in content else SUPER_GAUSSIAN
     except Exception as error:  # a damaged zip archive can fail with anything
         raise ValueError(f"--genes {path}: expected an .npz file with an array 'genes', got: {error}") from error
     try:
         if not len(genes) or genes.dtype.kind != "f":
             raise ValueError(f"they must be floats, one row a terrain, got {genes.dtype} of shape {genes.shape}")
         with np.errstate(over="ignore"):
-            return SUPER_GAUSSIAN.validate(genes.astype(np.float32))
+            return space.validate(genes.astype(np.float32)), space
     except (ValueError, TypeError) as error:
         raise ValueError(f"--genes {path}: 'genes': {error}") from None
 
@@ -89,7 +90,7 @@ class Comparison:
         self.device = resolve_device(cfg.device)
         self.policy = cfg.policy or self.robot.policy_file
         self.rng = np.random.default_rng([_KEY, cfg.seed])
-        self._pool = None if cfg.genes is None else read_pool(cfg.genes)
+        self._pool, self.space = (None, SUPER_GAUSSIAN) if cfg.genes is None else read_pool(cfg.genes)
         self._named = self._choice_named()
 
     def _choice_named(self) -> Choice | None:
@@ -115,9 +116,12 @@ class Comparison:
         if self._named is not None:
             return self._named
         cfg, at_once = self.cfg, 200 if self.device.startswith("cuda") else 32
-        pool = SUPER_GAUSSIAN.hard_random(_MAX_POOL, self.rng).astype(np.float32) if self._pool is None else self._pool
+        pool = self.space.hard_random(_MAX_POOL, self.rng) if self._pool is None else self._pool
         order = self.rng.permutation(len(pool))
-        rollout = Rollout(self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device)
+        rollout = Rollout(
+            self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device,
+            space=self.space,
+        )  # fmt: skip
         chosen: list[int] = []
         rates: list[float | None] = []
         looked_at = 0
@@ -162,10 +166,11 @@ class Comparison:
             num_replicas=cfg.episodes,
             device=self.device,
             solver=SolverCfg(time_constant_s=time_constant_s),
+            space=self.space,
         )
         ours = rollout.evaluate(genes, seeds)
         bank = TerrainBank(len(genes), device=self.device)
-        bank.set_genes(genes)
+        bank.set_genes(genes, self.space)
         heights: Any = bank.heights.numpy()
         starts = [
             draw_starts(self.robot, grid, int(seed), cfg.plain_episodes, self.device)

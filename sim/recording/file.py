@@ -18,7 +18,8 @@ from kernels.episode import Outcome
 from sim.bank import heights_of
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, read_arrays
-from sim.recording.recorder import FRAME_ARRAYS, Recording
+from sim.recording.recorder import FRAME_ARRAYS, Recording, space_in
+from sim.space import get_space
 
 FORMAT = "faultline recording 1"
 """Name and version in every file."""
@@ -130,12 +131,12 @@ def _built(content: dict[str, NDArray[Any]]) -> Recording:
         raise ValueError("genes must be finite")
     values: dict[str, Any] = {**content, "genes": genes}
     values |= {name: content[name].astype(np.float32) for name in FRAME_ARRAYS}
-    values["heights"] = content["heights"] if genes is None else heights_of(genes)
     for name in _WORDS:
         values[name] = tuple(content[name].tolist()) if content[name].ndim else str(content[name])
     origin = json.loads(values["origin"])
     if not isinstance(origin, dict):
         raise ValueError(f"origin must be a JSON object, got {type(origin).__name__}")
+    values["heights"] = content["heights"] if genes is None else heights_of(genes, get_space(space_in(origin)))
     return Recording(**values | {"origin": origin, "dt": float(content["dt"])})
 
 

@@ -143,6 +143,11 @@ class Recording:
         return np.concatenate([part[terrain, episode, frames].astype(np.float64) for part in parts], axis=1)
 
 
+def space_in(origin: dict[str, Any]) -> str:
+    """Terrain space of a recording's genes; recordings of the first search name none."""
+    return origin.get("space", "super_gaussian")
+
+
 class _Frames:
     """Collects the frames of a rollout's episodes."""
 
@@ -235,7 +240,12 @@ def record(
         genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
         seeds=seeds.astype(np.uint32),
         replicas=np.arange(rollout.num_replicas, dtype=np.int32),
-        origin={"policy": str(policy), "policy_sha256": controller_hash(str(policy)), **provenance(device, seed)},
+        origin={
+            "policy": str(policy),
+            "policy_sha256": controller_hash(str(policy)),
+            "space": rollout.space.name,
+            **provenance(device, seed),
+        },
         **{name: getattr(result, name) for name in ("outcome", "fallen", "duration_s")},
         **frames.stacked(),
     )

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,8 @@ class Failing(Crosser):
     def _fail(self, how, terrains, seeds):
         if how == "die":
             os.kill(os.getpid(), signal.SIGKILL)
+        if how == "hang":
+            time.sleep(600)
         if how == "raise":
             raise RuntimeError("the solver is broken")
         if how == "refuse":

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.bank import heights_of
-from sim.space import SPACES, SUPER_GAUSSIAN, SuperGaussian, get_space
+from sim.space import SPACES, SUPER_GAUSSIAN, SuperGaussian, clipped, get_space
 
 
 def test_a_space_is_found_by_its_name():
@@ -44,8 +44,8 @@ def test_no_terrain_and_no_bump_are_refused():
 def test_clip_keeps_the_inside_and_cuts_the_outside():
     genes = np.zeros((2, 64))
     genes[0, :3] = [-1.5, 0.25, 7.0]
-    assert SUPER_GAUSSIAN.clip(genes)[0, :4].tolist() == [-1.0, 0.25, 1.0, 0.0]
-    assert SUPER_GAUSSIAN.clip(genes).dtype == np.float32
+    assert clipped(genes)[0, :4].tolist() == [-1.0, 0.25, 1.0, 0.0]
+    assert clipped(genes).dtype == np.float32
     assert genes[0, 0] == -1.5
 
 

@@ -164,12 +164,12 @@ def _cross_missing(
     who: str, evaluator: EvaluatorCfg, sets: Mapping[str, TerrainSet], bar: tqdm, open_evaluator: Open
 ) -> Iterator[tuple[str, RolloutResult]]:
     """Crossings of one controller by set, each as soon as it is done; sets of one size share a simulation."""
-    for size in sorted({len(chosen) for chosen in sets.values()}, reverse=True):
+    for size, space in sorted({(len(chosen), chosen.space) for chosen in sets.values()}, reverse=True):
         bar.set_description_str(f"{who}: building the simulation")
         at_once = min(size, max(1, _MOST_ENVS // evaluator.num_replicas))
-        with open_evaluator(replace(evaluator, num_terrains=at_once)) as evaluate:
+        with open_evaluator(replace(evaluator, num_terrains=at_once, space=space)) as evaluate:
             for name, chosen in sets.items():
-                if len(chosen) == size:
+                if (len(chosen), chosen.space) == (size, space):
                     bar.set_description_str(f"{who} on {name}")
                     result = _cross(evaluate, chosen, evaluator.num_replicas, bar)
                     bar.write(_line(who, chosen, result))

@@ -44,6 +44,7 @@ def distances(flags: Distances) -> dict[str, Any]:
     from qd.archive import read_archive
     from sim.files.provenance import provenance
     from sim.robots.robot import get_robot
+    from sim.space import get_space
     from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, split_elites
 
     check(flags)
@@ -52,7 +53,9 @@ def distances(flags: Distances) -> dict[str, Any]:
     split = split_elites(archive, robot, flags.split_seed)
     count = flags.terrains or paper_terrains(robot)
     sets = make_sets(("hard_random", "generated"), count, flags.seed, archive=archive, split=split)
-    nearest = {name: nearest_distance(found.terrains, archive.genes[split.train]) for name, found in sets.items()}
+    space = get_space(archive.space)
+    train = archive.genes[split.train]
+    nearest = {name: nearest_distance(found.terrains, train, space) for name, found in sets.items()}
     nearest["generated_far"] = nearest["generated"][far_part(nearest["generated"])]
     return {
         **provenance("cpu", flags.seed),

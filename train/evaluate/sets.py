@@ -10,7 +10,7 @@ holds out others, among them some that a controller was trained on before: marks
 import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from qd.archive import Archive
 from sim.bank import heights_of
 from sim.files.atomic import read_json
 from sim.policy.spec import ControllerSpec
-from sim.space import SUPER_GAUSSIAN
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 
 SETS = ("hand_crafted", "hard_random", "generated", "generated_far")
@@ -71,6 +71,8 @@ class TerrainSet:
     """Index into :data:`sim.terrain.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
     levels: NDArray[np.int64] | None = None
     """Level of each hand-crafted terrain, likewise."""
+    space: str = SUPER_GAUSSIAN.name
+    """Terrain space of genes."""
 
     def __len__(self) -> int:
         """Number of terrains."""
@@ -152,7 +154,9 @@ def generated_set(archive: Archive, split: EliteSplit, count: int, seed: int) ->
     """Held-out elites: the first ``count`` drawn, or all of them; ``seed`` is that of their episodes."""
     seeds = set_rng("generated", seed).integers(2**32, size=len(split.test), dtype=np.uint32)
     rows = split.test[:count]
-    return TerrainSet(name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows)
+    return TerrainSet(
+        name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows, space=archive.space
+    )
 
 
 def far_part(distance: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -163,33 +167,36 @@ def far_part(distance: NDArray[np.float64]) -> NDArray[np.int64]:
 
 def part_of(whole: TerrainSet, places: NDArray[np.int64], name: str) -> TerrainSet:
     """Some of a set's terrains under a name of their own; their episodes are the same."""
-    return TerrainSet(
-        name=name, terrains=whole.terrains[places], seeds=whole.seeds[places], numbers=whole.numbers[places]
+    return replace(
+        whole, name=name, terrains=whole.terrains[places], seeds=whole.seeds[places], numbers=whole.numbers[places]
     )
 
 
-def nearest_distance(genes: NDArray[np.float32], training_genes: NDArray[np.float32]) -> NDArray[np.float64]:
+def nearest_distance(
+    genes: NDArray[np.float32], training_genes: NDArray[np.float32], space: TerrainSpace = SUPER_GAUSSIAN
+) -> NDArray[np.float64]:
     """Root mean square distance of height maps to the nearest of others.
 
     Args:
         genes: Terrains, shape (T, 64).
         training_genes: Terrains to be far from, shape (N, 64).
+        space: What the genes of both mean.
 
     Returns:
         Distance to the nearest over all nodes [m], shape (T,). Computed on the CPU, so that it is the same everywhere.
     """
-    maps = _heights(genes)
+    maps = _heights(genes, space)
     nearest = np.full(len(maps), np.inf)
     for first in range(0, len(training_genes), _BANK):
-        others = _heights(training_genes[first : first + _BANK])
+        others = _heights(training_genes[first : first + _BANK], space)
         squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
         nearest = np.minimum(nearest, squares.min(axis=1))
     return np.sqrt(np.maximum(nearest, 0.0) / maps.shape[1])
 
 
-def _heights(genes: NDArray[np.float32]) -> NDArray[np.float64]:
+def _heights(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:
     """Height maps [m] as rows, float64 since their squares are subtracted from each other."""
-    return heights_of(genes).reshape(len(genes), -1).astype(np.float64)
+    return heights_of(genes, space).reshape(len(genes), -1).astype(np.float64)
 
 
 def make_sets(
@@ -219,7 +226,7 @@ def make_sets(
     if archive is not None and split is not None:
         sets["generated"] = whole = generated_set(archive, split, count, seed)
         if "generated_far" in names:
-            far = far_part(nearest_distance(whole.terrains, archive.genes[split.train]))
+            far = far_part(nearest_distance(whole.terrains, archive.genes[split.train], get_space(archive.space)))
             sets["generated_far"] = part_of(whole, far, "generated_far")
     return {name: sets[name] for name in SETS if name in names}
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim.bank import TerrainBank
 from sim.files.settings import check, setting
-from sim.space import SUPER_GAUSSIAN
+from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import (
     CROSSING_TYPES,
     NUM_COLS,
@@ -71,6 +71,8 @@ class Mix:
     """Whether robots cross; else they are told velocities in the middle."""
     seed: int
     device: str
+    space: TerrainSpace = SUPER_GAUSSIAN
+    """What the genes mean."""
     swap: int = -1
     """Number of the present exchange, from 0."""
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -105,9 +107,9 @@ class Mix:
         heights, types = self._hand_crafted(rng)
         if self.cfg.mix != "hand-crafted":
             count = self.cfg.terrains - self.cfg.hand_crafted
-            genes = self.genes[self.rows] if self.cfg.mix == "generated" else SUPER_GAUSSIAN.hard_random(count, rng)
+            genes = self.genes[self.rows] if self.cfg.mix == "generated" else self.space.hard_random(count, rng)
             bank = TerrainBank(count, device=self.device)
-            bank.set_genes(genes)
+            bank.set_genes(genes, self.space)
             heights = np.concatenate([heights, bank.heights.numpy()])
             types += (self.cfg.mix,) * count
         return Tiles(heights=heights, type_of_column=types)

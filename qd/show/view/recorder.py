@@ -45,6 +45,8 @@ class RecorderCfg:
     """The controller."""
     replicas: int
     """Episodes at once."""
+    space: str = "super_gaussian"
+    """Terrain space of genes."""
 
 
 class _Recording:
@@ -52,9 +54,12 @@ class _Recording:
 
     def __init__(self, cfg: RecorderCfg) -> None:
         from sim.rollout import Rollout
+        from sim.space import get_space
 
-        self._policy = cfg.policy
-        self._rollout = Rollout(cfg.robot, cfg.policy, num_terrains=1, num_replicas=cfg.replicas, device="cpu")
+        self._policy, space = cfg.policy, get_space(cfg.space)
+        self._rollout = Rollout(
+            cfg.robot, cfg.policy, num_terrains=1, num_replicas=cfg.replicas, device="cpu", space=space
+        )
 
     def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None) -> Any:
         """The recording of the crossings of one terrain."""
@@ -112,7 +117,7 @@ class Recorder:
                 if self._stopped or self._wish is None:
                     return
                 wanted, self._wish = self._wish, None
-            cfg = RecorderCfg(robot=self._robot, policy=wanted.policy, replicas=wanted.replicas)
+            cfg = RecorderCfg(robot=self._robot, policy=wanted.policy, replicas=wanted.replicas, space=wanted.space)
             try:
                 self._report(self._recorded(wanted, cfg))
             except (ValueError, EvaluatorError, OSError) as error:

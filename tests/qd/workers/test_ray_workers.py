@@ -70,13 +70,16 @@ def test_how_terrains_are_spread_changes_nothing(workers):
     ("how", "says"),
     [
         ("die", "failed: "),
+        ("hang", "made no progress for 3 s"),
         ("raise", "failed: RuntimeError: the solver is broken"),
         ("nan", "answered with nonsense: valid episodes with penalties"),
         ("short", "answered with nonsense: penalties of shape (3, 4, 6)"),
         ("nonsense", "answered with nonsense: no result"),
     ],
 )
-def test_a_failed_shard_is_crossed_again_by_another(tmp_path, capsys, how, says):
+def test_a_failed_shard_is_crossed_again_by_another(tmp_path, capsys, monkeypatch, how, says):
+    if how == "hang":
+        monkeypatch.setattr("qd.workers.ray_workers._HANG_S", 3.0)
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:1")
     with open_evaluator(cfg, build=crossers.Failing) as evaluate:
         first = evaluate(GENES[:8], SEEDS[:8])

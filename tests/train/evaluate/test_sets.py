@@ -156,7 +156,7 @@ def test_distance_is_the_root_mean_square_over_all_nodes(monkeypatch):
     # Maps of 2 x 2 nodes; (0, 0, 0, 0) lies sqrt((1 + 1 + 1 + 1) / 4) = 1 from one and sqrt(.36 / 4) = .3 from another.
     maps = {0: [0, 0, 0, 0], 1: [1, -1, 1, -1], 2: [0, 0.6, 0, 0]}
     monkeypatch.setattr(
-        "train.evaluate.sets._heights", lambda genes: np.array([maps[int(row[0])] for row in genes], float)
+        "train.evaluate.sets._heights", lambda genes, space: np.array([maps[int(row[0])] for row in genes], float)
     )
     training = np.repeat([[1], [2]], 60, axis=0)  # more than are compared at once
     np.testing.assert_allclose(nearest_distance(np.array([[0], [1]]), training), [0.3, 0.0], atol=1e-9)
