@@ -166,6 +166,7 @@ def test_mutated_files(made, tmp_path, what):
     assert refused > 200
 
 
+@pytest.mark.kills
 @pytest.mark.parametrize(
     "what",
     ["a controller's checkpoint", "the archive", "the checkpoint of a training", "a recording", "a heightmap"],

@@ -16,6 +16,8 @@ from tests.qd import crossers, stand_in
 from tests.qd.test_search import make_job
 from tests.qd.workers.test_evaluator import same
 
+pytestmark = pytest.mark.ray
+
 ray = pytest.importorskip("ray")
 
 CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=8, num_replicas=4, device="cpu", workers="ray:2")

@@ -118,6 +118,7 @@ def test_an_output_that_is_not_finite_or_of_another_shape_is_refused():
         require_close("x", np.zeros(2), np.zeros(3), atol=1.0)
 
 
+@pytest.mark.slow
 def test_a_row_is_whole(cases, device):
     row = measure_case(cases["penalties"], make_ceiling(), device, QUICK, compiled=True)
     assert min(row["ours_ms"], row["torch_ms"]) > 0

@@ -208,6 +208,7 @@ def test_what_comes_from_files_is_escaped(whole):
     assert 'a"b' in page.ids and "<a>" in page.ids and "#'x" in page.links
 
 
+@pytest.mark.slow
 def test_crossings_are_kept_and_a_stopped_report_goes_on(reported, run, monkeypatch):
     first, crossed = reported()
     before = first.read_bytes()
@@ -237,9 +238,7 @@ def test_sections_without_data_name_the_command_that_makes_it(reported, run):
     (run / "metrics.jsonl").unlink()
     (run / "config.json").unlink()
     text = Page(reported()[0].read_bytes()).text
-    assert re.search(
-        r"no metrics\.jsonl .* A search writes one: \S*faultline archive --robot anymal", text
-    )
+    assert re.search(r"no metrics\.jsonl .* A search writes one: \S*faultline archive --robot anymal", text)
     assert "no config.json beside the archive" in text
     assert re.search(r"made by \S*faultline evaluate --robot anymal --policies base=shipped C-G=FILE", text)
 
