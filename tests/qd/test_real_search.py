@@ -14,7 +14,7 @@ from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
 from sim.space import SUPER_GAUSSIAN
 from tests.qd import stand_in
-from tests.qd.test_search import make_job, rows_of
+from tests.qd.searches import make_job, rows_of
 
 ROBOT = get_robot("anymal")
 CFG = EvaluatorCfg(

@@ -14,14 +14,12 @@ from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from tests.train.archives import make_archive
-from tests.train.starts import make_places, write_actor, write_bad_starts
+from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
 from train.finetune import Finetune
-from train.ppo.cfg import PpoCfg
 from train.ppo.learner import read_checkpoint
 from train.ppo.run import CommandTask, claimed, read_saved
 
-PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.train.test_finetune import write_actor
+from tests.train.starts import write_actor
 
 ROOT = Path(__file__).parents[2]
 

@@ -22,7 +22,7 @@ from sim.recording.file import read_recording
 from sim.recording.recorder import record
 from sim.recording.renderer import open_context
 from sim.rollout import Rollout
-from tests.qd.test_archive import fresh_values, small_archive
+from tests.builders import fresh_values, small_archive
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 

@@ -21,10 +21,10 @@ from qd.show.report.page import Absent, Facts, Heading, Section, Table, Text, re
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
+from tests.builders import fresh_values
 from tests.qd.recordings import stand_in_cross
 from tests.qd.show.report.test_numbers import grouped_archive
 from tests.qd.show.test_figures import rows
-from tests.qd.test_archive import fresh_values
 
 DOT = bytes.fromhex("89504e470d0a1a0a")
 VOID = {"meta", "img", "br", "link", "input", "hr"}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.show.view.plots import axes_of
-from tests.qd.test_archive import small_archive
+from tests.builders import small_archive
 
 collect_ignore = [] if find_spec("viser") else ["test_app.py", "test_panels.py"]
 

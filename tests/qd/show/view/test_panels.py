@@ -5,7 +5,7 @@ import pytest
 
 from qd.show.view.panels import PAGE, Clock, Selection
 from qd.show.view.plots import axes_of
-from tests.qd.test_archive import fresh_values, small_archive
+from tests.builders import fresh_values, small_archive
 
 
 @pytest.fixture
