@@ -16,18 +16,10 @@ from sim.rollout import Rollout, evaluate
 from sim.space import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
 from tests.sim.policies import stand, stretch
-from tests.sim.scenes import positions, put, velocities
+from tests.sim.scenes import FLAT, positions, put, spike, velocities
 
 SHORT = CrossingCfg(max_duration_s=0.6, poll_every_s=0.1)
-FLAT = np.zeros((161, 321), np.float32)
 TERRAINS, REPLICAS = 4, 4
-
-
-def spike():
-    """A needle of 1 m under the start; the robot starts over its tip and falls on it."""
-    grid = FLAT.copy()
-    grid[79:82, 39:42] = 1.0
-    return grid
 
 
 @pytest.fixture(scope="module")
