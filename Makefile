@@ -9,6 +9,8 @@ TORCH ?=
 BIN := .venv/bin
 STAMP := .venv/.setup-done
 PYTEST := $(BIN)/python -m pytest
+ON_TWO_CORES := -n 2 --dist loadfile
+FAULTLINE_DEVICE ?= cuda:0
 
 quoted = '$(subst ','\'',$(1))'
 faultline = $(BIN)/faultline $(1) $(if $(ROBOT),--robot $(call quoted,$(ROBOT))) $(ARGS)
@@ -58,13 +60,13 @@ bench: setup ## Time every kernel against torch and against the device's ceiling
 	$(call faultline,bench)
 
 test: setup ## Run the quick tests: about five minutes on two cores
-	$(PYTEST) -m 'not slow and not ray and not kills and not gpu' $(ARGS)
+	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray and not kills' $(ARGS)
 
-test-all: setup ## Run all tests but those that need a GPU
-	$(PYTEST) -m 'not gpu' $(ARGS)
+test-all: setup ## Run all tests: under fifteen minutes on two cores
+	$(PYTEST) $(ON_TWO_CORES) $(ARGS)
 
-test-gpu: setup ## Run the tests that need a CUDA device
-	FAULTLINE_DEVICE=cuda:0 $(PYTEST) -m gpu $(ARGS)
+test-gpu: setup ## Run on a GPU (FAULTLINE_DEVICE, default cuda:0) what can run there
+	FAULTLINE_DEVICE=$(FAULTLINE_DEVICE) $(PYTEST) -m gpu --record results/bench/gpu-tests.json $(ARGS)
 
 lint: setup ## Check style, documentation and types
 	$(BIN)/ruff check .

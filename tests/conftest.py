@@ -1,15 +1,46 @@
-"""Fixtures shared by the rooms: where to run, and the few simulations all tests use (each shape is built once)."""
+"""Fixtures shared by the rooms: where to run, and the few simulations all tests use (each shape is built once).
+
+A test that takes the ``device`` fixture, by itself or through another fixture, has the marker ``gpu``: it runs on the
+CPU, and on a GPU where FAULTLINE_DEVICE names one.
+"""
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from sim.bank import TerrainBank
+from sim.files.command import publish
+from sim.files.provenance import provenance
 from sim.robots.robot import ROBOTS, get_robot
 from sim.simulation import Simulation, resolve_device
 from tests.sim.scenes import Stepper
+
+DEVICE = os.environ.get("FAULTLINE_DEVICE", "cpu")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--record", type=Path, metavar="FILE", help="write the numbers of tests and the device to FILE")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks what runs on the device; in time for -m, which deselects afterwards."""
+    for item in items:
+        if "device" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.gpu)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Writes the numbers of tests and where they ran (--record)."""
+    out = config.getoption("--record")
+    if out is None:
+        return
+    outcomes = ("passed", "failed", "error", "skipped")
+    counts = {name: len(terminalreporter.getreports(name)) for name in outcomes}
+    counts["failed"] += counts.pop("error")
+    publish(out, lambda: counts | provenance(DEVICE, 0), lambda report: None)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -21,7 +52,7 @@ def one_thread():
 @pytest.fixture(scope="session")
 def device() -> str:
     """Warp device of this run: FAULTLINE_DEVICE, or the CPU."""
-    return resolve_device(os.environ.get("FAULTLINE_DEVICE", "cpu"))
+    return resolve_device(DEVICE)
 
 
 @pytest.fixture(scope="session")

@@ -17,9 +17,9 @@ import tyro
 import faultline
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
+from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.docs import PAGES, ROOT, code_of, commands_of, mentions_of, numbers_of, run_by_make, text_of
 from tests.sim.dogs import mjcf
-from tests.sim.policy.test_loaders import rsl_rl_actor, save_checkpoint
 
 REGISTRY = {word: command for group in faultline.COMMANDS.values() for word, command in group.items()}
 

@@ -8,16 +8,13 @@ from kernels.heightfield import (
     BLOCK,
     Terrain,
     ceiling_over,
-    ceiling_shape,
     height_at,
     max_blocks,
     nearest_surface_point,
     normal_at,
 )
 from sim.bench import oracle
-
-SPACING = 0.05
-RNG_SEED = 5
+from tests.builders import RNG_SEED, SPACING, make_terrain, rough
 
 
 def surface_normal(grid, spacing, x, y):
@@ -54,25 +51,11 @@ def _ceiling_kernel(terrain: Terrain, lower: wp.array[wp.vec2], upper: wp.array[
     out[k] = ceiling_over(terrain, 0, lower[k], upper[k])
 
 
-def make_terrain(grids, device, spacing=SPACING):
-    terrain = Terrain()
-    terrain.heights = wp.array(np.float32(grids), device=device)
-    terrain.ceilings = wp.zeros(ceiling_shape(*np.shape(grids)), dtype=float, device=device)
-    terrain.spacing = spacing
-    max_blocks(terrain.heights, terrain.ceilings)
-    return terrain
-
-
 def sample(terrain, points, reach, device, t=0):
     out = [wp.zeros(len(points), dtype=kind, device=device) for kind in (float, wp.vec3, float, wp.vec3)]
     inputs = [terrain, t, wp.array(np.float32(points), dtype=wp.vec3, device=device), reach]
     wp.launch(_sample_kernel, dim=len(points), inputs=inputs, outputs=out, device=device)
     return [array.numpy() for array in out]
-
-
-def rough(nrow, ncol, size=0.2, seed=RNG_SEED):
-    """A grid with no two nodes alike: cells as steep as 76 degrees."""
-    return np.random.default_rng(seed).uniform(-size, size, (nrow, ncol)).astype(np.float32)
 
 
 def scatter(nrow, ncol, count, spacing=SPACING, seed=RNG_SEED):

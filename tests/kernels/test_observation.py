@@ -6,8 +6,8 @@ import warp as wp
 
 from kernels.observation import Noise, Sensors, apply_action, write_observation, write_scan
 from sim.bench import oracle
+from tests.builders import SPACING, make_terrain, rough
 from tests.kernels.states import random_states, upright
-from tests.kernels.test_heightfield import SPACING, make_terrain, rough
 
 BASE_COM = (-0.02, 0.01, 0.03)
 

@@ -10,7 +10,7 @@ from kernels.restart import clear_rows, restart_episodes, seed_starts
 from kernels.rewards import Rewards, make_rewards
 from sim.bench import oracle
 from sim.crossing import CrossingCfg, make_start_ranges
-from tests.kernels.test_heightfield import make_terrain, rough
+from tests.builders import make_terrain, rough
 
 BASE_COM = (-0.02, 0.01, 0.03)
 

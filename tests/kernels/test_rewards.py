@@ -44,7 +44,7 @@ class Step:
         self.num_envs = num_envs
         self.min_air_time_s = 0.5
         self.outcome = np.zeros(num_envs, np.int32)
-        self.rewards = make_rewards(num_envs, NUM_JOINTS, geoms, "cpu")
+        self.rewards = make_rewards(num_envs, NUM_JOINTS, geoms, str(wp.get_device()))
 
     def reward(self, *, only_positive: bool = False, **weights: float) -> tuple[np.ndarray, np.ndarray]:
         """Reward (num_envs,) and the terms per second (num_envs, len(REWARDS))."""
@@ -291,7 +291,10 @@ def test_an_outcome_that_is_no_fall_costs_nothing():
 
 def test_a_step_is_paid_if_its_episode_had_not_ended_before():
     # At rest and told so, a step pays .02 * 1: the step that ends the first's episode is paid, those after it are not.
-    rewards, outcome = make_rewards(2, NUM_JOINTS, len(ROLES), "cpu"), wp.array([Outcome.OUT, 0], dtype=int)
+    rewards, outcome = (
+        make_rewards(2, NUM_JOINTS, len(ROLES), str(wp.get_device())),
+        wp.array([Outcome.OUT, 0], dtype=int),
+    )
     step = Step(2)
     step.rewards = rewards
     weights = make_weights(dict.fromkeys(REWARDS, 0.0) | {"tracking_lin_vel": 1.0}, only_positive=True, falls=())
@@ -312,7 +315,7 @@ def test_every_term_has_a_weight():
 
 
 def test_remembering_a_step():
-    rewards, counter = make_rewards(2, 2, 1, "cpu"), wp.array([41], dtype=int)
+    rewards, counter = make_rewards(2, 2, 1, str(wp.get_device())), wp.array([41], dtype=int)
     action = wp.array(np.float32([[1, 2], [3, 4]]), dtype=float)
     joint_qd = wp.array(np.arange(16, dtype=np.float32).reshape(2, 8), dtype=float)
     remember_steps(action, joint_qd, rewards, counter)

@@ -39,9 +39,14 @@ def make_batch(num_envs, *, outcome=Outcome.TIME_OUT, level=0, column=0, count=0
     """Episodes and what training keeps beside them."""
     full = np.full(num_envs, 1, np.int32)
     training = make_training(
-        full * column, full * level, num_joints=NUM_JOINTS, observation_size=4, first_count=count, device="cpu"
+        full * column,
+        full * level,
+        num_joints=NUM_JOINTS,
+        observation_size=4,
+        first_count=count,
+        device=str(wp.get_device()),
     )
-    episodes = make_episodes(num_envs, "cpu")
+    episodes = make_episodes(num_envs, str(wp.get_device()))
     episodes.outcome.assign(np.broadcast_to(np.int32(outcome), num_envs))
     return episodes, training
 
@@ -181,7 +186,7 @@ def test_no_pushes_when_told_so():
 def test_statistics_add_up():
     outcome = [Outcome.RUNNING, Outcome.TIME_OUT, Outcome.TILT, Outcome.INVALID]
     episodes, training = make_batch(4, outcome=outcome)
-    rewards = make_rewards(4, NUM_JOINTS, 1, "cpu")
+    rewards = make_rewards(4, NUM_JOINTS, 1, str(wp.get_device()))
     episodes.steps.assign(np.array([5, 1000, 20, 30], np.int32))
     rewards.total.assign(np.float32([11, 22, 33, 44]))
     training.command.assign(np.float32([[0.3, 0.4, 0.2]] * 4))

@@ -48,6 +48,7 @@ def search_run(tmp_path_factory):
     return run, searches.outcome(longer), printed.replace(str(replayed), "RUN")
 
 
+@pytest.mark.kills
 def test_damaged_files_of_a_search_and_going_on_with_it(folder, search_run):
     whole, longer, _ = search_run
     cases = [(file, *case) for file in sorted(whole.iterdir()) for case in damages(file, SEED).items()]
@@ -75,6 +76,7 @@ def test_damaged_files_of_a_search_and_going_on_with_it(folder, search_run):
     assert refused["metrics.jsonl"] == refused["archive.npz"] == 1  # made again, unless a directory is in the way
 
 
+@pytest.mark.kills
 def test_damaged_files_of_a_search_and_replay(folder, search_run):
     whole, _, printed = search_run
     cases = [
@@ -111,6 +113,7 @@ def training_run(tmp_path_factory):
     return run, trainings.saved(folder / "longer")
 
 
+@pytest.mark.kills
 def test_damaged_files_of_a_training_and_going_on_with_it(folder, training_run):
     whole, longer = training_run
     cases = [(file, *case) for file in sorted(whole.iterdir()) for case in damages(file, SEED).items()]

@@ -45,6 +45,7 @@ def each(steps: dict[int, str], check) -> None:
         list(pool.map(check, steps.keys(), steps.values()))
 
 
+@pytest.mark.kills
 def test_no_space_at_any_step_of_a_search(folder, begun):
     short, longer = begun
     steps = steps_that_need_space(folder, searches.search_watched, copied(short, folder / "run"), iterations=WANTED)
@@ -64,6 +65,7 @@ def test_no_space_at_any_step_of_a_search(folder, begun):
     each(steps, fill_at)
 
 
+@pytest.mark.kills
 def test_no_space_at_any_step_of_a_training(folder):
     steps = steps_that_need_space(folder, trainings.train_watched, folder / "run", iterations=1)
 
@@ -79,6 +81,7 @@ def test_no_space_at_any_step_of_a_training(folder):
 
 
 @pytest.mark.parametrize("limit", [3000, 9000])
+@pytest.mark.kills
 def test_a_limit_of_the_system_on_file_sizes(folder, begun, limit):
     short, longer = begun
     path = copied(short, folder / "run")
@@ -88,6 +91,7 @@ def test_a_limit_of_the_system_on_file_sizes(folder, begun, limit):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a file system")
+@pytest.mark.kills
 def test_a_file_system_that_is_full(tmp_path):
     mounted = tmp_path / "small"
     mounted.mkdir()

@@ -27,11 +27,11 @@ from sim.policy.loaders import MlpPolicy, load_policy
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import Recording
 from sim.robots.robot import RobotCfg, get_robot
+from tests.builders import small_archive
 from tests.kills import searches, trainings
 from tests.kills.children import run_child
 from tests.kills.damage import flipped, npz, other_arrays, other_values
 from tests.qd.recordings import recording_of
-from tests.qd.test_archive import small_archive
 from train.ppo.learner import read_checkpoint
 
 SEED = 5
@@ -166,6 +166,7 @@ def test_mutated_files(made, tmp_path, what):
     assert refused > 200
 
 
+@pytest.mark.kills
 @pytest.mark.parametrize(
     "what",
     ["a controller's checkpoint", "the archive", "the checkpoint of a training", "a recording", "a heightmap"],

@@ -31,6 +31,7 @@ def at_each(steps: dict[int, str], check: Callable[[int, str], None]) -> None:
         list(pool.map(check, steps.keys(), steps.values()))
 
 
+@pytest.mark.kills
 def test_a_search_killed_at_any_step_resumes_to_the_same_bits(folder):
     steps = steps_of(folder, search_watched)
     whole = searches.outcome(folder / "whole")
@@ -70,6 +71,7 @@ def stopped_trainings(tmp_path_factory):
     return at_stop, at_end
 
 
+@pytest.mark.kills
 def test_a_training_killed_at_any_step_loses_nothing_saved_and_goes_on_from_there(folder, stopped_trainings):
     at_stop, at_end = stopped_trainings
     steps = steps_of(folder, train_watched)

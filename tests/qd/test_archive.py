@@ -3,42 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qd.archive import FRESH, Archive, FreshValues, read_archive, write_archive
-
-
-def small_archive(num_elites: int = 3) -> Archive:
-    rng = np.random.default_rng(num_elites)
-    columns = rng.random((num_elites, 2))
-    rows = rng.random(num_elites)
-    return Archive(
-        robot="anymal",
-        space="super_gaussian",
-        penalties=("yaw_rate", "vel_x"),
-        scales=(0.5, 2.0),
-        intervals=10,
-        collision_bit=False,
-        iterations=7,
-        genes=rng.uniform(-1, 1, (num_elites, 64)).astype(np.float32),
-        ratios=columns,
-        cell=np.arange(num_elites),
-        fitness=np.sort(rows)[::-1] - 1.0,
-        penalty_mean=columns,
-        penalty_std=columns,
-        collision_rate=rows,
-        goal_rate=rows,
-        fallen_rate=rows,
-        invalid_episodes=np.zeros(num_elites, int),
-        episodes=np.full(num_elites, 4),
-        iteration=np.arange(num_elites) + 1,
-    )
-
-
-def fresh_values(archive: Archive) -> FreshValues:
-    """Forty fresh episodes that say half the fitness, and otherwise what the elites had."""
-    same = {name: getattr(archive, name) for name in FRESH if hasattr(archive, name)}
-    changed = {"fitness": archive.fitness / 2, "episodes": np.full(len(archive), 40)}
-    limits = {"collision_low": archive.collision_rate / 2, "collision_high": np.ones(len(archive))}
-    return FreshValues(**same | changed | limits, reproduced=np.arange(len(archive)) % 2 == 0)
+from qd.archive import FRESH, Archive, read_archive, write_archive
+from tests.builders import fresh_values, small_archive
 
 
 @pytest.mark.parametrize("num_elites", [0, 3])

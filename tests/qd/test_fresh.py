@@ -5,8 +5,8 @@ import pytest
 
 from qd.fitness import FitnessCfg
 from qd.fresh import drawn_elites, numbers_of, reevaluate
+from tests.builders import small_archive
 from tests.qd.stand_in import make_result
-from tests.qd.test_archive import small_archive
 
 
 def archive_of(ratios, *, collided=None):

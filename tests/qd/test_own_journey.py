@@ -15,6 +15,8 @@ from qd.run.arguments import Archive, job_of
 from qd.show.replay import ReplayElite, replay
 from tests.sim.dogs import write_dog
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 SIZE = ["--emitters", "1", "--batch-size", "4", "--replicas", "2"]
 

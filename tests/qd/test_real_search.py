@@ -14,7 +14,7 @@ from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
 from sim.space import SUPER_GAUSSIAN
 from tests.qd import stand_in
-from tests.qd.test_search import make_job, rows_of
+from tests.qd.searches import make_job, rows_of
 
 ROBOT = get_robot("anymal")
 CFG = EvaluatorCfg(
@@ -28,8 +28,9 @@ SETTINGS = {
 
 
 @pytest.fixture(scope="module")
-def evaluate():
-    with open_evaluator(CFG) as evaluate:
+def evaluate(device):
+    workers = CFG.workers if device == "cpu" else None
+    with open_evaluator(dataclasses.replace(CFG, device=device, workers=workers)) as evaluate:
         yield evaluate
 
 
@@ -39,7 +40,10 @@ def test_the_stand_in_has_the_fields_of_a_result():
     assert {field.name for field in dataclasses.fields(stand_in.Result)} <= real
 
 
-def test_one_and_two_processes_give_the_same_bits(evaluate):
+@pytest.mark.slow
+def test_one_and_two_processes_give_the_same_bits(evaluate, device):
+    if device != "cpu":
+        pytest.skip("a GPU is one process")
     terrains, seeds = SUPER_GAUSSIAN.uniform_random(4, 0), episode_seeds(0, 1, 4)
     with open_evaluator(dataclasses.replace(CFG, workers="1")) as evaluate_alone:
         one = evaluate_alone(terrains, seeds)
@@ -50,7 +54,7 @@ def test_one_and_two_processes_give_the_same_bits(evaluate):
     assert (one.penalties[:, :, 1] > 0).all()
 
 
-def test_a_resumed_search_equals_the_uninterrupted_one_bit_for_bit(tmp_path, evaluate):
+def test_a_resumed_search_equals_the_uninterrupted_one(tmp_path, evaluate, device):
     @contextmanager
     def opened(cfg):
         yield evaluate
@@ -74,5 +78,7 @@ def test_a_resumed_search_equals_the_uninterrupted_one_bit_for_bit(tmp_path, eva
         run_search(make_job(killed, iterations=3, **SETTINGS), open_evaluator=lost_in_the_third)
     assert len(rows_of(killed)) == 2
     run_search(make_job(killed, iterations=3, resumes=True, **SETTINGS), open_evaluator=opened)
-    assert (whole / "archive.npz").read_bytes() == (killed / "archive.npz").read_bytes()
+    assert [row["iteration"] for row in rows_of(killed)] == [1, 2, 3]
+    if device == "cpu":  # a GPU's crossings are not repeated bit for bit
+        assert (whole / "archive.npz").read_bytes() == (killed / "archive.npz").read_bytes()
     assert len(archive) >= 1

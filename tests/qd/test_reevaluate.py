@@ -17,8 +17,8 @@ from qd.workers.evaluator import EvaluatorError
 from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
 from tests.qd import stand_in
+from tests.qd.searches import make_job, rows_of, run
 from tests.qd.stand_in import open_stand_in
-from tests.qd.test_search import make_job, rows_of, run
 
 POLICY = "tests.sim.policies:stand"
 SHIPPED = {"policy": "shipped", "policy_sha256": file_hash(get_robot("anymal").policy_file)}

@@ -16,7 +16,7 @@ from sim.robots.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.recordings import recording_of
 from tests.qd.run.test_arguments import TINY, fails, in_a_folder_of_its_own, run_main  # noqa: F401 - a fixture for all of these
-from tests.qd.test_search import run
+from tests.qd.searches import run
 
 KEPT = [0, 1, 3, 5]  # without vel_y and stumble
 FITNESS = FitnessCfg(

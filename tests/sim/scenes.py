@@ -14,6 +14,7 @@ from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 NODE_X = np.arange(NUM_COLS) * SPACING
 NODE_Y = np.arange(NUM_ROWS) * SPACING
 PHYSICS_DT = 0.005
+FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 GAINS = {
     "anymal": ([80] * 12, [2] * 12, [80] * 12),
     "cassie": (
@@ -26,6 +27,13 @@ GAINS = {
 ONLY_ANYMAL = pytest.mark.parametrize("robot", ["anymal"], indirect=True)
 """For tests of a robot that stands by itself, or of its own figures."""
 ONLY_CASSIE = pytest.mark.parametrize("robot", ["cassie"], indirect=True)
+
+
+def spike():
+    """A needle of 1 m under the start; the robot starts over its tip and falls on it."""
+    grid = FLAT.copy()
+    grid[79:82, 39:42] = 1.0
+    return grid
 
 
 def slope(angle_x: float = 0.0, angle_y: float = 0.0) -> np.ndarray:

@@ -19,15 +19,15 @@ def _one_thread() -> None:
 
 
 @pytest.fixture
-def make_task() -> Callable[..., CommandTask]:
+def make_task(device: str) -> Callable[..., CommandTask]:
     def make(seed: int = 0, num_envs: int = NUM_ENVS, robot: str = "anymal", **changes: object) -> CommandTask:
         cfg = TaskCfg.of(get_robot(robot), curriculum=CURRICULUM, **changes)
-        return CommandTask(get_robot(robot), cfg, num_envs=num_envs, device="cpu", seed=seed)
+        return CommandTask(get_robot(robot), cfg, num_envs=num_envs, device=device, seed=seed)
 
     return make
 
 
 @pytest.fixture(scope="session")
-def shared_task() -> CommandTask:
+def shared_task(device: str) -> CommandTask:
     """A task that tests may step and change, but not count on finding at its beginning."""
-    return CommandTask(get_robot("anymal"), TaskCfg(curriculum=CURRICULUM), num_envs=NUM_ENVS, device="cpu", seed=1)
+    return CommandTask(get_robot("anymal"), TaskCfg(curriculum=CURRICULUM), num_envs=NUM_ENVS, device=device, seed=1)

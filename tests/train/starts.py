@@ -7,6 +7,9 @@ import torch
 
 from qd.archive import write_archive
 from tests.train.archives import make_archive
+from train.ppo.cfg import PpoCfg
+
+PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 
 
 def write_actor(path, *, hidden=(16, 8), critic=False, **extra):

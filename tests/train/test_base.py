@@ -32,9 +32,9 @@ def parsed(flags):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, device):
     run_dir = tmp_path_factory.mktemp("run") / "first"
-    assert config(run_dir, export=run_dir.parent / "out" / "robot.pt").execute() == 0
+    assert config(run_dir, export=run_dir.parent / "out" / "robot.pt", device=device).execute() == 0
     return run_dir
 
 
@@ -62,15 +62,15 @@ def test_a_run_leaves_tensorboard_scalars(finished):
     assert {"train/level", "terms/stumble", "losses/value", "train/env_steps_per_s"} <= set(events.Tags()["scalars"])
 
 
-def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path):
+def test_resume_goes_on_elsewhere_or_in_place(finished, tmp_path, device):
     before = (finished / "checkpoint.pt").read_bytes()
-    assert config(tmp_path / "second", resume=finished, iterations=3).execute() == 0
+    assert config(tmp_path / "second", resume=finished, iterations=3, device=device).execute() == 0
     assert (finished / "checkpoint.pt").read_bytes() == before
     record = json.loads((tmp_path / "second" / "policy.train.json").read_text())
     assert record["iterations"] == 3 and record["env_steps"] == 72
     assert [row["iteration"] for row in record["curve"]] == [1, 2, 3]
     assert [piece["from_iteration"] for piece in record["pieces"]] == [0, 2]
-    assert config(None, resume=tmp_path / "second", iterations=4).execute() == 0
+    assert config(None, resume=tmp_path / "second", iterations=4, device=device).execute() == 0
     assert torch.load(tmp_path / "second" / "checkpoint.pt", weights_only=True)["iter"] == 4
 
 

@@ -15,15 +15,13 @@ from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from tests.train.archives import make_archive
-from tests.train.starts import make_places, write_actor, write_bad_starts
+from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
 from train.finetune import Finetune
-from train.ppo.cfg import PpoCfg
 from train.ppo.learner import read_checkpoint
 from train.ppo.ppo import CapturedPPO
 from train.ppo.run import CommandTask, read_saved
 
-PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 ROBOT = get_robot("anymal")
 
 
@@ -40,9 +38,9 @@ def config(places, **changes):
     return Finetune(**{"rewards": Finetune.defaults([]).rewards, **values})
 
 
-def resumed(run, **changes):
+def resumed(run, device="cpu", **changes):
     """The command that goes on with a run."""
-    return replace(Finetune.defaults(["--resume", str(run)]), device="cpu", **changes)
+    return replace(Finetune.defaults(["--resume", str(run)]), device=device, **changes)
 
 
 def finetune(flags):
@@ -54,8 +52,8 @@ def job_of(flags):
 
 
 @pytest.fixture(scope="module")
-def finished(places):
-    assert finetune(config(places, run_dir=places / "run", export=places / "out" / "tuned.pt")) == 0
+def finished(places, device):
+    assert finetune(config(places, run_dir=places / "run", export=places / "out" / "tuned.pt", device=device)) == 0
     return places / "run"
 
 
@@ -197,7 +195,7 @@ def test_on_a_gpu_the_sizes_are_the_papers(robot, paper):
     assert tuning.sizes_of(given, robot, on_gpu=True)["swap_every"] == 7
 
 
-def test_terrains_are_exchanged_when_due(places, monkeypatch):
+def test_terrains_are_exchanged_when_due(places, monkeypatch, device):
     seen = []
     exchange = CommandTask.exchange
 
@@ -208,14 +206,14 @@ def test_terrains_are_exchanged_when_due(places, monkeypatch):
         assert (task.episode_steps == 0).all()
 
     monkeypatch.setattr(CommandTask, "exchange", watched)
-    finetune(config(places, run_dir=places / "swaps", iterations=5, swap_every=2))
+    finetune(config(places, run_dir=places / "swaps", iterations=5, swap_every=2, device=device))
     assert len(seen) == 2  # before iterations 3 and 5
     assert seen[1] - seen[0] == 2 * 4 + 1  # two iterations of 4 steps, and the restart's own
 
 
-def test_resume_needs_the_directory_alone_and_goes_on_with_the_same_terrains(finished, places):
+def test_resume_needs_the_directory_alone_and_goes_on_with_the_same_terrains(finished, places, device):
     state = read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["mix"]
-    assert finetune(resumed(finished, run_dir=places / "longer", iterations=4)) == 0
+    assert finetune(resumed(finished, device, run_dir=places / "longer", iterations=4)) == 0
     later = read_checkpoint(places / "longer" / "checkpoint.pt", "anymal")
     assert later["iter"] == 4 and later["extra"]["mix"]["rows"] == state["rows"]
     before = read_checkpoint(finished / "checkpoint.pt", "anymal")["extra"]["settings"]

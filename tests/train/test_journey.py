@@ -5,9 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
-from tests.train.test_finetune import write_actor
+from tests.train.starts import write_actor
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,6 +25,7 @@ def run(*words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_from_a_file_of_the_user_to_the_tables(tmp_path):
     mine, tuned = write_actor(tmp_path / "mine.pt", hidden=(24, 20, 16)), tmp_path / "tuned"
     sizes = ("--num-envs", "8", "--terrains", "4", "--swap-every", "1", "--iterations", "2", "--critic-iterations", "1")

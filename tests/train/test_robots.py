@@ -61,11 +61,11 @@ def test_falls_are_paid_for_and_clipped_nowhere(make_task):
     assert task.observation.shape == (task.num_envs, 169)
     falls, rewards = 0, []
     for _ in range(120):
-        task.step(torch.zeros(task.num_envs, 12))
-        fell = (task.end != 0).numpy()
-        assert (task.reward.numpy()[fell] < -3.5).all()
+        task.step(torch.zeros(task.num_envs, 12, device=task.device))
+        fell = (task.end != 0).cpu().numpy()
+        assert (task.reward.cpu().numpy()[fell] < -3.5).all()
         falls += int(fell.sum())
-        rewards.append(task.reward.numpy().copy())
+        rewards.append(task.reward.cpu().numpy().copy())
         assert task.observation.isfinite().all() and task.reward.isfinite().all()
     sums = task.read_statistics()
     assert falls >= task.num_envs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qd.show.figures import draw_archive, draw_curves, draw_spread, save_figure, spread, summary, write_figures
-from tests.qd.test_archive import fresh_values, small_archive
+from tests.builders import fresh_values, small_archive
 
 ROW = {"terrains": 10, "episodes": 40, "invalid_episodes": 1, "wall_s": 2.5}
 

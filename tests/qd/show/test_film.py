@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
@@ -23,7 +22,9 @@ from sim.recording.file import read_recording
 from sim.recording.recorder import record
 from sim.recording.renderer import open_context
 from sim.rollout import Rollout
-from tests.qd.test_archive import fresh_values, small_archive
+from tests.builders import fresh_values, small_archive
+
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 pytestmark = pytest.mark.usefixtures("in_a_folder_of_its_own")
 SCALES = (1.0, 1.0, 1.0, 900.0, 0.03, 0.1)
@@ -81,6 +82,7 @@ def frames_in(path):
     return imageio_ffmpeg.count_frames_and_secs(str(path))[0]
 
 
+@pytest.mark.slow
 def test_films_of_elites_and_of_their_recordings(opengl, run, capsys):
     cfg = Film(elite="0 2", policy="tests.sim.policies:stand", device="cpu", replicas=4, fps=1, shadows=False, seed=3)
     films = make_films(cfg)

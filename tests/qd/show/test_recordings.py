@@ -7,9 +7,9 @@ import pytest
 from qd.show.recordings import Recordings, on_elite
 from sim.policy.spec import controller_hash
 from sim.recording.file import write_recording
+from tests.builders import small_archive
 from tests.qd.recordings import stand_in_cross
 from tests.qd.show.view.made import make_recording
-from tests.qd.test_archive import small_archive
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ from qd.show.elites import Found, find_archive
 from qd.show.replay import Replay, ReplayElite, describe, draw, replay
 from sim.files.command import run_command
 from sim.robots.robot import get_robot
+from tests.builders import fresh_values, small_archive
 from tests.qd import stand_in
 from tests.qd.recordings import FRAMES, recording_of
-from tests.qd.test_archive import fresh_values, small_archive
-from tests.qd.test_search import CFG, run
+from tests.qd.searches import CFG, run
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import dataclasses
 from types import SimpleNamespace
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -24,6 +23,8 @@ from qd.show.shot import (
 )
 from sim.mujoco_c.model import surface_heights
 from sim.recording.recorder import Recording
+
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 SCALES = {"yaw_rate": 2.0, "vel_x": 1.0}
 FRAMES = 51

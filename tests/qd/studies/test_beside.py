@@ -11,8 +11,8 @@ from qd.archive import read_archive, write_archive
 from qd.run.directory import RunDirectory
 from qd.search import run_search
 from qd.studies.beside import Beside, draw_beside, sides_of
+from tests.qd.searches import CFG, make_job
 from tests.qd.stand_in import open_stand_in
-from tests.qd.test_search import CFG, make_job
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from qd.studies import scale
 from qd.studies import speed as speed_module
 from qd.studies.scale import Scale
 from qd.studies.speed import Speed, read_iterations, time_iterations
+from tests.qd.searches import CFG, make_job
 from tests.qd.stand_in import open_stand_in
-from tests.qd.test_search import CFG, make_job
 
 SHIPPED_RUN = Path(__file__).parents[3] / "results" / "anymal" / "archive"
 

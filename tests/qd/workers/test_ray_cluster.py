@@ -16,6 +16,8 @@ from qd.workers.evaluator import resolve_device
 from tests.qd import stand_in
 from tests.qd.cluster_run import GENES, SEEDS
 
+pytestmark = pytest.mark.ray
+
 pytest.importorskip("ray")
 
 ROOT = Path(__file__).parents[3]

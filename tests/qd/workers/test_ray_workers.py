@@ -13,8 +13,10 @@ from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device
 from qd.workers.shards import flaw_of
 from tests.qd import crossers, stand_in
-from tests.qd.test_search import make_job
+from tests.qd.searches import make_job
 from tests.qd.workers.test_evaluator import same
+
+pytestmark = pytest.mark.ray
 
 ray = pytest.importorskip("ray")
 

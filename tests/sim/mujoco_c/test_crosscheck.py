@@ -87,6 +87,7 @@ def test_numbers_without_sense_are_refused(settings):
         Comparison(Crosscheck(device="cpu", **settings))
 
 
+@pytest.mark.slow
 def test_a_pool_without_middling_terrains_says_how_many_it_has(tmp_path):
     np.savez(tmp_path / "flat.npz", genes=np.zeros((2, 64), np.float32))  # all bumps of height 0
     check = Comparison(Crosscheck(device="cpu", genes=tmp_path / "flat.npz", terrains=1, episodes=1))
@@ -107,6 +108,7 @@ def test_terrains_of_a_pool_can_be_named_whatever_their_rates(tmp_path):
         Comparison(Crosscheck(device="cpu", elite="all"))
 
 
+@pytest.mark.slow
 def test_named_terrains_are_crossed_in_both_simulators(tmp_path):
     genes = np.zeros((3, 64), np.float32)  # flat, but for the last
     genes[2] = SUPER_GAUSSIAN.hard_random(1, np.random.default_rng(3))[0]

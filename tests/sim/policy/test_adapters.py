@@ -16,8 +16,8 @@ from sim.policy.loaders import load_policy
 from sim.policy.spec import ControllerSpec
 from sim.rollout import Rollout
 from sim.space import SUPER_GAUSSIAN
+from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.sim.policies import stretch
-from tests.sim.policy.test_loaders import rsl_rl_actor, save_checkpoint
 from tests.sim.scenes import positions, velocities
 
 SHORT = CrossingCfg(max_duration_s=0.4, poll_every_s=0.1)

@@ -9,33 +9,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.policy.runner import PolicyRunner
-
-OBSERVATIONS, ACTIONS = 235, 12
-
-
-def rsl_rl_actor(observations=OBSERVATIONS, actions=ACTIONS, normalised=False):
-    """rsl_rl's own actor, with a normaliser that has seen something."""
-    torch.manual_seed(0)
-    rows = TensorDict({"policy": torch.randn(64, observations) * 3 + 1}, batch_size=64)
-    distribution = {"class_name": "GaussianDistribution", "init_std": 1.0}
-    actor = MLPModel(
-        rows, {"actor": ["policy"]}, "actor", actions, (32, 16), "elu", normalised, distribution_cfg=distribution
-    )
-    if normalised:
-        actor.train()
-        actor.obs_normalizer.update(rows["policy"])
-    return actor.eval()
-
-
-def save_checkpoint(path, state, **more):
-    """As rsl_rl's runner saves it."""
-    torch.save({"actor_state_dict": state, "critic_state_dict": {}, "iter": 7, "infos": None} | more, path)
-    return path
+from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor, save_checkpoint
 
 
 @pytest.mark.parametrize("normalised", [False, True])

@@ -16,8 +16,7 @@ from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import FRAME_ARRAYS, Recording, record
 from sim.rollout import Rollout
 from sim.space import SUPER_GAUSSIAN
-from tests.sim.scenes import slope
-from tests.sim.test_rollout import FLAT, spike
+from tests.sim.scenes import FLAT, slope, spike
 
 SHORT = CrossingCfg(max_duration_s=1.0, poll_every_s=0.5)
 SEEDS = np.array([5, 6], np.uint32)

@@ -15,7 +15,7 @@ from qd.archive import Archive, read_archive, write_archive
 from sim.bank import heights_of
 from sim.space import SUPER_GAUSSIAN
 from tests.train.archives import make_archive
-from tests.train.test_finetune import PPO, write_actor
+from tests.train.starts import PPO, write_actor
 from train.evaluate.distances import Distances, distances
 from train.evaluate.evaluate import Evaluate, evaluate_tables
 from train.evaluate.sets import (

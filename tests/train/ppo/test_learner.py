@@ -64,8 +64,12 @@ def test_resumed_training_is_repeatable(learner, tmp_path):
         assert all(value.equal(saved_state[key]) for key, value in state_of(again).items())
         losses = again.iterate().losses
         ends.append((losses, {key: value.clone() for key, value in state_of(again).items()}))
-    assert ends[0][0] == ends[1][0]
-    assert all(value.equal(ends[1][1][key]) for key, value in ends[0][1].items())
+    (losses, state), (losses_again, state_again) = ends
+    if learner.env.device == "cpu":
+        assert losses == losses_again and all(value.equal(state_again[key]) for key, value in state.items())
+    else:  # the solver adds in any order there; four steps of Adam, of .005 at most each, may go either way
+        assert losses == pytest.approx(losses_again, rel=0.2, abs=0.02)
+        assert all((value - state_again[key]).abs().max() < 0.04 for key, value in state.items())
     assert not (tmp_path / ".c.pt.part").exists()
 
 
@@ -163,6 +167,7 @@ def torchrun(*arguments: str) -> subprocess.CompletedProcess:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_controller_and_go_on(tmp_path):
     run = tmp_path / "run"
     size = ["--device", "cpu", "--num-envs", "4", "--ppo.hidden-dims", "16", "--ppo.steps-per-env", "8"]
@@ -180,6 +185,7 @@ def test_two_processes_train_one_controller_and_go_on(tmp_path):
     assert any(not torch.equal(before[key], value) for key, value in after["actor_state_dict"].items())
 
 
+@pytest.mark.slow
 def test_processes_agree_and_notice_drift():
     done = torchrun("-m", "tests.train.drift")
     assert done.returncode == 0, done.stderr

@@ -19,16 +19,17 @@ NUM_ENVS, NUM_OBS, NUM_ACTIONS = 6, 5, 2
 class DummyEnv(VecEnv):
     """Random observations; the reward is higher the nearer the first action is to the first observation."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: str) -> None:
         self.num_envs, self.num_actions, self.max_episode_length = NUM_ENVS, NUM_ACTIONS, 10
-        self.episode_length_buf = torch.zeros(NUM_ENVS, dtype=torch.long)
-        self.device = "cpu"
+        self.episode_length_buf = torch.zeros(NUM_ENVS, dtype=torch.long, device=device)
+        self.device = device
         self.cfg = {}
         self.generator = torch.Generator().manual_seed(0)
         self.obs = self._draw()
 
     def _draw(self) -> TensorDict:
-        return TensorDict({"policy": torch.randn(NUM_ENVS, NUM_OBS, generator=self.generator)}, [NUM_ENVS])
+        rows = torch.randn(NUM_ENVS, NUM_OBS, generator=self.generator)  # the same on every device
+        return TensorDict({"policy": rows.to(self.device)}, [NUM_ENVS])
 
     def get_observations(self) -> TensorDict:
         return self.obs
@@ -36,15 +37,15 @@ class DummyEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         reward = -(actions[:, 0] - self.obs["policy"][:, 0]).square()
         self.obs = self._draw()
-        done = torch.rand(NUM_ENVS, generator=self.generator) < 0.1
+        done = torch.rand(NUM_ENVS, generator=self.generator).to(self.device) < 0.1
         return self.obs, reward, done.long(), {"time_outs": done & (reward > -1.0)}
 
 
-def make_runner(algorithm: type[PPO], cfg: PpoCfg) -> OnPolicyRunner:
+def make_runner(algorithm: type[PPO], cfg: PpoCfg, device: str) -> OnPolicyRunner:
     torch.manual_seed(3)
     settings = runner_settings(cfg)
     settings["algorithm"]["class_name"] = algorithm
-    return OnPolicyRunner(DummyEnv(), settings, log_dir=None, device="cpu")
+    return OnPolicyRunner(DummyEnv(device), settings, log_dir=None, device=device)
 
 
 def parameters(runner: OnPolicyRunner) -> list[torch.Tensor]:
@@ -52,57 +53,64 @@ def parameters(runner: OnPolicyRunner) -> list[torch.Tensor]:
 
 
 CFG = PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=3, mini_batches=2)
+EXACT = {"rtol": 0.0, "atol": 0.0}
+
+
+def close(device: str) -> dict[str, float]:
+    """Tolerances of weights after an update; on CUDA the fused Adam of a captured graph rounds otherwise."""
+    return {"rtol": 1e-5, "atol": 1e-6} if device == "cpu" else {"rtol": 1e-3, "atol": 1e-4}
 
 
 @pytest.mark.parametrize("desired_kl", [1e-5, 0.01, 10.0])  # the learning rate falls, moves both ways, rises
-def test_update_equals_rsl_rl(desired_kl: float) -> None:
+def test_update_equals_rsl_rl(desired_kl: float, device: str) -> None:
     cfg = PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=3, mini_batches=2, desired_kl=desired_kl)
-    ours, theirs = make_runner(CapturedPPO, cfg), make_runner(PPO, cfg)
+    ours, theirs = make_runner(CapturedPPO, cfg, device), make_runner(PPO, cfg, device)
     for runner in (ours, theirs):
         torch.manual_seed(5)
         runner.learn(1)
-    assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-5)
+    assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-4)
     assert ours.alg.learning_rate != cfg.learning_rate
     for mine, other in zip(parameters(ours), parameters(theirs), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(mine, other, **close(device))
 
 
-def test_a_pace_set_later_is_the_one_of_a_ppo_that_has_it() -> None:
-    ours, theirs = make_runner(CapturedPPO, CFG), make_runner(PPO, replace(CFG, desired_kl=1e-5, entropy=0.5))
+def test_a_pace_set_later_is_the_one_of_a_ppo_that_has_it(device: str) -> None:
+    later = replace(CFG, desired_kl=1e-5, entropy=0.5)
+    ours, theirs = make_runner(CapturedPPO, CFG, device), make_runner(PPO, later, device)
     ours.alg.set_pace(1e-5, 0.5)
     for runner in (ours, theirs):
         torch.manual_seed(5)
         runner.learn(1)
-    assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-5)
+    assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-4)
     for mine, other in zip(parameters(ours), parameters(theirs), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(mine, other, **close(device))
 
 
-def test_losses_are_the_means_of_rsl_rl(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = make_runner(CapturedPPO, CFG), make_runner(PPO, CFG)
+def test_losses_are_the_means_of_rsl_rl(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    ours, theirs = make_runner(CapturedPPO, CFG, device), make_runner(PPO, CFG, device)
     losses = []
     for runner in (ours, theirs):
         torch.manual_seed(5)
         monkeypatch.setattr(runner.logger, "log", lambda loss_dict, **_: losses.append(loss_dict))
         runner.learn(1)
-    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4 if device == "cpu" else 1e-3)
 
 
-def test_checkpoint_continues_with_the_same_numbers(tmp_path: Any) -> None:
-    whole = make_runner(CapturedPPO, CFG)
+def test_checkpoint_continues_with_the_same_numbers(tmp_path: Any, device: str) -> None:
+    whole = make_runner(CapturedPPO, CFG, device)
     whole.learn(1)
     whole.save(str(tmp_path / "a.pt"))
     saved = torch.load(tmp_path / "a.pt", weights_only=True)
     assert isinstance(saved["optimizer_state_dict"]["param_groups"][0]["lr"], float)
-    half = make_runner(CapturedPPO, CFG)
+    half = make_runner(CapturedPPO, CFG, device)
     half.load(str(tmp_path / "a.pt"))
     assert half.alg.learning_rate == pytest.approx(whole.alg.learning_rate)
     for runner in (whole, half):
-        runner.env = DummyEnv()
+        runner.env = DummyEnv(device)
         torch.manual_seed(9)
         runner.learn(1)
     for mine, other in zip(parameters(whole), parameters(half), strict=True):
-        torch.testing.assert_close(mine, other, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(mine, other, **(EXACT if device == "cpu" else close(device)))
 
 
 def test_settings_are_fresh() -> None:
@@ -113,17 +121,17 @@ def test_settings_are_fresh() -> None:
     assert runner_settings(PpoCfg())["actor"]["hidden_dims"] == [512, 256, 128]
 
 
-def test_unsupported_features_are_refused() -> None:
+def test_unsupported_features_are_refused(device: str) -> None:
     settings = runner_settings(CFG)
     settings["algorithm"]["normalize_advantage_per_mini_batch"] = True
     with pytest.raises(ValueError, match="leave these three settings"):
-        OnPolicyRunner(DummyEnv(), settings, log_dir=None, device="cpu")
+        OnPolicyRunner(DummyEnv(device), settings, log_dir=None, device=device)
 
 
 @pytest.mark.parametrize("algorithm", [CapturedPPO, PPO])
-def test_the_value_moves_no_further_than_the_clip_in_an_update(algorithm: type[PPO]) -> None:
+def test_the_value_moves_no_further_than_the_clip_in_an_update(algorithm: type[PPO], device: str) -> None:
     # The critic says .5, which is what came; it said 0 before. Clipped to 0 + .2, its error is .3 and its square .09.
-    runner = make_runner(algorithm, PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=1, mini_batches=1))
+    runner = make_runner(algorithm, PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=1, mini_batches=1), device)
     alg = runner.alg
     with torch.no_grad():
         for parameter in alg.critic.parameters():

@@ -7,7 +7,7 @@ from train.task.vec_env import CommandVecEnv
 
 def test_shapes_and_settings(shared_task):
     env = CommandVecEnv(shared_task)
-    observations, rewards, dones, extras = env.step(torch.zeros(6, 12))
+    observations, rewards, dones, extras = env.step(torch.zeros(6, 12, device=env.device))
     assert (env.num_envs, env.num_actions, env.max_episode_length) == (6, 12, 1000)
     assert observations.batch_size == (6,) and observations["policy"].shape == (6, 235)
     assert rewards.shape == dones.shape == extras["time_outs"].shape == (6,)
@@ -17,41 +17,41 @@ def test_shapes_and_settings(shared_task):
 def test_nothing_handed_out_changes_later(shared_task):
     env = CommandVecEnv(shared_task)
     handed = [env.get_observations()["policy"], env.episode_length_buf]
-    observations, rewards, dones, extras = env.step(torch.zeros(6, 12))
+    observations, rewards, dones, extras = env.step(torch.zeros(6, 12, device=env.device))
     handed += [observations["policy"], rewards, dones, extras["time_outs"]]
     kept = [tensor.clone() for tensor in handed]
     for _ in range(3):
-        env.step(torch.ones(6, 12))
+        env.step(torch.ones(6, 12, device=env.device))
     assert all(tensor.equal(copy) for tensor, copy in zip(handed, kept, strict=True))
     assert not env.get_observations()["policy"].equal(handed[0])
 
 
 def test_actions_are_not_kept(shared_task):
     env = CommandVecEnv(shared_task)
-    actions = torch.full((6, 12), 0.1)
+    actions = torch.full((6, 12), 0.1, device=env.device)
     env.step(actions)
     assert (actions == 0.1).all()
 
 
 def test_steps_run_under_inference_mode_and_after_it(shared_task):
     env = CommandVecEnv(shared_task)
-    shared_task.restart_all(torch.zeros(6))
+    shared_task.restart_all(torch.zeros(6, device=env.device))
     with torch.inference_mode():
-        env.step(torch.zeros(6, 12))
-    observations, *_ = env.step(torch.zeros(6, 12))
+        env.step(torch.zeros(6, 12, device=env.device))
+    observations, *_ = env.step(torch.zeros(6, 12, device=env.device))
     assert env.episode_length_buf.tolist() == [2] * 6
-    weight = torch.zeros(235, requires_grad=True)
+    weight = torch.zeros(235, requires_grad=True, device=env.device)
     (observations["policy"] @ weight).sum().backward()  # a tensor of inference mode would be refused here
     torch.testing.assert_close(weight.grad, observations["policy"].sum(0))
 
 
 def test_time_outs_are_the_dones_of_the_clock(shared_task):
     env = CommandVecEnv(shared_task)
-    shared_task.restart_all(torch.zeros(6))
-    env.episode_length_buf = torch.tensor([0, 998, 999, 999, 5, 5])
+    shared_task.restart_all(torch.zeros(6, device=env.device))
+    env.episode_length_buf = torch.tensor([0, 998, 999, 999, 5, 5], device=env.device)
     joint_q = torch.from_dlpack(shared_task.sim.joint_q)
-    joint_q[3:5, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0])  # on their backs
-    _, _, dones, extras = env.step(torch.zeros(6, 12))
+    joint_q[3:5, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0], device=env.device)  # on their backs
+    _, _, dones, extras = env.step(torch.zeros(6, 12, device=env.device))
     assert dones.tolist() == [False, False, True, True, True, False]
     assert extras["time_outs"].tolist() == [False, False, True, False, False, False]
     assert env.episode_length_buf.tolist() == [1, 999, 0, 0, 0, 6]

@@ -11,8 +11,8 @@ from qd.show.elites import elites_of
 from qd.show.report.elites import choice_told
 from qd.show.report.modes import MAX_MODES, find_modes, silhouette
 from qd.show.report.page import percent
+from tests.builders import fresh_values, small_archive
 from tests.qd.recordings import NAMES, recording_of
-from tests.qd.test_archive import fresh_values, small_archive
 
 
 def grouped_archive(sizes=(6, 9, 5)):

@@ -21,10 +21,10 @@ from qd.show.report.page import Absent, Facts, Heading, Section, Table, Text, re
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
+from tests.builders import fresh_values
 from tests.qd.recordings import stand_in_cross
 from tests.qd.show.report.test_numbers import grouped_archive
 from tests.qd.show.test_figures import rows
-from tests.qd.test_archive import fresh_values
 
 DOT = bytes.fromhex("89504e470d0a1a0a")
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -208,6 +208,7 @@ def test_what_comes_from_files_is_escaped(whole):
     assert 'a"b' in page.ids and "<a>" in page.ids and "#'x" in page.links
 
 
+@pytest.mark.slow
 def test_crossings_are_kept_and_a_stopped_report_goes_on(reported, run, monkeypatch):
     first, crossed = reported()
     before = first.read_bytes()
@@ -237,9 +238,7 @@ def test_sections_without_data_name_the_command_that_makes_it(reported, run):
     (run / "metrics.jsonl").unlink()
     (run / "config.json").unlink()
     text = Page(reported()[0].read_bytes()).text
-    assert re.search(
-        r"no metrics\.jsonl .* A search writes one: \S*faultline archive --robot anymal", text
-    )
+    assert re.search(r"no metrics\.jsonl .* A search writes one: \S*faultline archive --robot anymal", text)
     assert "no config.json beside the archive" in text
     assert re.search(r"made by \S*faultline evaluate --robot anymal --policies base=shipped C-G=FILE", text)
 

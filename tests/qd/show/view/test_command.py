@@ -11,7 +11,7 @@ import tyro
 from qd.archive import read_archive, write_archive
 from qd.run.directory import RESULTS
 from qd.show.view.command import View, check_port, show_of
-from tests.qd.test_archive import small_archive
+from tests.builders import small_archive
 
 ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
 

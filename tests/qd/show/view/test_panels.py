@@ -5,21 +5,7 @@ import pytest
 
 from qd.show.view.panels import PAGE, Clock, Selection
 from qd.show.view.plots import axes_of
-from tests.qd.test_archive import fresh_values, small_archive
-
-
-@pytest.fixture
-def axes():
-    """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
-    numbers = np.arange(20)
-    archive = dataclasses.replace(
-        small_archive(20),
-        goal_rate=numbers / 20,
-        collision_rate=(numbers % 2).astype(float),
-        fitness=10.0 - numbers,
-        episodes=np.full(20, 20),
-    )
-    return axes_of(archive)
+from tests.builders import fresh_values, small_archive
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from qd.show.view.playing import crossing_of, endings, moment_text, paths_of, ro
 from qd.show.view.plots import Curves, axes_svg
 from sim.robots.skeleton import Skeleton
 from tests.qd.show.view.made import FRAMES, make_recording
-from tests.qd.show.view.test_panels import axes  # noqa: F401  # a fixture
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +70,7 @@ def test_the_mark_of_the_curves_moves_with_time():
     assert "&lt;two&gt;" in begin and ">4<" in begin  # the largest sum
 
 
-def test_the_plot_greys_what_ranges_leave_out(axes):  # noqa: F811
+def test_the_plot_greys_what_ranges_leave_out(axes):
     everything = axes_svg(axes, np.arange(20), {}, picked=3)
     some = axes_svg(axes, np.array([1, 2]), {"goal_rate": (0.05, 0.1)}, picked=None)
     lines = lambda svg: svg.count("M") - svg.count("</text>M")  # noqa: E731  # a line an elite

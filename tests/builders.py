@@ -1,0 +1,83 @@
+"""Small things that tests of several rooms are made of: archives, terrains and controllers."""
+
+import numpy as np
+import torch
+import warp as wp
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+
+from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+from qd.archive import FRESH, Archive, FreshValues
+
+SPACING = 0.05
+RNG_SEED = 5
+OBSERVATIONS, ACTIONS = 235, 12
+
+
+def small_archive(num_elites: int = 3) -> Archive:
+    rng = np.random.default_rng(num_elites)
+    columns = rng.random((num_elites, 2))
+    rows = rng.random(num_elites)
+    return Archive(
+        robot="anymal",
+        space="super_gaussian",
+        penalties=("yaw_rate", "vel_x"),
+        scales=(0.5, 2.0),
+        intervals=10,
+        collision_bit=False,
+        iterations=7,
+        genes=rng.uniform(-1, 1, (num_elites, 64)).astype(np.float32),
+        ratios=columns,
+        cell=np.arange(num_elites),
+        fitness=np.sort(rows)[::-1] - 1.0,
+        penalty_mean=columns,
+        penalty_std=columns,
+        collision_rate=rows,
+        goal_rate=rows,
+        fallen_rate=rows,
+        invalid_episodes=np.zeros(num_elites, int),
+        episodes=np.full(num_elites, 4),
+        iteration=np.arange(num_elites) + 1,
+    )
+
+
+def fresh_values(archive: Archive) -> FreshValues:
+    """Forty fresh episodes that say half the fitness, and otherwise what the elites had."""
+    same = {name: getattr(archive, name) for name in FRESH if hasattr(archive, name)}
+    changed = {"fitness": archive.fitness / 2, "episodes": np.full(len(archive), 40)}
+    limits = {"collision_low": archive.collision_rate / 2, "collision_high": np.ones(len(archive))}
+    return FreshValues(**same | changed | limits, reproduced=np.arange(len(archive)) % 2 == 0)
+
+
+def make_terrain(grids, device, spacing=SPACING):
+    terrain = Terrain()
+    terrain.heights = wp.array(np.float32(grids), device=device)
+    terrain.ceilings = wp.zeros(ceiling_shape(*np.shape(grids)), dtype=float, device=device)
+    terrain.spacing = spacing
+    max_blocks(terrain.heights, terrain.ceilings)
+    return terrain
+
+
+def rough(nrow, ncol, size=0.2, seed=RNG_SEED):
+    """A grid with no two nodes alike: cells as steep as 76 degrees."""
+    return np.random.default_rng(seed).uniform(-size, size, (nrow, ncol)).astype(np.float32)
+
+
+def rsl_rl_actor(observations=OBSERVATIONS, actions=ACTIONS, normalised=False):
+    """rsl_rl's own actor, with a normaliser that has seen something."""
+    torch.manual_seed(0)
+    rows = TensorDict({"policy": torch.randn(64, observations) * 3 + 1}, batch_size=64)
+    distribution = {"class_name": "GaussianDistribution", "init_std": 1.0}
+    actor = MLPModel(
+        rows, {"actor": ["policy"]}, "actor", actions, (32, 16), "elu", normalised, distribution_cfg=distribution
+    )
+    if normalised:
+        actor.train()
+        actor.obs_normalizer.update(rows["policy"])
+    return actor.eval()
+
+
+def save_checkpoint(path, state, **more):
+    """As rsl_rl's runner saves it."""
+    torch.save({"actor_state_dict": state, "critic_state_dict": {}, "iter": 7, "infos": None} | more, path)
+    return path

@@ -1,0 +1,58 @@
+"""Searches over the stand-in evaluator, for tests of several files."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+from qd.fitness import FitnessCfg
+from qd.run.arguments import Job
+from qd.run.directory import RunDirectory, origin_in
+from qd.run.settings import SchedulerCfg, SearchCfg
+from qd.search import run_search
+from qd.workers.evaluator import EvaluatorCfg
+from sim.files.provenance import provenance
+from tests.qd import stand_in
+from tests.qd.stand_in import open_stand_in
+
+CFG = SearchCfg(
+    robot="anymal",
+    preset="small",
+    policy="shipped",
+    policy_sha256=None,
+    seed=3,
+    iterations=2,
+    replicas=4,
+    intervals=10,
+    collision_bit=False,
+    fitness=FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES),
+    scheduler=SchedulerCfg(emitters=2, batch_size=6, sigma0=0.5, restart_rule="3"),
+)
+
+
+def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
+    cfg = dataclasses.replace(CFG, **changes)
+    evaluator = EvaluatorCfg(
+        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, workers="1"
+    )
+    begun = {**provenance("cpu", cfg.seed), "sessions": []}
+    origin = origin_in(RunDirectory(path).read_config()) if resumes else begun
+    return Job(
+        cfg=cfg,
+        path=path,
+        resumes=resumes,
+        evaluator=evaluator,
+        reproduce=reproduce,
+        origin=origin,
+        session={"command": f"to {cfg.iterations}", "commit": "c", "device": "d"},
+        resume_command=f"faultline archive --resume {path}",
+        reevaluate_command=f"faultline reevaluate --run {path}",
+    )
+
+
+def run(path: Path, **settings):
+    return run_search(make_job(path, **settings), open_evaluator=open_stand_in)
+
+
+def rows_of(path: Path, *, timed: bool = False) -> list[dict]:
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if timed or k not in ("wall_s", "episodes_per_s")} for row in rows]

@@ -1,0 +1,26 @@
+"""What tests of the page share; those of its widgets need viser."""
+
+import dataclasses
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from qd.show.view.plots import axes_of
+from tests.builders import small_archive
+
+collect_ignore = [] if find_spec("viser") else ["test_app.py", "test_panels.py"]
+
+
+@pytest.fixture
+def axes():
+    """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
+    numbers = np.arange(20)
+    archive = dataclasses.replace(
+        small_archive(20),
+        goal_rate=numbers / 20,
+        collision_rate=(numbers % 2).astype(float),
+        fitness=10.0 - numbers,
+        episodes=np.full(20, 20),
+    )
+    return axes_of(archive)
