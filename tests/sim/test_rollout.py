@@ -199,7 +199,8 @@ def test_penalties_equal_a_replay_on_the_host(robot, device):
     assert ended.tolist() == [False, False, True, True]
     np.testing.assert_array_equal(result.base_collision.ravel(), ended)
     columns = [PENALTIES.index(name) for name in robot.penalties]
-    np.testing.assert_allclose(result.penalties.reshape(4, -1), sums[:, columns], rtol=1e-4, atol=1e-6)
+    tolerance = {"rtol": 1e-3, "atol": 1e-4} if device.startswith("cuda") else {"rtol": 1e-4, "atol": 1e-6}
+    np.testing.assert_allclose(result.penalties.reshape(4, -1), sums[:, columns], **tolerance)
     assert (sums[:, :3] > 0.01).all()
     assert sums[2:, 5].min() > 0  # the base's touch itself is counted
 
@@ -269,11 +270,12 @@ def test_an_episode_depends_on_nothing_but_its_terrain_seed_and_replica(anymal, 
         same(expected, alone.evaluate(grids[t : t + 1], seeds[t : t + 1]), slice(t, t + 1))
 
 
-def test_genes_and_their_heights_are_the_same_terrain(rollout):
+def test_genes_and_their_heights_are_the_same_terrain(rollout, device):
     genes, seeds = SUPER_GAUSSIAN.uniform_random(TERRAINS, 3), np.arange(TERRAINS)
     by_genes = rollout.evaluate(genes, seeds)
     by_heights = rollout.evaluate(np.array(rollout.sim.bank.heights.numpy()), seeds)
-    np.testing.assert_array_equal(by_genes.final_position, by_heights.final_position)
+    atol = 1e-3 if device.startswith("cuda") else 0.0  # a GPU does not repeat its sums bit for bit
+    np.testing.assert_allclose(by_genes.final_position, by_heights.final_position, rtol=0.0, atol=atol)
 
 
 def test_progress_is_told_at_every_poll(rollout, grids):

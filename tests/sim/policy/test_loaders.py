@@ -16,6 +16,11 @@ from sim.policy.runner import PolicyRunner
 from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor, save_checkpoint
 
 
+def near(device: str) -> dict[str, float]:
+    """Tolerances of a small network: float32, or on a GPU the ten bits of TF32."""
+    return {"rtol": 2e-3, "atol": 5e-3} if device.startswith("cuda") else {"rtol": 1e-5, "atol": 1e-5}
+
+
 @pytest.mark.parametrize("normalised", [False, True])
 def test_an_rsl_rl_checkpoint_acts_as_rsl_rl_does(tmp_path, anymal, device, normalised):
     actor = rsl_rl_actor(normalised=normalised)
@@ -24,7 +29,7 @@ def test_an_rsl_rl_checkpoint_acts_as_rsl_rl_does(tmp_path, anymal, device, norm
     with torch.inference_mode():
         expected = actor(TensorDict({"policy": rows}, batch_size=9))
         got = policy(rows.to("cuda" if device.startswith("cuda") else "cpu"))
-    torch.testing.assert_close(got.cpu(), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(got.cpu(), expected, **near(device))
 
 
 def test_the_shipped_controller_loads(anymal, device):
@@ -42,7 +47,7 @@ def test_torchscript_loads(tmp_path, anymal, device, suffix):
     policy = load_policy(str(path), anymal, device)
     rows = torch.randn(5, OBSERVATIONS)
     got = policy(rows.to("cuda" if device.startswith("cuda") else "cpu"))
-    torch.testing.assert_close(got.detach().cpu(), module(rows).detach(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(got.detach().cpu(), module(rows).detach(), **near(device))
 
 
 def test_a_callable_loads(anymal, device):

