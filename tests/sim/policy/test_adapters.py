@@ -115,7 +115,8 @@ def test_an_actor_of_another_row_acts_the_same_through_its_adapter(tmp_path, wri
     rows = rows.to("cuda" if device.startswith("cuda") else "cpu")
     with torch.inference_mode():
         expected = direct(rows)
-        torch.testing.assert_close(adapted(rows), expected, rtol=1e-4, atol=1e-4)
+        atol = 5e-3 if device.startswith("cuda") else 1e-4  # a GPU multiplies with the ten bits of TF32
+        torch.testing.assert_close(adapted(rows), expected, rtol=1e-4, atol=atol)
         wrong = load_policy(theirs, anymal, device)(rows)  # the sizes are right, the meaning is not
     assert (wrong - expected).abs().max() > 0.1
 
