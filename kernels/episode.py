@@ -81,34 +81,42 @@ class Episodes:
     """Base pose at the end, world-local frame."""
     rng: wp.array[wp.uint32]
     """State of the random numbers that the next start is drawn from."""
-    num_running: wp.array[int]
-    """Episodes not yet ended, shape (1,)."""
 
 
 def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
-    """Allocate episodes that have not begun."""
+    """Allocate episodes of which none runs."""
     episodes = Episodes()
     for name in ("outcome", "steps", "counted"):
         setattr(episodes, name, wp.zeros(num_envs, dtype=int, device=device))
+    episodes.outcome.fill_(int(Outcome.TIME_OUT))
     episodes.base_force = wp.zeros(num_envs, dtype=float, device=device)
     episodes.start = wp.zeros(num_envs, dtype=wp.vec2, device=device)
     episodes.final_pose = wp.zeros(num_envs, dtype=wp.transform, device=device)
     episodes.rng = wp.zeros(num_envs, dtype=wp.uint32, device=device)
-    episodes.num_running = wp.zeros(1, dtype=int, device=device)
     return episodes
 
 
-def begin_all(episodes_out: Episodes) -> None:
-    """Set every episode running, with no step made; moves no robot."""
-    episodes_out.outcome.zero_()
-    episodes_out.steps.zero_()
-    episodes_out.num_running.fill_(episodes_out.outcome.shape[0])
+@wp.func
+def begin_episode(env: int, episodes_out: Episodes):
+    """Set an episode running, with no step made."""
+    episodes_out.outcome[env] = _RUNNING
+    episodes_out.steps[env] = 0
+    episodes_out.counted[env] = 0
+    episodes_out.base_force[env] = 0.0
+    episodes_out.final_pose[env] = wp.transform_identity()
 
 
-def end_all(episodes_out: Episodes) -> None:
-    """End every episode, so that all of them restart."""
-    episodes_out.outcome.fill_(int(Outcome.TIME_OUT))
-    episodes_out.num_running.zero_()
+@wp.kernel
+def _begin_episodes_kernel(mask: wp.array[int], episodes_out: Episodes):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    if mask[env] != 0:
+        begin_episode(env, episodes_out)
+
+
+def begin_episodes(mask: Any, episodes_out: Episodes) -> None:
+    """Set episodes running where the int ``mask`` (num_envs,) is not 0; moves no robot."""
+    wp.launch(_begin_episodes_kernel, mask.shape[0], inputs=[mask], outputs=[episodes_out], device=mask.device)
 
 
 @wp.func
@@ -226,7 +234,6 @@ def _latch_outcomes_kernel(
     if outcome != _RUNNING:
         episodes_out.outcome[env] = outcome
         episodes_out.final_pose[env] = wp.transform(base_position(joint_q, env), base_rotation(joint_q, env))
-        wp.atomic_sub(episodes_out.num_running, 0, 1)
 
 
 def latch_outcomes(

@@ -4,13 +4,10 @@ from typing import Any
 
 import warp as wp
 
-from kernels.episode import Episodes, Outcome
+from kernels.episode import Episodes, begin_episode
 from kernels.heightfield import Terrain, node_height
 from kernels.observation import Sensors
 from kernels.rewards import Rewards
-
-_RUNNING = wp.constant(int(Outcome.RUNNING))
-
 
 @wp.struct
 class StartRanges:
@@ -73,32 +70,8 @@ def _place_robot(
 
 
 @wp.kernel
-def _seed_starts_kernel(
-    seed_of_terrain: wp.array[wp.uint32], terrain_of_env: wp.array[int], num_replicas: int, episodes_out: Episodes
-):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    # The stream depends on the terrain's seed and the replica alone: sharding terrains changes no episode.
-    episodes_out.rng[env] = wp.rand_init(int(seed_of_terrain[terrain_of_env[env]]), env % num_replicas)
-
-
-def seed_starts(seed_of_terrain: Any, terrain_of_env: Any, num_replicas: int, episodes_out: Episodes) -> None:
-    """Let the next start of replica r on terrain t be drawn from the stream (seed of t, r).
-
-    Args:
-        seed_of_terrain: uint32 seeds, shape (num_terrains,).
-        terrain_of_env: Terrain of each environment, shape (num_envs,).
-        num_replicas: Episodes a terrain; the replica of an environment is ``env % num_replicas``.
-        episodes_out: Writes ``rng``.
-    """
-    inputs = [seed_of_terrain, terrain_of_env, num_replicas]
-    wp.launch(
-        _seed_starts_kernel, terrain_of_env.shape[0], inputs, outputs=[episodes_out], device=terrain_of_env.device
-    )
-
-
-@wp.kernel
 def _restart_episodes_kernel(
+    mask: wp.array[int],
     terrain_of_env: wp.array[int],
     terrain: Terrain,
     ranges: StartRanges,
@@ -111,15 +84,11 @@ def _restart_episodes_kernel(
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
-    if episodes_out.outcome[env] == _RUNNING:
+    if mask[env] == 0:
         return
     _place_robot(episodes_out.rng[env], terrain, terrain_of_env[env], ranges, sensors, env, joint_q_out, joint_qd_out)
     episodes_out.start[env] = wp.vec2(joint_q_out[env, 0], joint_q_out[env, 1])
-    episodes_out.outcome[env] = _RUNNING
-    episodes_out.steps[env] = 0
-    episodes_out.counted[env] = 0
-    episodes_out.final_pose[env] = wp.transform_identity()
-    wp.atomic_add(episodes_out.num_running, 0, 1)
+    begin_episode(env, episodes_out)
     for j in range(last_action_out.shape[1]):
         last_action_out[env, j] = 0.0
     if rewards_out.total.shape[0] == 0:
@@ -132,12 +101,13 @@ def _restart_episodes_kernel(
 
 
 def restart_episodes(
-    terrain_of_env: Any, terrain: Terrain, ranges: StartRanges, sensors: Sensors, joint_q_out: Any, joint_qd_out: Any,
-    last_action_out: Any, episodes_out: Episodes, rewards_out: Rewards,
+    mask: Any, terrain_of_env: Any, terrain: Terrain, ranges: StartRanges, sensors: Sensors, joint_q_out: Any,
+    joint_qd_out: Any, last_action_out: Any, episodes_out: Episodes, rewards_out: Rewards,
 ) -> None:  # fmt: skip
-    """Put the robots whose episodes ended at a new randomised start, with nothing remembered of the episode before.
+    """Put robots at a new randomised start, with nothing remembered of the episode before.
 
     Args:
+        mask: Not 0 where an episode begins, int, shape (num_envs,).
         terrain_of_env: Terrain of each environment, shape (num_envs,).
         terrain: Height grids.
         ranges: Nominal start and ranges.
@@ -148,7 +118,7 @@ def restart_episodes(
         episodes_out: Set running, zero steps; starts are drawn from ``rng``.
         rewards_out: Nothing summed; empty where nothing is rewarded.
     """
-    inputs = [terrain_of_env, terrain, ranges, sensors]
+    inputs = [mask, terrain_of_env, terrain, ranges, sensors]
     wp.launch(
         _restart_episodes_kernel,
         terrain_of_env.shape[0],

@@ -7,6 +7,8 @@ from kernels.heightfield import Terrain, ceiling_shape, max_blocks
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
+_ALL = slice(None)
+
 
 class TerrainBank:
     """Height grids on the device; an environment stands on the grid its terrain index names.
@@ -46,31 +48,41 @@ class TerrainBank:
         """Node heights [m] on the device, shape (num_terrains, nrow, ncol)."""
         return self.terrain.heights
 
-    def set_heights(self, heights: np.ndarray) -> None:
-        """Replace all terrains by height grids [m], shape (num_terrains, nrow, ncol).
+    def set_heights(self, heights: np.ndarray, slots: slice = _ALL) -> None:
+        """Replace terrains by height grids [m].
+
+        Args:
+            heights: Shape (number of slots, nrow, ncol).
+            slots: Which are replaced; all if left out.
 
         Raises:
             ValueError: If the shape differs or a height is not finite.
         """
-        expected = tuple(self.heights.shape)
+        replaced = self.heights[slots]
+        expected = tuple(replaced.shape)
         if heights.shape != expected:
             raise ValueError(f"heights must have shape {expected} [terrain, row, col], got {heights.shape}")
         if not np.isfinite(heights).all():
             raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
-        self.heights.assign(heights.astype(np.float32))
-        max_blocks(self.terrain.heights, self.terrain.ceilings)
+        replaced.assign(heights.astype(np.float32))
+        max_blocks(replaced, self.terrain.ceilings[slots])
 
-    def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN) -> None:
-        """Replace all terrains by those of genes of a space, shape (num_terrains, num_genes).
+    def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
+        """Replace terrains by those of genes of a space.
+
+        Args:
+            genes: Shape (number of slots, num_genes).
+            space: What the genes mean.
+            slots: Which are replaced; all if left out.
 
         Raises:
             ValueError: If the shape differs or a gene is not finite.
         """
-        valid = space.validate(genes)
-        if len(valid) != self.num_terrains:
-            raise ValueError(f"genes must be of {self.num_terrains} terrains, one row each, got {len(valid)} rows")
-        space.rasterise(wp.array(valid, dtype=float, device=self.device), SPACING, self.terrain.heights)
-        max_blocks(self.terrain.heights, self.terrain.ceilings)
+        valid, replaced = space.validate(genes), self.heights[slots]
+        if len(valid) != len(replaced):
+            raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
+        space.rasterise(wp.array(valid, dtype=float, device=self.device), SPACING, replaced)
+        max_blocks(replaced, self.terrain.ceilings[slots])
 
 
 def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str = "cpu") -> np.ndarray:

@@ -1,23 +1,25 @@
 """The crossing task: robots cross terrains toward a goal, and what it cost them comes back."""
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
-from kernels.episode import Outcome, begin_all, command_goal, end_all, latch_outcomes, make_episodes, park_ended
+from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
-from kernels.restart import restart_episodes, seed_starts
+from kernels.queue import make_queue, make_ready, turn_over
+from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges, make_task
 from sim.policy.loaders import PolicySpec, load_policy, prepare_torch
-from sim.policy.runner import PolicyRunner
+from sim.policy.runner import Memory, PolicyRunner
 from sim.reward import Reward
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation, SolverCfg
@@ -42,8 +44,11 @@ class RolloutResult:
     final_position: np.ndarray
     """Base position at the end, world-local [m], (T, R, 3) float32."""
     physics_steps: int
-    """Physics steps run until the last episode ended."""
+    """Physics steps run for it: since the result before, or since it was put in if nothing else was."""
+    robot_steps: int
+    """Physics steps of all robots in that time, those that waited included."""
     wall_s: float
+    """Time that took [s]."""
     reward: np.ndarray | None = None
     """Training reward summed to the end of the time, (T, R) float64, NaN where invalid; None unless asked for."""
 
@@ -76,14 +81,50 @@ class RolloutState:
     """Columns :data:`kernels.penalties.PENALTIES`, times the physics step, shape (num_envs, 6)."""
     command: Any
     """Command of the coming control step, zero once an episode has ended, shape (num_envs, 3)."""
+    episode: Any
+    """The episode that a robot runs: replica ``episode % num_replicas`` of terrain slot ``episode // num_replicas``, -1
+    for none; shape (num_envs,)."""
     outcome: Any
     """:class:`kernels.episode.Outcome`, shape (num_envs,)."""
     steps: Any
     """Physics steps up to the end, shape (num_envs,)."""
 
 
+class Watcher(Protocol):
+    """Looks at :attr:`Rollout.state` around every control step (:mod:`sim.recording.recorder`)."""
+
+    def before_step(self) -> None:
+        """Called before a control step: a robot that has just taken an episode stands at its start."""
+        ...
+
+    def after_step(self) -> None:
+        """Called after it, before robots whose episodes ended take the next."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Batch:
+    """Terrains that were put in together."""
+
+    slots: tuple[slice, ...]
+    """Where they lie in the ring, in order."""
+    num_episodes: int
+    most_steps: int
+    """Control steps by which they have ended if nothing else is under way."""
+    put_at: int
+    """Control steps made before."""
+
+
 class Rollout:
-    """Crossings of ``num_terrains`` x ``num_replicas`` robots at once; built once, used again and again."""
+    """Crossings: ``num_envs`` robots run any number of episodes, and each takes the next when its own has ended.
+
+    Built once, used again and again. Terrains are put in and their results taken out in the same order; several lots
+    may be under way, so that robots have work while the last episodes of one lot still run. :meth:`evaluate` does both
+    for a single lot.
+
+    An episode depends on its terrain, the terrain's seed and its replica alone, whichever robot runs it beside whatever
+    others; on the CPU bit for bit from 4 robots on.
+    """
 
     def __init__(
         self,
@@ -93,6 +134,7 @@ class Rollout:
         num_terrains: int,
         num_replicas: int,
         device: str,
+        num_envs: int | None = None,
         cfg: CrossingCfg | None = None,
         solver: SolverCfg | None = None,
         space: TerrainSpace = SUPER_GAUSSIAN,
@@ -102,9 +144,10 @@ class Rollout:
         Args:
             robot: Robot settings.
             policy: The controller, by file, ``module:callable`` or as a callable on device tensors.
-            num_terrains: Terrains of one evaluation.
+            num_terrains: Terrains that may be under way at once.
             num_replicas: Episodes on each.
             device: Warp device name.
+            num_envs: Robots; one an episode if None, and never more.
             cfg: The crossing.
             solver: Solver options.
             space: What the genes of terrains mean.
@@ -112,26 +155,34 @@ class Rollout:
         Raises:
             ValueError: If the policy does not fit the robot, or a number is not positive.
         """
-        if num_terrains < 1 or num_replicas < 1:
-            raise ValueError(f"num_terrains and num_replicas must be positive, got {num_terrains} and {num_replicas}")
+        if num_terrains < 1 or num_replicas < 1 or (num_envs is not None and num_envs < 1):
+            raise ValueError(
+                "num_terrains, num_replicas and num_envs must be positive, "
+                f"got {num_terrains}, {num_replicas} and {num_envs}"
+            )
         self.robot = robot
         self.cfg = cfg or CrossingCfg()
         self.num_terrains = num_terrains
         self.num_replicas = num_replicas
+        self.num_envs = min(num_envs or num_terrains * num_replicas, num_terrains * num_replicas)
         self.space = space
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         bank = TerrainBank(num_terrains, device=device)
-        terrain_of_env = np.repeat(np.arange(num_terrains), num_replicas)
-        self.sim = Simulation(robot, bank, terrain_of_env, cfg=solver)
+        self.sim = Simulation(robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
+        self._batches: deque[_Batch] = deque()
+        self._first_free = self._waiting = 0  # the ring's next slot, and episodes that no robot may take yet
+        self._most = round(self.cfg.max_duration_s / robot.control_dt)
+        self._steps = self._began = self._taken_at = 0  # control steps: now, when all waited, at the last result
+        self._taken_s = time.perf_counter()
         with wp.ScopedDevice(device):
             self._allocate()
-            self._start(np.zeros(num_terrains, dtype=np.uint32))
-            self._policy = PolicyRunner(loaded, self._observation, self._action)
-            self._graph = self.sim.capture(self._launch_control_step)
+            self._policy = PolicyRunner(loaded, self._observation, self._action, self._queue.begins)
+            self._step_graph = self.sim.capture(self._launch_control_step)
+            self._turn_graph = self.sim.capture(self._launch_turn_over)
 
     def _allocate(self) -> None:
-        num_envs, robot = self.sim.num_envs, self.robot
+        num_envs, robot, sim = self.num_envs, self.robot, self.sim
         self._ranges = make_start_ranges(self.cfg, robot)
         self._command = wp.zeros((num_envs, 3), dtype=float)
         self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
@@ -139,8 +190,9 @@ class Rollout:
         self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
         self._counter = wp.zeros(1, dtype=int)
         self._sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
-        self._everyone = wp.ones(num_envs, dtype=int)
-        self._seeds = wp.zeros(self.num_terrains, dtype=wp.uint32)
+        self._queue = make_queue(
+            num_envs, self.num_terrains, self.num_replicas, len(PENALTIES), rewarded=self.cfg.reward, device=sim.device
+        )
         self._task = make_task(self.cfg, robot)
         self._episode = self._stepped = make_episodes(num_envs)
         self._latches = [(self._task, self._episode)]
@@ -149,44 +201,17 @@ class Rollout:
             # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them runs,
             # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
             io = {"command": self._command, "action": self._last_action}
-            self._reward = Reward(self.sim, robot.training, falls=(Outcome.BASE_COLLISION,), **io)
+            self._reward = Reward(sim, robot.training, falls=(Outcome.BASE_COLLISION,), **io)
             self._stepped = make_episodes(num_envs)
             self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
         self._rewards = Rewards() if self._reward is None else self._reward.state
-
-    def _start(self, seeds: np.ndarray) -> None:
-        sim = self.sim
-        self._seeds.assign(seeds)
-        begin_all(self._stepped)
-        end_all(self._episode)
-        seed_starts(self._seeds, sim.terrain_of_env, self.num_replicas, self._episode)
-        restart_episodes(
-            sim.terrain_of_env, sim.bank.terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,
-            self._last_action, self._episode, self._rewards,
-        )  # fmt: skip
-        self._remember()
-        sim.clear_solver(self._everyone)
-        self._sums.zero_()
-        sim.refresh()
-        self._observe()
-
-    def _observe(self) -> None:
-        command_goal(self.sim.joint_q, self._episode.outcome, self._task, self._command)
-        write_observation(
-            self.sim.joint_q, self.sim.joint_qd, self._command, self._last_action, self.sim.terrain_of_env,
-            self.sim.bank.terrain, self.sim.sensors, Noise(), self._counter, self._observation,
-        )  # fmt: skip
-
-    def _remember(self) -> None:
-        if self._reward is not None:
-            remember_steps(self._last_action, self.sim.joint_qd, self._rewards, self._counter)
 
     def _launch_control_step(self) -> None:
         sim, robot = self.sim, self.robot
         apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
         park_ended(
             self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets,
-            sim.body_q.reshape((sim.num_envs, -1)),
+            sim.body_q.reshape((self.num_envs, -1)),
         )  # fmt: skip
         for _ in range(robot.decimation):
             sim.physics_step()
@@ -202,34 +227,24 @@ class Rollout:
             )  # fmt: skip
         if self._reward is not None:
             self._reward.pay(self._stepped.outcome)
-        self._remember()
-        self._observe()
 
-    def evaluate(
-        self,
-        terrains: np.ndarray,
-        seeds: np.ndarray,
-        *,
-        before_step: Callable[[], None] | None = None,
-        progress: Callable[[float], None] | None = None,
-    ) -> RolloutResult:
-        """Run one crossing of every replica on every terrain.
-
-        An episode depends on its terrain, the terrain's seed and its replica alone.
-
-        Args:
-            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
-            seeds: One seed a terrain, shape (num_terrains,), uint32.
-            before_step: Called before every control step, to look at :attr:`state` (:mod:`sim.recording.recorder`).
-            progress: Called at every poll with the share done of the most control steps.
-
-        Raises:
-            ValueError: If a shape does not fit or a value is not finite.
-        """
-        began = time.perf_counter()
-        self.begin(terrains, seeds)
-        control_steps = self._run(progress, before_step)
-        return self._collect(control_steps, began)
+    def _launch_turn_over(self) -> None:
+        sim, begins = self.sim, self._queue.begins
+        turn_over(self._stepped.outcome, self._rewards, self._episode, self._sums, sim.terrain_of_env, self._queue)
+        restart_episodes(
+            begins, sim.terrain_of_env, sim.bank.terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,
+            self._last_action, self._episode, self._rewards,
+        )  # fmt: skip
+        if self._reward is not None:
+            begin_episodes(begins, self._stepped)
+            remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
+        sim.clear_solver(begins)
+        sim.refresh()
+        command_goal(sim.joint_q, self._episode.outcome, self._task, self._command)
+        write_observation(
+            sim.joint_q, sim.joint_qd, self._command, self._last_action, sim.terrain_of_env, sim.bank.terrain,
+            sim.sensors, Noise(), self._counter, self._observation,
+        )  # fmt: skip
 
     @property
     def state(self) -> RolloutState:
@@ -237,65 +252,210 @@ class Rollout:
         sim, episode = self.sim, self._episode
         return RolloutState(
             joint_q=sim.joint_q, geom_force=sim.geom_force, penalty_sums=self._sums, command=self._command,
-            outcome=episode.outcome, steps=episode.steps,
+            episode=self._queue.episode_of_env, outcome=episode.outcome, steps=episode.steps,
         )  # fmt: skip
 
-    def begin(self, terrains: np.ndarray, seeds: np.ndarray) -> None:
-        """Set the terrains and put every robot at its start; arguments and errors as of :meth:`evaluate`."""
-        if seeds.shape != (self.num_terrains,):
-            raise ValueError(f"seeds must have shape ({self.num_terrains},), one a terrain, got {seeds.shape}")
+    @property
+    def num_free(self) -> int:
+        """Terrains that may be put in now."""
+        return self.num_terrains - sum(batch.num_episodes for batch in self._batches) // self.num_replicas
+
+    def evaluate(
+        self,
+        terrains: np.ndarray,
+        seeds: np.ndarray,
+        *,
+        watcher: Watcher | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> RolloutResult:
+        """Run one crossing of every replica on every terrain; nothing else may be under way.
+
+        Args:
+            terrains: Genes, shape (count, num_genes), or heights [m], shape (count, nrow, ncol); at most
+                ``num_terrains`` of them.
+            seeds: One seed a terrain, shape (count,), uint32.
+            watcher: Looks on.
+            progress: Called now and then with the share that is done.
+
+        Raises:
+            ValueError: If a shape does not fit, a value is not finite, or there are too many.
+        """
+        self.clear()
+        try:
+            self.put(terrains, seeds)
+            return self.take(progress, watcher=watcher)
+        except BaseException:
+            self.clear()
+            raise
+
+    def clear(self) -> None:
+        """Forget all that is under way."""
+        if not self._batches:
+            return
+        self._batches.clear()
+        self._waiting = 0
+        for _, episode in self._latches:
+            episode.outcome.fill_(int(Outcome.TIME_OUT))
+        self._queue.episode_of_env.fill_(-1)
+        self._queue.counts.zero_()
+
+    def put(self, terrains: np.ndarray, seeds: np.ndarray) -> None:
+        """Let every replica on some terrains be crossed, behind what is under way; waits for nothing.
+
+        Args:
+            terrains: As of :meth:`evaluate`; at most :attr:`num_free` of them.
+            seeds: One seed a terrain.
+
+        Raises:
+            ValueError: As of :meth:`evaluate`.
+        """
+        count, idle = len(terrains), not self._batches
+        if seeds.shape != (count,):
+            raise ValueError(f"seeds must have shape ({count},), one a terrain, got {seeds.shape}")
+        if not 1 <= count <= self.num_free:
+            raise ValueError(f"terrains must be 1 to {self.num_free} at once here, got {count}")
+        first = 0 if idle else self._first_free
+        slots = _ring_slices(first, count, self.num_terrains)
+        self._write_terrains(terrains, seeds, slots)
+        num_episodes = count * self.num_replicas
+        most_steps = self._most * -(-num_episodes // self.num_envs)
+        self._batches.append(
+            _Batch(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._steps)
+        )
+        self._first_free = (first + count) % self.num_terrains
+        self._waiting += num_episodes
+        if idle:
+            self._queue.counts.zero_()
+            self._began = self._taken_at = self._steps
+            self._taken_s = time.perf_counter()
+        if idle or self._policy.memory is not Memory.WHOLE:
+            self._release(begin=idle)
+
+    def _write_terrains(self, terrains: np.ndarray, seeds: np.ndarray, slots: Sequence[slice]) -> None:
+        done = 0
         with wp.ScopedDevice(self.sim.device):
-            if terrains.ndim == 3:
-                self.sim.bank.set_heights(terrains)
-            else:
-                self.sim.bank.set_genes(terrains, self.space)
-            self._start(seeds.astype(np.uint32))
-        self._policy.reset()
+            for own in slots:
+                part = slice(done, done + own.stop - own.start)
+                if terrains.ndim == 3:
+                    self.sim.bank.set_heights(terrains[part], own)
+                else:
+                    self.sim.bank.set_genes(terrains[part], self.space, own)
+                self._queue.seed[own].assign(seeds[part].astype(np.uint32))
+                self._queue.num_ended[own].zero_()
+                done = part.stop
 
-    def control_step(self) -> None:
-        """Let the policy act, then run the captured control step, without waiting for either."""
+    def _release(self, *, begin: bool) -> None:
+        """Let robots take what was put in; one episode each if they have to begin together.
+
+        Args:
+            begin: Whether all of them wait and are to begin now; else each takes one when its own has ended.
+        """
+        count = self._waiting
+        if self._policy.memory is Memory.WHOLE:
+            count = min(count, self.num_envs)
+            self._policy.reset()
+        self._waiting -= count
+        with wp.ScopedDevice(self.sim.device):
+            make_ready(count, self._queue)
+        if begin:
+            self.sim.launch(self._turn_graph)
+
+    def control_step(self, watcher: Watcher | None = None) -> None:
+        """Let the policy act, make the step, and let robots take the next episodes; waits for none of it."""
+        if watcher is not None:
+            watcher.before_step()
         self._policy()
-        self.sim.launch(self._graph)
+        self.sim.launch(self._step_graph)
+        if watcher is not None:
+            watcher.after_step()
+        self.sim.launch(self._turn_graph)
+        self._steps += 1
 
-    def _run(self, progress: Callable[[float], None] | None, before_step: Callable[[], None] | None) -> int:
-        most = round(self.cfg.max_duration_s / self.robot.control_dt)
-        poll = max(1, round(self.cfg.poll_every_s / self.robot.control_dt))
-        for step in range(1, most + 1):
-            if before_step is not None:
-                before_step()
-            self.control_step()
-            if step % poll == 0 or step == most:
-                running_count = int(self._stepped.num_running.numpy()[0])
-                if progress is not None:
-                    progress(step / most)
-                if running_count == 0:
-                    return step
-        return most
+    def _advance(self, watcher: Watcher | None = None) -> None:
+        """Make the control steps up to the next look at what has ended."""
+        poll, since = max(1, round(self.cfg.poll_every_s / self.robot.control_dt)), self._steps - self._began
+        stop = min((since // every + 1) * every for every in (poll, self._most))
+        for _ in range(stop - since):
+            self.control_step(watcher)
 
-    def _collect(self, control_steps: int, began: float) -> RolloutResult:
-        shape = (self.num_terrains, self.num_replicas)
-        outcome = self._episode.outcome.numpy().astype(np.uint8).reshape(shape)
-        pose = self._episode.final_pose.numpy().reshape(*shape, 7).copy()  # on the CPU numpy() is a view
-        columns = [PENALTIES.index(name) for name in self.robot.penalties]
-        penalties = self._sums.numpy().astype(np.float64)[:, columns].reshape(*shape, len(columns))
+    def take(
+        self, progress: Callable[[float], None] | None = None, *, watcher: Watcher | None = None
+    ) -> RolloutResult:
+        """Wait for the terrains that were put in first.
+
+        Args:
+            progress: Called at every look with the share of them that is done; may put in more.
+            watcher: Looks on.
+
+        Returns:
+            What came of their episodes. What else is under way goes on meanwhile: on a GPU without waiting.
+
+        Raises:
+            RuntimeError: If nothing is under way.
+        """
+        if not self._batches:
+            raise RuntimeError("take() must follow put(), got nothing under way")
+        batch, share = self._batches[0], 0.0
+        while True:
+            ended = self._num_ended(batch)
+            share = max(share, ended / batch.num_episodes, (self._steps - batch.put_at) / batch.most_steps)
+            if progress is not None and self._steps > batch.put_at:
+                progress(min(1.0, share))
+            if ended == batch.num_episodes:
+                break
+            under_way = sum(other.num_episodes for other in self._batches) - self._waiting
+            if self._waiting and sum(map(self._num_ended, self._batches)) == under_way:
+                self._release(begin=True)
+            self._advance(watcher)
+        result = self._collect(batch)
+        self._batches.popleft()
+        if self._batches and not self._waiting and watcher is None:
+            self._advance()
+        return result
+
+    def _num_ended(self, batch: _Batch) -> int:
+        return sum(int(self._queue.num_ended[own].numpy().sum()) for own in batch.slots)
+
+    def _collect(self, batch: _Batch) -> RolloutResult:
+        queue, robot = self._queue, self.robot
+        rows = [slice(own.start * self.num_replicas, own.stop * self.num_replicas) for own in batch.slots]
+
+        def of(array: Any) -> np.ndarray:
+            values = np.concatenate([array[own].numpy() for own in rows])  # a copy: on the CPU numpy() is a view
+            return values.reshape(-1, self.num_replicas, *values.shape[1:])
+
+        outcome, pose = of(queue.outcome).astype(np.uint8), of(queue.final_pose)
+        columns = [PENALTIES.index(name) for name in robot.penalties]
+        penalties = of(queue.penalty_sums).astype(np.float64)[..., columns]
         penalties[outcome == Outcome.INVALID] = np.nan
         reward = None
         if self._reward is not None:
-            reward = self._rewards.total.numpy().astype(np.float64).reshape(shape)
+            reward = of(queue.reward).astype(np.float64)
             reward[outcome == Outcome.INVALID] = np.nan
         with np.errstate(invalid="ignore"):
             upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)
+        physics_steps = (self._steps - self._taken_at) * robot.decimation
+        wall_s = time.perf_counter() - self._taken_s
+        self._taken_at, self._taken_s = self._steps, self._taken_s + wall_s
         return RolloutResult(
             penalties=penalties,
-            penalty_names=self.robot.penalties,
+            penalty_names=robot.penalties,
             outcome=outcome,
             fallen=upright < np.cos(np.deg2rad(_FALLEN_TILT_DEG)),
-            duration_s=(self._episode.steps.numpy() * self.robot.physics_dt).astype(np.float32).reshape(shape),
+            duration_s=(of(queue.steps) * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],
-            physics_steps=control_steps * self.robot.decimation,
-            wall_s=time.perf_counter() - began,
+            physics_steps=physics_steps,
+            robot_steps=physics_steps * self.num_envs,
+            wall_s=wall_s,
             reward=reward,
         )
+
+
+def _ring_slices(first: int, count: int, size: int) -> tuple[slice, ...]:
+    """``count`` slots from ``first`` on, of a ring of ``size``."""
+    whole = slice(first, min(first + count, size))
+    rest = first + count - size
+    return (whole, slice(0, rest)) if rest > 0 else (whole,)
 
 
 def evaluate(

@@ -95,7 +95,8 @@ def record_segments(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -
     """State and targets of the first 10 of every 20 control steps of the crossings."""
     sim, segments = rollout.sim, []
     most = round(rollout.cfg.max_duration_s / rollout.robot.control_dt)
-    rollout.begin(terrains, seeds)
+    rollout.clear()
+    rollout.put(terrains, seeds)
     for step in range(most):
         if step % _SEGMENT_EVERY == 0:
             segments.append(Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
@@ -120,7 +121,8 @@ def replay_segments(sim: Simulation, graph: Any, segments: list[Segment]) -> Non
 
 def _time_standing(rollout: Rollout, graph: Any, terrains: np.ndarray, seeds: np.ndarray, steps: int) -> float:
     sim, robot = rollout.sim, rollout.robot
-    rollout.begin(terrains, seeds)
+    rollout.clear()
+    rollout.put(terrains, seeds)
     sim.joint_qd.zero_()
     targets = np.zeros(sim.targets.shape, dtype=np.float32)
     targets[:, 7:] = robot.default_joint_pos
@@ -246,7 +248,8 @@ def time_control_step(scene: Scene) -> float:
     """Seconds a control step over whole crossings: policy, four physics steps, penalties, ends, observation."""
     rollout = scene.rollout
     steps = round(scene.cfg.duration_s / scene.robot.control_dt)
-    rollout.begin(scene.genes, scene.seeds)
+    rollout.clear()
+    rollout.put(scene.genes, scene.seeds)
     return _time(lambda: [rollout.control_step() for _ in range(steps)], rollout.sim.device) / steps
 
 

@@ -63,37 +63,25 @@ class Scene:
         return self.rollout.robot
 
 
-def _build_rollout(robot: RobotCfg, cfg: SceneCfg, device: str) -> Rollout:
-    """A rollout of any number of environments, which its terrains need not divide.
-
-    A rollout wants terrains x replicas. It gets as many grids as that takes; then its environments are spread evenly
-    over the first ``cfg.num_terrains`` of them, each robot of a terrain a replica of its own.
-    """
-    num_grids = next(n for n in range(cfg.num_terrains, cfg.num_envs + 1) if cfg.num_envs % n == 0)
-    rollout = Rollout(
-        robot,
-        robot.policy_file,
-        num_terrains=num_grids,
-        num_replicas=cfg.num_envs // num_grids,
-        device=device,
-        cfg=CrossingCfg(max_duration_s=cfg.duration_s),
-    )
-    rollout.num_replicas = -(-cfg.num_envs // cfg.num_terrains)
-    rollout.sim.terrain_of_env.assign(np.arange(cfg.num_envs) * cfg.num_terrains // cfg.num_envs)
-    return rollout
-
-
 def build_scene(robot: RobotCfg, cfg: SceneCfg, device: str) -> Scene:
     """Builds the simulation and lets the robots walk, by their shipped controller.
 
     Raises:
         ValueError: If fewer than half of the robots still stand on something: nothing would be worth timing.
     """
-    rollout = _build_rollout(robot, cfg, device)
+    rollout = Rollout(
+        robot,
+        robot.policy_file,
+        num_terrains=cfg.num_terrains,
+        num_replicas=-(-cfg.num_envs // cfg.num_terrains),
+        num_envs=cfg.num_envs,
+        device=device,
+        cfg=CrossingCfg(max_duration_s=cfg.duration_s),
+    )
     sim = rollout.sim
     genes = SUPER_GAUSSIAN.hard_random(rollout.num_terrains, cfg.seed)
     seeds = np.random.SeedSequence(cfg.seed).generate_state(rollout.num_terrains, np.uint32)
-    rollout.begin(genes, seeds)
+    rollout.put(genes, seeds)
     for _ in range(round(cfg.walk_s / robot.control_dt)):
         rollout.control_step()
     if sim.contact_count.numpy()[0] < cfg.num_envs // 2:
@@ -109,7 +97,7 @@ def build_scene(robot: RobotCfg, cfg: SceneCfg, device: str) -> Scene:
             genes=genes,
             seeds=seeds,
             fresh=TerrainBank(cfg.num_terrains, device=device),
-            genes_on_device=wp.array(genes[: cfg.num_terrains], dtype=float),
+            genes_on_device=wp.array(genes, dtype=float),
             command=command,
             last_action=wp.array(rng.normal(size=(cfg.num_envs, robot.num_joints)).astype(np.float32)),
             counted=wp.ones(cfg.num_envs, dtype=int),

@@ -18,10 +18,11 @@ import warp as wp
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from kernels.episode import Outcome, end_all, make_episodes
+from kernels.episode import Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import BASE, PENALTIES
-from kernels.restart import restart_episodes, seed_starts
+from kernels.queue import make_queue, make_ready, turn_over
+from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
@@ -101,13 +102,16 @@ def draw_starts(
         episodes, terrain_of_env, sensors = make_episodes(count), wp.zeros(count, dtype=int), Sensors()
         sensors.base_com = base_com = wp.vec3(*builder.body_com[0])
         sensors.default_joint_pos = wp.array(robot.default_joint_pos, dtype=float)
-        end_all(episodes)
-        seed_starts(wp.array([seed], dtype=wp.uint32), terrain_of_env, count, episodes)
+        queue = make_queue(count, 1, count, 0, rewarded=False, device=device)
+        queue.seed.fill_(int(seed))
+        make_ready(count, queue)
+        turn_over(episodes.outcome, Rewards(), episodes, wp.zeros((count, 0), dtype=float), terrain_of_env, queue)
         restart_episodes(
-            terrain_of_env, bank.terrain, make_start_ranges(cfg or CrossingCfg(), robot), sensors, joint_q, joint_qd,
-            wp.zeros((count, robot.num_joints), dtype=float), episodes, Rewards(),
+            queue.begins, terrain_of_env, bank.terrain, make_start_ranges(cfg or CrossingCfg(), robot), sensors,
+            joint_q, joint_qd, wp.zeros((count, robot.num_joints), dtype=float), episodes, Rewards(),
         )  # fmt: skip
-    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), np.array(base_com))
+    order = np.argsort(queue.episode_of_env.numpy())  # on a GPU robots take them in any order
+    return to_mujoco(joint_q.numpy()[order], joint_qd.numpy()[order], np.array(base_com))
 
 
 def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:

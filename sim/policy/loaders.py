@@ -28,8 +28,9 @@ _FORMATS = (
 class Policy(Protocol):
     """Anything that maps observations to actions.
 
-    One that remembers has a method ``reset()``, called before every evaluation: all robots begin anew, perhaps others
-    and another number of them.
+    One that remembers has a method ``reset(rows)``, called before every step with a bool tensor of shape (num_envs,):
+    True where a robot begins a new episode. Robots begin at different times. One whose ``reset()`` takes no rows is
+    called when all its robots begin together, which leaves robots idle that have ended.
     """
 
     def __call__(self, observation: torch.Tensor, /) -> torch.Tensor:

@@ -1,6 +1,8 @@
 """A controller in the loop: from the observation buffer to that of the actions, every control step."""
 
+import inspect
 from collections.abc import Callable
+from enum import Enum
 from typing import Any
 
 import torch
@@ -20,40 +22,62 @@ def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
     return None
 
 
-def forget(policy: Any) -> bool:
-    """Let a policy that remembers forget; returns whether it is one."""
+class Memory(Enum):
+    """What a policy remembers from one step to the next, by its ``reset``."""
+
+    NONE = "none"
+    BY_ROW = "reset(rows)"
+    """It forgets single robots."""
+    WHOLE = "reset()"
+    """It forgets all of them or none: its robots have to begin together."""
+
+
+def memory_of(policy: Any) -> Memory:
+    """What a policy remembers."""
     reset = getattr(policy, "reset", None)
-    if callable(reset):
-        reset()
-    return callable(reset)
+    if not callable(reset):
+        return Memory.NONE
+    try:
+        inspect.signature(reset).bind(None)
+    except (TypeError, ValueError):  # a ValueError of what has no signature
+        return Memory.WHOLE
+    return Memory.BY_ROW
 
 
 class PolicyRunner:
     """Runs a policy between two Warp buffers: captured as a CUDA graph where it is a torch module without memory."""
 
-    def __init__(self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any) -> None:
+    def __init__(
+        self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any, begins: Any
+    ) -> None:
         """Bind the buffers.
 
         Args:
             policy: The controller.
             observation: Warp array, shape (num_envs, observation_size).
             action: Warp array the actions are written to, shape (num_envs, num_joints).
+            begins: Warp array, not 0 where an episode begins with the coming step, int, shape (num_envs,).
         """
-        self._policy = policy
+        self._policy: Any = policy
+        self.memory = memory_of(policy)
+        self._begins = wp.to_torch(begins)
         self._observation = wp.to_torch(observation)
         self._action = wp.to_torch(action)
         self._graph: torch.cuda.CUDAGraph | None = None
         # A graph would repeat its first memory for ever.
-        if self._observation.is_cuda and isinstance(policy, torch.nn.Module) and not forget(policy):
+        if self._observation.is_cuda and isinstance(policy, torch.nn.Module) and self.memory is Memory.NONE:
             self._graph = self._capture()
 
     def reset(self) -> None:
-        """Let a policy that remembers forget."""
-        forget(self._policy)
+        """Let a policy forget that can only forget all robots."""
+        if self.memory is Memory.WHOLE:
+            self._policy.reset()
 
     def _call(self) -> None:
         """Calls the controller with a copy of the rows, which it may keep or change, and checks its actions."""
         try:
+            if self.memory is Memory.BY_ROW:
+                self._policy.reset(self._begins != 0)
             action = self._policy(self._observation.clone())
         except (Exception, SystemExit) as error:  # a controller can fail with anything
             raise ValueError(f"the controller failed in the middle of a crossing: {in_one_line(error)}") from error

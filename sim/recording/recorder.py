@@ -125,6 +125,7 @@ class Recording:
             duration_s=self.duration_s,
             final_position=position,
             physics_steps=0,
+            robot_steps=0,
             wall_s=0.0,
         )
 
@@ -149,48 +150,64 @@ def space_in(origin: dict[str, Any]) -> str:
 
 
 class _Frames:
-    """Collects the frames of a rollout's episodes."""
+    """Collects the frames of a rollout's episodes, whichever robots run them (:class:`sim.rollout.Watcher`)."""
 
-    def __init__(self, rollout: "Rollout") -> None:
+    def __init__(self, rollout: "Rollout", num_terrains: int) -> None:
         self._rollout = rollout
         robot = rollout.robot
-        self._shape = (rollout.num_terrains, rollout.num_replicas)
+        self._shape = (num_terrains, rollout.num_replicas)
         self._feet = [robot.geom_names.index(name) for name in robot.foot_geoms]
         self._columns = [PENALTIES.index(name) for name in robot.penalties]
-        self._taken: dict[str, list[NDArray[Any]]] = {name: [] for name in FRAME_ARRAYS}
+        self._num_frames = np.zeros(num_terrains * rollout.num_replicas, dtype=np.int32)
+        self._over = np.zeros(len(self._num_frames), dtype=bool)
+        self._taken: list[tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[Any]]]] = []
 
-    def take(self) -> None:
-        """Add the present state as a frame."""
+    def before_step(self) -> None:
+        """Add the present state of every robot on its way as a frame."""
+        outcome = self._rollout.state.outcome.numpy()
+        self._take(np.flatnonzero(outcome == Outcome.RUNNING), ended=False)
+
+    def after_step(self) -> None:
+        """Add the last frame of every episode that ended; where a step broke the state, there is none."""
         state = self._rollout.state
-        joint_q = state.joint_q.numpy()
-        force = state.geom_force.numpy()[:, self._feet]
-        if not self._taken["foot_force"]:
-            force = np.zeros_like(force)  # at the start there was no step yet, and what is there is of another episode
+        outcome, episode = state.outcome.numpy(), state.episode.numpy()
+        ended = np.flatnonzero((outcome != Outcome.RUNNING) & (episode >= 0))
+        ended = ended[~self._over[episode[ended]]]
+        self._over[episode[ended]] = True
+        self._take(ended[outcome[ended] != Outcome.INVALID], ended=True)
+
+    def _take(self, envs: NDArray[Any], *, ended: bool) -> None:
+        if len(envs) == 0:
+            return
+        state = self._rollout.state
+        row = state.episode.numpy()[envs]
+        frame = self._num_frames[row]
+        joint_q = state.joint_q.numpy()[envs]
+        force = state.geom_force.numpy()[envs][:, self._feet]
+        force[frame == 0] = 0.0  # at the start there was no step yet, and what is there is of another episode
+        command = state.command.numpy()[envs]
         values = {
             "base_position": joint_q[:, :3],
             "base_quaternion": joint_q[:, [6, 3, 4, 5]],
             "joint_position": joint_q[:, 7:],
             "foot_force": np.clip(force, -_MAX_FORCE, _MAX_FORCE),
-            "penalties": state.penalty_sums.numpy()[:, self._columns],
-            "command": state.command.numpy(),
+            "penalties": state.penalty_sums.numpy()[envs][:, self._columns],
+            "command": np.zeros_like(command) if ended else command,
         }
-        for name, taken in self._taken.items():
-            with np.errstate(over="ignore", invalid="ignore"):  # of an episode that broke
-                taken.append(values[name].astype(FRAME_ARRAYS[name]))
+        with np.errstate(over="ignore", invalid="ignore"):  # of an episode that broke
+            rounded = {name: values[name].astype(dtype) for name, dtype in FRAME_ARRAYS.items()}
+        self._taken.append((row, frame, rounded))
+        self._num_frames[row] += 1
 
     def stacked(self) -> dict[str, Any]:
         """All frames by name once the episodes are over, and how many each episode has."""
-        state, decimation = self._rollout.state, self._rollout.robot.decimation
-        control_steps = -(-state.steps.numpy() // decimation)
-        valid = state.outcome.numpy() != Outcome.INVALID
-        num_frames = (control_steps + valid).reshape(self._shape).astype(np.int32)
-        most = int(num_frames.max())
-        absent = np.arange(most) >= num_frames[..., None]
-        stacks: dict[str, Any] = {"num_frames": num_frames}
-        for name, taken in self._taken.items():
-            stack = np.stack(taken[:most], axis=1).reshape(*self._shape, most, *taken[0].shape[1:])
-            stacks[name] = stack.astype(np.float32)
-            stacks[name][absent] = np.nan
+        most = int(self._num_frames.max())
+        stacks: dict[str, Any] = {"num_frames": self._num_frames.reshape(self._shape)}
+        for name in FRAME_ARRAYS:
+            stack = np.full((len(self._num_frames), most, *self._taken[0][2][name].shape[1:]), np.nan, np.float32)
+            for row, frame, values in self._taken:
+                stack[row, frame] = values[name]
+            stacks[name] = stack.reshape(*self._shape, *stack.shape[1:])
         return stacks
 
 
@@ -223,10 +240,9 @@ def record(
     Raises:
         ValueError: If a shape does not fit.
     """
-    frames = _Frames(rollout)
-    result = rollout.evaluate(terrains, seeds, before_step=frames.take, progress=progress)
-    frames.take()
-    heights: Any = rollout.sim.bank.heights.numpy()
+    frames = _Frames(rollout, len(terrains))
+    result = rollout.evaluate(terrains, seeds, watcher=frames, progress=progress)
+    heights: Any = rollout.sim.bank.heights[: len(terrains)].numpy()
     device = rollout.sim.device
     robot = rollout.robot
     return result, Recording(
@@ -235,7 +251,7 @@ def record(
         foot_names=robot.foot_geoms,
         penalty_names=robot.penalties,
         dt=robot.control_dt,
-        labels=tuple(labels or (f"terrain {k}" for k in range(rollout.num_terrains))),
+        labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
         heights=heights.copy(),  # on the CPU numpy() is a view
         genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
         seeds=seeds.astype(np.uint32),

@@ -6,7 +6,7 @@ import warp as wp
 from kernels.episode import (
     PARKING_HEIGHT,
     Outcome,
-    begin_all,
+    begin_episodes,
     command_goal,
     latch_outcomes,
     make_episodes,
@@ -42,7 +42,6 @@ def make_state(num_envs, device, outcome=0, steps=0):
     state.outcome.assign(np.broadcast_to(np.int32(outcome), num_envs))
     state.steps.assign(np.broadcast_to(np.int32(steps), num_envs))
     state.counted.fill_(9)
-    state.num_running.fill_(int(np.count_nonzero(np.broadcast_to(outcome, num_envs) == Outcome.RUNNING)))
     return state
 
 
@@ -85,7 +84,7 @@ def test_latch_parity_with_the_oracle(device, anymal):
 
 
 def test_an_ended_episode_stays_ended(device, anymal):
-    # Ended episodes keep outcome, steps and pose whatever happens to their robots after; the count runs down once each.
+    # Ended episodes keep outcome, steps and pose whatever happens to their robots after.
     q, qd = upright(4, 3)
     state = make_state(4, device, outcome=[0, Outcome.GOAL, Outcome.TIME_OUT, 0], steps=[7, 8, 9, 10])
     q[3, 0] = 14.0
@@ -93,14 +92,12 @@ def test_an_ended_episode_stays_ended(device, anymal):
     assert latch((q, qd), device, anymal, state) == [Outcome.RUNNING, Outcome.GOAL, Outcome.TIME_OUT, Outcome.GOAL]
     assert state.steps.numpy().tolist() == [8, 8, 9, 11]
     assert state.counted.numpy().tolist() == [1, 0, 0, 1]
-    assert state.num_running.numpy()[0] == 1
     np.testing.assert_array_equal(state.final_pose.numpy()[3], np.float32([14, 4, 0.6, 0, 0, 0, 1]))
     assert not state.final_pose.numpy()[:3].any()
     q[:] = np.nan
     latch((q, qd), device, anymal, state)
     assert state.outcome.numpy().tolist() == [Outcome.INVALID, Outcome.GOAL, Outcome.TIME_OUT, Outcome.GOAL]
     assert state.counted.numpy().tolist() == [0, 0, 0, 0]
-    assert state.num_running.numpy()[0] == 0
 
 
 def test_robots_whose_episode_ended_are_parked_and_the_others_left_alone(device):
@@ -196,9 +193,18 @@ def test_a_touch_noted_between_ends_the_episode_and_is_then_forgotten(device, an
     assert state.base_force.numpy().tolist() == [0.0, 40.0]
     assert latch(upright(2, 3), device, anymal, state) == [Outcome.RUNNING, Outcome.BASE_COLLISION]
     assert state.base_force.numpy().tolist() == [0.0, 0.0]
-    begin_all(state)
-    assert latch(upright(2, 3), device, anymal, state) == [Outcome.RUNNING] * 2
-    assert state.steps.numpy().tolist() == [1, 1] and state.num_running.numpy()[0] == 2
+
+
+def test_masked_episodes_begin(device, anymal):
+    state = make_state(3, device, outcome=[Outcome.GOAL, Outcome.GOAL, Outcome.RUNNING], steps=[7, 8, 9])
+    state.base_force.fill_(5.0)
+    begin_episodes(wp.array([1, 0, 1], dtype=int, device=device), state)
+    assert state.outcome.numpy().tolist() == [Outcome.RUNNING, Outcome.GOAL, Outcome.RUNNING]
+    assert state.steps.numpy().tolist() == [0, 8, 0]
+    assert state.counted.numpy().tolist() == [0, 9, 0]
+    assert state.base_force.numpy().tolist() == [0.0, 5.0, 0.0]
+    # What touched the base before is forgotten: the episode that began goes on, the one left alone stays ended.
+    assert latch(upright(3, 3), device, anymal, state) == [Outcome.RUNNING, Outcome.GOAL, Outcome.RUNNING]
 
 
 def command(states, device, anymal, outcome=0):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.episode import Outcome, end_all, make_episodes
+from kernels.episode import Outcome, make_episodes
 from kernels.observation import Sensors
-from kernels.restart import clear_rows, restart_episodes, seed_starts
+from kernels.queue import make_queue, make_ready, turn_over
+from kernels.restart import clear_rows, restart_episodes
 from kernels.rewards import Rewards, make_rewards
 from sim.bench import oracle
 from sim.crossing import CrossingCfg, make_start_ranges
@@ -15,27 +16,35 @@ from tests.builders import make_terrain, rough
 BASE_COM = (-0.02, 0.01, 0.03)
 
 
-def start(seeds, replicas, grids, device, anymal, terrain_of_env=None, outcome=None, rewards=None):
+def starts_of(seeds, replicas, device):
+    """What each start is drawn from, as a queue hands it out: replica by replica, terrain by terrain."""
+    num_envs = len(seeds) * replicas
+    queue, waiting = make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=device), make_episodes(num_envs, device)
+    queue.seed.assign(np.uint32(seeds))
+    make_ready(num_envs, queue)
+    sums, terrain_of_env = wp.zeros((num_envs, 1), device=device), wp.zeros(num_envs, dtype=int, device=device)
+    turn_over(waiting.outcome, Rewards(), waiting, sums, terrain_of_env, queue)
+    return wp.array(waiting.rng.numpy()[np.argsort(queue.episode_of_env.numpy())], device=device)
+
+
+def start(seeds, replicas, grids, device, anymal, outcome=None, rewards=None):
     """Joint coordinates and velocities and the episodes after a restart; all have ended unless ``outcome`` is given."""
     num_envs, joints = len(seeds) * replicas, anymal.num_joints
     q = wp.full((num_envs, 7 + joints), 3.0, dtype=float, device=device)
     qd = wp.full((num_envs, 6 + joints), 3.0, dtype=float, device=device)
     action = wp.full((num_envs, joints), 3.0, dtype=float, device=device)
     state = make_episodes(num_envs, device)
-    end_all(state)
     state.steps.fill_(77)
-    if outcome is not None:
-        state.outcome.assign(np.int32(outcome))
-    if terrain_of_env is None:
-        terrain_of_env = np.repeat(np.arange(len(seeds)), replicas)
-    terrain_of_env = wp.array(terrain_of_env, dtype=int, device=device)
+    ended = np.full(num_envs, 1) if outcome is None else np.int32(outcome) != Outcome.RUNNING
+    mask = wp.array(ended, dtype=int, device=device)
+    terrain_of_env = wp.array(np.repeat(np.arange(len(seeds)), replicas), dtype=int, device=device)
     sensors = Sensors()
     sensors.base_com = BASE_COM
     sensors.default_joint_pos = wp.array(np.float32(anymal.default_joint_pos), device=device)
     ranges = make_start_ranges(CrossingCfg(), anymal)
-    seed_starts(wp.array(np.uint32(seeds), device=device), terrain_of_env, replicas, state)
+    state.rng = starts_of(seeds, replicas, device)
     terrain = make_terrain(grids, device)
-    restart_episodes(terrain_of_env, terrain, ranges, sensors, q, qd, action, state, rewards or Rewards())
+    restart_episodes(mask, terrain_of_env, terrain, ranges, sensors, q, qd, action, state, rewards or Rewards())
     assert (action.numpy() == np.where(q.numpy()[:, :1] == 3.0, 3.0, 0.0)).all()
     return q.numpy(), qd.numpy(), state
 
@@ -49,7 +58,6 @@ def test_running_episodes_are_left_alone(device, anymal):
     assert (q[1] == 3.0).all() and (qd[1] == 3.0).all()
     assert (q[[0, 2], 0] != 3.0).all() and not qd[[0, 2], 6:].any()
     assert state.steps.numpy().tolist() == [0, 77, 0]
-    assert state.num_running.numpy()[0] == 2  # those that began
     assert rewards.running.numpy().tolist() == [1, 5, 1]
     for array in (rewards.total, rewards.air_time, rewards.touched):
         values = array.numpy().reshape(3, -1)
@@ -86,7 +94,6 @@ def test_starts_fill_their_ranges(device, anymal):
     np.testing.assert_allclose(q[:, 2], anymal.default_base_height, atol=1e-6)
     assert (state.outcome.numpy() == Outcome.RUNNING).all()
     assert not state.steps.numpy().any()
-    assert state.num_running.numpy()[0] == 800
     np.testing.assert_array_equal(state.start.numpy(), q[:, :2])
 
 

@@ -119,7 +119,7 @@ def test_a_robot_has_fallen_that_tilts_by_more_than_60_degrees(anymal, device):
 def test_robots_that_are_done_wait_above_the_ground(anymal, device):
     # One starts at the goal, the other walks on: the first is over at once and touches nothing from then on.
     rollout = crossing(anymal, device, replicas=2, num_terrains=2, start=(2.0, 4.0), goal_radius=0.5)
-    rollout.begin(np.stack([FLAT, FLAT]), np.arange(2))
+    rollout.put(np.stack([FLAT, FLAT]), np.arange(2))
     q = positions(rollout.sim)
     q[0, :2] = 14.0, 4.0
     put(rollout.sim, q)

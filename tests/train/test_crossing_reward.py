@@ -28,7 +28,7 @@ def test_a_crossing_is_paid_as_training_pays_it(anymal):
 
     cfg = CrossingCfg(start=(13.0, 4.0), max_duration_s=2.0, reward=True)
     rollout = Rollout(anymal, record, num_terrains=1, num_replicas=NUM_ENVS, device="cpu", cfg=cfg)
-    rollout.begin(FLAT[None], np.array([3]))
+    rollout.put(FLAT[None], np.array([3]))
     start = rollout.sim.joint_q.numpy().copy(), rollout.sim.joint_qd.numpy().copy()
     commands.clear(), actions.clear()
     result = rollout.evaluate(FLAT[None], np.array([3]))

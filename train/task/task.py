@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kernels.episode import Outcome, end_all, latch_outcomes, make_episodes, note_base_forces
+from kernels.episode import Outcome, latch_outcomes, make_episodes, note_base_forces
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.restart import StartRanges, restart_episodes
 from kernels.rewards import REWARDS, remember_steps
@@ -163,7 +163,6 @@ class CommandTask:
         self.levels.copy_(levels)
         self._terrain_of_env.copy_(self.levels * self.tiles.num_columns + self._column)
         self.end.fill_(int(Outcome.TIME_OUT))
-        end_all(self._episodes)
         self._begin_episodes()
 
     def counts(self) -> dict[str, np.ndarray]:
@@ -217,8 +216,8 @@ class CommandTask:
         sim, episodes, training, terrain = self.sim, self._episodes, self._training, self.sim.bank.terrain
         seed_restarts(training, episodes)
         restart_episodes(
-            sim.terrain_of_env, terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd, training.last_action,
-            episodes, self._reward.state,
+            training.ended, sim.terrain_of_env, terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,
+            training.last_action, episodes, self._reward.state,
         )  # fmt: skip
         sim.clear_solver(training.ended)
         command_episodes(sim.joint_q, episodes, self._rules, self._task, sim.joint_qd, training)

@@ -70,7 +70,7 @@ def test_observation_command_and_penalties_are_those_of_the_oracle(robot, height
 def test_starts_are_those_of_the_rollout(robot):
     genes = SUPER_GAUSSIAN.hard_random(1, 5)
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
-    rollout.begin(genes, np.array([77], np.uint32))
+    rollout.put(genes, np.array([77], np.uint32))
     expected = to_mujoco(
         rollout.sim.joint_q.numpy(), rollout.sim.joint_qd.numpy(), np.array(rollout.sim.sensors.base_com)
     )
@@ -142,7 +142,7 @@ def side_by_side(robot, policy, changes, time_constant_s, cfg=None):
     solver = SolverCfg(time_constant_s=time_constant_s)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg, solver=solver)
     flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    rollout.begin(flat[None], np.array([1000], np.uint32))
+    rollout.put(flat[None], np.array([1000], np.uint32))
     model = crossing_model(robot, flat, time_constant_s=time_constant_s)
     ground = model.geom("ground").id
     model.geom_type[ground], model.geom_dataid[ground], model.geom_rbound[ground] = mujoco.mjtGeom.mjGEOM_PLANE, -1, 0.0

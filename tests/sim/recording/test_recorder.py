@@ -58,7 +58,7 @@ def test_recorded_episodes_are_those_of_an_evaluation(rollout, recorded):
 
 
 def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anymal):
-    rollout.begin(np.stack([spike(), SLOPE]), SEEDS)
+    rollout.put(np.stack([spike(), SLOPE]), SEEDS)
     start = np.array(rollout.sim.joint_q.numpy()).reshape(2, 4, -1)
     np.testing.assert_array_equal(recording.base_position[:, :, 0], start[..., :3])
     np.testing.assert_array_equal(recording.base_quaternion[:, :, 0], start[..., [6, 3, 4, 5]])

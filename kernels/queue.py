@@ -1,0 +1,171 @@
+"""The queue of episodes: a robot whose episode has ended writes down what came of it and takes the next one.
+
+Any number of episodes runs through a fixed number of robots, on the device, without the host. Which robot takes which
+episode changes nothing: a start depends on the seed of the terrain and the number of the replica alone.
+
+The terrains are a ring of slots. Terrains that are put in take the slots behind those put in before, so that episode
+number ``n`` since the ring was empty is replica ``n % num_replicas`` of slot ``n // num_replicas % num_slots``.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from kernels.episode import Episodes, Outcome
+from kernels.rewards import Rewards
+
+_RUNNING = wp.constant(int(Outcome.RUNNING))
+_TAKEN = wp.constant(0)
+_READY = wp.constant(1)
+
+
+@wp.struct
+class EpisodeQueue:
+    """Episodes to come, who runs which, and what came of those that ended."""
+
+    num_replicas: int
+    """Episodes a terrain."""
+    counts: wp.array[int]
+    """Episodes taken and episodes ready to be taken since the ring was empty; shape (2,)."""
+    seed: wp.array[wp.uint32]
+    """Seed of each slot's terrain, shape (num_slots,)."""
+    num_ended: wp.array[int]
+    """Episodes that have ended on each slot's terrain, shape (num_slots,)."""
+    episode_of_env: wp.array[int]
+    """Row of the results that each robot works on, -1 where it waits; shape (num_envs,)."""
+    begins: wp.array[int]
+    """1 where a robot has just taken an episode, shape (num_envs,)."""
+    outcome: wp.array[int]
+    """Results, shape (num_slots * num_replicas,): :class:`kernels.episode.Outcome`."""
+    steps: wp.array[int]
+    """Physics steps up to the end."""
+    final_pose: wp.array[wp.transform]
+    """Base pose at the end, world-local frame."""
+    penalty_sums: wp.array2d[float]
+    """Columns :data:`kernels.penalties.PENALTIES`, times the physics step."""
+    reward: wp.array[float]
+    """Reward of the whole time; empty where nothing is rewarded."""
+
+
+def make_queue(
+    num_envs: int, num_slots: int, num_replicas: int, num_penalties: int, *, rewarded: bool, device: str
+) -> EpisodeQueue:
+    """Allocate an empty queue.
+
+    Args:
+        num_envs: Number of robots.
+        num_slots: Terrains that fit at once.
+        num_replicas: Episodes a terrain.
+        num_penalties: Columns of the penalty sums.
+        rewarded: Whether rewards are kept.
+        device: Warp device name.
+    """
+    rows = num_slots * num_replicas
+    queue = EpisodeQueue()
+    queue.num_replicas = num_replicas
+    queue.counts = wp.zeros(2, dtype=int, device=device)
+    queue.seed = wp.zeros(num_slots, dtype=wp.uint32, device=device)
+    queue.num_ended = wp.zeros(num_slots, dtype=int, device=device)
+    queue.episode_of_env = wp.full(num_envs, -1, dtype=int, device=device)
+    queue.begins = wp.zeros(num_envs, dtype=int, device=device)
+    queue.outcome = wp.zeros(rows, dtype=int, device=device)
+    queue.steps = wp.zeros(rows, dtype=int, device=device)
+    queue.final_pose = wp.zeros(rows, dtype=wp.transform, device=device)
+    queue.penalty_sums = wp.zeros((rows, num_penalties), dtype=float, device=device)
+    queue.reward = wp.zeros(rows if rewarded else 0, dtype=float, device=device)
+    return queue
+
+
+@wp.func
+def _write_down(
+    row: int, env: int, episodes: Episodes, penalty_sums: wp.array2d[float], rewards: Rewards, queue_out: EpisodeQueue
+):
+    queue_out.outcome[row] = episodes.outcome[env]
+    queue_out.steps[row] = episodes.steps[env]
+    queue_out.final_pose[row] = episodes.final_pose[env]
+    for k in range(penalty_sums.shape[1]):
+        queue_out.penalty_sums[row, k] = penalty_sums[env, k]
+    if queue_out.reward.shape[0] > 0:
+        queue_out.reward[row] = rewards.total[env]
+    wp.atomic_add(queue_out.num_ended, row // queue_out.num_replicas, 1)
+
+
+@wp.func
+def _take_next(queue_out: EpisodeQueue) -> int:
+    """Row of the next episode, -1 where none is ready."""
+    ready = queue_out.counts[_READY]
+    if queue_out.counts[_TAKEN] >= ready:  # so that robots that wait do not count on for ever
+        return -1
+    number = wp.atomic_add(queue_out.counts, _TAKEN, 1)
+    if number >= ready:
+        return -1
+    return number % (queue_out.seed.shape[0] * queue_out.num_replicas)
+
+
+@wp.kernel
+def _turn_over_kernel(
+    stepped: wp.array[int],
+    rewards: Rewards,
+    episodes_out: Episodes,
+    penalty_sums_out: wp.array2d[float],
+    terrain_of_env_out: wp.array[int],
+    queue_out: EpisodeQueue,
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    queue_out.begins[env] = 0
+    if stepped[env] == _RUNNING:
+        return
+    row = queue_out.episode_of_env[env]
+    if row >= 0:
+        _write_down(row, env, episodes_out, penalty_sums_out, rewards, queue_out)
+    row = _take_next(queue_out)
+    queue_out.episode_of_env[env] = row
+    if row < 0:
+        return
+    slot = row // queue_out.num_replicas
+    # The stream depends on the terrain's seed and the replica alone: neither robot nor slot changes an episode.
+    episodes_out.rng[env] = wp.rand_init(int(queue_out.seed[slot]), row % queue_out.num_replicas)
+    terrain_of_env_out[env] = slot
+    queue_out.begins[env] = 1
+    for k in range(penalty_sums_out.shape[1]):
+        penalty_sums_out[env, k] = 0.0
+
+
+def turn_over(
+    stepped: Any, rewards: Rewards, episodes_out: Episodes, penalty_sums_out: Any, terrain_of_env_out: Any,
+    queue_out: EpisodeQueue,
+) -> None:  # fmt: skip
+    """Write down what came of the episodes that ended, and let their robots take the next ones.
+
+    It moves no robot: :func:`kernels.restart.restart_episodes` does, where ``begins`` is 1.
+
+    Args:
+        stepped: :class:`kernels.episode.Outcome` of what each robot is stepped for, shape (num_envs,); not
+            ``episodes_out.outcome`` where a robot goes on after the crossing has ended.
+        rewards: Totals; empty where nothing is rewarded.
+        episodes_out: How each crossing ended; ``rng`` is written where one begins.
+        penalty_sums_out: Penalty sums of each robot, shape (num_envs, num_penalties); zero where one begins.
+        terrain_of_env_out: Terrain of each robot, shape (num_envs,); written where one begins.
+        queue_out: Updated in place.
+    """
+    wp.launch(
+        _turn_over_kernel,
+        stepped.shape[0],
+        inputs=[stepped, rewards],
+        outputs=[episodes_out, penalty_sums_out, terrain_of_env_out, queue_out],
+        device=stepped.device,
+    )
+
+
+@wp.kernel
+def _make_ready_kernel(count: int, queue_out: EpisodeQueue):
+    """Grid (1,)."""
+    ready = queue_out.counts[_READY]
+    queue_out.counts[_TAKEN] = wp.min(queue_out.counts[_TAKEN], ready)  # robots that found none have counted on
+    queue_out.counts[_READY] = ready + count
+
+
+def make_ready(count: int, queue_out: EpisodeQueue) -> None:
+    """Let robots take ``count`` more episodes."""
+    wp.launch(_make_ready_kernel, 1, inputs=[count], outputs=[queue_out], device=queue_out.counts.device)

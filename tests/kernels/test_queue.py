@@ -1,0 +1,116 @@
+"""The queue of episodes: each is run once, what came of it stands in its own row, and robots find no more than is ready."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.episode import Outcome, make_episodes
+from kernels.queue import make_queue, make_ready, turn_over
+from kernels.rewards import Rewards, make_rewards
+
+SLOTS, REPLICAS = 3, 4
+
+
+class Robots:
+    """Robots without physics: what a test says of their episodes is what happened."""
+
+    def __init__(self, num_envs, device, *, rewarded=False):
+        self.queue = make_queue(num_envs, SLOTS, REPLICAS, 2, rewarded=rewarded, device=device)
+        self.queue.seed.assign(np.uint32([10, 11, 2**32 - 1]))
+        self.episodes = make_episodes(num_envs, device)
+        self.rewards = make_rewards(num_envs, 1, 1, device) if rewarded else Rewards()
+        self.sums = wp.full((num_envs, 2), 7.0, dtype=float, device=device)
+        self.terrain = wp.full(num_envs, 99, dtype=int, device=device)
+
+    def turn(self):
+        turn_over(self.episodes.outcome, self.rewards, self.episodes, self.sums, self.terrain, self.queue)
+        running = self.queue.episode_of_env.numpy() >= 0
+        self.episodes.outcome.assign(np.where(running, Outcome.RUNNING, Outcome.TIME_OUT).astype(np.int32))
+        return self.queue.episode_of_env.numpy().copy()
+
+    def end(self, envs, outcome=Outcome.GOAL):
+        now = self.episodes.outcome.numpy().copy()
+        now[envs] = outcome
+        self.episodes.outcome.assign(now)
+
+
+@pytest.mark.parametrize("num_envs", [1, 5, 12])
+def test_every_episode_is_run_once(device, num_envs):
+    robots, taken, rng = Robots(num_envs, device), [], np.random.default_rng(num_envs)
+    make_ready(SLOTS * REPLICAS, robots.queue)
+    for _ in range(200):
+        rows = robots.turn()
+        taken += rows[robots.queue.begins.numpy() != 0].tolist()
+        running = np.flatnonzero(rows >= 0)
+        if len(running) == 0:
+            break
+        robots.end(rng.choice(running, rng.integers(1, len(running) + 1), replace=False))
+    assert sorted(taken) == list(range(12))
+    assert robots.queue.num_ended.numpy().tolist() == [4, 4, 4]
+    assert (robots.queue.outcome.numpy() == Outcome.GOAL).all()
+
+
+def test_robots_that_find_nothing_wait_and_take_what_comes_later(device):
+    robots = Robots(4, device)
+    make_ready(2, robots.queue)
+    rows = robots.turn()
+    assert sorted(rows) == [-1, -1, 0, 1] and robots.queue.begins.numpy().sum() == 2
+    for _ in range(3):  # they ask again and again
+        assert (robots.turn() == rows).all() and not robots.queue.begins.numpy().any()
+    make_ready(1, robots.queue)
+    later = robots.turn()
+    assert sorted(later) == [-1, 0, 1, 2]
+    assert robots.queue.begins.numpy().tolist() == (later == 2).astype(int).tolist()
+
+
+def test_rows_are_taken_round_the_ring(device):
+    robots = Robots(5, device)
+    for lot in range(7):  # five at a time of twelve rows: 0-4, 5-9, 10-2, 3-7, ...
+        make_ready(5, robots.queue)
+        rows = robots.turn()
+        assert sorted(rows) == sorted((5 * lot + k) % 12 for k in range(5))
+        robots.end(range(5))
+    robots.turn()
+    # 35 episodes on 3 terrains of 4: rows 0 to 10 were run three times, row 11 twice.
+    assert robots.queue.num_ended.numpy().tolist() == [12, 12, 11]
+
+
+def test_what_came_of_an_episode_stands_in_its_row(device):
+    robots = Robots(2, device, rewarded=True)
+    make_ready(3, robots.queue)
+    rows = robots.turn()
+    assert (robots.sums.numpy() == 0.0).all()  # a new episode has cost nothing
+    first, second = np.argsort(rows)
+    robots.sums.assign(np.float32([[1.5, 2.5], [3.5, 4.5]]))
+    robots.episodes.steps.assign([30, 40])
+    robots.rewards.total.assign(np.float32([0.25, 0.5]))
+    pose = np.zeros((2, 7), np.float32)
+    pose[:, 0] = [8.0, 9.0]
+    robots.episodes.final_pose.assign(pose)
+    robots.end([second], Outcome.OUT)
+    rows = robots.turn()
+    queue = robots.queue
+    assert queue.outcome.numpy()[1] == Outcome.OUT and queue.steps.numpy()[1] == [30, 40][second]
+    assert queue.penalty_sums.numpy()[1].tolist() == [[1.5, 2.5], [3.5, 4.5]][second]
+    assert queue.reward.numpy()[1] == [0.25, 0.5][second]
+    assert queue.final_pose.numpy()[1, 0] == [8.0, 9.0][second]
+    assert queue.num_ended.numpy().tolist() == [1, 0, 0] and not queue.steps.numpy()[[0, 2]].any()
+    # The robot goes on with the third, from nothing; the other keeps what it has so far.
+    assert rows[second] == 2 and rows[first] == 0
+    assert robots.sums.numpy()[second].tolist() == [0.0, 0.0]
+    assert robots.sums.numpy()[first].tolist() == [[1.5, 2.5], [3.5, 4.5]][first]
+
+
+def test_a_start_is_drawn_from_the_terrains_seed_and_the_replica(device):
+    robots = Robots(12, device)
+    make_ready(12, robots.queue)
+    rows = robots.turn()
+    np.testing.assert_array_equal(robots.terrain.numpy(), rows // REPLICAS)
+    one = robots.episodes.rng.numpy()[np.argsort(rows)]
+    assert len(np.unique(one)) == 12
+    # The same seed in another slot, run by another robot: the same streams.
+    other = Robots(3, device)
+    other.queue.seed.assign(np.uint32([2**32 - 1, 0, 0]))
+    make_ready(3, other.queue)
+    rows = other.turn()
+    np.testing.assert_array_equal(other.episodes.rng.numpy()[np.argsort(rows)], one[8:11])
