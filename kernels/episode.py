@@ -6,7 +6,15 @@ from typing import Any
 import warp as wp
 
 from kernels.penalties import max_base_force
-from kernels.state import base_position, base_rotation, base_yaw, projected_gravity, state_is_invalid, wrap_angle
+from kernels.state import (
+    base_position,
+    base_rotation,
+    base_yaw,
+    is_too_fast,
+    projected_gravity,
+    row_is_finite,
+    wrap_angle,
+)
 
 
 class Outcome(IntEnum):
@@ -21,6 +29,16 @@ class Outcome(IntEnum):
     TILT = 6
 
 
+class Invalidity(IntEnum):
+    """Why an episode is invalid; of several reasons the first of ACTION, OVERFLOW, STATE and SPEED."""
+
+    NONE = 0
+    ACTION = 1
+    STATE = 2
+    SPEED = 3
+    OVERFLOW = 4
+
+
 _RUNNING = wp.constant(int(Outcome.RUNNING))
 _GOAL = wp.constant(int(Outcome.GOAL))
 _BASE_COLLISION = wp.constant(int(Outcome.BASE_COLLISION))
@@ -28,6 +46,11 @@ _TIME_OUT = wp.constant(int(Outcome.TIME_OUT))
 _OUT = wp.constant(int(Outcome.OUT))
 _INVALID = wp.constant(int(Outcome.INVALID))
 _TILT = wp.constant(int(Outcome.TILT))
+_NO_INVALIDITY = wp.constant(int(Invalidity.NONE))
+_ACTION = wp.constant(int(Invalidity.ACTION))
+_STATE = wp.constant(int(Invalidity.STATE))
+_SPEED = wp.constant(int(Invalidity.SPEED))
+_OVERFLOW = wp.constant(int(Invalidity.OVERFLOW))
 
 PARKING_HEIGHT = wp.constant(50.0)
 """Height at which robots whose episodes have ended are kept [m]."""
@@ -69,6 +92,8 @@ class Episodes:
 
     outcome: wp.array[int]
     """:class:`Outcome`, 0 while it runs."""
+    invalidity: wp.array[int]
+    """:class:`Invalidity` at the end; means nothing while the episode runs."""
     steps: wp.array[int]
     """Steps made up to the end."""
     counted: wp.array[int]
@@ -86,7 +111,7 @@ class Episodes:
 def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
     """Allocate episodes of which none runs."""
     episodes = Episodes()
-    for name in ("outcome", "steps", "counted"):
+    for name in ("outcome", "invalidity", "steps", "counted"):
         setattr(episodes, name, wp.zeros(num_envs, dtype=int, device=device))
     episodes.outcome.fill_(int(Outcome.TIME_OUT))
     episodes.base_force = wp.zeros(num_envs, dtype=float, device=device)
@@ -164,12 +189,28 @@ def command_goal(joint_q: Any, outcome: Any, task: Task, command_out: Any) -> No
 
 
 @wp.func
-def judge_state(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_force: float, overflow: int, steps: int,
-    task: Task, env: int,
+def find_invalidity(
+    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], action: wp.array2d[float], overflow: int, task: Task,
+    env: int,
 ) -> int:  # fmt: skip
+    """Why a step is invalid, if it is; causes go before what comes of them."""
+    if not row_is_finite(action, env):
+        return _ACTION
+    if (overflow & task.overflow_mask) != 0:
+        return _OVERFLOW
+    if not row_is_finite(joint_q, env) or not row_is_finite(joint_qd, env):
+        return _STATE
+    if is_too_fast(joint_qd, env, task.max_speed):
+        return _SPEED
+    return _NO_INVALIDITY
+
+
+@wp.func
+def judge_state(
+    joint_q: wp.array2d[float], base_force: float, invalidity: int, steps: int, task: Task, env: int
+) -> int:
     """Outcome of an episode after its ``steps``-th step; the gravest of several wins."""
-    if (overflow & task.overflow_mask) != 0 or state_is_invalid(joint_q, joint_qd, env, task.max_speed):
+    if invalidity != _NO_INVALIDITY:
         return _INVALID
     if base_force > task.base_force:
         return _BASE_COLLISION
@@ -208,6 +249,7 @@ def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) ->
 def _latch_outcomes_kernel(
     joint_q: wp.array2d[float],
     joint_qd: wp.array2d[float],
+    action: wp.array2d[float],
     geom_force: wp.array2d[wp.vec3],
     geom_role: wp.array[int],
     overflow: wp.array[int],
@@ -226,18 +268,20 @@ def _latch_outcomes_kernel(
     if contact_count[0] > contact_capacity:
         bits = task.overflow_mask  # whose contacts were dropped is not known, so no episode is trusted
     force = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
-    outcome = judge_state(joint_q, joint_qd, force, bits, steps, task, env)
+    invalidity = find_invalidity(joint_q, joint_qd, action, bits, task, env)
+    outcome = judge_state(joint_q, force, invalidity, steps, task, env)
     episodes_out.base_force[env] = 0.0
     episodes_out.steps[env] = steps
     if outcome != _INVALID and steps >= task.first_counted_step:
         episodes_out.counted[env] = 1
     if outcome != _RUNNING:
         episodes_out.outcome[env] = outcome
+        episodes_out.invalidity[env] = invalidity
         episodes_out.final_pose[env] = wp.transform(base_position(joint_q, env), base_rotation(joint_q, env))
 
 
 def latch_outcomes(
-    joint_q: Any, joint_qd: Any, geom_force: Any, geom_role: Any, overflow: Any, contact_count: Any,
+    joint_q: Any, joint_qd: Any, action: Any, geom_force: Any, geom_role: Any, overflow: Any, contact_count: Any,
     contact_capacity: int, task: Task, episodes_out: Episodes,
 ) -> None:  # fmt: skip
     """Judge every running episode after a step and latch its end.
@@ -245,6 +289,7 @@ def latch_outcomes(
     Args:
         joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
         joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
+        action: The step's actions as :func:`kernels.observation.apply_action` left them, shape (num_envs, num_joints).
         geom_force: Contact forces, world frame [N], shape (num_envs, num_geoms).
         geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
         overflow: Solver overflow bits of the step, shape (num_envs,).
@@ -253,7 +298,7 @@ def latch_outcomes(
         task: Goal and limits.
         episodes_out: Updated in place; forgets what forces were noted.
     """
-    inputs = [joint_q, joint_qd, geom_force, geom_role, overflow, contact_count, contact_capacity, task]
+    inputs = [joint_q, joint_qd, action, geom_force, geom_role, overflow, contact_count, contact_capacity, task]
     wp.launch(_latch_outcomes_kernel, overflow.shape[0], inputs, outputs=[episodes_out], device=joint_q.device)
 
 

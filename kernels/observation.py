@@ -196,12 +196,16 @@ def _apply_action_kernel(
     """Grid (num_envs, num_joints)."""
     env, joint = wp.tid()
     clipped = wp.clamp(action[env, joint], -ACTION_LIMIT, ACTION_LIMIT)
+    if not wp.isfinite(action[env, joint]):  # of which clamp would make a limit: a wild action, but a valid one
+        clipped = wp.nan
     last_action_out[env, joint] = clipped
     targets_out[env, 7 + joint] = default_joint_pos[joint] + scale * clipped
 
 
 def apply_action(action: Any, sensors: Sensors, scale: float, last_action_out: Any, targets_out: Any) -> None:
     """Turn actions into joint position targets [rad]: default pose + ``scale`` * clip(action, -100, 100).
+
+    One that is not finite becomes NaN, and its episode invalid.
 
     Args:
         action: Policy output, shape (num_envs, num_joints).

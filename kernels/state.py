@@ -70,13 +70,20 @@ def wrap_angle(angle: float) -> float:
 
 
 @wp.func
-def state_is_invalid(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], env: int, max_speed: float) -> bool:
-    """True where a coordinate is not finite or any velocity exceeds ``max_speed`` [m/s or rad/s]."""
-    invalid = bool(False)
-    for k in range(joint_q.shape[1]):
-        if not wp.isfinite(joint_q[env, k]):
-            invalid = True
+def row_is_finite(rows: wp.array2d[float], env: int) -> bool:
+    """Whether all numbers of an environment's row are finite."""
+    finite = bool(True)
+    for k in range(rows.shape[1]):
+        if not wp.isfinite(rows[env, k]):
+            finite = False
+    return finite
+
+
+@wp.func
+def is_too_fast(joint_qd: wp.array2d[float], env: int, max_speed: float) -> bool:
+    """Whether any velocity exceeds ``max_speed`` [m/s or rad/s]."""
+    too_fast = bool(False)
     for k in range(joint_qd.shape[1]):
-        if not (wp.abs(joint_qd[env, k]) <= max_speed):
-            invalid = True
-    return invalid
+        if wp.abs(joint_qd[env, k]) > max_speed:
+            too_fast = True
+    return too_fast

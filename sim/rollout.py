@@ -37,6 +37,8 @@ class RolloutResult:
     penalty_names: tuple[str, ...]
     outcome: np.ndarray
     """:class:`kernels.episode.Outcome` of each episode, uint8."""
+    invalidity: np.ndarray
+    """:class:`kernels.episode.Invalidity` of each episode, uint8."""
     fallen: np.ndarray
     """Tilt above 60 degrees at the end, bool."""
     duration_s: np.ndarray
@@ -218,8 +220,8 @@ class Rollout:
             sim.read_geom_forces()
             for task, episode in self._latches:
                 latch_outcomes(
-                    sim.joint_q, sim.joint_qd, sim.geom_force, sim.geom_role, sim.overflow, sim.contact_count,
-                    sim.contact_capacity, task, episode,
+                    sim.joint_q, sim.joint_qd, self._last_action, sim.geom_force, sim.geom_role, sim.overflow,
+                    sim.contact_count, sim.contact_capacity, task, episode,
                 )  # fmt: skip
             add_penalties(
                 sim.joint_q, sim.joint_qd, sim.sensors.base_com, self._command, sim.geom_force, sim.geom_role,
@@ -441,6 +443,7 @@ class Rollout:
             penalties=penalties,
             penalty_names=robot.penalties,
             outcome=outcome,
+            invalidity=self._episode.invalidity.numpy().astype(np.uint8).reshape(shape),
             fallen=upright < np.cos(np.deg2rad(_FALLEN_TILT_DEG)),
             duration_s=(of(queue.steps) * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome
+from kernels.episode import Invalidity, Outcome
 from sim.bank import heights_of
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, read_arrays
@@ -26,7 +26,7 @@ FORMAT = "faultline recording 1"
 
 _WORDS = ("robot", "joint_names", "foot_names", "penalty_names", "labels", "origin")
 _KINDS = dict.fromkeys(_WORDS, "U") | {
-    "seeds": "u", "outcome": "u", "replicas": "i", "num_frames": "i", "fallen": "b",
+    "seeds": "u", "outcome": "u", "invalidity": "u", "replicas": "i", "num_frames": "i", "fallen": "b",
 }  # fmt: skip
 _NAMES = tuple(field.name for field in fields(Recording))
 _LIMITS = {"base_position": 1e3, "base_quaternion": 1.001, "joint_position": 1e3, "command": 1e3}
@@ -87,7 +87,9 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     if version != FORMAT:
         raise ValueError(f"its format must be '{FORMAT}', got {version}")
     absent = "heights" if "genes" in found else "genes"
-    return read_arrays(path, [name for name in _NAMES if name != absent])
+    late = {"invalidity"} - {*found}  # the first recordings have none
+    content = read_arrays(path, [name for name in _NAMES if name != absent and name not in late])
+    return content | {name: np.zeros(content["outcome"].shape, np.uint8) for name in late}
 
 
 def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
@@ -113,7 +115,7 @@ def _check_shapes(content: dict[str, NDArray[Any]]) -> None:
         "command": (3,),
     }
     expected = {name: (*each, *frames, *rest) for name, rest in row.items()}
-    expected |= dict.fromkeys(("outcome", "fallen", "duration_s", "num_frames"), each)
+    expected |= dict.fromkeys(("outcome", "invalidity", "fallen", "duration_s", "num_frames"), each)
     expected |= {"labels": (terrains,), "robot": (), "dt": (), "origin": ()}
     for name, shape in expected.items():
         if content[name].shape != shape:
@@ -150,6 +152,8 @@ def _check_values(recording: Recording) -> None:
     ended = (recording.outcome > Outcome.RUNNING) & (recording.outcome <= max(Outcome))
     if not ended.all() or not (recording.duration_s > 0.0).all():
         raise ValueError(f"outcomes must lie in 1..{max(Outcome)} and durations be positive")
+    if (recording.invalidity > max(Invalidity)).any():
+        raise ValueError(f"invalidity must lie in 0..{max(Invalidity)}")
     there = np.arange(most) < recording.num_frames[..., None]
     for name in FRAME_ARRAYS:
         values = getattr(recording, name)

@@ -59,6 +59,8 @@ class Recording:
     """Number of each recorded episode among the terrain's, shape (K,)."""
     outcome: NDArray[np.uint8]
     """:class:`kernels.episode.Outcome` of each episode, shape (T, K)."""
+    invalidity: NDArray[np.uint8]
+    """:class:`kernels.episode.Invalidity` of each episode, shape (T, K); NONE throughout a file that lacks it."""
     fallen: NDArray[np.bool_]
     """Tilt above 60 degrees at the end, shape (T, K)."""
     duration_s: NDArray[np.float32]
@@ -103,7 +105,7 @@ class Recording:
         """
         num_frames = self.num_frames[terrain : terrain + 1]
         cut = {name: getattr(self, name)[terrain : terrain + 1, :, : num_frames.max()] for name in FRAME_ARRAYS}
-        each = ("labels", "heights", "seeds", "outcome", "fallen", "duration_s")
+        each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s")
         cut |= {name: getattr(self, name)[terrain : terrain + 1] for name in each}
         genes = None if self.genes is None else self.genes[terrain : terrain + 1]
         return replace(self, num_frames=num_frames, genes=genes, **cut)
@@ -121,6 +123,7 @@ class Recording:
             penalties=np.where(invalid, np.nan, penalties.astype(np.float64)),
             penalty_names=self.penalty_names,
             outcome=self.outcome,
+            invalidity=self.invalidity,
             fallen=self.fallen,
             duration_s=self.duration_s,
             final_position=position,
@@ -262,6 +265,6 @@ def record(
             "space": rollout.space.name,
             **provenance(device, seed),
         },
-        **{name: getattr(result, name) for name in ("outcome", "fallen", "duration_s")},
+        **{name: getattr(result, name) for name in ("outcome", "invalidity", "fallen", "duration_s")},
         **frames.stacked(),
     )

@@ -5,6 +5,7 @@ import warp as wp
 
 from kernels.episode import (
     PARKING_HEIGHT,
+    Invalidity,
     Outcome,
     begin_episodes,
     command_goal,
@@ -45,8 +46,8 @@ def make_state(num_envs, device, outcome=0, steps=0):
     return state
 
 
-def latch(states, device, anymal, state, *, force=0.0, overflow=0, contacts=(0, 10), cfg=None, **limits):
-    """One judged step; ``force`` [N] acts on the second base geom of every environment."""
+def latch(states, device, anymal, state, *, action=0.0, force=0.0, overflow=0, contacts=(0, 10), cfg=None, **limits):
+    """One judged step; ``force`` [N] acts on the second base geom of every environment, ``action`` is of one joint."""
     num_envs = len(states[0])
     forces = np.zeros((num_envs, len(ROLES), 3))
     forces[:, 0] = forces[:, 2] = 500.0  # limbs and feet may touch as they like
@@ -56,6 +57,7 @@ def latch(states, device, anymal, state, *, force=0.0, overflow=0, contacts=(0, 
         setattr(task, name, value)
     latch_outcomes(
         *(wp.array(np.float32(array), device=device) for array in states),
+        wp.array(np.broadcast_to(np.float32(action), num_envs)[:, None], device=device),
         wp.array(np.float32(forces), dtype=wp.vec3, device=device),
         wp.array(ROLES, dtype=int, device=device),
         wp.array(np.broadcast_to(overflow, num_envs), dtype=int, device=device),
@@ -129,10 +131,31 @@ def test_the_episode_lasts_twenty_seconds(device, anymal):
     assert state.steps.numpy()[0] == 4000
 
 
+def test_an_invalid_episode_says_why_and_a_cause_goes_before_what_comes_of_it(device, anymal):
+    # Seven robots: one fault each, then two that have several, of which the first in the order ACTION, OVERFLOW, STATE,
+    # SPEED is named; the last one walks.
+    q, qd = upright(8, 3)
+    action, overflow = np.zeros(8), np.zeros(8, int)
+    action[0], overflow[1], q[2, 8], qd[3, 0], qd[4, 1] = np.nan, 4, np.nan, -101.0, np.inf
+    action[5] = q[5, 0] = qd[5, 0] = qd[6, 0] = np.nan
+    overflow[5] = overflow[6] = 4
+    state = make_state(8, device)
+    outcomes = latch((q, qd), device, anymal, state, action=action, overflow=overflow)
+    assert outcomes == [Outcome.INVALID] * 7 + [Outcome.RUNNING]
+    expected = ["ACTION", "OVERFLOW", "STATE", "SPEED", "STATE", "ACTION", "OVERFLOW"]
+    assert [Invalidity(k).name for k in state.invalidity.numpy()[:7]] == expected
+    # An episode that ends otherwise has no reason, whatever the one before it had.
+    q, qd = upright(8, 3, x=14.0)
+    begin_all(state)
+    assert latch((q, qd), device, anymal, state) == [Outcome.GOAL] * 8
+    assert not state.invalidity.numpy().any()
+
+
 def test_dropped_contacts_make_every_running_episode_invalid(device, anymal):
     state = make_state(3, device, outcome=[0, Outcome.GOAL, 0])
     outcomes = latch(upright(3, 3), device, anymal, state, contacts=(11, 10))
     assert outcomes == [Outcome.INVALID, Outcome.GOAL, Outcome.INVALID]
+    assert state.invalidity.numpy()[[0, 2]].tolist() == [Invalidity.OVERFLOW] * 2
     assert latch(upright(1, 3), device, anymal, make_state(1, device), contacts=(10, 10)) == [Outcome.RUNNING]
 
 

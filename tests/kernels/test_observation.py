@@ -179,6 +179,12 @@ def test_action_by_hand(device):
     assert (targets[:, :7] == 9).all()
 
 
+def test_an_action_that_is_not_finite_is_not_made_a_limit(device):
+    last, targets = act([[0.2, np.nan], [np.inf, -np.inf]], device)
+    np.testing.assert_array_equal(last, np.float32([[0.2, np.nan], [np.nan, np.nan]]))
+    np.testing.assert_allclose(targets[:, 7:], [[-0.4, np.nan], [np.nan, np.nan]], atol=1e-6)
+
+
 def test_wrong_action_shape_is_named(device):
     with pytest.raises(ValueError, match=r"\(4, 2\), got \(4, 3\)"):
         act(np.zeros((4, 3)), device)

@@ -30,6 +30,23 @@ def not_finite(observation):
     return stand(observation) * float("nan")
 
 
+class NanAfterASecond:
+    """Stands for a second, then returns NaN: weights that training has spoiled, say."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def reset(self):
+        self.calls = 0
+
+    def __call__(self, observation):
+        self.calls += 1
+        return stand(observation) + (float("nan") if self.calls > 50 else 0.0)  # 50 control steps of 0.02 s
+
+
+nan_after_a_second = NanAfterASecond()
+
+
 def list_of_actions(observation):
     """Returns no tensor."""
     return [0.0] * NUM_JOINTS

@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from kernels.episode import Outcome
+from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
 from sim.bench import oracle
 from sim.crossing import CrossingCfg
@@ -15,7 +15,7 @@ from sim.policy.loaders import load_policy
 from sim.rollout import Rollout, evaluate
 from sim.space import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
-from tests.sim.policies import stand, stretch
+from tests.sim.policies import NanAfterASecond, stand, stretch
 from tests.sim.scenes import FLAT, positions, put, spike, velocities
 
 SHORT = CrossingCfg(max_duration_s=0.6, poll_every_s=0.1)
@@ -146,6 +146,8 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
     expected = np.zeros((TERRAINS, REPLICAS), bool)
     expected[1, 2] = True
     np.testing.assert_array_equal(result.invalid, expected)
+    why = Invalidity.STATE if what == "not a number" else Invalidity.SPEED
+    np.testing.assert_array_equal(result.invalidity, np.where(expected, why, Invalidity.NONE))
     assert np.isnan(result.penalties[1, 2]).all()
     assert np.isfinite(result.penalties[~expected]).all()
     # The step that broke is the first after the first poll at 0.1 s.
@@ -157,6 +159,15 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
         np.testing.assert_array_equal(result.penalties[~expected], clean.penalties[~expected])
         np.testing.assert_array_equal(result.outcome[~expected], clean.outcome[~expected])
         same(clean, again)
+
+
+def test_actions_that_are_not_finite_make_their_episodes_invalid_in_the_step_they_act_in(anymal, device):
+    # The 51st control step begins at 1 s; its first physics step of 0.005 s is judged invalid. Clipping made a limit of
+    # NaN once: robots threw themselves about, and fell as others do.
+    rollout = crossing(anymal, device, NanAfterASecond(), max_duration_s=1.2)
+    result = rollout.evaluate(FLAT[None], np.array([1]))
+    assert (result.invalidity == Invalidity.ACTION).all() and result.invalid.all()
+    np.testing.assert_allclose(result.duration_s, 1.005, atol=1e-6)
 
 
 def test_penalties_equal_a_replay_on_the_host(robot, device):

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from kernels.episode import Outcome
+from kernels.episode import Invalidity, Outcome
 from sim.rollout import RolloutResult
 
 GOAL, HIT, LATE, OUT, BAD = Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT, Outcome.INVALID
@@ -29,6 +29,7 @@ def result_of(
         penalties=penalties,
         penalty_names=names,
         outcome=outcome,
+        invalidity=np.where(outcome == Outcome.INVALID, np.uint8(Invalidity.STATE), np.uint8(0)),
         fallen=np.zeros(outcome.shape, bool) if fallen is None else np.array(fallen, bool),
         duration_s=np.full(outcome.shape, 12.0, np.float32) if duration_s is None else np.array(duration_s),
         final_position=np.zeros((*outcome.shape, 3), np.float32),

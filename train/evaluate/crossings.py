@@ -37,7 +37,7 @@ Open = Callable[[EvaluatorCfg], AbstractContextManager[Evaluate]]
 _MOST_ENVS = 16_384  # at once, so that any number of terrains fits a GPU
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
 _ROOMS = ("kernels", "sim")
-_ARRAYS = ("penalties", "outcome", "fallen", "duration_s", "final_position", "reward")
+_ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_position", "reward")
 _SETTINGS = ("penalty_names", "physics_steps", "wall_s")
 
 

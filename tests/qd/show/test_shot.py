@@ -46,6 +46,7 @@ def recording():
         labels=("a hill",), heights=np.zeros((1, 161, 321), np.float32), genes=None, seeds=np.uint32([1]),
         replicas=np.arange(5, dtype=np.int32),
         outcome=np.uint8([[*LATE[:1], Outcome.GOAL, *LATE, Outcome.BASE_COLLISION]]),
+        invalidity=np.zeros((1, 5), np.uint8),
         fallen=np.array([[False] * 4 + [True]]), duration_s=np.ones((1, 5), np.float32),
         num_frames=np.full((1, 5), FRAMES, np.int32), base_position=position, base_quaternion=quaternion,
         joint_position=np.zeros((*shape, 1), np.float32), foot_force=np.zeros((*shape, 1, 3), np.float32),

@@ -36,6 +36,7 @@ def make_recording(robot, genes, *, seeds, policy_sha256, replicas=3) -> Recordi
         seeds=seeds,
         replicas=np.arange(replicas, dtype=np.int32),
         outcome=np.resize(OUTCOMES, each).astype(np.uint8),
+        invalidity=np.resize([4 * (outcome == Outcome.INVALID) for outcome in OUTCOMES], each).astype(np.uint8),
         fallen=np.resize((True, False, False), each),
         duration_s=np.resize((0.09, 0.06, 0.01), each).astype(np.float32),
         num_frames=num_frames,
