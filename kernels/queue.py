@@ -37,6 +37,8 @@ class EpisodeQueue:
     """1 where a robot has just taken an episode, shape (num_envs,)."""
     outcome: wp.array[int]
     """Results, shape (num_slots * num_replicas,): :class:`kernels.episode.Outcome`."""
+    invalidity: wp.array[int]
+    """:class:`kernels.episode.Invalidity`."""
     steps: wp.array[int]
     """Physics steps up to the end."""
     final_pose: wp.array[wp.transform]
@@ -68,8 +70,8 @@ def make_queue(
     queue.num_ended = wp.zeros(num_slots, dtype=int, device=device)
     queue.episode_of_env = wp.full(num_envs, -1, dtype=int, device=device)
     queue.begins = wp.zeros(num_envs, dtype=int, device=device)
-    queue.outcome = wp.zeros(rows, dtype=int, device=device)
-    queue.steps = wp.zeros(rows, dtype=int, device=device)
+    for name in ("outcome", "invalidity", "steps"):
+        setattr(queue, name, wp.zeros(rows, dtype=int, device=device))
     queue.final_pose = wp.zeros(rows, dtype=wp.transform, device=device)
     queue.penalty_sums = wp.zeros((rows, num_penalties), dtype=float, device=device)
     queue.reward = wp.zeros(rows if rewarded else 0, dtype=float, device=device)
@@ -81,6 +83,7 @@ def _write_down(
     row: int, env: int, episodes: Episodes, penalty_sums: wp.array2d[float], rewards: Rewards, queue_out: EpisodeQueue
 ):
     queue_out.outcome[row] = episodes.outcome[env]
+    queue_out.invalidity[row] = episodes.invalidity[env]
     queue_out.steps[row] = episodes.steps[env]
     queue_out.final_pose[row] = episodes.final_pose[env]
     for k in range(penalty_sums.shape[1]):

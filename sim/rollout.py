@@ -443,7 +443,7 @@ class Rollout:
             penalties=penalties,
             penalty_names=robot.penalties,
             outcome=outcome,
-            invalidity=self._episode.invalidity.numpy().astype(np.uint8).reshape(shape),
+            invalidity=of(queue.invalidity).astype(np.uint8),
             fallen=upright < np.cos(np.deg2rad(_FALLEN_TILT_DEG)),
             duration_s=(of(queue.steps) * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],

@@ -28,7 +28,7 @@ from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
 from sim.mujoco_c.model import Array, crossing_model, goal_commands, observations, step_penalties
 from sim.policy.loaders import Policy, load_policy, prepare_torch
-from sim.policy.runner import forget
+from sim.policy.runner import forget_all
 from sim.robots.model import build_robot
 from sim.robots.robot import RobotCfg
 
@@ -202,7 +202,7 @@ def cross(
     steps, sums = np.zeros(count, int), np.zeros((count, len(PENALTIES)))
     last_action = np.zeros((count, robot.num_joints))
     rows = np.zeros((count, robot.observation_size))
-    remembers = forget(policy)  # it must be asked for the same robots every time
+    remembers = forget_all(policy, count)  # it must be asked for the same robots every time
     most = round(cfg.max_duration_s / robot.physics_dt)
     for step in range(most):
         running = np.flatnonzero(outcome == Outcome.RUNNING)

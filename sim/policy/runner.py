@@ -44,6 +44,16 @@ def memory_of(policy: Any) -> Memory:
     return Memory.BY_ROW
 
 
+def forget_all(policy: Any, num_envs: int) -> bool:
+    """Let a policy that remembers forget all its robots; returns whether it is one."""
+    memory = memory_of(policy)
+    if memory is Memory.BY_ROW:
+        policy.reset(torch.ones(num_envs, dtype=torch.bool))
+    elif memory is Memory.WHOLE:
+        policy.reset()
+    return memory is not Memory.NONE
+
+
 class PolicyRunner:
     """Runs a policy between two Warp buffers: captured as a CUDA graph where it is a torch module without memory."""
 

@@ -146,7 +146,7 @@ def test_an_invalid_episode_says_why_and_a_cause_goes_before_what_comes_of_it(de
     assert [Invalidity(k).name for k in state.invalidity.numpy()[:7]] == expected
     # An episode that ends otherwise has no reason, whatever the one before it had.
     q, qd = upright(8, 3, x=14.0)
-    begin_all(state)
+    begin_episodes(wp.ones(8, dtype=int, device=device), state)
     assert latch((q, qd), device, anymal, state) == [Outcome.GOAL] * 8
     assert not state.invalidity.numpy().any()
 

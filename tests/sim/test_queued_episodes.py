@@ -16,7 +16,7 @@ from tests.sim.policies import stretch
 from tests.sim.scenes import FLAT, spike
 
 REPLICAS = 4
-ARRAYS = ("penalties", "outcome", "fallen", "duration_s", "final_position", "reward")
+ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_position", "reward")
 SEEDS = np.array([5, 6, 7, 8, 9], np.uint32)
 
 
@@ -33,14 +33,14 @@ NEAR = CrossingCfg(start=(12.5, 4.0), max_duration_s=2.4, poll_every_s=0.2)
 
 
 class FearsDepth:
-    """The shipped controller, but it whips its legs where the height scan is at its limit: above the pit."""
+    """The shipped controller, but NaN where some of the height scan is at its limit: before the pit."""
 
     def __init__(self, robot, device):
         self.walker = load_policy(robot.policy_file, robot, device)
 
     def __call__(self, row):
-        deep = (row[:, 48:] >= 5.0).any(dim=1, keepdim=True)
-        return torch.where(deep, 100.0, self.walker(row))
+        deep = (row[:, 48:] >= 5.0).float().mean(dim=1, keepdim=True)
+        return torch.where((deep > 0.0) & (deep < 0.5), torch.nan, self.walker(row))
 
 
 def rollout_of(robot, num_envs, policy=None, cfg=NEAR, device="cpu", num_terrains=len(GRIDS)):
@@ -69,7 +69,7 @@ def test_any_number_of_robots_runs_the_same_episodes(robot, reward):
         queued = rollout_of(robot, num_envs, cfg=cfg).evaluate(GRIDS, SEEDS)
         same(alone, queued)
         assert queued.robot_steps == num_envs * queued.physics_steps
-        assert queued.physics_steps > alone.physics_steps
+        assert queued.physics_steps >= alone.physics_steps
 
 
 def test_recordings_are_the_same_too(anymal):

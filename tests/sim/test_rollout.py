@@ -313,10 +313,11 @@ def test_evaluate_in_one_call(anymal, device):
     ("terrains", "seeds", "message"),
     [
         (np.zeros((4, 63)), np.arange(4), r"64\), got \(4, 63\)"),
-        (np.zeros((3, 64)), np.arange(4), "4 terrains.*got 3"),
+        (np.zeros((5, 64)), np.arange(5), "1 to 4 at once here, got 5"),
         (np.zeros((4, 161, 320)), np.arange(4), r"\(4, 161, 321\).*got \(4, 161, 320\)"),
         (np.full((4, 64), np.nan), np.arange(4), "finite"),
         (np.zeros((4, 64)), np.arange(3), r"\(4,\).*got \(3,\)"),
+        (np.zeros((0, 64)), np.arange(0), "1 to 4 at once here, got 0"),
     ],
 )
 def test_wrong_input_is_named(rollout, terrains, seeds, message):

@@ -34,6 +34,7 @@ def result_of(
         duration_s=np.full(outcome.shape, 12.0, np.float32) if duration_s is None else np.array(duration_s),
         final_position=np.zeros((*outcome.shape, 3), np.float32),
         physics_steps=1,
+        robot_steps=1,
         wall_s=1.0,
         reward=rewards,
     )
