@@ -85,7 +85,7 @@ class Scheduler:
         if learns:
             self.archive = _make_archive(space.num_genes, num_cells, num_ratios, streams[0], learning)
         self.emitters: list[Emitter] = [self._emitter(cfg, name, space, stream) for name, stream in in_turn]
-        self._asked: NDArray[np.float32] | None = None
+        self._asked: list[NDArray[np.float32] | None] = [None] * cfg.groups
 
     def _emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
         if method.endswith("random"):
@@ -115,39 +115,51 @@ class Scheduler:
             seed=stream,
         )
 
-    def ask(self) -> NDArray[np.float32]:
-        """The next terrains to evaluate.
+    def _group(self, group: int) -> list[Emitter]:
+        """Emitters of a group: equal parts of them, as far as that goes."""
+        first, last = (k * len(self.emitters) // len(self._asked) for k in (group, group + 1))
+        return self.emitters[first:last]
+
+    def ask(self, group: int = 0) -> NDArray[np.float32]:
+        """The next terrains of a group of emitters to evaluate; the same until it is told of them.
+
+        Args:
+            group: Number of the group.
 
         Returns:
-            Clipped genes, shape (emitters * batch_size, num_genes).
+            Clipped genes, shape (emitters of the group * batch_size, num_genes).
         """
-        self._asked = np.concatenate([emitter.ask() for emitter in self.emitters])
-        return clipped(self._asked)
+        asked = self._asked[group]
+        if asked is None:
+            asked = self._asked[group] = np.concatenate([emitter.ask() for emitter in self._group(group)])
+        return clipped(asked)
 
-    def tell(self, evaluation: Evaluation, iteration: int) -> None:
-        """What became of the terrains last asked for.
+    def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
+        """What became of the terrains that a group last asked for.
 
         Args:
             evaluation: One row a terrain, in the order asked.
             iteration: Number of the iteration, from 1.
+            group: Number of the group.
 
         Raises:
-            RuntimeError: If nothing was asked for.
+            RuntimeError: If it asked for nothing.
             ValueError: If the number of rows differs.
         """
-        if self._asked is None:
+        asked = self._asked[group]
+        if asked is None:
             raise RuntimeError("tell() must follow ask(), got no terrains asked for")
-        if len(evaluation.fitness) != len(self._asked):
-            raise ValueError(f"evaluation must have {len(self._asked)} rows, got {len(evaluation.fitness)}")
-        told = _rows(self._asked, evaluation, iteration)
-        self._asked = None
+        if len(evaluation.fitness) != len(asked):
+            raise ValueError(f"evaluation must have {len(asked)} rows, got {len(evaluation.fitness)}")
+        told = _rows(asked, evaluation, iteration)
+        self._asked[group] = None
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
         plain = self._add(told, accepted)
         learned = plain if self.archive is self.result else self.archive.add(**told)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
-        for emitter in self.emitters:
+        for emitter in self._group(group):
             own = slice(first, first + emitter.batch_size)
             added = plain if emitter.archive is self.result else learned
             emitter.tell(
@@ -173,8 +185,8 @@ class Scheduler:
         return elites | {"fitness": data["objective"][order], "cell": data["index"][order].astype(np.int64)}
 
     def state(self) -> dict[str, Any]:
-        """Everything a resumed search needs, valid between ``tell`` and ``ask``."""
-        return {"archive": self.archive, "result": self.result, "emitters": self.emitters}
+        """Everything a resumed search needs; what was asked for and not told stays asked for."""
+        return {"archive": self.archive, "result": self.result, "emitters": self.emitters, "asked": self._asked}
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Scheduler":
@@ -183,18 +195,20 @@ class Scheduler:
         Raises:
             ValueError: If the state is none of a search.
         """
-        archive, result, emitters = (state.get(name) for name in ("archive", "result", "emitters"))
+        archive, result, emitters, asked = (state.get(name) for name in ("archive", "result", "emitters", "asked"))
         if not (
             isinstance(archive, GridArchive)
             and isinstance(result, GridArchive)
             and isinstance(emitters, list)
             and emitters
             and all(isinstance(emitter, Emitter) for emitter in emitters)
+            and isinstance(asked, list)
+            and 1 <= len(asked) <= len(emitters)
+            and all(isinstance(genes, np.ndarray | None) for genes in asked)
         ):
-            raise ValueError("a search has two archives and a list of emitters, got something else")
+            raise ValueError("a search has two archives, emitters, and what they asked for, got something else")
         search = cls.__new__(cls)
-        search.archive, search.result, search.emitters = archive, result, emitters
-        search._asked = None
+        search.archive, search.result, search.emitters, search._asked = archive, result, emitters, asked
         return search
 
 

@@ -49,6 +49,8 @@ class RolloutResult:
     """Physics steps run for it: since the result before, or since it was put in if nothing else was."""
     robot_steps: int
     """Physics steps of all robots in that time, those that waited included."""
+    busy_steps: int
+    """Physics steps of the episodes."""
     wall_s: float
     """Time that took [s]."""
     reward: np.ndarray | None = None
@@ -68,6 +70,11 @@ class RolloutResult:
     def invalid(self) -> np.ndarray:
         """Non-finite, too fast or overflowed, bool."""
         return self.outcome == Outcome.INVALID
+
+    @property
+    def idle_share(self) -> float:
+        """Share of the robots' steps in which they waited."""
+        return 1.0 - self.busy_steps / self.robot_steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -426,7 +433,7 @@ class Rollout:
             values = np.concatenate([array[own].numpy() for own in rows])  # a copy: on the CPU numpy() is a view
             return values.reshape(-1, self.num_replicas, *values.shape[1:])
 
-        outcome, pose = of(queue.outcome).astype(np.uint8), of(queue.final_pose)
+        outcome, steps, pose = of(queue.outcome).astype(np.uint8), of(queue.steps), of(queue.final_pose)
         columns = [PENALTIES.index(name) for name in robot.penalties]
         penalties = of(queue.penalty_sums).astype(np.float64)[..., columns]
         penalties[outcome == Outcome.INVALID] = np.nan
@@ -445,10 +452,11 @@ class Rollout:
             outcome=outcome,
             invalidity=of(queue.invalidity).astype(np.uint8),
             fallen=upright < np.cos(np.deg2rad(_FALLEN_TILT_DEG)),
-            duration_s=(of(queue.steps) * robot.physics_dt).astype(np.float32),
+            duration_s=(steps * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],
             physics_steps=physics_steps,
             robot_steps=physics_steps * self.num_envs,
+            busy_steps=int(steps.sum()),
             wall_s=wall_s,
             reward=reward,
         )

@@ -7,6 +7,8 @@ however terrains are spread.
 import importlib
 import os
 import re
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,13 +20,14 @@ from numpy.typing import NDArray
 
 from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
-from qd.workers.shards import MIN_ROWS, checked_count, merged, taken
+from qd.workers.shards import MIN_ROWS, checked_count, merged
 from sim.files.provenance import provenance
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
 
+_SPARE_SLOTS = 8  # of a process: lots do not always divide evenly
 _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
 
 
@@ -61,13 +64,16 @@ class EvaluatorCfg:
     policy: str
     """Controller, as :func:`sim.policy.loaders.load_policy` takes it."""
     num_terrains: int
-    """Terrains at once; more are taken in turns."""
+    """Terrains under way at once; of more, half as many follow each time that the first half is done."""
     num_replicas: int
     """Episodes a terrain."""
     device: str = "cpu"
     """Warp device name."""
     workers: str | None = None
     """Who crosses them, as :func:`parse_workers` takes it; a GPU without Ray needs one process."""
+    num_envs: int | None = None
+    """Robots at once over all workers, which take the episodes one after the other; as many as the device is good for
+    if None. It changes no result."""
     penalties_from_s: float = 0.0
     """Penalties are summed from this time of an episode on [s]."""
     reward: bool = False
@@ -83,8 +89,21 @@ class EvaluatorCfg:
             return count or _ray_module("ray_cluster").num_devices(self.device)
         if self.device.startswith("cuda"):
             return 1
-        by_rows = self.num_terrains * self.num_replicas // MIN_ROWS
+        by_rows = (self.num_envs or self.num_terrains * self.num_replicas) // MIN_ROWS
         return max(1, min(count or available_cores(), self.num_terrains, by_rows))
+
+    @property
+    def envs_of_worker(self) -> int:
+        """Robots of a worker, at least 4."""
+        if self.num_envs is None:
+            return best_num_envs(self.device)
+        return max(MIN_ROWS, -(-self.num_envs // self.num_workers))
+
+
+def best_num_envs(device: str) -> int:
+    """Robots at once with which a device crosses the most episodes a second: a GPU is full with them, and on a core
+    more would wait longer for the last ones to arrive (results/anymal/speed.json)."""
+    return 32_768 if device.startswith("cuda") else 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,6 +224,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
         cfg.policy,
         num_terrains=num_terrains,
         num_replicas=cfg.num_replicas,
+        num_envs=cfg.envs_of_worker,
         device=cfg.device,
         cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
         space=get_space(cfg.space),
@@ -249,72 +269,134 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
             yield workers
         return
     if cfg.device.startswith("cuda"):
-        crosser = build(cfg, cfg.num_terrains)
-        yield _in_turns(
-            lambda terrains, seeds, progress=None: crosser.evaluate(terrains, seeds, progress=progress),
-            cfg.num_terrains,
-        )
+        yield _Here(build(cfg, cfg.num_terrains), cfg.num_terrains)
         return
     processes: list[WorkerProcess] = []
     try:
-        per_process = -(-cfg.num_terrains // cfg.num_workers)
-        for first in range(0, cfg.num_terrains, per_process):
-            num_terrains = min(per_process, cfg.num_terrains - first)
-            processes.append(WorkerProcess(num_terrains, build, cfg))
-            if first == 0:
+        for number in range(cfg.num_workers):
+            processes.append(WorkerProcess(-(-cfg.num_terrains // cfg.num_workers) + _SPARE_SLOTS, build, cfg))
+            if number == 0:
                 processes[0].receive()  # it compiles the kernels; the others then find them compiled
         for process in processes[1:]:
             process.receive()
-        yield _in_turns(_over_processes(processes), cfg.num_terrains)
+        yield _Processes(processes, cfg.num_terrains)
     finally:
         for process in processes:
             process.stop()
 
 
-def _over_processes(processes: list[WorkerProcess]) -> Evaluate:
-    """Crosses shards of whole terrains, one a process, and puts them together in order."""
+class Pipeline(ABC):
+    """Evaluates any number of terrains (:class:`Evaluate`): lots of them are put in, and come out in the same order.
 
-    def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
-        first = 0
-        for process in processes:
-            own = slice(first, first + process.num_terrains)
+    Robots go on with the lots behind while the last robots of the first one still walk.
+
+    Args:
+        num_terrains: Terrains that may be under way at once.
+    """
+
+    def __init__(self, num_terrains: int) -> None:
+        self.num_terrains = num_terrains
+
+    @abstractmethod
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """Lets a lot of terrains be crossed; waits for nothing."""
+
+    @abstractmethod
+    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        """Waits for the lot that was put in first; ``progress`` is told the share of it that is done."""
+
+    def __call__(
+        self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
+    ) -> "RolloutResult":
+        """Crosses each terrain once a replica; nothing else may be under way."""
+        count = checked_count(terrains, seeds)
+        size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
+        lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
+        for own in lots[:2]:
+            self.put(terrains[own], seeds[own])
+        results = []
+        for number, own in enumerate(lots):
+            done, share = own.start / count, (own.stop - own.start) / count
+            results.append(self.take(None if progress is None else _share_of(progress, done, share)))
+            for behind in lots[number + 2 : number + 3]:
+                self.put(terrains[behind], seeds[behind])
+        return merged(results, join=1)
+
+
+class _Here(Pipeline):
+    """A simulation in this process."""
+
+    def __init__(self, crosser: Crosser, num_terrains: int) -> None:
+        super().__init__(num_terrains)
+        self._crosser = crosser
+
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """Hands a lot to the simulation."""
+        self._crosser.put(terrains, seeds)
+
+    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        """Waits for the simulation."""
+        return self._crosser.take(progress)
+
+
+class _Processes(Pipeline):
+    """Processes that each cross a part of every lot, whole terrains in order."""
+
+    def __init__(self, processes: list[WorkerProcess], num_terrains: int) -> None:
+        super().__init__(num_terrains)
+        self._processes = processes
+        self._parts: deque[int] = deque()  # of each lot under way
+        self._results: list[deque[Any]] = [deque() for _ in processes]
+
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """Hands a part to each process, as far as there are terrains."""
+        count = len(terrains)
+        size = -(-count // len(self._processes))
+        parts = [slice(first, min(first + size, count)) for first in range(0, count, size)]
+        for process, own in zip(self._processes, parts, strict=False):
             process.send(terrains[own], seeds[own])
-            first = own.stop
-        results: dict[int, Any] = {}
-        shares = np.zeros(len(processes))
-        while len(results) < len(processes):
-            for index in _ready(processes, results):
-                message, value = processes[index].receive()
+        self._parts.append(len(parts))
+
+    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        """Puts the parts of a lot together."""
+        results = self._results[: self._parts.popleft()]
+        shares = np.zeros(len(results))
+        while not all(results):
+            for index in self._ready(results):
+                message, value = self._processes[index].receive()
                 if message == "result":
-                    results[index] = value
+                    results[index].append(value)
                 shares[index] = value if message == "progress" else 1.0
             if progress is not None:
                 progress(float(shares.mean()))
-        return merged([results[index] for index in range(len(processes))], join=0)
+        return merged([own.popleft() for own in results], join=0)
 
-    return evaluate
-
-
-def _ready(processes: list[WorkerProcess], results: dict[int, Any]) -> list[int]:
-    """Processes without a result yet that have something to say, or died."""
-    waiting = {processes[k].connection: k for k in range(len(processes)) if k not in results}
-    return [waiting[connection] for connection in wait(list(waiting)) if isinstance(connection, Connection)]
+    def _ready(self, results: list[deque[Any]]) -> list[int]:
+        """Processes without a result yet that have something to say, or died."""
+        waiting = {self._processes[k].connection: k for k, own in enumerate(results) if not own}
+        return [waiting[connection] for connection in wait(list(waiting)) if isinstance(connection, Connection)]
 
 
-def _in_turns(evaluate: Evaluate, at_once: int) -> Evaluate:
-    """Evaluates any number of terrains, ``at_once`` at a time; the last turn is filled up with earlier ones."""
+class _OneByOne(Pipeline):
+    """An evaluator that has one lot under way at a time."""
 
-    def in_turns(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> "RolloutResult":
-        count = checked_count(terrains, seeds)
-        parts = []
-        for first in range(0, count, at_once):
-            turn = np.arange(first, first + at_once) % count
-            report = None if progress is None else _share_of(progress, first / count, at_once / count)
-            result = evaluate(terrains[turn], seeds[turn], report)
-            parts.append(taken(result, min(at_once, count - first)))
-        return merged(parts, join=1)
+    def __init__(self, evaluate: Evaluate) -> None:
+        super().__init__(0)
+        self._evaluate = evaluate
+        self._lots: deque[tuple[NDArray, NDArray]] = deque()
 
-    return in_turns
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """Keeps a lot until it is waited for."""
+        self._lots.append((terrains, seeds))
+
+    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        """Crosses the lot that was put in first."""
+        return self._evaluate(*self._lots.popleft(), progress)
+
+
+def pipeline_of(evaluate: Evaluate) -> Pipeline:
+    """An evaluator as a pipeline; one that knows a single lot at a time takes them one after the other."""
+    return evaluate if isinstance(evaluate, Pipeline) else _OneByOne(evaluate)
 
 
 def _share_of(progress: Callable[[float], None], start: float, share: float) -> Callable[[float], None]:

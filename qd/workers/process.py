@@ -3,8 +3,10 @@
 import contextlib
 import multiprocessing
 import os
+import queue
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
@@ -22,7 +24,7 @@ class EvaluatorError(UserError):
 
 
 class Crosser(Protocol):
-    """What evaluates a fixed number of terrains, such as :class:`sim.rollout.Rollout`."""
+    """What lets robots cross terrains: :class:`sim.rollout.Rollout`."""
 
     def evaluate(
         self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None
@@ -30,19 +32,26 @@ class Crosser(Protocol):
         """Cross each terrain."""
         ...
 
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """Let terrains be crossed behind those under way."""
+        ...
+
+    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+        """Wait for the terrains that were put in first; ``progress`` may put in more."""
+        ...
+
 
 class WorkerProcess:
     """A process that has a simulation of its own.
 
     Args:
-        num_terrains: Terrains it evaluates at once.
+        num_terrains: Terrains it may have under way at once.
         build: Called in the process with ``cfg`` and ``num_terrains``; a module-level function.
         cfg: Anything that can be pickled.
     """
 
     def __init__(self, num_terrains: int, build: Callable[[Any, int], Crosser], cfg: Any) -> None:
         context = multiprocessing.get_context("spawn")  # a fork of a process with threads and CUDA may hang
-        self.num_terrains = num_terrains
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, cfg, num_terrains, build), daemon=True)
         # A blocked signal stays blocked in the child: Ctrl-C reaches the whole group, and the parent ends its workers.
@@ -54,7 +63,7 @@ class WorkerProcess:
         theirs.close()  # so that its death ends the stream here
 
     def send(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Hands out terrains to evaluate."""
+        """Hands out terrains to evaluate, behind those handed out before."""
         try:
             self.connection.send((terrains, seeds))
         except OSError:
@@ -95,19 +104,43 @@ class WorkerProcess:
 def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[[Any, int], Crosser]) -> None:
     """A worker's life: build, then evaluate until the other end closes."""
     os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported: one core a worker
+    inbox: queue.SimpleQueue[tuple[NDArray, NDArray]] = queue.SimpleQueue()
+    under_way = 0
+
+    def put_in(*, wait: bool) -> None:
+        nonlocal under_way
+        while wait or not inbox.empty():
+            crosser.put(*inbox.get())
+            under_way, wait = under_way + 1, False
+
+    def report(share: float) -> None:
+        put_in(wait=False)
+        connection.send(("progress", share))
+
     try:
         crosser = build(cfg, num_terrains)
         connection.send(("ready", None))
+        threading.Thread(target=_read, args=(connection, inbox), daemon=True).start()
         while True:
-            terrains, seeds = connection.recv()
-            report = lambda share: connection.send(("progress", share))  # noqa: E731
-            connection.send(("result", crosser.evaluate(terrains, seeds, progress=report)))
+            put_in(wait=under_way == 0)
+            result = crosser.take(report)
+            under_way -= 1
+            connection.send(("result", result))
     except (EOFError, ConnectionError):  # the other end is gone: closed, or killed with unread messages
         sys.exit(0)
     except ValueError as error:
         _send_last(connection, "refused", str(error))
     except Exception as error:
         _send_last(connection, "failed", f"{type(error).__name__}: {error}")
+
+
+def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[NDArray, NDArray]]") -> None:
+    """Takes in what is handed out while the worker crosses terrains, so that nobody waits for it to be read."""
+    try:
+        while True:
+            inbox.put(connection.recv())
+    except (EOFError, OSError):  # the other end is gone: closed, or killed with unread messages
+        os._exit(0)
 
 
 def _send_last(connection: Connection, message: str, value: str) -> None:

@@ -41,6 +41,8 @@ def merged(results: list[Any], *, join: int) -> Any:
     }
     for name in ("physics_steps", "wall_s"):
         fields[name] = combine(getattr(result, name) for result in results)
+    for name in ("robot_steps", "busy_steps"):
+        fields[name] = sum(getattr(result, name) for result in results)
     return dataclasses.replace(results[0], **fields)
 
 

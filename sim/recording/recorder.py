@@ -129,6 +129,7 @@ class Recording:
             final_position=position,
             physics_steps=0,
             robot_steps=0,
+            busy_steps=0,
             wall_s=0.0,
         )
 

@@ -35,6 +35,7 @@ def result_of(
         final_position=np.zeros((*outcome.shape, 3), np.float32),
         physics_steps=1,
         robot_steps=1,
+        busy_steps=1,
         wall_s=1.0,
         reward=rewards,
     )

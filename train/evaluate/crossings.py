@@ -38,7 +38,7 @@ _MOST_ENVS = 16_384  # at once, so that any number of terrains fits a GPU
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
 _ROOMS = ("kernels", "sim")
 _ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_position", "reward")
-_SETTINGS = ("penalty_names", "physics_steps", "robot_steps", "wall_s")
+_SETTINGS = ("penalty_names", "physics_steps", "robot_steps", "busy_steps", "wall_s")
 
 
 def take_terrains(result: RolloutResult, places: np.ndarray) -> RolloutResult:
@@ -79,15 +79,17 @@ class KeptCrossings:
             check_zip(file)
             with np.load(file, allow_pickle=False) as content:
                 arrays = {name: content[name] for name in _ARRAYS}
-                names, steps, robot_steps, wall_s = (content[name] for name in _SETTINGS)
+                names, *steps, wall_s = (content[name] for name in _SETTINGS)
             self._check(arrays, len(terrains), len(names))
         except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
             print(f"{file} is damaged ({' '.join(str(error).split())}): its terrains are crossed again", flush=True)
             return None
         return RolloutResult(
-            **arrays, penalty_names=tuple(names.tolist()), physics_steps=int(steps), robot_steps=int(robot_steps),
+            **arrays,
+            **dict(zip(_SETTINGS[1:-1], map(int, steps), strict=True)),
+            penalty_names=tuple(names.tolist()),
             wall_s=float(wall_s),
-        )  # fmt: skip
+        )
 
     def write(self, policy: str, terrains: TerrainSet, result: RolloutResult) -> None:
         """Keep crossings.
