@@ -22,6 +22,7 @@ from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, orig
 from qd.run.progress import share_bar
 from qd.run.settings import SearchCfg, file_hash, policy_spec, refuse_unnamed_code
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, open_evaluator, origin_of, resolve_device
+from qd.workers.invalid import tell_invalid
 from qd.workers.shards import taken
 from sim.files.command import Where, Who, command_line, naming_what_is_next
 from sim.files.intervals import bootstrap_interval, wilson_interval
@@ -64,6 +65,7 @@ def reevaluate(
 
     Raises:
         ValueError: If ``evaluate`` gives another number of episodes.
+        AllInvalidError: If none of them is valid.
     """
     times = -(-FRESH_EPISODES // num_replicas)
     counts = [len(archive) for archive in archives]
@@ -72,6 +74,7 @@ def reevaluate(
     genes = np.concatenate([archive.genes for archive in archives]).repeat(times, axis=0)
     drawn = [_elite_seeds(archive, seed, times) for archive, seed in zip(archives, seeds, strict=True)]
     result = evaluate(genes, np.concatenate(drawn), progress)
+    tell_invalid(result, "fresh episodes")
     if result.base_collision.shape[1] != num_replicas:
         raise ValueError(f"evaluate must give {num_replicas} episodes, got {result.base_collision.shape[1]}")
     found, first = [], 0

@@ -12,6 +12,7 @@ from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, cla
 from qd.run.progress import ProgressBar, plan
 from qd.run.settings import SearchCfg, code_of
 from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, worker_status
+from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from sim.files.command import command_line, naming_what_is_next
 
 if TYPE_CHECKING:
@@ -34,6 +35,9 @@ def search_terrains(
         metrics: Rows so far; one more an iteration.
         evaluate: Crosses terrains.
         bar: Shows progress.
+
+    Raises:
+        AllInvalidError: If no episode of an iteration is valid; those before are saved.
     """
     began = time.perf_counter()
     for iteration in range(len(metrics) + 1, cfg.iterations + 1):
@@ -66,7 +70,11 @@ def take_in(
 
     Returns:
         What the search has found, and the iteration's row of metrics but for its timing.
+
+    Raises:
+        AllInvalidError: If no episode is valid; the search is as it was.
     """
+    refuse_all_invalid(result)
     evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
     search.tell(evaluation, iteration)
     found = archive_of(cfg, search, iteration)
@@ -75,7 +83,8 @@ def take_in(
         "rollout_s": float(result.wall_s),
         "mean_duration_s": float(result.duration_s.mean()),
     }
-    return found, {"iteration": iteration, **found.scores(), **evaluation.means(), **physics}
+    invalid = {"invalid_reasons": invalid_reasons(result)}
+    return found, {"iteration": iteration, **found.scores(), **evaluation.means(), **invalid, **physics}
 
 
 def _look_again(cfg: SearchCfg, found: Archive, evaluate: Evaluate) -> dict[str, Any]:
@@ -113,6 +122,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
         ValueError: If the run directory does not fit the job.
         Interrupted: On Ctrl-C or SIGTERM; all iterations that ended are saved.
         EvaluatorError: If a worker is lost; likewise.
+        AllInvalidError: If no episode of an iteration is valid; likewise.
     """
     cfg, run = job.cfg, RunDirectory(job.path)
     with claimed(job.path):
@@ -143,6 +153,9 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                 # The run's numbers are of the machine that searched, the fresh episodes of this one.
                 by = origin_of(job.device, cfg.seed, job.evaluator.workers)
                 write_results(run, archive, metrics, origin, reproduced_by=by)
+    invalid = invalid_iterations(metrics)
+    if invalid is not None:
+        print(f"Warning: {invalid}")
     worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
     print(f"Next, see the worst terrain:  {worst}")
     return archive

@@ -9,6 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from qd.run.settings import SearchCfg
+from qd.workers.invalid import WARNED_SHARE, reason_words
 from sim.policy.spec import SHIPPED
 
 _EPISODE_STEPS = 4000  # 20 s at 200 Hz
@@ -112,11 +113,14 @@ class ProgressBar:
         if row["iteration"] == self._first + 1:
             left = (self._iterations - row["iteration"]) * row["wall_s"]
             self._bar.write(f"First iteration: {row['wall_s']:.1f} s; about {clock(left)} to go.", file=sys.stderr)
+        invalid = row["invalid_episodes"] / row["episodes"]
+        why = reason_words(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
         self._describe(
             row["iteration"],
             f"{row['elites']} elites ({row['reachable_coverage']:.1%} of reachable), QD {row['qd_score']:.0f}, "
             f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s"
-            + (f" by {workers}" if workers else ""),
+            + (f" by {workers}" if workers else "")
+            + (f", {invalid:.0%} invalid ({why})" if why else ""),
         )
 
     def _describe(self, done: int, state: str) -> None:

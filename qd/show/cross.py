@@ -13,6 +13,7 @@ from qd.run.directory import RUNS
 from qd.show.elites import robot_named
 from qd.show.figures import PENALTY_UNITS, save_figure
 from qd.workers.evaluator import check_policy, origin_of, resolve_device
+from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OnDevice, Who, split_words
 from sim.files.intervals import rate_words, wilson_interval
@@ -108,6 +109,7 @@ def cross(cfg: Cross) -> dict[str, Any]:
         FileNotFoundError: If there is no height map.
         ValueError: If robot, map, device, controller or a number is not as it must be; before anything is crossed.
         OSError: If a file cannot be written.
+        AllInvalidError: If no crossing is valid.
     """
     from qd.show.crossed import crossed_of
     from qd.show.crossing_figures import draw_paths
@@ -125,7 +127,9 @@ def cross(cfg: Cross) -> dict[str, Any]:
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)
     (recording,) = Recordings(robot, device=device).all_of([wanted])
     origin, about = origin_of(device, cfg.seed, None), _about(cfg, robot.name, terrain, policy)
-    report = {**origin, **about, **numbers_of(recording.result())}
+    result = recording.result()
+    refuse_all_invalid(result)
+    report = {**origin, **about, **numbers_of(result)}
     print(describe(report))
     write_atomically(out, to_json(report))
     crossed = crossed_of(recording, robot.penalties, (1.0,) * len(robot.penalties))
@@ -174,6 +178,7 @@ def numbers_of(result: "RolloutResult") -> dict[str, Any]:
     return {
         "episodes": len(valid),
         "invalid_episodes": int((~valid).sum()),
+        "invalid_reasons": invalid_reasons(result),
         "rates": {name: _rate(int((hit & valid).sum()), int(valid.sum())) for name, hit in flags.items()},
         "outcomes": {o.name.lower(): int((result.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT},
         "duration_s": float(result.duration_s[0, valid].mean()) if valid.any() else None,
@@ -210,7 +215,8 @@ def describe(report: dict[str, Any]) -> str:
     if count:
         lines.append(f"  {'duration [s]':30}{report['duration_s']:>17.1f}")
     if report["invalid_episodes"]:
-        lines.append(f"  {report['invalid_episodes']} invalid episodes are left out.")
+        why = reason_words(report["invalid_reasons"])
+        lines.append(f"  {report['invalid_episodes']} invalid episodes are left out: {why}.")
     lines.append(
         "  Rates with their 95 % intervals (Wilson). A robot that stands still succeeds: read the goal rate too."
     )

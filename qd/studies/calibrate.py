@@ -4,22 +4,35 @@ The scale of a penalty is its mean over all valid episodes or, where it is 0 in 
 Scales are measured once with the shipped controller, before any search, and never tuned on an archive.
 """
 
-from dataclasses import dataclass
+import hashlib
+import io
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.files.command import Where, Who, publish
+from qd.workers.invalid import tell_invalid
+from sim.files.atomic import write_atomically
+from sim.files.command import Where, Who, naming_what_is_next, publish
+from sim.files.provenance import code_fingerprint
 from sim.files.settings import check, setting
-from sim.policy.spec import ControllerSpec
+from sim.policy.spec import ControllerSpec, controller_hash
 
 if TYPE_CHECKING:
     from qd.fresh import Open
-    from sim.rollout import RolloutResult
+    from qd.workers.evaluator import Evaluate, EvaluatorCfg
+    from sim.robots.robot import RobotCfg
 
 _CPU_TERRAINS = 16  # at once: enough to keep some cores busy, little enough memory
+_LOOK = (16, 5)
+"""Terrains and episodes of the look at a few before the many; a GPU crosses all of them as quickly."""
+_FEW = 30
+"""Episodes with a penalty that its scale should at least be a mean over."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +61,11 @@ class Calibrate(Who, Where):
             open_evaluator: Opens what crosses the terrains.
 
         Raises:
-            ValueError: If something asked for cannot be had, or a penalty never occurred.
+            ValueError: If something asked for cannot be had; if a penalty never occurred, once the scales of the others
+                are written.
+            AllInvalidError: If no episode is valid.
+            EvaluatorError: If a worker is lost; what was crossed is kept.
         """
-        from qd.run.progress import share_bar
         from qd.workers import evaluator as workers
         from sim.robots.robot import get_robot
         from sim.space import get_space
@@ -75,55 +90,196 @@ class Calibrate(Who, Where):
         )
         genes = get_space(self.space).hard_random(self.terrains, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self.terrains, np.uint32)
+        out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
+        kept = _Kept(out.with_name(f"{out.stem}.part.npz"), robot, evaluator, [self.seed, self.terrains])
 
         def measure() -> dict[str, Any]:
+            crossed = kept.read()
+            if len(crossed):
+                print(f"{len(crossed)} terrains are kept from before in {kept.file}.", flush=True)
+            elif device == "cpu" and math.prod(_LOOK) < self.terrains * self.replicas / 2:
+                _look(opened, evaluator, genes, seeds)
             print(f"Crossing {self.terrains} hard-random terrains {self.replicas} times on {device}.", flush=True)
-            opened = open_evaluator or workers.open_evaluator
-            with opened(evaluator) as evaluate, share_bar("calibrate") as progress:
-                result = evaluate(genes, seeds, progress)
+            if len(crossed) < self.terrains:
+                with (
+                    naming_what_is_next(kept.state, lambda: "The same command goes on."),
+                    opened(evaluator) as evaluate,
+                ):
+                    crossed = _cross(evaluate, evaluator.num_terrains, genes, seeds, crossed, kept.write)
+            tell_invalid(crossed, "hard-random terrains")
             return {
                 **workers.origin_of(device, self.seed, self.workers),
                 "robot": robot.name,
                 "policy": ControllerSpec.parse(policy).label,
-                **_measured(result),
+                **_measured(crossed),
             }
 
-        publish(self.out or robot.scales_file, measure, _show)
+        report = publish(out, measure, _show)
+        kept.file.unlink(missing_ok=True)
+        absent = [name for name in robot.penalties if name not in report["scales"]]
+        if absent:
+            raise ValueError(
+                f"no scale for {', '.join(absent)}: 0 in all {_valid(report)} valid episodes. Leave it out of the "
+                f"robot's penalties, and the scales in {out} fit, or calibrate on more --terrains"
+            )
 
 
-def penalty_scales(result: "RolloutResult") -> dict[str, float]:
-    """Scale of each penalty over the valid episodes of a rollout.
+@dataclass(frozen=True, kw_only=True)
+class Crossed:
+    """What scales are measured by, of T terrains x R episodes."""
+
+    penalties: NDArray[np.float64]
+    """Raw sums, shape (T, R, P)."""
+    invalidity: NDArray[np.uint8]
+    """:class:`kernels.episode.Invalidity` of each episode, shape (T, R)."""
+    penalty_names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.invalidity)
+
+    @property
+    def invalid(self) -> NDArray[np.bool_]:
+        """Shape (T, R)."""
+        return self.invalidity != 0
+
+
+class _Kept:
+    """What is crossed so far, in a file; only what was crossed in the same way is read.
+
+    Args:
+        file: The file.
+        robot: The robot.
+        evaluator: What crosses.
+        drawn: What the terrains were drawn by.
+    """
+
+    def __init__(self, file: Path, robot: "RobotCfg", evaluator: "EvaluatorCfg", drawn: list[int]) -> None:
+        from sim.robots.own import robot_digest
+
+        self.file, self._names = file, robot.penalties
+        self._empty = Crossed(
+            penalties=np.zeros((0, evaluator.num_replicas, len(self._names))),
+            invalidity=np.zeros((0, evaluator.num_replicas), np.uint8),
+            penalty_names=self._names,
+        )
+        controller = controller_hash(evaluator.policy)
+        model = hashlib.sha256(robot.model_file.read_bytes()).hexdigest()
+        way = [robot.name, robot_digest(robot), model, controller, evaluator.space, evaluator.num_replicas, *drawn]
+        way += [evaluator.device.startswith("cuda"), code_fingerprint(("kernels", "sim")), *self._names]
+        self._key = None if controller is None else hashlib.sha256(json.dumps(way).encode()).hexdigest()
+
+    @property
+    def state(self) -> str:
+        """What is kept, in words."""
+        where = f"what is crossed is kept in {self.file}"
+        return where if self._key else "nothing is kept, since the controller's code has no file"
+
+    def read(self) -> Crossed:
+        """What is kept; nothing if the file is damaged or of something else."""
+        try:
+            with np.load(self.file, allow_pickle=False) as content:
+                if str(content["key"]) != self._key:
+                    return self._empty
+                crossed = replace(self._empty, penalties=content["penalties"], invalidity=content["invalidity"])
+        except Exception:  # zip, zlib and npy headers answer damage with a dozen types
+            return self._empty
+        fits = crossed.penalties.shape == (*crossed.invalidity.shape, len(self._names))
+        return crossed if fits else self._empty
+
+    def write(self, crossed: Crossed) -> None:
+        """Keeps it.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        if self._key is not None:
+            buffer = io.BytesIO()
+            np.savez(buffer, key=self._key, penalties=crossed.penalties, invalidity=crossed.invalidity)
+            write_atomically(self.file, buffer.getvalue())
+
+
+def _look(opened: "Open", evaluator: "EvaluatorCfg", genes: NDArray[Any], seeds: NDArray[Any]) -> None:
+    """Crosses a few terrains a few times, and says what is wrong already.
 
     Raises:
-        ValueError: If no episode is valid, or a penalty is 0 in all of them.
+        AllInvalidError: If no episode is valid.
     """
-    rows: NDArray[np.float64] = np.asarray(result.penalties, dtype=np.float64)[~result.invalid]
-    if len(rows) == 0:
-        raise ValueError("no episode was valid: there is nothing to measure a scale by; look at the controller")
-    scales = {}
-    for name, values in zip(result.penalty_names, rows.T, strict=True):
-        hit = values > 0.0
-        if not hit.any():
-            raise ValueError(
-                f"penalty '{name}' is 0 in all {len(values)} episodes, so it has no scale: "
-                "leave it out of the robot's penalties, or calibrate on more terrains"
+    terrains, replicas = min(_LOOK[0], len(genes)), min(_LOOK[1], evaluator.num_replicas)
+    print(f"A look at {terrains} terrains x {replicas} episodes first.", flush=True)
+    with opened(replace(evaluator, num_terrains=terrains, num_replicas=replicas)) as evaluate:
+        crossed = _cross(evaluate, terrains, genes[:terrains], seeds[:terrains], None, lambda part: None)
+    tell_invalid(crossed, "hard-random terrains")
+    scales, episodes = penalty_scales(crossed), int((~crossed.invalid).sum())
+    for name in crossed.penalty_names:
+        if name not in scales:
+            print(
+                f"Penalty '{name}' is 0 in all {episodes} of them. If it cannot occur on this robot, stop here "
+                "(Ctrl-C) and leave it out of the robot's penalties.",
+                flush=True,
             )
-        scales[name] = float(values[hit].mean() if hit.mean() < 0.5 else values.mean())
+
+
+def _cross(
+    evaluate: "Evaluate", at_once: int, genes: NDArray[Any], seeds: NDArray[Any], crossed: Crossed | None,
+    keep: Callable[[Crossed], None],
+) -> Crossed:  # fmt: skip
+    """Crosses the terrains that are not yet crossed, some at once, and keeps what is crossed after each turn."""
+    from qd.run.progress import share_bar
+
+    with share_bar("calibrate") as progress:
+        for first in range(0 if crossed is None else len(crossed), len(genes), at_once):
+            turn = slice(first, first + at_once)
+
+            def show(share: float, first: int = first) -> None:
+                progress(min(1.0, (first + share * at_once) / len(genes)))
+
+            result = evaluate(genes[turn], seeds[turn], show)
+            before = ([crossed.penalties], [crossed.invalidity]) if crossed is not None else ([], [])
+            crossed = Crossed(
+                penalties=np.concatenate([*before[0], np.asarray(result.penalties, np.float64)]),
+                invalidity=np.concatenate([*before[1], result.invalidity]),
+                penalty_names=tuple(result.penalty_names),
+            )
+            keep(crossed)
+    assert crossed is not None
+    return crossed
+
+
+def penalty_scales(crossed: Any) -> dict[str, float]:
+    """Scale of each penalty over the valid episodes of crossings; a penalty that never occurred has none.
+
+    Args:
+        crossed: :class:`Crossed`, or a rollout's result.
+    """
+    rows: NDArray[np.float64] = np.asarray(crossed.penalties, dtype=np.float64)[~crossed.invalid]
+    scales = {}
+    for name, values in zip(crossed.penalty_names, rows.T, strict=True):
+        hit = values > 0.0
+        if hit.any():
+            scales[name] = float(values[hit].mean() if hit.mean() < 0.5 else values.mean())
     return scales
 
 
-def _measured(result: "RolloutResult") -> dict[str, Any]:
+def _measured(crossed: Crossed) -> dict[str, Any]:
     """The scales, and what they were measured on."""
-    rows = np.asarray(result.penalties)[~result.invalid]
+    rows = crossed.penalties[~crossed.invalid]
     shares = (rows > 0.0).mean(axis=0).tolist()
     return {
-        "terrains": result.invalid.shape[0],
-        "episodes": int(result.invalid.size),
-        "invalid_episodes": int(result.invalid.sum()),
-        "scales": penalty_scales(result),
-        "share_of_episodes_with": dict(zip(result.penalty_names, shares, strict=True)),
+        "terrains": len(crossed),
+        "episodes": int(crossed.invalid.size),
+        "invalid_episodes": int(crossed.invalid.sum()),
+        "scales": penalty_scales(crossed),
+        "share_of_episodes_with": dict(zip(crossed.penalty_names, shares, strict=True)),
     }
 
 
+def _valid(report: dict[str, Any]) -> int:
+    return report["episodes"] - report["invalid_episodes"]
+
+
 def _show(report: dict[str, Any]) -> None:
-    print("\n".join(f"  {name:<14}{scale:12.4f}" for name, scale in report["scales"].items()))
+    for name, scale in report["scales"].items():
+        print(f"  {name:<14}{scale:12.4f}")
+        hits = round(report["share_of_episodes_with"][name] * _valid(report))
+        if hits < _FEW:
+            print(f"  {'':<14}of {hits} episodes alone: too few for a scale to rely on; calibrate on more --terrains")

@@ -63,6 +63,8 @@ def flaw_of(result: Any, count: int, num_replicas: int) -> str | None:
             return f"penalties of shape {penalties.shape} and type {penalties.dtype}"
         if not (np.isfinite(penalties[~invalid]).all() and (penalties[~invalid] >= 0.0).all()):
             return "valid episodes with penalties that are negative or not finite"
+        if ((result.invalidity != 0) != invalid).any():
+            return "invalid episodes without a reason, or valid ones with one"
         if "reward" in arrays and not np.isfinite(arrays["reward"][~invalid]).all():
             return "valid episodes with rewards that are not finite"
         if (np.asarray(result.base_collision) & (np.asarray(result.reached_goal) | invalid)).any():

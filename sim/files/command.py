@@ -69,6 +69,9 @@ class Which:
 class UserError(Exception):
     """What a user can mend, where no built-in error says it; its text is all that is shown."""
 
+    status = 2
+    """Exit status."""
+
 
 class Interrupted(KeyboardInterrupt):
     """The program was asked to stop; its text says what comes next, for example how to resume."""
@@ -116,8 +119,8 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
 
     Returns:
         Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user
-        can mend (ValueError, OSError, FloatingPointError, UserError); 130 for Ctrl-C and SIGTERM. FAULTLINE_DEBUG=1
-        shows the traceback instead of the line.
+        can mend (ValueError, OSError, FloatingPointError), after a UserError its own; 130 for Ctrl-C and SIGTERM.
+        FAULTLINE_DEBUG=1 shows the traceback instead of the line.
     """
     import tyro
 
@@ -132,7 +135,7 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
         if os.environ.get(_DEBUG):
             raise
         print(f"error: {' '.join(filter(None, map(str.strip, str(error).splitlines())))}", file=sys.stderr)
-        return 2
+        return error.status if isinstance(error, UserError) else 2
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130

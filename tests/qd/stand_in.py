@@ -22,6 +22,7 @@ class Result:
     reached_goal: np.ndarray
     fallen: np.ndarray
     invalid: np.ndarray
+    invalidity: np.ndarray
     duration_s: np.ndarray
     physics_steps: int = 4000
     wall_s: float = 0.5
@@ -41,6 +42,7 @@ def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES
         reached_goal=~collided & ~excluded,
         fallen=never,
         invalid=excluded,
+        invalidity=np.where(excluded, np.uint8(2), np.uint8(0)),  # Invalidity.STATE
         duration_s=np.full(never.shape, 15.0, dtype=np.float32),
     )
 

@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from kernels.episode import Outcome
 from qd.workers.evaluator import Evaluate, EvaluatorCfg
+from qd.workers.invalid import tell_invalid
 from sim.files.atomic import check_zip, write_atomically
 from sim.files.provenance import code_fingerprint
 from sim.policy.spec import controller_hash
@@ -138,6 +139,7 @@ def cross_all(
     Raises:
         OSError: If crossings cannot be kept.
         EvaluatorError: If a worker is lost.
+        AllInvalidError: If no episode of a controller on a set is valid.
     """
     whole = {name: chosen for name, chosen in sets.items() if name != "generated_far" or "generated" not in sets}
     kept, found = KeptCrossings(folder, evaluator), {}
@@ -175,6 +177,7 @@ def _cross_missing(
                 if (len(chosen), chosen.space) == (size, space):
                     bar.set_description_str(f"{who} on {name}")
                     result = _cross(evaluate, chosen, evaluator.num_replicas, bar)
+                    tell_invalid(result, f"{who} on {name}")
                     bar.write(_line(who, chosen, result))
                     yield name, result
 

@@ -11,6 +11,7 @@ from kernels.episode import Outcome
 from qd.fitness import MAX_INVALID_SHARE
 from qd.run.progress import share_bar
 from qd.workers.evaluator import Evaluate
+from qd.workers.invalid import tell_invalid
 from sim.files.intervals import bootstrap_interval
 from sim.rollout import RolloutResult
 from sim.terrain import CROSSING_TYPES
@@ -184,12 +185,16 @@ def base_rates(evaluate: Evaluate, count: int, seed: int) -> dict[str, Any]:
     """What ``base.json`` says of one controller on ``count`` terrains each, hand-crafted, hard-random and flat.
 
     Penalties of ``evaluate`` must count from :data:`VELOCITY_FROM_S` on; the seed draws the test sets.
+
+    Raises:
+        AllInvalidError: If no episode of a set is valid.
     """
     sets = {name: plain_set(name, count, seed) for name in ("hand_crafted", "hard_random", "flat")}
     results = {}
     for name, chosen in sets.items():
         with share_bar(name) as show:
             results[name] = evaluate(chosen.terrains, chosen.seeds, show)
+        tell_invalid(results[name], name)
     hand_crafted = sets["hand_crafted"]
     return {
         "hand_crafted": summarise(results["hand_crafted"], seed, types=hand_crafted.types, levels=hand_crafted.levels),

@@ -98,7 +98,10 @@ class CommandTask:
         )
         self._reward = Reward(self.sim, cfg, command=training.command, action=training.last_action, falls=_FALLS)
         self._make_views()
-        self._graph = self.sim.capture(self._control_step)  # makes one step, which is undone here
+        # Capturing makes a step, which is undone after. At its file's pose a robot may be deep in the ground, with more
+        # contacts than there is room for: it is put at a start before.
+        self.restart_all(torch.from_numpy(levels))
+        self._graph = self.sim.capture(self._control_step)
         self.counter.fill_(first_count)
         self.restart_all(torch.from_numpy(levels))
 
