@@ -1,8 +1,12 @@
 """The search: ask for terrains, let robots cross them, tell the emitters what became of them."""
 
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.fitness import evaluation_of
@@ -11,8 +15,9 @@ from qd.run.arguments import Job
 from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, reached, write_results
 from qd.run.progress import ProgressBar, plan
 from qd.run.settings import SearchCfg, code_of
-from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, worker_status
+from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, pipeline_of, worker_status
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
+from qd.workers.shards import merged, taken
 from sim.files.command import command_line, naming_what_is_next
 
 if TYPE_CHECKING:
@@ -26,7 +31,7 @@ MOST_DRAWN = 200
 def search_terrains(
     cfg: SearchCfg, run: RunDirectory, search: "Scheduler", metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
 ) -> None:
-    """The loop: runs the iterations that are left, each saved before the next begins.
+    """The loop: runs the iterations that are left, and saves each.
 
     Args:
         cfg: The search.
@@ -37,15 +42,14 @@ def search_terrains(
         bar: Shows progress.
 
     Raises:
-        AllInvalidError: If no episode of an iteration is valid; those before are saved.
+        AllInvalidError: If no episode of a group is valid; the iterations before are saved.
     """
+    left = range(len(metrics) + 1, cfg.iterations + 1)
     began = time.perf_counter()
-    for iteration in range(len(metrics) + 1, cfg.iterations + 1):
-        genes = search.ask()
-        seeds = episode_seeds(cfg.seed, iteration, len(genes))
-        result = evaluate(genes, seeds, bar.within(iteration))
-        found, row = take_in(cfg, search, result, iteration)
-        if cfg.reevaluate_every and iteration % cfg.reevaluate_every == 0:
+    for iteration, (result,) in crossed_iterations([(cfg, search)], left, evaluate, bar):
+        found = archive_of(cfg, search, iteration)
+        row = row_of(cfg, found, result, iteration)
+        if looks_again(cfg, iteration):
             row |= _look_again(cfg, found, evaluate)
         ended = time.perf_counter()
         wall_s = ended - began  # from the end of the iteration before, so saving counts
@@ -57,34 +61,89 @@ def search_terrains(
         bar.show(metrics[-1], None if workers is None else str(workers))
 
 
-def take_in(
-    cfg: SearchCfg, search: "Scheduler", result: "RolloutResult", iteration: int
-) -> tuple[Archive, dict[str, Any]]:
-    """Tells a search what became of the terrains it asked for.
+def crossed_iterations(
+    searches: "Sequence[tuple[SearchCfg, Scheduler]]", iterations: range, evaluate: Evaluate, bar: ProgressBar
+) -> "Iterator[tuple[int, list[RolloutResult]]]":
+    """Lets the groups of some searches ask, have their terrains crossed, and tells them, in turn.
+
+    A group that was told asks again at once, and its next terrains wait in the queue while those of the other groups
+    are crossed. The order is fixed, and what a group has asked for is part of the saved state: a search that goes on
+    where it was stopped is the same as one that was not.
+
+    Args:
+        searches: Settings and states; all have as many groups and episodes a terrain. They are crossed together.
+        iterations: Which to run.
+        evaluate: Crosses terrains.
+        bar: Shows progress.
+
+    Yields:
+        Number of an iteration whose groups were all told, and its crossings, one result a search. Nothing is under way
+        before an iteration at whose end elites cross fresh episodes (:func:`looks_again`) goes on.
+    """
+    cfg, pipeline = searches[0][0], pipeline_of(evaluate)
+    groups, under_way = range(cfg.scheduler.groups), 0
+
+    def put(iteration: int, group: int) -> None:
+        parts = [_group_terrains(own, search, iteration, group) for own, search in searches]
+        pipeline.put(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    for iteration in iterations:
+        for group in groups[under_way:]:
+            put(iteration, group)
+        ahead = iteration + 1 in iterations and not looks_again(cfg, iteration)
+        results: list[list[RolloutResult]] = [[] for _ in searches]
+        for group in groups:
+            result, first = pipeline.take(bar.within(iteration, group, len(groups))), 0
+            for (own, search), told in zip(searches, results, strict=True):
+                told.append(taken(result, len(search.ask(group)), first=first))
+                first += len(search.ask(group))
+                _tell(own, search, told[-1], iteration, group)
+            if ahead:
+                put(iteration + 1, group)
+        under_way = len(groups) if ahead else 0
+        yield iteration, [merged(told, join=1) for told in results]
+
+
+def _group_terrains(
+    cfg: SearchCfg, search: "Scheduler", iteration: int, group: int
+) -> "tuple[NDArray[np.float32], NDArray[np.uint32]]":
+    """Genes that a group asks for, and their seeds, which are those of their place in the iteration."""
+    first = sum(len(search.ask(before)) for before in range(group))
+    genes = search.ask(group)
+    return genes, episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[first : first + len(genes)]
+
+
+def _tell(cfg: SearchCfg, search: "Scheduler", result: "RolloutResult", iteration: int, group: int) -> None:
+    refuse_all_invalid(result)
+    search.tell(evaluation_of(result, cfg.cells, cfg.fitness), iteration, group)
+    search.ask(group)
+
+
+def looks_again(cfg: SearchCfg, iteration: int) -> bool:
+    """Whether elites cross fresh episodes at the end of an iteration."""
+    return bool(cfg.reevaluate_every) and iteration % cfg.reevaluate_every == 0
+
+
+def row_of(cfg: SearchCfg, found: Archive, result: "RolloutResult", iteration: int) -> dict[str, Any]:
+    """An iteration's row of metrics but for its timing.
 
     Args:
         cfg: The search.
-        search: Has asked; is told.
-        result: The crossings.
+        found: What it has found.
+        result: The iteration's crossings.
         iteration: Number of the iteration, from 1.
-
-    Returns:
-        What the search has found, and the iteration's row of metrics but for its timing.
-
-    Raises:
-        AllInvalidError: If no episode is valid; the search is as it was.
     """
-    refuse_all_invalid(result)
-    evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
-    search.tell(evaluation, iteration)
-    found = archive_of(cfg, search, iteration)
-    physics = {
+    return {
+        "iteration": iteration,
+        **found.scores(),
+        **evaluation_of(result, cfg.cells, cfg.fitness).means(),
+        "invalid_reasons": invalid_reasons(result),
         "physics_steps": int(result.physics_steps),
+        "robot_steps": int(result.robot_steps),
+        "idle_share": result.idle_share,
         "rollout_s": float(result.wall_s),
         "mean_duration_s": float(result.duration_s.mean()),
     }
-    invalid = {"invalid_reasons": invalid_reasons(result)}
-    return found, {"iteration": iteration, **found.scores(), **evaluation.means(), **invalid, **physics}
 
 
 def _look_again(cfg: SearchCfg, found: Archive, evaluate: Evaluate) -> dict[str, Any]:

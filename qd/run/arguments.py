@@ -39,7 +39,7 @@ class Archive(Who, Where):
     """
 
     preset: str | None = None
-    """Size of the search: paper (a GPU's work) or small (minutes on a CPU); by default what the device can do."""
+    """Size of the search: wide or paper (for a GPU), or small (minutes on a CPU); by default what the device can do."""
     iterations: int | None = None
     """Iterations to reach; with --resume, more than before extend a finished run."""
     seed: int | None = None
@@ -77,7 +77,7 @@ class Archive(Who, Where):
     reevaluate_every: int | None = None
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
-    """Evaluate every elite again with 40 fresh episodes at the end; auto: with preset paper."""
+    """Evaluate every elite again with 40 fresh episodes at the end; auto: with presets wide and paper."""
 
     def execute(self) -> None:
         """Runs the search."""
@@ -147,7 +147,7 @@ def job_of(args: Archive) -> Job:
         path, cfg = args.resume, resumed(args.resume, there, robot, changes, moved)
         refuse_changes(path, "run", as_settings(there), as_settings(cfg))
     else:
-        name = args.preset or ("paper" if device.startswith("cuda") else "small")
+        name = args.preset or ("wide" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
         path = _free_path(args, cfg, robot)
     get_space(cfg.space)
@@ -158,7 +158,7 @@ def job_of(args: Archive) -> Job:
         path=path,
         resumes=there is not None,
         evaluator=evaluator_of(cfg, robot, moved or policy_spec(cfg, robot), device, args.workers),
-        reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset == "paper"),
+        reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset != "small"),
         origin=origin_in(RunDirectory(path).read_config()) if there else {**now, **own_file(robot), "sessions": []},
         session={name: now[name] for name in _SESSION},
         resume_command=_resume_command(robot, path, args, named),
@@ -190,7 +190,7 @@ def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | 
 
 
 def evaluator_of(
-    cfg: SearchCfg, robot: "RobotCfg", policy: str, device: str, workers: str | None, *, runs_on_gpu: int = 1
+    cfg: SearchCfg, robot: "RobotCfg", policy: str, device: str, workers: str | None, *, runs: int = 1
 ) -> EvaluatorCfg:
     """What evaluates an iteration's terrains all at once, with a controller that was tried.
 
@@ -200,7 +200,7 @@ def evaluator_of(
         policy: Controller.
         device: Warp device name.
         workers: Who crosses them, as on a command line.
-        runs_on_gpu: Searches whose terrains a GPU crosses at once; the CPU is busy with those of one.
+        runs: Searches whose terrains are crossed together.
 
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot.
@@ -209,7 +209,7 @@ def evaluator_of(
     return EvaluatorCfg(
         robot=robot,
         policy=policy,
-        num_terrains=cfg.scheduler.num_terrains * (runs_on_gpu if device.startswith("cuda") else 1),
+        num_terrains=cfg.scheduler.num_terrains * runs,
         num_replicas=cfg.replicas,
         device=device,
         workers=workers,

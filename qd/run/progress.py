@@ -98,9 +98,9 @@ class ProgressBar:
         """Leaves the bar as it stands."""
         self._bar.close()
 
-    def within(self, iteration: int) -> Callable[[float], None]:
-        """A function that moves the bar to a share of an iteration, counted from 1."""
-        return lambda share: self._move_to(iteration - 1 + share)
+    def within(self, iteration: int, part: int = 0, parts: int = 1) -> Callable[[float], None]:
+        """A function that moves the bar to a share of an iteration, counted from 1, or of one of its equal parts."""
+        return lambda share: self._move_to(iteration - 1 + (part + share) / parts)
 
     def show(self, row: dict[str, Any], workers: str | None = None) -> None:
         """Shows where the search stands after an iteration.

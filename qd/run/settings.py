@@ -41,7 +41,7 @@ class SchedulerCfg:
     """Emitters, each with an evolution strategy or a stream of its own."""
     batch_size: int = setting(20, least=2)
     """Terrains an emitter asks for in an iteration."""
-    groups: int = setting(1, least=1)
+    groups: int = setting(1, least=1, most=32)
     """Groups of emitters that ask and are told in turn, in a fixed order: robots have the terrains of the others to
     cross while the last robots of a group's terrains still walk."""
     learning_rate: float = setting(0.09, least=0.0, most=1.0)

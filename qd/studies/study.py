@@ -11,17 +11,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from qd.archive import Archive
 from qd.fresh import Open, drawn_elites, numbers_of, reevaluate
 from qd.run.arguments import evaluator_of, own_file
 from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, origin_in, write_results
 from qd.run.progress import ProgressBar
 from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, refuse_changes
-from qd.search import MOST_DRAWN, begin, take_in
-from qd.workers.evaluator import Evaluate, EvaluatorCfg, episode_seeds, origin_of, worker_status
-from qd.workers.shards import taken
+from qd.search import MOST_DRAWN, begin, crossed_iterations, looks_again, row_of
+from qd.workers.evaluator import Evaluate, EvaluatorCfg, origin_of, worker_status
 from sim.files.atomic import is_leftover, prepare_output
 from sim.files.command import naming_what_is_next, publish
 
@@ -81,7 +78,7 @@ class Study:
         return cls(
             path=path,
             runs=runs,
-            evaluator=evaluator_of(cfg, robot, controller, device, workers, runs_on_gpu=len(runs)),
+            evaluator=evaluator_of(cfg, robot, controller, device, workers, runs=len(runs)),
             origin={**origin_of(device, cfg.seed, workers), **own_file(robot)},
             sampled=sampled,
         )
@@ -160,31 +157,35 @@ def _lock_step(searches: Sequence[_Search], evaluate: Evaluate, *, sampled: bool
     iterations = min(one.cfg.iterations for one in searches)
     with ProgressBar(iterations, min(one.done for one in searches)) as bar:
         while (done := min(one.done for one in searches)) < iterations:
-            _iterate([one for one in searches if one.done == done], evaluate, done + 1, bar, sampled=sampled)
+            active = [one for one in searches if one.done == done]
+            caught_up = min((one.done for one in searches if one.done > done), default=iterations)
+            _iterate(active, evaluate, range(done + 1, min(caught_up, iterations) + 1), bar, sampled=sampled)
 
 
-def _iterate(active: Sequence[_Search], evaluate: Evaluate, iteration: int, bar: ProgressBar, *, sampled: bool) -> None:
-    """One iteration of some searches, saved."""
-    began, every = time.perf_counter(), active[0].cfg.reevaluate_every
-    asked = [one.search.ask() for one in active]
-    seeds = [episode_seeds(one.cfg.seed, iteration, len(genes)) for one, genes in zip(active, asked, strict=True)]
-    result = evaluate(np.concatenate(asked), np.concatenate(seeds), bar.within(iteration))
-    rows, first = [], 0
-    for one, genes in zip(active, asked, strict=True):
-        one.found, row = take_in(one.cfg, one.search, taken(result, len(genes), first=first), iteration)
-        rows.append(row)
-        first += len(genes)
-    if (every and iteration % every == 0) or (iteration == active[0].cfg.iterations and not sampled):
-        rows = [row | again for row, again in zip(rows, _elites_again(active, evaluate, sampled), strict=True)]
-    wall_s = time.perf_counter() - began
-    for one, row in zip(active, rows, strict=True):
-        one.metrics.append({**row, "wall_s": wall_s / len(active), "episodes_per_s": row["episodes"] / wall_s})
-        assert one.found is not None
-        one.run.save(one.cfg, one.search, one.metrics, one.found)
-    best = max((one.metrics[-1] for one in active), key=lambda row: row["elites"])
-    episodes = sum(row["episodes"] for row in rows)
-    status = worker_status(evaluate)
-    bar.show({**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}, None if status is None else str(status))
+def _iterate(
+    active: Sequence[_Search], evaluate: Evaluate, iterations: range, bar: ProgressBar, *, sampled: bool
+) -> None:
+    """Some iterations of some searches, each saved."""
+    began = time.perf_counter()
+    states = [(one.cfg, one.search) for one in active]
+    for iteration, results in crossed_iterations(states, iterations, evaluate, bar):
+        rows = []
+        for one, result in zip(active, results, strict=True):
+            one.found = archive_of(one.cfg, one.search, iteration)
+            rows.append(row_of(one.cfg, one.found, result, iteration))
+        if looks_again(active[0].cfg, iteration) or (iteration == active[0].cfg.iterations and not sampled):
+            rows = [row | again for row, again in zip(rows, _elites_again(active, evaluate, sampled), strict=True)]
+        ended = time.perf_counter()
+        wall_s, began = ended - began, ended
+        for one, row in zip(active, rows, strict=True):
+            one.metrics.append({**row, "wall_s": wall_s / len(active), "episodes_per_s": row["episodes"] / wall_s})
+            assert one.found is not None
+            one.run.save(one.cfg, one.search, one.metrics, one.found)
+        best = max((one.metrics[-1] for one in active), key=lambda row: row["elites"])
+        episodes = sum(row["episodes"] for row in rows)
+        status = worker_status(evaluate)
+        shown = {**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
+        bar.show(shown, None if status is None else str(status))
 
 
 def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) -> list[dict[str, Any]]:

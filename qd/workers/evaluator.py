@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
 
-_SPARE_SLOTS = 8  # of a process: lots do not always divide evenly
+_SPARE_SLOTS = 32  # terrains of a process: each lot under way may not divide evenly
 _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
 
 

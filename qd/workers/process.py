@@ -104,13 +104,16 @@ class WorkerProcess:
 def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[[Any, int], Crosser]) -> None:
     """A worker's life: build, then evaluate until the other end closes."""
     os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported: one core a worker
-    inbox: queue.SimpleQueue[tuple[NDArray, NDArray]] = queue.SimpleQueue()
+    inbox: queue.SimpleQueue[tuple[NDArray, NDArray] | None] = queue.SimpleQueue()
     under_way = 0
 
     def put_in(*, wait: bool) -> None:
         nonlocal under_way
         while wait or not inbox.empty():
-            crosser.put(*inbox.get())
+            lot = inbox.get()
+            if lot is None:
+                raise EOFError
+            crosser.put(*lot)
             under_way, wait = under_way + 1, False
 
     def report(share: float) -> None:
@@ -134,13 +137,13 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
         _send_last(connection, "failed", f"{type(error).__name__}: {error}")
 
 
-def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[NDArray, NDArray]]") -> None:
+def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[NDArray, NDArray] | None]") -> None:
     """Takes in what is handed out while the worker crosses terrains, so that nobody waits for it to be read."""
     try:
         while True:
             inbox.put(connection.recv())
-    except (EOFError, OSError):  # the other end is gone: closed, or killed with unread messages
-        os._exit(0)
+    except (EOFError, OSError):
+        inbox.put(None)  # the other end is gone
 
 
 def _send_last(connection: Connection, message: str, value: str) -> None:

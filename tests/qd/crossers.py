@@ -16,9 +16,17 @@ class Crosser:
 
     def __init__(self, cfg, num_terrains: int) -> None:
         self.cfg, self.num_terrains = cfg, num_terrains
+        self.lots = []
+
+    def put(self, terrains, seeds):
+        self.lots.append((terrains, seeds))
+        assert sum(len(lot) for lot, _ in self.lots) <= self.num_terrains
+
+    def take(self, progress=None):
+        return self.evaluate(*self.lots.pop(0), progress=progress)
 
     def evaluate(self, terrains, seeds, *, progress=None):
-        assert len(terrains) == len(seeds) == self.num_terrains
+        assert len(terrains) == len(seeds) <= self.num_terrains
         if progress is not None:
             progress(0.5)
             progress(1.0)

@@ -25,6 +25,9 @@ class Result:
     invalidity: np.ndarray
     duration_s: np.ndarray
     physics_steps: int = 4000
+    robot_steps: int = 4000
+    busy_steps: int = 3000
+    idle_share: float = 0.25
     wall_s: float = 0.5
     reward: np.ndarray | None = None
 

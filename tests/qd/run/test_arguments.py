@@ -69,7 +69,7 @@ def test_unknown_robot_and_preset(capsys):
     assert fails(capsys, "--robot", "dog").startswith(expected)
     assert fails(capsys, "--robot", "dog.py") == "dog.py: no such file"
     assert fails(capsys, "--space", "blocks", *TINY) == "unknown terrain space 'blocks': expected one of super_gaussian"
-    assert fails(capsys, "--preset", "huge", *TINY) == "unknown preset 'huge': expected one of paper, small"
+    assert fails(capsys, "--preset", "huge", *TINY) == "unknown preset 'huge': expected one of wide, paper, small"
     assert not Path("runs").exists()
 
 

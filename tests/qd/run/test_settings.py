@@ -45,7 +45,7 @@ def test_small_crosses_every_terrain_at_least_four_times():
 
 
 def test_unknown_preset():
-    with pytest.raises(ValueError, match="unknown preset 'huge': expected one of paper, small"):
+    with pytest.raises(ValueError, match="unknown preset 'huge': expected one of wide, paper, small"):
         preset("huge", robot())
 
 
