@@ -1,13 +1,14 @@
 """A robot's file, MJCF or URDF, as a Newton model, checked against the robot's settings."""
 
 import xml.etree.ElementTree as ET
-from collections.abc import Container, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
+from sim.files.command import told
 from sim.robots.model_files import ModelFiles, joints_without_effort, read_model_files
 from sim.robots.robot import RobotCfg
 
@@ -48,7 +49,7 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
     return builder
 
 
-def read_robot(robot: RobotCfg, wrong: Container[str] = ()) -> tuple[newton.ModelBuilder, list[str]]:
+def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.ModelBuilder, list[str]]:
     """One robot as :func:`build_robot` makes it, and what is wrong with it, one line each.
 
     Args:
@@ -67,7 +68,7 @@ def read_robot(robot: RobotCfg, wrong: Container[str] = ()) -> tuple[newton.Mode
         _add_model(builder, robot, files)
     except Exception as error:  # an importer can fail with anything
         said = ": ".join(filter(None, [type(error).__name__, " ".join(str(error).split())]))
-        return builder, problems or [f"{robot.model_file} cannot be imported: {said}"]
+        return newton.ModelBuilder(), problems or [told(error, f"{robot.model_file} cannot be imported: {said}")]
     # The other checks need a tree of single joints, where joints and their columns are the same.
     structure = _structure_problems(builder)
     if structure:
@@ -79,10 +80,10 @@ def read_robot(robot: RobotCfg, wrong: Container[str] = ()) -> tuple[newton.Mode
     problems += named
     if not named and "joint_names" not in wrong:
         problems += _joint_value_problems(builder, robot, files, wrong)
-    for role in ("base_geoms", "limb_geoms", "foot_geoms"):
-        if role not in wrong:
-            problems += _unknown("geom", getattr(robot, role), geom_names(builder), robot)
-    if not problems:
+    roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
+    geoms = [name for role in roles for name in getattr(robot, role)]
+    problems += _unknown("geom", geoms, geom_names(builder), robot)
+    if not problems and not wrong:
         _set_contact(builder, robot, is_urdf=files.is_urdf)
     return builder, problems
 
@@ -180,7 +181,7 @@ def _joint_name_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[
 
 
 def _joint_value_problems(
-    builder: newton.ModelBuilder, robot: RobotCfg, files: ModelFiles, wrong: Container[str]
+    builder: newton.ModelBuilder, robot: RobotCfg, files: ModelFiles, wrong: Collection[str]
 ) -> list[str]:
     """What is wrong with the settings that have a value for each joint; gains, limits and armature are taken over."""
     joints, problems = robot.joint_names, []
