@@ -16,10 +16,11 @@ import tyro
 
 import faultline
 from sim.policy.loaders import load_policy
+from sim.robots.model import build_robot, effort_limits
 from sim.robots.robot import get_robot
 from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.docs import PAGES, ROOT, code_of, commands_of, mentions_of, numbers_of, run_by_make, text_of
-from tests.sim.dogs import mjcf
+from tests.sim.dogs import MASS, mjcf
 
 REGISTRY = {word: command for group in faultline.COMMANDS.values() for word, command in group.items()}
 
@@ -101,13 +102,98 @@ def test_a_wrong_number_is_found(text, agrees):
     assert number.agrees is agrees
 
 
+def settings_of(page: str, folder: Path) -> dict[str, str]:
+    """Writes the robots' settings of a page into a folder, each under the name it has there; returns them."""
+    found = {text.split("\n")[0].removeprefix("# mine/"): text for text in code_of(page, "python") if "ROBOT =" in text}
+    for name, text in found.items():
+        (folder / name).write_text(text)
+    return found
+
+
 @pytest.mark.parametrize("page", ["README.md", "docs/own-robot.md"])
 def test_the_robot_is_read(page, tmp_path):
-    (text,) = [code for code in code_of(page, "python") if "ROBOT =" in code]
-    (tmp_path / "dog.py").write_text(text)
+    assert "dog.py" in settings_of(page, tmp_path)
+    (tmp_path / "dog.xml").write_text(mjcf(actuators="none"))
+    with pytest.raises(ValueError, match="no gains for FL_hip"):
+        get_robot(str(tmp_path / "dog.py"))
     (tmp_path / "dog.xml").write_text(mjcf())
     dog = get_robot(str(tmp_path / "dog.py"))
     assert (dog.name, dog.num_joints, dog.observation_size) == ("dog", 8, 51)
+
+
+def test_the_urdf_of_the_page_is_the_dog(tmp_path):
+    settings_of("docs/own-robot.md", tmp_path)
+    (text,) = code_of("docs/own-robot.md", "xml")
+    leg = text[text.index('  <link name="FL_thigh">') : text.index("  <!-- FR, HL")]
+    places = {"FR": "0.2 -0.12 0", "HL": "-0.2 0.12 0", "HR": "-0.2 -0.12 0"}
+    others = [leg.replace("FL_", f"{name}_").replace("0.2 0.12 0", place) for name, place in places.items()]
+    (tmp_path / "dog.urdf").write_text(text.replace("  <!-- FR, HL and HR likewise -->\n", "".join(others)))
+    dog = get_robot(str(tmp_path / "dog_urdf.py"))
+    builder = build_robot(dog)
+    assert sum(builder.body_mass) == pytest.approx(MASS)
+    assert (builder.body_count, effort_limits(builder)) == (9, [30.0] * 8)
+    assert dog.default_base_height == 0.29
+
+
+# Links and joints as the two public URDFs call them, with their lengths: the joint before each link, or fixed.
+A1 = """trunk box .267 .08 .114, trunk cylinder .057 .267, trunk cylinder .057 .267
+hip_joint hip .1805 .047 0 cylinder .046 .04, thigh_joint thigh 0 .0838 0 box .034 .0245 .1
+calf_joint calf 0 0 -.2 box .016 .016 .1, fixed foot 0 0 -.2 sphere .02"""
+ANYMAL_B = """base box .531 .27 .24
+HAA HIP .277 .116 0, HFE THIGH .0635 .041 0 cylinder .06 .12
+KFE SHANK 0 .109 -.25, fixed ADAPTER .1 -.02 0 cylinder .015 .25, fixed FOOT 0 0 -.298 sphere .031"""
+
+
+def public_urdf(shape: str, legs: str) -> str:
+    """A URDF with the names and lengths of a public robot; its other legs are mirror images of the left front one."""
+    sizes = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
+    inertial = '<inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+    def geometry(kind: str = "", *values: str) -> str:
+        values = (" ".join(values),) if kind == "box" else values
+        attributes = " ".join(f'{name}="{value}"' for name, value in zip(sizes.get(kind, ()), values, strict=True))
+        return f"<collision><geometry><{kind} {attributes}/></geometry></collision>" if kind else ""
+
+    base, *rest = shape.split("\n")
+    name = base.split()[0]
+    parts = [f'<link name="{name}">{inertial}']
+    parts += [geometry(*one.split()[1:]) for one in base.split(", ")] + ["</link>"]
+    for leg in legs.split():
+        before, hind, right = name, "F" not in leg, leg in ("FR", "RR", "RF", "RH")
+        for one in ", ".join(rest).split(", "):
+            joint, link, x, y, z, *form = one.split()
+            x, y = float(x) * (-1 if hind else 1), float(y) * (-1 if right else 1)
+            kind = "fixed" if joint == "fixed" else "revolute"
+            axis = "1 0 0" if joint in ("hip_joint", "HAA") else "0 1 0"
+            parts.append(
+                f'<link name="{leg}_{link}">{inertial}{geometry(*form)}</link><joint name="{leg}_{joint}_{link}" '
+                f'type="{kind}"><parent link="{before}"/><child link="{leg}_{link}"/><origin xyz="{x} {y} {z}"/>'
+                f'<axis xyz="{axis}"/><limit lower="-3" upper="5" effort="30" velocity="20"/></joint>'
+            )
+            parts[-1] = parts[-1].replace(f"_{joint}_{link}", f"_{joint}") if kind == "revolute" else parts[-1]
+            before = f"{leg}_{link}"
+    return f'<robot name="it">{"".join(parts)}</robot>'
+
+
+@pytest.mark.parametrize(
+    ("file", "model", "text", "height"),
+    [
+        # Longest with hips out by 0.08 rad, thighs at 0.64, calves -1.2 from them:
+        # (0.2 cos 0.64 + 0.2 cos 0.56) cos 0.08 - 0.0838 sin 0.08 + 0.02 = 0.342 m.
+        ("a1.py", "a1_description/urdf/a1.urdf", public_urdf(A1, "FR FL RR RL"), 0.342),
+        # Longest with thighs at 0.48 rad, knees -0.64 from them; the foot lies (0.1, -0.298) m from the knee:
+        # 0.25 cos 0.48 + 0.298 cos 0.16 - 0.1 sin 0.16 + 0.031 = 0.531 m.
+        ("anymal_b.py", "anymal_b/urdf/anymal_b.urdf", public_urdf(ANYMAL_B, "LF RF LH RH"), 0.531),
+    ],
+)
+def test_the_settings_of_public_robots_fit_urdfs_with_their_names(tmp_path, file, model, text, height):
+    assert file in settings_of("docs/own-robot.md", tmp_path)
+    (tmp_path / model).parent.mkdir(parents=True)
+    (tmp_path / model).write_text(text)
+    robot = get_robot(str(tmp_path / file))
+    assert robot.num_joints == 12
+    assert effort_limits(build_robot(robot)) == pytest.approx(list(robot.effort_limit))
+    assert robot.default_base_height == pytest.approx(height, abs=0.01)  # of 64 draws the longest
 
 
 def test_the_controller_of_readme_acts(tmp_path, anymal):

@@ -28,6 +28,7 @@ from qd.workers.evaluator import WorkerStatus, parse_workers
 from qd.workers.process import Crosser, EvaluatorError
 from qd.workers.ray_cluster import connect, num_devices, resources
 from qd.workers.shards import MIN_ROWS, checked_count, flaw_of, merged, taken
+from sim.files.command import debugging
 from sim.files.provenance import code_fingerprint
 from sim.policy.spec import ControllerSpec
 
@@ -422,9 +423,10 @@ def _as_raised(error: BaseException | None, message: str) -> Exception:
 
 
 def reason_of(error: BaseException) -> str:
-    """Why a worker failed, in one line: the exception that it raised, or how it died."""
+    """Why a worker failed, in one line: the exception that it raised, or how it died; its traceback for debugging."""
     if isinstance(error, RayTaskError):
-        return f"{type(error.cause).__name__}: {' '.join(str(error.cause).split())}"
+        text = f"{type(error.cause).__name__}: {' '.join(str(error.cause).split())}"
+        return f"{text}\n{error}" if debugging() else text  # Ray keeps the worker's traceback in the error's text
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
 

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -106,7 +107,17 @@ def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None
     except KeyboardInterrupt:
         raise Interrupted(f"Stopped; {state}. {command()}") from None
     except (UserError, OSError) as error:
-        raise type(error)(f"{error}. {command()}") from None
+        raise type(error)(f"{error}. {command()}") from error
+
+
+def debugging() -> bool:
+    """Whether errors are to be shown with their tracebacks: FAULTLINE_DEBUG is set."""
+    return os.environ.get(_DEBUG, "0") not in ("", "0")
+
+
+def told(error: BaseException, text: str) -> str:
+    """What a process says of an error to the one that waits for it: a text, and the traceback if that is wanted."""
+    return f"{text}\n{''.join(traceback.format_exception(error))}" if debugging() else text
 
 
 def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
@@ -132,7 +143,7 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
         status = command.execute()
         return status if isinstance(status, int) else 0
     except (ValueError, OSError, FloatingPointError, UserError) as error:
-        if os.environ.get(_DEBUG):
+        if debugging():
             raise
         print(f"error: {' '.join(filter(None, map(str.strip, str(error).splitlines())))}", file=sys.stderr)
         return error.status if isinstance(error, UserError) else 2

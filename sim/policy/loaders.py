@@ -1,5 +1,6 @@
 """Controllers as black boxes: a batch of observation rows to a batch of actions."""
 
+import inspect
 import os
 import re
 import warnings
@@ -15,9 +16,10 @@ from sim.files.atomic import check_zip
 from sim.files.command import command_line
 from sim.policy.onnx_file import load_onnx
 from sim.policy.runner import action_problem
-from sim.policy.spec import ControllerSpec, find_named
+from sim.policy.spec import ControllerSpec, find_named, in_one_line, place_of_code
 from sim.robots.robot import RobotCfg
 
+_CALLED_WITH = {"factory": "robot, device", "adapter": "controller, robot"}
 _FORMATS = (
     "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), module:callable or "
     "file.py:callable (a function on device tensors, or a class or factory marked by `faultline_factory = True` that "
@@ -137,21 +139,50 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
     try:
         target: Any = find_named(spec.place, spec.name)
     except Exception as error:  # a module can fail with anything
-        raise ValueError(f"policy '{spec}' cannot be imported: {reason_of(error)}; expected {_FORMATS}") from error
+        raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; expected {_FORMATS}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
     kind, arguments = "factory", (robot, device)
     if spec.file is not None:
         kind, arguments = "adapter", (_load_file(Path(spec.file), robot, device, fits=False), robot)
     elif not getattr(target, "faultline_factory", False):
+        _check_unmarked(target, spec)
         return target
     try:
         policy = target(*arguments)
     except Exception as error:
-        raise ValueError(f"policy '{spec}' is {_a(kind)} that failed: {reason_of(error)}; mend it first") from error
+        raise ValueError(
+            f"policy '{spec}' is {_a(kind)} that failed, called with ({_CALLED_WITH[kind]}): "
+            f"{in_one_line(error, target)}; mend it first"
+        ) from error
     if not callable(policy):
         raise ValueError(f"policy '{spec}' is {_a(kind)} that must return a callable, got {type(policy).__name__}")
     return policy
+
+
+def _check_unmarked(target: Any, spec: ControllerSpec) -> None:
+    """Refuses what is no function of the observation: a class without the mark, or a function of something else.
+
+    Raises:
+        ValueError: If it is.
+    """
+    where = place_of_code(target)
+    if inspect.isclass(target):
+        raise ValueError(
+            f"policy '{spec}' is a class without the mark{where}: write `faultline_factory = True` into it, and it is "
+            "called with (robot, device) and makes the controller"
+        )
+    try:
+        signature = inspect.signature(target)
+    except (TypeError, ValueError):  # not all that is written in C has one
+        return
+    try:
+        signature.bind(None)
+    except TypeError as error:
+        raise ValueError(
+            f"policy '{spec}' must take one argument, the observation, got {spec.name}{signature}{where}: one that is "
+            "called with (robot, device) and makes a controller is marked by `faultline_factory = True`"
+        ) from error
 
 
 def _a(kind: str) -> str:
@@ -221,7 +252,7 @@ def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None
     except (Exception, SystemExit) as error:  # a controller can fail with anything
         raise ValueError(
             f"policy '{spec}' failed on observations of shape {tuple(observation.shape)}, which robot '{robot.name}' "
-            f"gives: {reason_of(error)}"
+            f"gives: {in_one_line(error) if ControllerSpec.parse(spec).runs_code else reason_of(error)}"
         ) from error
     problem = action_problem(action, expected)
     if problem is not None:

@@ -90,13 +90,14 @@ class PolicyRunner:
                 self._policy.reset(self._begins != 0)
             action = self._policy(self._observation.clone())
         except (Exception, SystemExit) as error:  # a controller can fail with anything
-            raise ValueError(f"the controller failed in the middle of a crossing: {in_one_line(error)}") from error
+            raise ValueError(
+                f"controller {getattr(self._policy, '__qualname__', type(self._policy).__qualname__)} failed in the "
+                f"middle of a crossing, on observations of shape {tuple(self._observation.shape)}: {in_one_line(error)}"
+            ) from error
         shape = tuple(self._action.shape)
         problem = action_problem(action, shape)
         if problem is not None:
-            raise ValueError(
-                f"the controller must return actions of shape {shape}, {problem}, during a crossing"
-            )
+            raise ValueError(f"the controller must return actions of shape {shape}, {problem}, during a crossing")
         self._action.copy_(action)
 
     @torch.inference_mode()

@@ -3,9 +3,12 @@
 import hashlib
 import importlib
 import importlib.util
+import inspect
 import os
 import re
 import sys
+import sysconfig
+import traceback
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,10 +106,53 @@ def controller_hash(policy: str) -> str | None:
     return digest if spec.file is None else f"{digest} {spec.digest()}"
 
 
-def in_one_line(error: BaseException) -> str:
-    """Kind of an error and the first line of what it says."""
+_ROOT = Path(__file__).resolve().parents[2]
+_NOT_THEIRS = (
+    *(_ROOT / room for room in ("kernels", "sim", "qd", "train")),
+    *(Path(sysconfig.get_path(kind)) for kind in ("stdlib", "platstdlib", "purelib", "platlib")),
+)
+
+
+def in_one_line(error: BaseException, code: Any = None) -> str:
+    """Kind of an error, the first line of what it says, and the line of the user's code that it comes from.
+
+    Args:
+        error: What was raised.
+        code: The function or class that was called; it is named if the error came before its first line.
+    """
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return ": ".join([type(error).__name__, *lines[:1]])
+    text = ": ".join([type(error).__name__, *lines[:1]])
+    if isinstance(error, SyntaxError):  # which says file and line itself
+        return f"{text}: `{error.text.strip()}`" if error.text else text
+    return f"{text}{_place_of(error) or place_of_code(code)}"
+
+
+def _place_of(error: BaseException) -> str:
+    """The innermost line of a traceback that is neither the project's nor an installed package's, in brackets."""
+    theirs = [
+        (frame.filename, frame.lineno)
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith("<") and not _is_installed(Path(frame.filename))
+    ]
+    return f" ({_short(theirs[-1][0])}, line {theirs[-1][1]})" if theirs else ""
+
+
+def _is_installed(file: Path) -> bool:
+    return any(file.is_relative_to(folder) for folder in _NOT_THEIRS)
+
+
+def _short(file: str) -> str:
+    """A path from the working directory, if it lies below."""
+    path = Path(file)
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+
+
+def place_of_code(code: Any) -> str:
+    """File and line of a function or class, in brackets; empty if it has none."""
+    try:
+        return f" ({_short(inspect.getfile(code))}, line {inspect.getsourcelines(code)[1]})"
+    except (TypeError, OSError):
+        return ""
 
 
 def run_file(path: Path) -> ModuleType:
@@ -131,8 +177,15 @@ def run_file(path: Path) -> ModuleType:
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)  # no .pyc that an edit could outrun
     except (Exception, SystemExit) as error:  # a file can fail with anything
         del sys.modules[name]
-        raise ValueError(f"{path} fails: {in_one_line(error)}") from error
+        raise ValueError(f"{path} fails: {in_one_line(error)}{_commas(error, path)}") from error
     return module
+
+
+def _commas(error: BaseException, path: Path) -> str:
+    """Where a file that is no Python may have a comma in place of a decimal point."""
+    lines = path.read_text(errors="replace").splitlines() if isinstance(error, SyntaxError) else []
+    found = [str(number) for number, line in enumerate(lines, 1) if re.search(r"=\s*[-+]?\d+,\d", line)]
+    return f"; is the comma in line {', '.join(found)} a decimal point?" if found else ""
 
 
 def find_named(place: str, name: str) -> Any:
@@ -147,6 +200,8 @@ def find_named(place: str, name: str) -> Any:
     """
     found: Any = run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
     for part in name.split("."):
+        if not hasattr(found, part):
+            raise AttributeError(f"it has no '{name}', only {', '.join(k for k in vars(found) if k[0] != '_')}")
         found = getattr(found, part)
     return found
 

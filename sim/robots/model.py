@@ -1,14 +1,15 @@
 """A robot's file, MJCF or URDF, as a Newton model, checked against the robot's settings."""
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
-from sim.robots.model_files import ModelFiles, read_model_files
+from sim.files.command import told
+from sim.robots.model_files import ModelFiles, joints_without_effort, read_model_files
 from sim.robots.robot import RobotCfg
 
 _URDF_FRICTION = 1.0
@@ -42,31 +43,56 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
         ValueError: If a file is missing or cannot be read, or file and settings do not agree; all that is wrong is
             named at once.
     """
+    builder, problems = read_robot(robot)
+    if problems:
+        raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
+    return builder
+
+
+def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.ModelBuilder, list[str]]:
+    """One robot as :func:`build_robot` makes it, and what is wrong with it, one line each.
+
+    Args:
+        robot: Its settings.
+        wrong: Fields of the settings that cannot be compared with the model, since they are wrong by themselves.
+    """
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     builder.rigid_gap = 0.0  # the default of 0.1 m triples the contacts
     try:
         files = read_model_files(robot.model_file)
+    except ValueError as error:
+        return builder, [str(error)]
+    problems = list(files.problems)
+    try:
         _add_model(builder, robot, files)
     except Exception as error:  # an importer can fail with anything
-        raise ValueError(f"robot '{robot.name}': {' '.join(str(error).split()) or type(error).__name__}") from error
+        said = ": ".join(filter(None, [type(error).__name__, " ".join(str(error).split())]))
+        return newton.ModelBuilder(), problems or [told(error, f"{robot.model_file} cannot be imported: {said}")]
     # The other checks need a tree of single joints, where joints and their columns are the same.
-    problems = _structure_problems(builder)
-    if not problems:
-        bodies = [leaf_name(label) for label in builder.body_label]
-        problems = number_problems(builder, bodies, joint_names(builder)) + _name_problems(builder, robot)
-    if not problems:
-        problems = _set_drives(builder, robot) or drive_problems(builder, files.root, robot.joint_names)
-    if problems:
-        raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
-    _set_contact(builder, robot, is_urdf=files.is_urdf)
-    return builder
+    structure = _structure_problems(builder)
+    if structure:
+        return builder, problems + structure
+    joints = joint_names(builder)
+    problems += number_problems(builder, [leaf_name(label) for label in builder.body_label], joints)
+    problems += drive_problems(builder, files.root, joints)
+    named = [] if "joint_names" in wrong else _joint_name_problems(builder, robot)
+    problems += named
+    if not named and "joint_names" not in wrong:
+        problems += _joint_value_problems(builder, robot, files, wrong)
+    roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
+    geoms = [name for role in roles for name in getattr(robot, role)]
+    problems += _unknown("geom", geoms, geom_names(builder), robot)
+    if not problems and not wrong:
+        _set_contact(builder, robot, is_urdf=files.is_urdf)
+    return builder, problems
 
 
 def _add_model(builder: newton.ModelBuilder, robot: RobotCfg, files: ModelFiles) -> None:
     if files.is_urdf:
         for capsule in files.root.iter("capsule"):
             capsule.set("height", capsule.get("length", capsule.get("height", "1")))  # Newton knows it by this name
+        builder.default_shape_cfg.density = 0.0  # a link without <inertial> has no mass
         text = ET.tostring(files.root, encoding="unicode")
         builder.add_urdf(text, floating=True, enable_self_collisions=False)
         _name_by_link(builder)
@@ -146,18 +172,34 @@ def _structure_problems(builder: newton.ModelBuilder) -> list[str]:
     return problems
 
 
-def _name_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
+def _joint_name_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
     joints = joint_names(builder)
     problems = _unknown("joint", robot.joint_names, joints, robot)
     if not problems and tuple(joints) != robot.joint_names:
         problems.append(f"joint_names must follow the file's order {tuple(joints)}, got {robot.joint_names}")
-    for name in ("default_joint_pos", "stiffness", "damping", "effort_limit", "armature"):
-        values = getattr(robot, name)
-        if values is not None and len(values) != len(joints):
-            problems.append(f"{name} needs {len(joints)} {_UNITS[name]}, got {len(values)}")
-    if not problems:
-        problems = _range_problems(builder, robot)
-    return [*problems, *_unknown("geom", robot.geom_names, geom_names(builder), robot)]
+    return problems
+
+
+def _joint_value_problems(
+    builder: newton.ModelBuilder, robot: RobotCfg, files: ModelFiles, wrong: Collection[str]
+) -> list[str]:
+    """What is wrong with the settings that have a value for each joint; gains, limits and armature are taken over."""
+    joints, problems = robot.joint_names, []
+    values = {name: getattr(robot, name) for name in _UNITS if name not in wrong}
+    short = {name: len(given) for name, given in values.items() if given is not None and len(given) != len(joints)}
+    for name, count in short.items():
+        problems.append(f"{name} needs {len(joints)} {_UNITS[name]}, got {count}")
+    if "default_joint_pos" in values and "default_joint_pos" not in short:
+        problems += _range_problems(builder, robot)
+    weak = joints_without_effort(files.root) if files.is_urdf and robot.effort_limit is None else []
+    if weak:
+        problems.append(
+            f"joints without effort (<limit effort>): {', '.join(weak)}: give them one above 0 [N m], or effort_limit "
+            "in the settings"
+        )
+    if len(values) == len(_UNITS) and not short:
+        problems += _set_drives(builder, robot)
+    return problems
 
 
 def _range_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
@@ -171,7 +213,8 @@ def _range_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
     )
     beyond = [f"{name} ({low:g} to {high:g}, got {angle:g})" for name, angle, low, high in ranges
               if not low - _SLACK <= angle <= high + _SLACK]  # fmt: skip
-    return [f"default_joint_pos is outside of the file's range for {', '.join(beyond)}"] if beyond else []
+    degrees = ": angles are in radians" if any(abs(angle) > 2.0 * np.pi for angle in robot.default_joint_pos) else ""
+    return [f"default_joint_pos is outside of the file's range for {', '.join(beyond)}{degrees}"] if beyond else []
 
 
 _SLACK = 1e-3  # files round [rad]
@@ -250,11 +293,16 @@ def number_problems(builder: newton.ModelBuilder, bodies: Sequence[str], joints:
         joints: Names of its joints but for that of its base.
     """
     light = [name for name, mass in zip(bodies, builder.body_mass, strict=True) if not 0.0 < mass < np.inf]
-    problems = [f"every body must have a mass above 0, unlike {', '.join(light)}"] if light else []
+    problems = (
+        [f"every body must have a mass above 0, unlike {', '.join(light)}: give it an <inertial>"] if light else []
+    )
     hollow = [name for name, inertia in zip(bodies, builder.body_inertia, strict=True)
               if name not in light and not _is_inertia(inertia)]  # fmt: skip
     if hollow:
-        problems.append(f"every body must have an inertia above 0 about every axis, unlike {', '.join(hollow)}")
+        problems.append(
+            f"every body must have an inertia above 0 about every axis, unlike {', '.join(hollow)}: an <inertial> has "
+            "one beside its mass"
+        )
     lost = [name for name, com in zip(bodies, builder.body_com, strict=True) if not np.isfinite(np.array(com)).all()]
     lost += [
         name for name, pose in zip(joints, builder.joint_X_p[1:], strict=True) if not np.isfinite(np.array(pose)).all()
@@ -280,6 +328,17 @@ def _joint_problems(builder: newton.ModelBuilder, joints: Sequence[str]) -> list
     skew = [name for name, axis in zip(joints, builder.joint_axis[6:], strict=True)
             if not abs(np.linalg.norm(np.array(axis, dtype=np.float64)) - 1.0) < 1e-3]  # fmt: skip
     return [*problems, f"axis must be a direction, unlike that of {', '.join(skew)}"] if skew else problems
+
+
+def effort_limits(builder: newton.ModelBuilder) -> list[float]:
+    """Largest torque of each joint [N m]: the joint's own, or its actuator's if that is less."""
+    attributes: Any = builder.custom_attributes
+    efforts = [float(effort) for effort in builder.joint_effort_limit[6:]]
+    names = ("actuator_trnid", "actuator_has_forcerange", "actuator_forcerange")
+    for target, limited, span in zip(*(attributes[f"mujoco:{name}"].values or () for name in names), strict=True):
+        if limited and 0 <= target[0] - 6 < len(efforts):
+            efforts[target[0] - 6] = min(efforts[target[0] - 6], float(span[1]))
+    return efforts
 
 
 def drive_problems(builder: newton.ModelBuilder, root: ET.Element, joints: Sequence[str]) -> list[str]:

@@ -2,10 +2,18 @@
 
 import os
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from xml.parsers import expat
 
 _PACKAGE = "package://"
+_NUMBERS = """
+pos quat euler axisangle fromto size mass diaginertia fullinertia axis range armature damping stiffness frictionloss
+friction solref solimp margin kp kv gear forcerange ctrlrange actuatorfrcrange density scale
+xyz rpy ixx iyy izz ixy ixz iyz lower upper effort velocity radius length multiplier offset
+"""  # attributes of MJCF, and of URDF
+_MOVING = ("revolute", "prismatic", "continuous")
 _SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf")  # .msh: MuJoCo's own
 
 
@@ -17,6 +25,8 @@ class ModelFiles:
     """Of the XML; in a URDF the meshes' file names are absolute."""
     files: tuple[Path, ...]
     """The model file, included files and meshes."""
+    problems: tuple[str, ...] = ()
+    """What an importer would stumble over: texts in place of numbers; in a URDF joints without parts that they need."""
 
     @property
     def is_urdf(self) -> bool:
@@ -28,13 +38,17 @@ def read_model_files(model_file: Path) -> ModelFiles:
     """Reads a model file and looks for the files that it names.
 
     Raises:
-        ValueError: If it is neither MJCF nor URDF, or files are missing; all of them are named.
+        ValueError: If it is neither MJCF nor URDF, a xacro file, or files are missing; all of them are named.
     """
-    root = _parse(model_file)
+    lines: dict[ET.Element, int] = {}
+    root = _parse(model_file, lines)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
+    _refuse_xacro(root, model_file, lines)
+    found = [f"{model_file}, line {lines[element]}: {text}" for element, text in _number_problems(root)]
     files = [model_file]
     if root.tag == "robot":
+        found += [f"{model_file}, line {lines[element]}: {text}" for element, text in _urdf_problems(root)]
         files += [_take_urdf_mesh(mesh, model_file) for mesh in root.iter("mesh") if mesh.get("filename")]
     else:
         files += _mjcf_files(root, (Path(os.path.abspath(model_file)),), model_file.parent)
@@ -44,15 +58,95 @@ def read_model_files(model_file: Path) -> ModelFiles:
     foreign = sorted({str(file) for file in files if file.suffix.lower() not in _SUFFIXES and file != model_file})
     if foreign:
         raise ValueError(f"{model_file}: meshes must be STL or OBJ files, got {', '.join(foreign)}: convert them")
-    return ModelFiles(root=root, files=tuple(dict.fromkeys(Path(os.path.abspath(file)) for file in files)))
+    every = tuple(dict.fromkeys(Path(os.path.abspath(file)) for file in files))
+    return ModelFiles(root=root, files=every, problems=tuple(found))
 
 
-def _parse(file: Path) -> ET.Element:
+def _refuse_xacro(root: ET.Element, file: Path, lines: dict[ET.Element, int]) -> None:
+    for element in root.iter():
+        marks = [value for value in element.attrib.values() if "${" in value or "$(" in value]
+        if element.tag.startswith("xacro:") or marks:
+            raise ValueError(
+                f"{file}, line {lines[element]}: a xacro file ({marks[0] if marks else f'<{element.tag}>'}), expected "
+                f"a URDF: make one of it first, `xacro {file.name} > {file.stem}.expanded.urdf`"
+            )
+
+
+def _number_problems(root: ET.Element) -> Iterator[tuple[ET.Element, str]]:
+    """Attributes that hold something else than the numbers they are for."""
+    numbers = _NUMBERS.split()
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            if not (name in numbers or (name == "value" and element.tag == "mass")):
+                continue
+            if not all(map(_is_number, value.split())):
+                comma = ": write a decimal point" if "," in value else ""
+                yield element, f'<{element.tag} {name}="{value}"> must be numbers{comma}'
+
+
+def _is_number(word: str) -> bool:
     try:
-        root = ET.parse(file).getroot()
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _urdf_problems(root: ET.Element) -> Iterator[tuple[ET.Element, str]]:
+    """Links and joints that lack what a URDF's need."""
+    links = [link.get("name") for link in root.findall("link")]
+    for link in root.findall("link"):
+        if not link.get("name"):
+            yield link, "a link without a name"
+    for joint in root.findall("joint"):
+        name, kind = f"joint {joint.get('name', 'without a name')}", joint.get("type", "")
+        for end in ("parent", "child"):
+            element = joint.find(end)
+            link = None if element is None else element.get("link")
+            if link is None:
+                yield joint, f'{name} has no <{end} link="...">'
+            elif link not in links:
+                yield joint, f"{name}: no link named {link}, the file has {', '.join(map(str, links))}"
+        if kind not in (*_MOVING, "fixed", "floating", "planar"):
+            yield joint, f"{name} must be of type {', '.join(_MOVING)} or fixed, got '{kind}'"
+        limit = joint.find("limit")
+        lacking = [key for key in ("lower", "upper") if limit is None or limit.get(key) is None]
+        if kind in _MOVING[:2] and lacking:
+            missing = "<limit>" if limit is None else " and ".join(lacking)
+            yield joint, f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
+
+
+def joints_without_effort(root: ET.Element) -> list[str]:
+    """Names of a URDF's moving joints whose limits say nothing of effort, or 0."""
+    found = []
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        effort = "0" if limit is None else limit.get("effort", "0")
+        if joint.get("type") in _MOVING and _is_number(effort) and not float(effort) > 0.0:
+            found.append(joint.get("name", ""))
+    return found
+
+
+def _with_lines(file: Path, lines: dict[ET.Element, int]) -> ET.Element:
+    """The root of an XML file; the line of every element goes into ``lines``."""
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda tag: builder.end(tag) and None
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(file.read_bytes(), True)
+    return builder.close()
+
+
+def _parse(file: Path, lines: dict[ET.Element, int] | None = None) -> ET.Element:
+    try:
+        root = _with_lines(file, {} if lines is None else lines)
     except FileNotFoundError:
         raise ValueError(f"model file expected at {file}, no such file") from None
-    except (ET.ParseError, OSError, ValueError) as error:
+    except (expat.ExpatError, OSError, ValueError) as error:
         raise ValueError(f"{file} cannot be read as XML: {error}") from None
     for parent in list(root.iter()):
         for visual in parent.findall("visual") if root.tag == "robot" else ():

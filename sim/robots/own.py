@@ -23,12 +23,13 @@ def load_robot(path: Path) -> RobotCfg:
 
     Raises:
         ValueError: If the file is missing or fails, sets no ``ROBOT``, or something in the settings or the model is
-            wrong. The message names all problems of the settings, or all of the model.
+            wrong. The message names all that is wrong.
     """
     import warp as wp
 
-    from sim.robots.model import build_robot
+    from sim.robots.model import read_robot
     from sim.robots.probes import make_probes
+    from sim.robots.stand import start_height
 
     robot: Any = getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
@@ -37,17 +38,26 @@ def load_robot(path: Path) -> RobotCfg:
     if isinstance(robot.model_file, str):
         robot = replace(robot, model_file=Path(robot.model_file))
     found = settings_problems(robot)
+    wrong = {line.split(" ", 1)[0] for line in found}
+    file = path.resolve()  # of a link, the model lies beside what it points to
+    if "model_file" not in wrong:
+        robot = replace(robot, model_file=file.parent / robot.model_file, settings_file=file)
+        with wp.ScopedDevice("cpu"):
+            builder, of_model = read_robot(robot, wrong)
+            try:
+                make_probes(builder)
+            except ValueError as error:
+                of_model.append(str(error))
+            found += of_model
+            if not found and not robot.default_base_height:
+                robot = replace(robot, default_base_height=start_height(robot, builder))
     if found:
         raise ValueError(f"{path}: {'; '.join(found)}")
-    path = path.resolve()  # of a link, the model lies beside what it points to
-    robot = replace(robot, model_file=path.parent / robot.model_file, settings_file=path)
-    with wp.ScopedDevice("cpu"):
-        make_probes(build_robot(robot))
     return robot
 
 
 def settings_problems(robot: RobotCfg) -> list[str]:
-    """What is wrong with settings by themselves, one line each; :func:`build_robot` compares them with the model."""
+    """What is wrong with settings by themselves, one line each; :func:`read_robot` compares them with the model."""
     found = problems(robot)
     wrong = {line.split(" ", 1)[0] for line in found}
 

@@ -280,7 +280,8 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     longest = max(2.0 * sizes.max(initial=0.0), float(np.ptp(vertices, axis=0).max()))
     if not longest <= MAX_SIDE:
         raise ValueError(
-            f"it is {longest:g} m long, at most {MAX_SIDE:g} m are taken: a mesh in millimetres has a scale"
+            f"it is {longest:g} m long, at most {MAX_SIDE:g} m are taken: lengths are in metres, and a mesh in "
+            "millimetres has a scale"
         )
     if shape_type == newton.GeoType.SPHERE:
         return [Strip(centres=np.zeros((1, 3)), radius=float(scale[0]))]
@@ -308,9 +309,9 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
     """Sphere probes of all collision shapes of one robot, on the current device.
 
     Raises:
-        ValueError: If a shape has no probes, by its name.
+        ValueError: If a shape has no probes; all such shapes are named.
     """
-    centres, radius, spread, body, shape = [], [], [], [], []
+    centres, radius, spread, body, shape, problems = [], [], [], [], [], []
     for k in range(builder.shape_count):
         if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
             continue
@@ -320,13 +321,17 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
                 newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k]), builder.shape_source[k]
             )
         except ValueError as error:
-            raise ValueError(f"geom {builder.shape_label[k]}: {error}") from error
+            name = builder.shape_label[k].rsplit("/", 1)[-1]
+            problems.append(f"geom {name}: {error}")
+            continue
         for strip in strips:
             centres.append([placed(pose, centre) for centre in strip.centres])
             radius.append(strip.radius)
             spread.append(strip.spread)
             body.append(builder.shape_body[k])
             shape.append(k)
+    if problems:
+        raise ValueError("; ".join(problems))
     probes = Probes()
     probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
     probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)

@@ -36,8 +36,9 @@ class RobotCfg:
     """Actuated joints in policy order, which is the file's order."""
     default_joint_pos: tuple[float, ...]
     """Default pose [rad]; an action of 0 holds it."""
-    default_base_height: float = setting(above=0)
-    """Height of the base over flat ground at the start [m]."""
+    default_base_height: float = setting(0.0, least=0)
+    """Height of the base over flat ground at the start [m]; of a settings file without it, the lowest one at which no
+    foot starts in the ground."""
     footprint: tuple[float, float] = setting(above=0)
     """Half length and half width of the stance [m]."""
     scan_x: tuple[float, ...]

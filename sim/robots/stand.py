@@ -1,15 +1,19 @@
 """What a robot's files hold, whether it stands, and how many contacts it needs when it lies."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import newton
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sim.bank import TerrainBank
-from sim.robots.model import build_robot, geom_names, leaf_name
-from sim.robots.probes import placed
+from sim.crossing import CrossingCfg
+from sim.robots.model import build_robot, effort_limits, geom_names, leaf_name
+from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS, Simulation
 from sim.space import SUPER_GAUSSIAN
@@ -20,6 +24,15 @@ _TERRAINS = 4
 _ROOM = 1.5  # highest ground that a dropped robot could touch is looked for this far round it [m]
 _UPRIGHT_DEG = 15.0
 _SUNK = 0.005  # deeper than this in the ground at the start is a mistake [m]
+_FALL = 0.1  # a start so much above the right one is a mistake [m]
+_DRAWS = 64  # of start poses
+_REST_S = 0.5  # the end of the time that a robot stands, at which it should rest
+_RESTLESS = 0.1  # feet whose force changes by more than this share of the weight a step, on average, bounce
+_TURN = 2.0 * np.pi
+_FREE = 1e3  # a joint with a wider range has none [rad]
+_NO_EFFORT_LIMIT = 1e5  # more is no limit [N m]
+_SIZES = (0.05, 5.0)  # farthest point of a robot from its base [m]
+_MASSES = (0.1, 1000.0)  # [kg]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +43,8 @@ class Standing:
     """Height of its lowest foot over the ground at the start [m]; below 0 it starts in the ground."""
     lowest: str
     """The geom that was lowest then."""
+    right_height: float
+    """The lowest ``default_base_height`` at which no foot starts in the ground [m] (:func:`start_height`)."""
     height: tuple[float, float]
     """Of the base, at the start and at the end [m]."""
     tilt_deg: float
@@ -37,7 +52,11 @@ class Standing:
     joint_error: float
     """Largest distance of a joint from its default angle at the end [rad]."""
     carried: dict[str, float]
-    """Share of the weight that each touching geom carries, at the end."""
+    """Share of the weight that each touching geom carries, on average over the last half second."""
+    bounce: tuple[float, float]
+    """Least and most force of a physics step on all feet in that time, in weights."""
+    restless: float
+    """How much the forces on its feet change from one physics step to the next in that time, in weights."""
     contacts: float
     """Most contacts a robot, on average over all."""
     rows: int
@@ -60,6 +79,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     Raises:
         ValueError: If settings and model do not agree.
     """
+    builder = build_robot(robot)
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)
     genes = np.concatenate([np.zeros((1, SUPER_GAUSSIAN.num_genes)), SUPER_GAUSSIAN.hard_random(_TERRAINS, seed)])
@@ -70,10 +90,9 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     sim = Simulation(robot, bank, np.concatenate([[0], 1 + np.arange(drops) % _TERRAINS]))
     q = np.zeros((1 + drops, 7 + robot.num_joints), dtype=np.float32)
     q[:, :3], q[:, 6], q[:, 7:] = (8.0, 4.0, robot.default_base_height), 1.0, robot.default_joint_pos
-    sim.joint_q.assign(q)
     sim.targets.assign(q)
-    sim.refresh()
-    bottoms, reach = _extent(sim)
+    ((bottoms, reach),) = _extents(builder, [robot.default_joint_pos])
+    bottoms = {name: robot.default_base_height + bottom for name, bottom in bottoms.items()}
     q[1:, :2] = rng.uniform([5.0, 2.0], [11.0, 6.0], (drops, 2))
     turn = rng.normal(size=(drops, 4))
     q[1:, 3:7] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
@@ -81,26 +100,47 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         reach + _ground(heights[k], x, y) for k, (x, y) in zip(1 + np.arange(drops) % _TERRAINS, q[1:, :2], strict=True)
     ]
     sim.joint_q.assign(q)
-    contacts, rows, overflowed = _let_fall(sim, seconds)
-    return _judged(sim, robot, bottoms, contacts, rows, overflowed)
+    contacts, rows, overflowed, forces = _let_fall(sim, seconds)
+    return _judged(sim, robot, bottoms, start_height(robot, builder), contacts, rows, overflowed, forces)
 
 
-def _extent(sim: Simulation) -> tuple[dict[str, float], float]:
-    """Lowest point of each geom of the first robot [m], and the farthest that any of it is from its base [m]."""
-    names = geom_names(build_robot(sim.robot))
-    starts, centres = sim.probes.strip_start.numpy(), sim.probes.position.numpy()
-    bodies, shapes, radii = (getattr(sim.probes, f"strip_{name}").numpy() for name in ("body", "shape", "radius"))
-    poses: Any = sim.body_q.numpy()
-    bottoms: dict[str, float] = {}
-    reach = 0.0
-    for strip, radius in enumerate(radii):
-        pose = wp.transform(*poses[bodies[strip]])
-        for centre in centres[starts[strip] : starts[strip + 1]]:
-            point = np.array(placed(pose, centre))
-            name = names[shapes[strip]]
-            bottoms[name] = min(bottoms.get(name, np.inf), float(point[2] - radius))
-            reach = max(reach, float(np.linalg.norm(point - poses[0][:3]) + radius))
-    return bottoms, reach
+def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
+    """Height of the base over flat ground at which a crossing starts with no foot in the ground [m], to the next mm.
+
+    Crossings start with every joint up to a fifth from its default angle.
+    """
+    rng, spread = np.random.default_rng(0), CrossingCfg().start_joint_range
+    scale = rng.uniform(1.0 - spread, 1.0 + spread, (_DRAWS, robot.num_joints))
+    scale[0] = 1.0
+    feet = (bottoms[name] for bottoms, _ in _extents(builder, scale * robot.default_joint_pos)
+            for name in robot.foot_geoms)  # fmt: skip
+    return float(np.ceil(-1e3 * min(feet) - 1e-3) / 1e3)
+
+
+def _extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str, float], float]]:
+    """Of each pose, shape (num_joints,) [rad], relative to the upright base: lowest points, and the farthest one [m].
+
+    The lowest points are by the names of their geoms.
+    """
+    with wp.ScopedDevice("cpu"):
+        model, probes = builder.finalize(), make_probes(builder)
+        state: Any = model.state()
+        counts = np.diff(np.append(probes.strip_start.numpy(), len(probes.position))).astype(int)
+        counts = counts[: len(probes.strip_radius)]
+        body, shape, radius = (
+            np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("body", "shape", "radius")
+        )
+        points, names = probes.position.numpy(), np.array(geom_names(builder))[shape]
+        for pose in poses:
+            state.joint_q.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *pose], dtype=np.float32))
+            newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+            poses_of_bodies = state.body_q.numpy()[body]
+            at = poses_of_bodies[:, :3] + Rotation.from_quat(poses_of_bodies[:, 3:]).apply(points)
+            bottom = at[:, 2] - radius
+            yield (
+                {name: float(bottom[names == name].min()) for name in dict.fromkeys(names)},
+                float((np.linalg.norm(at, axis=1) + radius).max()),
+            )
 
 
 def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
@@ -109,43 +149,56 @@ def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
     return float(heights[max(row - room, 0) : row + room + 1, max(column - room, 0) : column + room + 1].max())
 
 
-def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool]:
-    """Most contacts a robot on average, most rows of one, and whether a buffer overflowed."""
+def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool, NDArray[np.float64]]:
+    """Most contacts a robot on average, most rows of one, whether a buffer overflowed, and forces on the first robot.
+
+    The forces are the vertical ones on each geom with a role in the physics steps of the last half second [N], shape
+    (num_steps, num_geoms). One that changes from step to step would look steady in every fourth.
+    """
     start = sim.joint_q.numpy().copy()
 
     def launch() -> None:
-        sim.refresh()
-        for _ in range(sim.robot.decimation):
-            sim.physics_step()
+        sim.physics_step()
         sim.read_geom_forces()
 
+    sim.refresh()
     graph = sim.capture(launch)  # makes steps of its own
     sim.joint_q.assign(start)
     sim.joint_qd.zero_()
+    sim.refresh()
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
-    contacts, rows, overflowed = 0.0, 0, False
-    for _ in range(round(seconds / sim.robot.control_dt)):
+    contacts, rows, overflowed, forces = 0.0, 0, False, []
+    steps = max(1, round(seconds / sim.robot.physics_dt))
+    for step in range(steps):
         sim.launch(graph)
-        contacts = max(contacts, int(sim.contact_count.numpy()[0]) / sim.num_envs)
-        rows = max(rows, int(sim.solver.mjw_data.nefc.numpy().max()))
-        overflowed |= bool((sim.overflow.numpy() & CAPACITY_OVERFLOWS).any())
-    return contacts, rows, overflowed or contacts > sim.robot.nconmax
+        if step >= steps - max(2, round(_REST_S / sim.robot.physics_dt)):
+            forces.append(sim.geom_force.numpy()[0][:, 2].copy())
+        if step % sim.robot.decimation == 0:
+            contacts = max(contacts, int(sim.contact_count.numpy()[0]) / sim.num_envs)
+            rows = max(rows, int(sim.solver.mjw_data.nefc.numpy().max()))
+            overflowed |= bool((sim.overflow.numpy() & CAPACITY_OVERFLOWS).any())
+    return contacts, rows, overflowed or contacts > sim.robot.nconmax, np.array(forces, dtype=np.float64)
 
 
 def _judged(
-    sim: Simulation, robot: RobotCfg, bottoms: dict[str, float], contacts: float, rows: int, overflowed: bool
-) -> Standing:
+    sim: Simulation, robot: RobotCfg, bottoms: dict[str, float], right_height: float, contacts: float, rows: int,
+    overflowed: bool, forces: NDArray[np.float64],
+) -> Standing:  # fmt: skip
     q = sim.joint_q.numpy()[0].astype(np.float64)
     weight = float(sim.model.body_mass.numpy()[: sim.layout.bodies_per_env].sum()) * _GRAVITY
     up = 1.0 - 2.0 * (q[3] ** 2 + q[4] ** 2)
-    forces = dict(zip(sim.geom_names, sim.geom_force.numpy()[0][:, 2], strict=True))
+    mean = dict(zip(sim.geom_names, forces.mean(axis=0) / weight, strict=True))
+    on_feet = forces[:, [name in robot.foot_geoms for name in sim.geom_names]] / weight
     return Standing(
         gap=min(bottoms[name] for name in robot.foot_geoms),
         lowest=min(bottoms, key=lambda name: bottoms[name]),
+        right_height=right_height,
         height=(robot.default_base_height, float(q[2])),
         tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),
         joint_error=float(np.abs(q[7:] - robot.default_joint_pos).max(initial=0.0)),
-        carried={name: float(force) / weight for name, force in forces.items() if force > 1e-3 * weight},
+        carried={name: float(share) for name, share in mean.items() if share > 1e-3},
+        bounce=(float(on_feet.sum(axis=1).min()), float(on_feet.sum(axis=1).max())),
+        restless=float(np.abs(np.diff(on_feet, axis=0)).sum(axis=1).mean()),
         contacts=contacts,
         rows=rows,
         overflowed=overflowed,
@@ -154,27 +207,56 @@ def _judged(
 
 
 def describe_model(robot: RobotCfg) -> str:
-    """Joints and geoms of a robot as they were read."""
+    """Joints and geoms of a robot as they were read, and numbers that look like other units."""
     builder: Any = build_robot(robot)
     lines = [
         f"{robot.name}: {robot.model_file}",
         f"  {sum(builder.body_mass):.2f} kg in {builder.body_count} bodies, {robot.num_joints} joints, "
         f"{robot.observation_size} observations",
-        f"  {'joint':22}{'default':>9}{'range [rad]':>18}{'kp':>8}{'kd':>7}{'armature':>10}",
+        f"  {'joint':22}{'default':>9}{'range [rad]':>18}{'kp':>8}{'kd':>7}{'effort':>9}{'armature':>10}",
     ]
     rows = zip(robot.joint_names, robot.default_joint_pos, *(
         getattr(builder, f"joint_{name}")[6:]
         for name in ("limit_lower", "limit_upper", "target_ke", "target_kd", "armature")
-    ), strict=True)  # fmt: skip
-    for name, angle, low, high, kp, kd, armature in rows:
-        span = f"{low:.2f} to {high:.2f}" if high - low < 1e3 else "free"
-        lines.append(f"  {name:22}{angle:9.3f}{span:>18}{kp:8g}{kd:7g}{armature:10.3g}")
+    ), effort_limits(builder), strict=True)  # fmt: skip
+    for name, angle, low, high, kp, kd, armature, effort in rows:
+        most = f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
+        span = f"{low:.2f} to {high:.2f}" if high - low < _FREE else "free"
+        lines.append(f"  {name:22}{angle:9.3f}{span:>18}{kp:8g}{kd:7g}{most:>9}{armature:10.3g}")
     lines.append(f"  {'geom':22}{'role':>9}  {'body':18}friction")
     for name, body, friction in zip(geom_names(builder), builder.shape_body, builder.shape_material_mu, strict=True):
         roles = (("base", robot.base_geoms), ("foot", robot.foot_geoms), ("limb", robot.limb_geoms))
         role = next((kind for kind, names in roles if name in names), "-")
         lines.append(f"  {name:22}{role:>9}  {leaf_name(builder.body_label[body]):18}{friction:g}")
+    lines += [f"Warning: {text}" for text in unit_warnings(robot, builder)]
     return "\n".join(lines)
+
+
+def unit_warnings(robot: RobotCfg, builder: newton.ModelBuilder) -> list[str]:
+    """Numbers that no legged robot has in metres, kilograms and radians, one line each."""
+    masses, warnings = np.array(builder.body_mass), []
+    ((_, reach),) = _extents(builder, [robot.default_joint_pos])
+    if not _SIZES[0] <= reach <= _SIZES[1]:
+        warnings.append(f"it reaches {reach:.3g} m from its base: are lengths in the model in metres?")
+    if not _MASSES[0] <= masses.sum() <= _MASSES[1]:
+        warnings.append(f"it weighs {masses.sum():.3g} kg: are masses in the model in kilograms?")
+    spread = np.sqrt([np.linalg.eigvalsh(np.reshape(inertia, (3, 3)))[-1] for inertia in builder.body_inertia] / masses)
+    far = [f"{leaf_name(builder.body_label[k])} ({spread[k]:.3g} m)" for k in np.flatnonzero(spread > reach)]
+    if far:
+        warnings.append(
+            f"the radius of gyration of {', '.join(far)} is more than the robot's {reach:.3g} m: "
+            "are inertias in kg m^2?"
+        )
+    turned = [f"{name} ({angle:g})" for name, angle in zip(robot.joint_names, robot.default_joint_pos, strict=True)
+              if abs(angle) > _TURN]  # fmt: skip
+    if turned:
+        warnings.append(f"default_joint_pos is beyond a full turn for {', '.join(turned)}: is it in radians?")
+    spans = zip(robot.joint_names, builder.joint_limit_lower[6:], builder.joint_limit_upper[6:], strict=True)
+    wide = [f"{name} ({low:g} to {high:g})" for name, low, high in spans if 2.0 * _TURN < high - low < _FREE
+            and max(abs(low), abs(high)) > 2.0 * _TURN]  # fmt: skip
+    if wide:
+        warnings.append(f"joints turn by more than two full turns: {', '.join(wide)}: are limits in radians?")
+    return warnings
 
 
 def describe_standing(robot: RobotCfg, found: Standing) -> tuple[str, bool]:
@@ -189,11 +271,25 @@ def describe_standing(robot: RobotCfg, found: Standing) -> tuple[str, bool]:
     ]
     wrong = []
     if found.gap < -_SUNK:
-        wrong.append(f"its feet start {-found.gap:.3f} m in the ground: default_base_height is that much too low")
+        wrong.append(
+            f"its feet start {-found.gap:.3f} m in the ground: default_base_height {found.right_height:.3f} is right, "
+            f"got {first:g}"
+        )
+    if first > found.right_height + _FALL:
+        wrong.append(
+            f"it starts with its feet {found.gap:.3f} m over the ground and falls: default_base_height "
+            f"{found.right_height:.3f} is right, got {first:g}"
+        )
     if found.lowest not in robot.foot_geoms:
         wrong.append(f"in the default pose {found.lowest} is lower than the feet")
     if not found.finite:
         wrong.append("states became not finite: gains too high for physics_dt, or too little armature?")
+    if found.stands and found.restless > _RESTLESS:
+        wrong.append(
+            f"its feet bounce at rest: the force on them changes from step to step, between {found.bounce[0]:.1f} and "
+            f"{found.bounce[1]:.1f} times its weight: give the joints armature (a rotor's inertia, .01 kg m^2 for a "
+            "dog of 13 kg), or a longer contact_time_constant_s"
+        )
     if found.overflowed:
         wrong.append("a buffer of the solver was too small: raise nconmax and njmax above the numbers above")
     lines += [f"To mend: {text}" for text in wrong]

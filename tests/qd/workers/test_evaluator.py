@@ -130,6 +130,17 @@ def test_a_failure_in_a_worker_names_its_reason():
         evaluate(GENES, SEEDS)
 
 
+@pytest.mark.parametrize(("policy", "error"), [("refuse to build", ValueError), ("fail", EvaluatorError)])
+def test_for_debugging_an_error_of_a_worker_brings_its_traceback(monkeypatch, policy, error):
+    monkeypatch.setenv("FAULTLINE_DEBUG", "1")
+    cfg = dataclasses.replace(CFG, policy=policy)
+    with (
+        pytest.raises(error, match=r"(?s)Traceback .*test_evaluator\.py\", line \d+"),
+        open_evaluator(cfg, build=Crosser) as evaluate,
+    ):
+        evaluate(GENES, SEEDS)
+
+
 def test_a_dead_worker_is_noticed():
     cfg = dataclasses.replace(CFG, policy="die", workers="2")
     with (

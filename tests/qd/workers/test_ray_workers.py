@@ -206,3 +206,12 @@ def test_flaws_are_found():
         ({"reward": np.zeros((3, 3))}, "reward of shape (3, 3)"),
     ]:
         assert says in flaw_of(dataclasses.replace(result, **change), 3, 4)
+
+
+def test_for_debugging_an_error_of_a_worker_brings_its_traceback(monkeypatch):
+    monkeypatch.setenv("FAULTLINE_DEBUG", "1")
+    with (
+        pytest.raises(ValueError, match=r"(?s)use another.*crossers\.py\", line \d+"),
+        open_evaluator(CFG, build=crossers.Refusing),
+    ):
+        pass

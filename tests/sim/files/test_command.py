@@ -70,6 +70,24 @@ def test_a_bug_keeps_its_traceback_and_so_does_every_error_for_debugging(monkeyp
     monkeypatch.setenv("FAULTLINE_DEBUG", "1")
     with pytest.raises(ValueError, match="two"):
         run("--how", "value")
+    monkeypatch.setenv("FAULTLINE_DEBUG", "0")
+    assert run("--how", "value") == 2
+
+
+def test_what_comes_next_keeps_the_error_before_it():
+    lost = UserError("lost")
+    with pytest.raises(UserError) as raised, naming_what_is_next("", lambda: "x"):
+        raise lost
+    assert raised.value.__cause__ is lost
+    monkeypatch.setenv("FAULTLINE_DEBUG", "0")
+    assert run("--how", "value") == 2
+
+
+def test_what_comes_next_keeps_the_error_before_it():
+    lost = UserError("lost")
+    with pytest.raises(UserError) as raised, naming_what_is_next("", lambda: "x"):
+        raise lost
+    assert raised.value.__cause__ is lost
 
 
 def test_the_option_groups_are_flags(capsys):

@@ -192,11 +192,19 @@ def test_the_reason_is_the_finding_without_torchs_advice(tmp_path, anymal):
     [
         ("def policy(:", "cannot be imported: SyntaxError"),
         ("1 / 0", "cannot be imported: ZeroDivisionError"),
-        ("def policy(observation): raise ValueError", "failed on observations.*ValueError"),
+        ("def policy(observation):\n raise ValueError", r"observations of.*ValueError \(.*theirs\.py, line 2\)"),
+        ("def policy(o): return o @ o", r"\(4, 235\).*RuntimeError: mat.*\(.*theirs\.py, line 1\)"),
+        ("class policy: pass", r"a class without the mark \(.*theirs\.py, line 1\): .*faultline_factory = True"),
+        ("\ndef policy(robot, device): pass", r"one argument.*policy\(robot, device\) \(.*line 2\).*faultline_factory"),
+        (
+            "class policy:\n faultline_factory = True\n def __init__(self, robot): pass",
+            r"TypeError: .*theirs\.py, line 1",
+        ),
+        ("def act(o): pass", "it has no 'policy', only act;"),
         ("def policy(observation): return {}['gone']", "failed on observations.*KeyError: 'gone'"),
         (
             "def policy(robot, device): raise KeyError('gone')\npolicy.faultline_factory = True",
-            "factory that failed: KeyError",
+            r"factory that failed, .*: KeyError: 'gone' \(.*theirs\.py, line 1\)",
         ),
     ],
 )
@@ -277,7 +285,7 @@ def fails(_):
         (lambda row: torch.zeros(5, ACTIONS, device="meta"), "plain floats, got .* on meta"),
         (lambda row: torch.zeros(5, ACTIONS).to_sparse(), "plain floats, got .*sparse"),
         (lambda row: None, "got NoneType"),
-        (fails, "failed in the middle of a crossing: RuntimeError: enough$"),
+        (fails, r"fails failed .* of shape \(5, 235\): RuntimeError: enough \(.*test_loaders.py, line \d+\)$"),
     ],
 )
 def test_what_goes_wrong_in_a_crossing_is_named(policy, message):

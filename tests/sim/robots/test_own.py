@@ -59,6 +59,8 @@ CHANGES = [
     ("collision_bit=False,", "collision_bit=False, effort_limit=(1.0,) * 4,", r"effort_limit needs 8 limits.*got 4"),
     ("collision_bit=False,", "collision_bit=False, physics_dt=1.0,", "physics_dt must be .* at most 0.05, got 1"),
     ("collision_bit=False,", "collision_bit=False, friction=-1.0,", "friction must be above 0"),
+    ("collision_bit=False,", 'collision_bit=False, friction="a",', "friction must be a finite number or None"),
+    ("collision_bit=False,", 'collision_bit=False, contact_time_constant_s="a",', "constant_s must be a finite number"),
     (
         "collision_bit=False,", "collision_bit=False, contact_time_constant_s=0.004,",
         "contact_time_constant_s must be at least twice physics_dt, 0.01 s",
@@ -85,6 +87,21 @@ def test_all_that_is_wrong_is_named_at_once(tmp_path):
     file.write_text(write_dog(tmp_path).read_text().replace('"trunk"', '"body"').replace('"knee"', '"shin"'))
     with pytest.raises(ValueError, match=r"no joint named FL_shin.*no geom named body"):
         get_robot(str(file))
+
+
+def test_settings_and_model_are_judged_together(tmp_path):
+    model = mjcf().replace('mass="8"', 'mass="0"').replace(BALL, EGG).replace(HIP, f'{HIP} armature="-1"')
+    file = write_dog(tmp_path, model=model)
+    text = file.read_text().replace("150.0", "-1").replace("* 4", "* 3").replace('"shank"', '"shin"')
+    file.write_text(text.replace('base_geoms=("trunk",)', "base_geoms=()"))
+    with pytest.raises(ValueError, match=r"dog\.py: ") as raised:
+        get_robot(str(file))
+    parts = (
+        "contact_force_limit must be above 0, got -1", "base_geoms must name at least one", "above 0, unlike trunk",
+        "armature must be a number, 0 or more, got FL_hip (-1)", "default_joint_pos needs 8 angles, got 6",
+        "no geom named FL_shin", "geom FL_foot: no probes for a ELLIPSOID", "geom HR_foot: no probes for a ELLIPSOID",
+    )  # fmt: skip
+    assert [part for part in parts if part not in str(raised.value)] == []
 
 
 FREE = '<freejoint name="root"/>'
@@ -124,6 +141,97 @@ MODELS = [
     (urdf(trunk='<mesh filename="https://example.org/trunk.stl"/>'), "nothing is downloaded"),
     (urdf(trunk='<mesh filename="../meshes/gone.stl"/>'), r"not there: .*meshes/gone\.stl"),
 ]
+
+
+LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
+FIRST_MASS = '<mass value="0.8"/>'
+URDFS = [
+    # The hip's <joint> is the 22nd line, the thigh's <mass> the eighth.
+    (urdf().replace(LIMIT, "", 1), r"dog\.urdf, line 22: joint FL_hip has no <limit>.*without effort .*: FL_hip"),
+    (urdf().replace('lower="-1.5" ', "", 1), "line 22: joint FL_hip has no lower: give it <limit lower"),
+    (urdf().replace('effort="30"', 'effort="0"', 2), "joints without effort .*: FL_hip, FL_knee: .*effort_limit"),
+    (urdf().replace(' effort="30"', "", 1), r"joints without effort \(<limit effort>\): FL_hip: "),
+    (urdf().replace(FIRST_MASS, "", 1), "mass above 0, unlike FL_thigh: give it an <inertial>"),
+    (urdf().replace(FIRST_MASS, '<mass value="0,8"/>', 1), r'line 8: <mass value="0,8"> must be numbers.* point'),
+    (urdf().replace('xyz="0.2 0.12 0"', 'xyz="0.2 left 0"'), 'line 23: <origin xyz="0.2 left 0"> must be numbers'),
+    (urdf().replace(FIRST_MASS, '<mass value="${m}"/>'), r"line 8: a xacro file \(\$\{m\}\).*`xacro dog\.urdf > "),
+    (urdf().replace('<parent link="trunk"/>', "", 1), "line 22: joint FL_hip has no <parent link"),
+    (
+        urdf().replace('<child link="FL_thigh"/>', '<child link="leg"/>'),
+        "joint FL_hip: no link named leg, the file has",
+    ),
+    (urdf().replace('"revolute"', '"hinge"', 1), "joint FL_hip must be of type revolute.*got 'hinge'"),
+    (urdf().replace('"trunk">', '"">', 1), "line 2: a link without a name"),
+]
+
+
+@pytest.mark.parametrize(("model", "message"), URDFS, ids=[message for _, message in URDFS])
+def test_what_a_urdf_lacks_is_named_by_file_and_line(tmp_path, model, message):
+    more = GAINS.replace("\n    effort_limit=(30.0,) * 8,", "")
+    with pytest.raises(ValueError, match=message):
+        get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=more)))
+
+
+def test_effort_may_stand_in_the_settings_and_a_link_without_inertial_weighs_nothing(tmp_path):
+    foot = '<inertial><origin xyz="0 0 0.0"/><mass value="0.1"/>'
+    model = urdf().replace(' effort="30"', "")
+    start = model.index(foot)
+    model = model[:start] + model[model.index("</inertial>", start) + len("</inertial>") :]
+    builder = build_robot(get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=GAINS))))
+    assert builder.joint_effort_limit[6:] == [30.0] * 8
+    assert sum(builder.body_mass) == pytest.approx(MASS - 0.1)
+
+
+def test_a_decimal_comma_in_the_settings_is_asked_for(tmp_path):
+    file = write_dog(tmp_path)
+    file.write_text(file.read_text().replace("height=0.29", "height=0,29"))
+    line = next(number for number, text in enumerate(file.read_text().splitlines(), 1) if "0,29" in text)
+    with pytest.raises(ValueError, match=rf"fails: SyntaxError: .*the comma in line {line} a decimal point"):
+        get_robot(str(file))
+
+
+LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
+FIRST_MASS = '<mass value="0.8"/>'
+URDFS = [
+    # The hip's <joint> is the 22nd line, the thigh's <mass> the eighth.
+    (urdf().replace(LIMIT, "", 1), r"dog\.urdf, line 22: joint FL_hip has no <limit>.*without effort .*: FL_hip"),
+    (urdf().replace('lower="-1.5" ', "", 1), "line 22: joint FL_hip has no lower: give it <limit lower"),
+    (urdf().replace('effort="30"', 'effort="0"', 2), "joints without effort .*: FL_hip, FL_knee: .*effort_limit"),
+    (urdf().replace(' effort="30"', "", 1), r"joints without effort \(<limit effort>\): FL_hip: "),
+    (urdf().replace(FIRST_MASS, "", 1), "mass above 0, unlike FL_thigh: give it an <inertial>"),
+    (urdf().replace(FIRST_MASS, '<mass value="0,8"/>', 1), r'line 8: <mass value="0,8"> must be numbers.* point'),
+    (urdf().replace('xyz="0.2 0.12 0"', 'xyz="0.2 left 0"'), 'line 23: <origin xyz="0.2 left 0"> must be numbers'),
+    (urdf().replace(FIRST_MASS, '<mass value="${m}"/>'), r"line 8: a xacro file \(\$\{m\}\).*`xacro dog\.urdf > "),
+    (urdf().replace('<parent link="trunk"/>', "", 1), "line 22: joint FL_hip has no <parent link"),
+    (urdf().replace('<child link="FL_thigh"/>', '<child link="leg"/>'), "joint FL_hip: no link named leg, the file has"),
+    (urdf().replace('"revolute"', '"hinge"', 1), "joint FL_hip must be of type revolute.*got 'hinge'"),
+    (urdf().replace('"trunk">', '"">', 1), "line 2: a link without a name"),
+]
+
+
+@pytest.mark.parametrize(("model", "message"), URDFS, ids=[message for _, message in URDFS])
+def test_what_a_urdf_lacks_is_named_by_file_and_line(tmp_path, model, message):
+    more = GAINS.replace("\n    effort_limit=(30.0,) * 8,", "")
+    with pytest.raises(ValueError, match=message):
+        get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=more)))
+
+
+def test_effort_may_stand_in_the_settings_and_a_link_without_inertial_weighs_nothing(tmp_path):
+    foot = '<inertial><origin xyz="0 0 0.0"/><mass value="0.1"/>'
+    model = urdf().replace(' effort="30"', "")
+    start = model.index(foot)
+    model = model[:start] + model[model.index("</inertial>", start) + len("</inertial>") :]
+    builder = build_robot(get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=GAINS))))
+    assert builder.joint_effort_limit[6:] == [30.0] * 8
+    assert sum(builder.body_mass) == pytest.approx(MASS - 0.1)
+
+
+def test_a_decimal_comma_in_the_settings_is_asked_for(tmp_path):
+    file = write_dog(tmp_path)
+    file.write_text(file.read_text().replace("height=0.29", "height=0,29"))
+    line = next(number for number, text in enumerate(file.read_text().splitlines(), 1) if "0,29" in text)
+    with pytest.raises(ValueError, match=rf"fails: SyntaxError: .*the comma in line {line} a decimal point"):
+        get_robot(str(file))
 
 
 @pytest.mark.parametrize(("model", "message"), MODELS, ids=[message for _, message in MODELS])
