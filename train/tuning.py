@@ -115,7 +115,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
     """
     robot, device = get_robot(flags.robot), device_of(flags)
-    saved = read_saved(flags.resume, robot.name, finetuning=True) if flags.resume else None
+    saved = read_saved(flags.resume, robot.name, flags.command) if flags.resume else None
     size = sizes_of(flags, robot.name, on_gpu=device.startswith("cuda"))
     if saved is None:
         path = flags.policy or robot.policy_file
@@ -149,9 +149,8 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     if saved is not None:
         _refuse_changes(flags, saved, settings)
     return TuningJob(
-        command="finetune", flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations,
-        task=task, ppo=ppo, settings=settings, saved=saved, began=began,
-        run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
+        flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations, task=task, ppo=ppo,
+        settings=settings, saved=saved, began=began, run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
         start=start, mix=Mix(cfg=mix_cfg, genes=genes, space=space, crosses=crosses, seed=flags.seed, device=device),
     )  # fmt: skip
 
