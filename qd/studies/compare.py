@@ -4,21 +4,20 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from qd.fitness import FITNESS_FLOOR
-from qd.run.directory import RUNS, Metrics
+from qd.fresh import Open
+from qd.run.directory import Metrics
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
-from sim.files.command import Where, Who
-from sim.files.intervals import MAX_T_VALUES, t_interval
+from qd.studies.study import StudyFlags, publish_with_figure, run_study, study_of
+from qd.workers.evaluator import open_evaluator, resolve_device
+from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from qd.fresh import Open
 
 METHODS: dict[str, dict[str, Any]] = {
     "uniform_random": {"method": "uniform_random"},
@@ -60,15 +59,13 @@ _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called,
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(Who, Where):
+class Compare(StudyFlags):
     """Compare ways to search on the same number of terrains, several seeds each, all in lock-step.
 
     Every search is an ordinary run in its own folder METHOD-SEED. State is saved after every iteration: stop with
     Ctrl-C whenever you like, and the same command goes on.
     """
 
-    preset: str | None = None
-    """Size of an iteration: paper (a GPU's work) or small; by default what the device can do."""
     methods: tuple[str, ...] = tuple(METHODS)
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
     size .5), mixed (cma_mae+map_elites); all. Settings of the search after a colon make another one of it:
@@ -81,12 +78,8 @@ class Compare(Who, Where):
     """Iterations of every run; more than before extend a comparison that is there."""
     reevaluate_every: int = 11
     """Every so many iterations, and at the end, all elites cross 40 fresh episodes."""
-    run_dir: Path | None = None
-    """The comparison's folder, new or to go on with; runs/<robot>-compare."""
-    out: Path | None = None
-    """Where to write the numbers, with a figure beside them; compare.json in that folder."""
 
-    def execute(self, *, open_evaluator: "Open | None" = None) -> dict[str, Any]:
+    def execute(self, *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
         """Runs the searches that are not done and publishes the comparison.
 
         Args:
@@ -97,9 +90,6 @@ class Compare(Who, Where):
             Interrupted: On Ctrl-C; all iterations that ended are saved.
             EvaluatorError: If a worker is lost; likewise.
         """
-        from qd.studies.study import Study, publish_with_figure, run_study
-        from qd.workers.evaluator import open_evaluator as opened
-        from qd.workers.evaluator import resolve_device
         from sim.robots.robot import get_robot
 
         robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device, self.workers)
@@ -109,11 +99,10 @@ class Compare(Who, Where):
         methods = self._methods(shared)
         seeds = range(self.seed, self.seed + self.seeds)
         runs = {f"{name}-{seed}": replace(cfg, seed=seed) for name, cfg in methods.items() for seed in seeds}
-        path = self.run_dir or RUNS / f"{robot.name}-compare"
-        study = Study.of(path, runs, robot, device=device, workers=self.workers, sampled=False)
+        study = study_of(self, "compare", runs, robot, device, sampled=False)
 
         def measure() -> dict[str, Any]:
-            found = run_study(study, open_evaluator or opened)
+            found = run_study(study, open_evaluator)
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds] for name in methods}
             return {
                 **study.origin,
@@ -125,7 +114,7 @@ class Compare(Who, Where):
                 **report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()}),
             }
 
-        return publish_with_figure(self.out or path / "compare.json", measure, _show, draw_comparison)
+        return publish_with_figure(study.out, measure, _show, draw_comparison)
 
     def _methods(self, shared: SearchCfg) -> dict[str, SearchCfg]:
         """Settings of each method: different searches on the same number of terrains.
@@ -272,7 +261,4 @@ def _show(report: dict[str, Any]) -> None:
     print(f"\ncorrected QD score after {report['corrected_at'][-1]:,} terrains, 95 % interval over seeds")
     for name, method in report["methods"].items():
         last = method["corrected_qd_score"][-1]
-        words = "none" if last["mean"] is None else f"{last['mean']:.0f}"
-        if last["interval"]:
-            words += " ({:.0f} to {:.0f})".format(*last["interval"])
-        print(f"  {name}: {words}")
+        print(f"  {name}: {value_words(last['mean'], last['interval'], '.0f')}")
