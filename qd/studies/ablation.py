@@ -19,8 +19,9 @@ from qd.run.settings import (
     refuse_unnamed_code,
     resumed,
 )
-from qd.studies.study import LOOKS, StudyFlags, publish_with_figure, run_study, study_of
+from qd.studies.study import LOOKS, StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, resolve_device
+from sim.files.command import publish
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,6 +60,7 @@ class Ablation(StudyFlags):
             Interrupted: On Ctrl-C; all iterations that ended are saved.
             EvaluatorError: If a worker is lost; likewise.
         """
+        from qd.show.figures import as_png
         from sim.robots.robot import get_robot, robot_of
 
         device, moved, names = resolve_device(self.device, self.workers), None, list(_ALPHAS)
@@ -85,7 +87,7 @@ class Ablation(StudyFlags):
             numbers = numbers_of(metrics, base.iterations)
             return {**study.origin, "robot": robot.name, "preset": base.preset, **numbers}
 
-        return publish_with_figure(study.out, measure, _show, draw_ablation)
+        return publish(study.out, measure, _show, draw=lambda report: as_png(draw_ablation(report)))
 
     def _begun(self, robot: "RobotCfg", device: str) -> SearchCfg:
         """Settings of searches from the start."""

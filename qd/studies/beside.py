@@ -12,6 +12,7 @@ from qd.archive import Archive, read_archive
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import as_settings, differences
+from sim.files.command import publish
 from sim.files.intervals import bootstrap_interval
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class Beside:
             FileNotFoundError: If there is no run.
             ValueError: If runs cannot be compared, or a file cannot be written.
         """
-        from qd.studies.study import publish_with_figure
+        from qd.show.figures import as_png
         from sim.files.provenance import provenance
 
         sides = sides_of(self.runs)
@@ -53,7 +54,7 @@ class Beside:
             "iterations": sides[0].archive.iterations,
             "runs": {side.name: numbers_of(side) for side in sides},
         }
-        return publish_with_figure(self.out, lambda: report, _show, lambda _: draw_beside(sides))
+        return publish(self.out, lambda: report, _show, draw=lambda _: as_png(draw_beside(sides)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,9 +12,11 @@ from qd.fitness import FITNESS_FLOOR
 from qd.fresh import Open
 from qd.run.directory import Metrics
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
-from qd.studies.study import StudyFlags, publish_with_figure, run_study, study_of
+from qd.studies.study import StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, resolve_device
+from sim.files.command import publish
 from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
+from sim.files.settings import check, setting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,13 +72,13 @@ class Compare(StudyFlags):
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
     size .5), mixed (cma_mae+map_elites); all. Settings of the search after a colon make another one of it:
     cma_mae:restart-rule=20,learning-rate=0.3."""
-    seeds: int = 3
+    seeds: int = setting(3, least=1, most=MAX_T_VALUES)
     """Runs of each method, with seeds from --seed on."""
     seed: int = 0
     """The first seed."""
     iterations: int = 33
     """Iterations of every run; more than before extend a comparison that is there."""
-    reevaluate_every: int = 11
+    reevaluate_every: int = setting(11, least=1)
     """Every so many iterations, and at the end, all elites cross 40 fresh episodes."""
 
     def execute(self, *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
@@ -90,8 +92,10 @@ class Compare(StudyFlags):
             Interrupted: On Ctrl-C; all iterations that ended are saved.
             EvaluatorError: If a worker is lost; likewise.
         """
+        from qd.show.figures import as_png
         from sim.robots.robot import get_robot
 
+        check(self)
         robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device, self.workers)
         size = self.preset or ("paper" if device.startswith("cuda") else "small")
         asked = {name: getattr(self, name) for name in ("seed", "iterations", "reevaluate_every", "policy")}
@@ -114,7 +118,7 @@ class Compare(StudyFlags):
                 **report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()}),
             }
 
-        return publish_with_figure(study.out, measure, _show, draw_comparison)
+        return publish(study.out, measure, _show, draw=lambda report: as_png(draw_comparison(report)))
 
     def _methods(self, shared: SearchCfg) -> dict[str, SearchCfg]:
         """Settings of each method: different searches on the same number of terrains.
@@ -125,10 +129,6 @@ class Compare(StudyFlags):
         unknown = [name for name in self.methods if name.split(":")[0] not in METHODS]
         if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
             raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(self.methods)}")
-        if not 1 <= self.seeds <= MAX_T_VALUES:
-            raise ValueError(f"seeds must be 1 to {MAX_T_VALUES}, got {self.seeds}")
-        if self.reevaluate_every < 1:
-            raise ValueError(f"reevaluate_every must be at least 1, got {self.reevaluate_every}")
         names: dict[SearchCfg, str] = {}
         for name in self.methods:
             if not _NAME.fullmatch(name):

@@ -5,7 +5,7 @@ The same command goes on where it was stopped.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,12 +22,10 @@ from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, r
 from qd.search import MOST_DRAWN, begin, take_in
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, episode_seeds, origin_of, worker_status
 from qd.workers.shards import taken
-from sim.files.atomic import is_leftover, prepare_output
-from sim.files.command import Where, Who, naming_what_is_next, publish
+from sim.files.atomic import is_leftover
+from sim.files.command import Where, Who, naming_what_is_next
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from qd.scheduler import Scheduler
     from sim.robots.robot import RobotCfg
 
@@ -217,26 +215,3 @@ def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) 
         )
         rows |= {k: numbers_of(one, cfg.cells, sampled=sampled) for k, one in zip(own, again, strict=True)}
     return [rows[k] for k in range(len(active))]
-
-
-def publish_with_figure(
-    out: Path,
-    measure: Callable[[], dict[str, Any]],
-    show: Callable[[dict[str, Any]], None],
-    draw: Callable[[dict[str, Any]], "Figure"],
-) -> dict[str, Any]:
-    """Publishes a report (:func:`sim.files.command.publish`) and a figure of it, ``.png`` in place of ``.json``.
-
-    Raises:
-        ValueError: If a file cannot be written, or ``out`` has another ending: the figure would take its place.
-    """
-    from qd.show.figures import save_figure
-
-    figure = out.with_suffix(".png")
-    if out.suffix != ".json":
-        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
-    prepare_output(figure)
-    report = publish(out, measure, show)
-    save_figure(figure, draw(report))
-    print(f"written to {figure}")
-    return report
