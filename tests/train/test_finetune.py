@@ -20,7 +20,7 @@ from train import tuning
 from train.finetune import Finetune
 from train.ppo.learner import read_checkpoint
 from train.ppo.ppo import CapturedPPO
-from train.ppo.run import CommandTask, read_saved
+from train.ppo.run import CommandTask, read_saved, sizes_of
 
 ROBOT = get_robot("anymal")
 
@@ -189,10 +189,10 @@ def test_a_damaged_setting_of_the_resumed_run_is_named(damage, message, finished
     [("cassie", (600, 100, 200, 3000)), ("anymal", (1500, 500, 400, 1200)), ("mine", (1500, 500, 400, 1200))],
 )
 def test_on_a_gpu_the_sizes_are_the_papers(robot, paper):
-    sizes = tuning.sizes_of(Finetune.defaults([]), robot, on_gpu=True)
+    sizes = sizes_of(Finetune.defaults([]), tuning.paper_sizes(robot), {}, device="cuda:0")
     assert tuple(sizes[name] for name in ("num_envs", "terrains", "swap_every", "iterations")) == paper
     given = replace(Finetune.defaults([]), swap_every=7)
-    assert tuning.sizes_of(given, robot, on_gpu=True)["swap_every"] == 7
+    assert sizes_of(given, tuning.paper_sizes(robot), {}, device="cuda:0")["swap_every"] == 7
 
 
 def test_terrains_are_exchanged_when_due(places, monkeypatch, device):

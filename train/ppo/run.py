@@ -15,6 +15,7 @@ from sim.files.atomic import locked, prepare_output, read_json, to_json, write_a
 from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import problems
+from sim.robots.own import own_hash
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
 from train.evaluate.sets import TRAINED_ON
@@ -89,16 +90,39 @@ def device_of(flags: TrainingFlags) -> str:
     return device
 
 
-def check_training(flags: TrainingFlags, task: TaskCfg, ppo: PpoCfg, *, robot: RobotCfg, num_envs: int) -> None:
-    """Refuses flags and settings that nothing can be learned with.
+def sizes_of(flags: TrainingFlags, on_gpu: dict[str, int], small: dict[str, int], *, device: str) -> dict[str, int]:
+    """Sizes of a training: those of its flags; left out, those ``on_gpu``, or the ``small`` ones of the CPU."""
+    on_cuda = device.startswith("cuda")
+    sizes = on_gpu if on_cuda else small
+    if not on_cuda and flags.num_envs is None and flags.iterations is None:
+        print(
+            f"No GPU: a small training of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough to "
+            "see that it runs. A whole one takes minutes on one GPU."
+        )
+    given = {name: getattr(flags, name) for name in sizes}
+    return {**sizes, **{name: value for name, value in given.items() if value is not None}}
+
+
+def settings_of(
+    flags: TrainingFlags, robot: RobotCfg, size: dict[str, int], task: TaskCfg, ppo: PpoCfg
+) -> dict[str, Any]:
+    """The settings that every training has, checked, as plain values.
 
     Raises:
-        ValueError: Naming all that are wrong.
+        ValueError: If nothing can be learned with flags or settings, naming all that are wrong.
     """
     own = [line for line in problems(flags) if not line.startswith(("task.", "ppo."))]
-    found = [*own, *task_problems(task, robot.control_dt), *ppo_problems(ppo, num_envs)]
+    found = [*own, *task_problems(task, robot.control_dt), *ppo_problems(ppo, size["num_envs"])]
     if found:
         raise ValueError("; ".join(found))
+    return {
+        "seed": flags.seed,
+        "num_envs": size["num_envs"],
+        "iterations": size["iterations"],
+        "task": asdict(task),
+        "ppo": asdict(ppo),
+        **own_hash(robot),
+    }
 
 
 def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
