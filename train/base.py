@@ -32,13 +32,10 @@ class Train(TrainingFlags):
     """The task, with the robot's own settings."""
 
     @classmethod
-    def of_robot(cls, robot: "RobotCfg") -> dict[str, Any]:
-        """The flags that follow from a robot."""
-        return {"task": TaskCfg.of(robot), "ppo": PpoCfg.of(robot)}
-
-    @classmethod
-    def of_run(cls, settings: dict[str, Any]) -> dict[str, Any]:
-        """The flags that a run was begun with."""
+    def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
+        """The flags that follow from a robot, or that a run was begun with."""
+        if settings is None:
+            return {"task": TaskCfg.of(robot), "ppo": PpoCfg.of(robot)}
         return {name: settings[name] for name in ("seed", "num_envs", "iterations", "task", "ppo")}
 
     def execute(self) -> int:

@@ -52,13 +52,10 @@ class Finetune(TrainingFlags):
     """The learner; its layers are those of the controller."""
 
     @classmethod
-    def of_robot(cls, robot: "RobotCfg") -> dict[str, Any]:
-        """The flags that follow from a robot."""
-        return {"rewards": replace(robot.training.rewards, **_REWARDS)}
-
-    @classmethod
-    def of_run(cls, settings: dict[str, Any]) -> dict[str, Any]:
-        """The flags that a run was begun with."""
+    def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
+        """The flags that follow from a robot, or that a run was begun with."""
+        if settings is None:
+            return {"rewards": replace(robot.training.rewards, **_REWARDS)}
         same = ("seed", "num_envs", "iterations", "critic_iterations", "split_seed", "ppo")
         policy, archive, task = settings["policy"], settings.get("archive"), settings["task"]
         return {

@@ -88,9 +88,8 @@ def sides_of(runs: Sequence[str]) -> list[Side]:
     for side in sides:
         if len(side.archive) == 0:
             raise ValueError(f"the search against {side.name} has no elites: let it go on")
-        other = {key: value for key, value in side.settings.items() if key not in _MAY_DIFFER}
-        own = {key: value for key, value in first.settings.items() if key not in _MAY_DIFFER}
-        if different := differences(own, other):
+        found = differences(first.settings, side.settings)
+        if different := [line for line in found if line.split()[0] not in _MAY_DIFFER]:
             raise ValueError(f"searches laid side by side must have the same settings, but: {', '.join(different)}")
         if len(side.metrics) != len(first.metrics) or side.archive.iterations != len(side.metrics):
             raise ValueError(
@@ -135,7 +134,7 @@ def draw_beside(sides: Sequence[Side]) -> "Figure":
     archive = sides[0].archive
     names = " and ".join(side.name for side in sides)
     figure.suptitle(f"{archive.robot}: searches of {archive.iterations} iterations against {names}")
-    axes = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1))
+    axes = figure.subplots(1, 4)
     for side, (color, style) in zip(sides, LOOKS, strict=False):
         label = f"{side.name}: {len(side.archive)} elites"
         iterations = [row["iteration"] for row in side.metrics]

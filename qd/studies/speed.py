@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.run.arguments import evaluator_of
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.progress import ProgressBar
 from qd.run.settings import SearchCfg, changed, policy_spec, preset, refuse_unnamed_code
@@ -145,15 +146,8 @@ def measure(args: Speed) -> dict[str, Any]:
     else:
         cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
         metrics, terrains = [], None
-    evaluator = EvaluatorCfg(
-        robot=robot,
-        policy=policy_spec(cfg, robot),
-        num_terrains=cfg.scheduler.num_terrains,
-        num_replicas=cfg.replicas,
-        device=device,
-        space=cfg.space,
-        workers="1",  # bare physics is measured in one process too
-    )
+    # In one process, as bare physics is measured.
+    evaluator = evaluator_of(cfg, robot, policy_spec(cfg, robot), device, "1")
     if terrains is None:
         metrics, terrains = time_iterations(cfg, evaluator)
         metrics = metrics[_WARM_UP:]

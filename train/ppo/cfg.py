@@ -112,13 +112,13 @@ class TrainingFlags(OnDevice):
         named = parser.parse_known_args(argv)[0]
         robot = get_robot(named.robot)
         if named.resume is None:
-            return cls(robot=named.robot, **cls.of_robot(robot))
+            return cls(robot=named.robot, **cls.begun(robot, None))
         from train.ppo.run import CHECKPOINT, read_saved
 
         saved = read_saved(named.resume, robot.name, cls.command)
         try:
-            begun = cls.of_run(saved["extra"]["settings"])
-            flags = built(cls, {**begun, "robot": named.robot, "resume": named.resume}, "a training")
+            values = cls.begun(robot, saved["extra"]["settings"])
+            flags = built(cls, {**values, "robot": named.robot, "resume": named.resume}, "a training")
             check(flags)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
@@ -128,11 +128,6 @@ class TrainingFlags(OnDevice):
         return flags
 
     @classmethod
-    def of_robot(cls, robot: "RobotCfg") -> dict[str, Any]:
-        """The flags that follow from a robot."""
-        raise NotImplementedError
-
-    @classmethod
-    def of_run(cls, settings: dict[str, Any]) -> dict[str, Any]:
-        """The flags that a run was begun with, as JSON values, from the ``settings`` of its checkpoint."""
+    def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
+        """The flags that follow from a robot, or with the ``settings`` of a checkpoint those that it was begun with."""
         raise NotImplementedError
