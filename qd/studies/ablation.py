@@ -42,7 +42,7 @@ class Ablation(StudyFlags):
     """
 
     run: Path | None = None
-    """A run with alpha 1 whose first iterations are taken; left out, one is made too."""
+    """A run with alpha 1 whose first iterations are taken, with its preset and seed; left out, one is made too."""
     iterations: int | None = None
     """Iterations to compare; 150 of preset paper, 6 of small."""
     seed: int | None = None
