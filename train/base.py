@@ -3,20 +3,19 @@
 import os
 import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from train.ppo.cfg import PpoCfg, TrainingFlags, named_robot_and_run
+from train.ppo.cfg import PpoCfg, TrainingFlags
 from train.task.cfg import TaskCfg
 
 if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
     from train.ppo.run import Job
 
-_SMALL_ENVS, _SMALL_ITERATIONS = 32, 20
-_KINDS = {"seed": int, "num_envs": int, "iterations": int, "task": TaskCfg, "ppo": PpoCfg}
+_SMALL = {"num_envs": 32, "iterations": 20}  # on the CPU
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,25 +27,16 @@ class Train(TrainingFlags):
     for those that are given. On several GPUs: torchrun --nproc-per-node 4 -m faultline train, each with --num-envs.
     """
 
+    command: ClassVar[str] = "train"
     task: TaskCfg
     """The task, with the robot's own settings."""
 
     @classmethod
-    def defaults(cls, argv: Sequence[str]) -> Self:
-        """The settings that a command line leaves out: those of the resumed run, or of the robot.
-
-        Raises:
-            ValueError: If there is no such robot, no such run, or one whose settings cannot be read.
-        """
-        from sim.robots.robot import get_robot
-
-        name, run = named_robot_and_run(argv)
-        robot = get_robot(name)
-        if run is None:
-            return cls(robot=name, task=TaskCfg.of(robot), ppo=PpoCfg.of(robot))
-        from train.ppo.run import read_saved, settings_of
-
-        return cls(robot=name, resume=run, **settings_of(run, read_saved(run, robot.name, finetuning=False), _KINDS))
+    def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
+        """The flags that follow from a robot, or that a run was begun with."""
+        if settings is None:
+            return {"task": TaskCfg.of(robot), "ppo": PpoCfg.of(robot)}
+        return {name: settings[name] for name in ("seed", "num_envs", "iterations", "task", "ppo")}
 
     def execute(self) -> int:
         """Trains; returns the exit status: 0, or 130 after Ctrl-C.
@@ -69,38 +59,21 @@ class Train(TrainingFlags):
 
 def _job_of(flags: Train, began: float) -> "Job":
     """What the flags ask for, checked."""
-    from sim.robots.own import own_hash
     from sim.robots.robot import get_robot
     from train.ppo.learner import Ranks
-    from train.ppo.run import Job, check_resumed, check_training, device_of, prepare_run_dir, read_saved
+    from train.ppo.run import Job, check_resumed, device_of, prepare_run_dir, read_saved, settings_of, sizes_of
 
     robot, device = get_robot(flags.robot), device_of(flags)
-    on_cuda = device.startswith("cuda")
-    num_envs = flags.num_envs if flags.num_envs is not None else robot.learning.num_envs if on_cuda else _SMALL_ENVS
-    iterations = flags.iterations
-    if iterations is None:
-        iterations = robot.learning.iterations if on_cuda else _SMALL_ITERATIONS
-    check_training(flags, flags.task, flags.ppo, robot=robot, num_envs=num_envs)
-    if not on_cuda and flags.num_envs is None and flags.iterations is None:
-        print(
-            f"No GPU: a small training of {num_envs} robots and {iterations} iterations, enough to see that it runs. "
-            "A controller that walks takes minutes on one GPU."
-        )
-    settings = {
-        "seed": flags.seed,
-        "num_envs": num_envs,
-        "iterations": iterations,
-        "processes": Ranks.of_environment().size,
-        "task": asdict(flags.task),
-        "ppo": asdict(flags.ppo),
-        **own_hash(robot),
-    }
-    saved = read_saved(flags.resume, robot.name, finetuning=False) if flags.resume else None
+    on_gpu = {"num_envs": robot.learning.num_envs, "iterations": robot.learning.iterations}
+    size = sizes_of(flags, on_gpu, _SMALL, device=device)
+    settings = settings_of(flags, robot, size, flags.task, flags.ppo) | {"processes": Ranks.of_environment().size}
+    saved = read_saved(flags.resume, robot.name, flags.command) if flags.resume else None
     for change in check_resumed(flags, saved, settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     run_dir = prepare_run_dir(flags, f"{robot.name}-base")
-    print(f"Training '{robot.name}': {num_envs} robots on {device}, {iterations} iterations, in {run_dir}", flush=True)
+    words = f"{size['num_envs']} robots on {device}, {size['iterations']} iterations"
+    print(f"Training '{robot.name}': {words}, in {run_dir}", flush=True)
     return Job(
-        command="train", flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations,
-        task=flags.task, ppo=flags.ppo, settings=settings, saved=saved, run_dir=run_dir, began=began,
+        flags=flags, robot=robot, device=device, **size, task=flags.task, ppo=flags.ppo, settings=settings, saved=saved,
+        run_dir=run_dir, began=began,
     )  # fmt: skip

@@ -1,15 +1,16 @@
 """Fine-tune a controller on the terrains that broke it."""
 
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from sim.files.settings import setting
 from sim.robots.training import RewardCfg
-from train.ppo.cfg import PpoCfg, TrainingFlags, named_robot_and_run
-from train.task.cfg import TaskCfg
+from train.ppo.cfg import PpoCfg, TrainingFlags
+
+if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
 
 _REWARDS = {"termination": -200.0, "tracking_lin_vel": 2.0}  # the best of six weightings
 _PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005, final_kl=0.002)
@@ -23,6 +24,7 @@ class Finetune(TrainingFlags):
     and stops; --resume RUN_DIR goes on with the settings of that run.
     """
 
+    command: ClassVar[str] = "finetune"
     policy: Path | None = None
     """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one. The checkpoint.pt of a
     training brings its critic too."""
@@ -50,36 +52,20 @@ class Finetune(TrainingFlags):
     """The learner; its layers are those of the controller."""
 
     @classmethod
-    def defaults(cls, argv: Sequence[str]) -> Self:
-        """The settings that a command line leaves out: those of the resumed run, or of the robot.
-
-        Raises:
-            ValueError: If there is no such robot, no such run, or one whose settings cannot be read.
-        """
-        from sim.robots.robot import get_robot
-
-        name, run = named_robot_and_run(argv)
-        robot = get_robot(name)
-        if run is None:
-            return cls(robot=name, rewards=replace(robot.training.rewards, **_REWARDS))
-        from train.ppo.run import read_saved, settings_of
-        from train.task.mix import MixCfg
-
-        saved = read_saved(run, robot.name, finetuning=True)
-        sizes = dict.fromkeys(("seed", "num_envs", "iterations", "critic_iterations", "split_seed"), int)
-        begun = settings_of(run, saved, {**sizes, "policy": str, "mix": MixCfg, "task": TaskCfg, "ppo": PpoCfg})
-        archive = saved["extra"]["settings"].get("archive")
-        task, mix, policy = begun.pop("task"), begun.pop("mix"), begun.pop("policy")
-        return cls(
-            robot=name,
-            resume=run,
-            policy=None if policy == "shipped" else Path(policy),
-            archive=None if archive is None else Path(archive["path"]),
-            task="crossing" if task.crosses else "commands",
-            rewards=task.rewards,
-            **asdict(mix),
-            **begun,
-        )
+    def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
+        """The flags that follow from a robot, or that a run was begun with."""
+        if settings is None:
+            return {"rewards": replace(robot.training.rewards, **_REWARDS)}
+        same = ("seed", "num_envs", "iterations", "critic_iterations", "split_seed", "ppo")
+        policy, archive, task = settings["policy"], settings.get("archive"), settings["task"]
+        return {
+            **{name: settings[name] for name in same},
+            **settings["mix"],
+            "policy": None if policy == "shipped" else Path(policy),
+            "archive": None if archive is None else Path(archive["path"]),
+            "task": "crossing" if task["crosses"] else "commands",
+            "rewards": task["rewards"],
+        }
 
     def execute(self) -> int:
         """Fine-tunes; returns the exit status: 0, or 130 after Ctrl-C.

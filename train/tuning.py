@@ -9,7 +9,6 @@ import numpy as np
 from qd.archive import read_archive
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
-from sim.robots.own import own_hash
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
@@ -21,10 +20,11 @@ from train.ppo.run import (
     Job,
     Training,
     check_resumed,
-    check_training,
     device_of,
     prepare_run_dir,
     read_saved,
+    settings_of,
+    sizes_of,
 )
 from train.task.cfg import TaskCfg
 from train.task.mix import Mix, MixCfg
@@ -115,42 +115,38 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
     """
     robot, device = get_robot(flags.robot), device_of(flags)
-    saved = read_saved(flags.resume, robot.name, finetuning=True) if flags.resume else None
-    size = sizes_of(flags, robot.name, on_gpu=device.startswith("cuda"))
+    saved = read_saved(flags.resume, robot.name, flags.command) if flags.resume else None
+    size = sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
+    alone = flags.critic_iterations
+    alone = min(_CRITIC_ITERATIONS, size["iterations"] // 2) if alone is None else alone
     if saved is None:
         path = flags.policy or robot.policy_file
         start, before = read_start(path, robot), sorted(recorded_marks(str(path)))
         ppo = replace(flags.ppo, hidden_dims=start.hidden_dims)
-        size["critic_iterations"] = 0 if start.critic is not None else size["critic_iterations"]
+        alone = 0 if start.critic is not None else alone
     else:  # all of it is in the checkpoint: the file it began with may be gone
         start, ppo, before = None, flags.ppo, saved["extra"]["settings"].get("trained_before", [])
-    num_envs, iterations = size["num_envs"], size["iterations"]
     crosses = flags.task == "crossing"
     task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards)
-    check_training(flags, task, ppo, robot=robot, num_envs=num_envs)
+    common = settings_of(flags, robot, size, task, ppo)
     mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
-    if num_envs < mix_cfg.terrains:
-        raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {num_envs}")
+    if size["num_envs"] < mix_cfg.terrains:
+        raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
     genes, space, archive = _elites(flags, robot)
     settings = {
-        "seed": flags.seed,
-        "num_envs": num_envs,
-        "iterations": iterations,
+        **common,
         "policy": str(flags.policy or "shipped"),
         "mix": asdict(mix_cfg),
         "archive": archive,
         "split_seed": flags.split_seed,
-        "critic_iterations": size["critic_iterations"],
-        "task": asdict(task),
-        "ppo": asdict(ppo),
-        **own_hash(robot),
+        "critic_iterations": alone,
         **({"trained_before": before} if before else {}),
     }
     if saved is not None:
         _refuse_changes(flags, saved, settings)
     return TuningJob(
-        command="finetune", flags=flags, robot=robot, device=device, num_envs=num_envs, iterations=iterations,
-        task=task, ppo=ppo, settings=settings, saved=saved, began=began,
+        flags=flags, robot=robot, device=device, num_envs=size["num_envs"], iterations=size["iterations"], task=task,
+        ppo=ppo, settings=settings, saved=saved, began=began,
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
         start=start, mix=Mix(cfg=mix_cfg, genes=genes, space=space, crosses=crosses, seed=flags.seed, device=device),
     )  # fmt: skip
@@ -166,17 +162,9 @@ def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
     return f"Rewards: {given} (the robot's own: {', '.join(f'{usual[name]:g}' for name in other)})"
 
 
-def sizes_of(flags: Finetune, robot: str, *, on_gpu: bool) -> dict[str, int]:
-    """Sizes of the training, with those left out as the device can do."""
-    sizes = _PAPER.get(robot, _PAPER_OTHERS) if on_gpu else _SMALL
-    if not on_gpu and flags.num_envs is None and flags.iterations is None:
-        print(
-            f"No GPU: a small fine-tuning of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough "
-            "to see that it runs. The paper's takes minutes on one GPU."
-        )
-    given = {name: getattr(flags, name) for name in (*sizes, "critic_iterations")}
-    found = {**sizes, **{name: value for name, value in given.items() if value is not None}}
-    return {"critic_iterations": min(_CRITIC_ITERATIONS, found["iterations"] // 2), **found}
+def paper_sizes(robot: str) -> dict[str, int]:
+    """Sizes of the paper's fine-tuning; of a robot that it does not have, those of its ANYmal."""
+    return _PAPER.get(robot, _PAPER_OTHERS)
 
 
 def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace, dict[str, Any] | None]:

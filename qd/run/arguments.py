@@ -130,12 +130,15 @@ def job_of(args: Archive) -> Job:
         FileNotFoundError: If there is no run to resume.
         ValueError: If robot, preset, device, controller, space, a setting or the run directory is not as it must be.
     """
+    from sim.robots.robot import get_robot, robot_of
     from sim.space import get_space
 
     if args.resume and args.run_dir:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
     there = RunDirectory(args.resume).read_cfg() if args.resume else None
-    robot = _robot_of(args, there)
+    robot = (
+        robot_of(there.robot, args.robot, args.resume) if there and args.resume else get_robot(args.robot or "anymal")
+    )
     device = resolve_device(args.device, args.workers)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
     if args.without is not None:
@@ -171,14 +174,6 @@ def job_of(args: Archive) -> Job:
 def own_file(robot: "RobotCfg") -> dict[str, Any]:
     """For the origin of a run: where the settings of a robot that is not shipped were."""
     return {} if robot.settings_file is None else {"robot_file": str(robot.settings_file)}
-
-
-def _robot_of(args: Archive, there: SearchCfg | None) -> "RobotCfg":
-    from sim.robots.robot import get_robot, robot_of
-
-    if args.resume and there:
-        return robot_of(there.robot, args.robot, args.resume)
-    return get_robot(args.robot or "anymal")
 
 
 def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | None) -> str:

@@ -75,7 +75,7 @@ def share_bar(what: str) -> Iterator[Callable[[float], None]]:
         yield move_to
 
 
-class ProgressBar:
+class ProgressBar(tqdm):
     """A bar over iterations that moves within them; closes on leaving its context.
 
     Args:
@@ -84,19 +84,11 @@ class ProgressBar:
     """
 
     def __init__(self, iterations: int, done: int) -> None:
-        self._iterations, self._first, self._at = iterations, done, float(done)
-        self._bar = tqdm(
+        self._iterations, self._first = iterations, done
+        super().__init__(
             total=iterations, initial=done, file=sys.stderr, dynamic_ncols=True, mininterval=0.5, bar_format=_FORMAT
         )
         self._describe(done, "compiling and evaluating")
-
-    def __enter__(self) -> "ProgressBar":
-        """Nothing to do: the bar is there from the start."""
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Leaves the bar as it stands."""
-        self._bar.close()
 
     def within(self, iteration: int, part: int = 0, parts: int = 1) -> Callable[[float], None]:
         """A function that moves the bar to a share of an iteration, counted from 1, or of one of its equal parts."""
@@ -112,7 +104,7 @@ class ProgressBar:
         self._move_to(row["iteration"])
         if row["iteration"] == self._first + 1:
             left = (self._iterations - row["iteration"]) * row["wall_s"]
-            self._bar.write(f"First iteration: {row['wall_s']:.1f} s; about {clock(left)} to go.", file=sys.stderr)
+            self.write(f"First iteration: {row['wall_s']:.1f} s; about {clock(left)} to go.", file=sys.stderr)
         invalid = row["invalid_episodes"] / row["episodes"]
         why = reason_words(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
         self._describe(
@@ -124,8 +116,7 @@ class ProgressBar:
         )
 
     def _describe(self, done: int, state: str) -> None:
-        self._bar.set_description_str(f"iteration {min(done + 1, self._iterations)}/{self._iterations}: {state}")
+        self.set_description_str(f"iteration {min(done + 1, self._iterations)}/{self._iterations}: {state}")
 
     def _move_to(self, position: float) -> None:
-        self._bar.update(position - self._at)
-        self._at = position
+        self.update(position - self.n)

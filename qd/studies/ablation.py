@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.run.directory import RUNS, Metrics, RunDirectory
+from qd.fresh import FRESH_EPISODES, Open
+from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import (
     SearchCfg,
     as_settings,
@@ -18,12 +19,13 @@ from qd.run.settings import (
     refuse_unnamed_code,
     resumed,
 )
-from sim.files.command import Where, Who
+from qd.studies.study import LOOKS, StudyFlags, run_study, study_of
+from qd.workers.evaluator import open_evaluator, resolve_device
+from sim.files.command import publish
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from qd.fresh import Open
     from sim.robots.robot import RobotCfg
 
 _ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
@@ -31,7 +33,7 @@ _DEFAULTS = {"paper": (150, 50), "small": (6, 2)}  # iterations, and how often e
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ablation(Who, Where):
+class Ablation(StudyFlags):
     """Search with and without the standard deviations in the fitness, and see how repeatable the elites are.
 
     Every so many iterations up to 200 elites of each search are drawn and cross 40 fresh episodes; the mean of their
@@ -40,19 +42,13 @@ class Ablation(Who, Where):
     """
 
     run: Path | None = None
-    """A run with alpha 1 whose first iterations are taken; left out, one is made too."""
-    preset: str | None = None
-    """Size of the searches: paper or small; that of --run, or what the device can do."""
+    """A run with alpha 1 whose first iterations are taken, with its preset and seed; left out, one is made too."""
     iterations: int | None = None
     """Iterations to compare; 150 of preset paper, 6 of small."""
     seed: int | None = None
     """Seed of the searches; that of --run, or 0."""
-    run_dir: Path | None = None
-    """The study's folder, new or to go on with; runs/<robot>-ablation."""
-    out: Path | None = None
-    """Where to write the numbers, with a figure beside them; ablation.json in that folder."""
 
-    def execute(self, *, open_evaluator: "Open | None" = None) -> dict[str, Any]:
+    def execute(self, *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
         """Runs the searches that are not done and publishes what they show.
 
         Args:
@@ -64,36 +60,34 @@ class Ablation(Who, Where):
             Interrupted: On Ctrl-C; all iterations that ended are saved.
             EvaluatorError: If a worker is lost; likewise.
         """
-        from qd.studies.study import Study, publish_with_figure, run_study
-        from qd.workers.evaluator import open_evaluator as opened
-        from qd.workers.evaluator import resolve_device
+        from qd.show.figures import as_png
         from sim.robots.robot import get_robot, robot_of
 
-        device = resolve_device(self.device, self.workers)
+        device, moved, names = resolve_device(self.device, self.workers), None, list(_ALPHAS)
         if self.run is None:
             robot = get_robot(self.robot or "anymal")
+            base = self._begun(robot, device)
         else:
-            robot = robot_of(RunDirectory(self.run).read_cfg().robot, self.robot, self.run)
-        path = self.run_dir or RUNS / f"{robot.name}-ablation"
-        base = self._begun(robot, device) if self.run is None else self._of_run(self.run, robot)
+            there = RunDirectory(self.run).read_cfg()
+            robot = robot_of(there.robot, self.robot, self.run)
+            moved = moved_policy(there, self.policy)
+            base, names = self._of_run(self.run, there, robot, moved), ["alpha_0"]
         if base.iterations < base.reevaluate_every:
             raise ValueError(
                 f"no iteration up to {base.iterations} at which elites cross fresh episodes, which is every "
                 f"{base.reevaluate_every}: give at least {base.reevaluate_every} --iterations"
             )
-        names = _ALPHAS if self.run is None else ("alpha_0",)
         runs = {name: changed(base, {"alpha": _ALPHAS[name]}) for name in names}
-        moved = None if self.run is None else moved_policy(base, self.policy)
-        study = Study.of(path, runs, robot, device=device, workers=self.workers, sampled=True, moved=moved)
+        study = study_of(self, "ablation", runs, robot, device, sampled=True, moved=moved)
 
         def measure() -> dict[str, Any]:
-            metrics = run_study(study, open_evaluator or opened)
+            metrics = run_study(study, open_evaluator)
             if self.run is not None:
                 metrics["alpha_1"] = RunDirectory(self.run).read_metrics()
             numbers = numbers_of(metrics, base.iterations)
             return {**study.origin, "robot": robot.name, "preset": base.preset, **numbers}
 
-        return publish_with_figure(self.out or path / "ablation.json", measure, _show, draw_ablation)
+        return publish(study.out, measure, _show, draw=lambda report: as_png(draw_ablation(report)))
 
     def _begun(self, robot: "RobotCfg", device: str) -> SearchCfg:
         """Settings of searches from the start."""
@@ -103,32 +97,20 @@ class Ablation(Who, Where):
         asked = {"iterations": self.iterations or iterations, "seed": self.seed, "policy": self.policy}
         return measured_now(changed(cfg, {**asked, "reevaluate_every": every}), robot)
 
-    def _of_run(self, path: Path, robot: "RobotCfg") -> SearchCfg:
+    def _of_run(self, path: Path, there: SearchCfg, robot: "RobotCfg", moved: str | None) -> SearchCfg:
         """Settings of a run with alpha 1.
 
         Raises:
             ValueError: If it is another run than the one asked for, its elites never crossed fresh episodes, or its
                 robot or controller has changed since.
         """
-        cfg = RunDirectory(path).read_cfg()
-        moved = moved_policy(cfg, self.policy)
-        wrong = [
-            f"{name} {there}, got {wanted}"
-            for name, there, wanted in (
-                ("preset", cfg.preset, self.preset or cfg.preset),
-                ("seed", cfg.seed, cfg.seed if self.seed is None else self.seed),
-                ("policy", cfg.policy, cfg.policy if moved else self.policy or cfg.policy),
-                ("alpha 1; it has", cfg.fitness.alpha, 1.0),
-            )
-            if there != wanted
-        ]
-        if wrong:
-            raise ValueError(f"{path} is a run of {'; '.join(wrong)}: leave that out, or give another --run")
-        if cfg.reevaluate_every == 0:
+        if there.reevaluate_every == 0:
             raise ValueError(f"{path} has no fresh episodes of its elites (reevaluate_every 0): give another --run")
-        refuse_unnamed_code(cfg.policy, self.policy, path)
-        now = resumed(path, cfg, robot, {"iterations": self.iterations or _DEFAULTS[cfg.preset][0]}, moved)
-        refuse_changes(path, "run", as_settings(cfg), as_settings(now))
+        refuse_unnamed_code(there.policy, self.policy, path)
+        asked = {"preset": self.preset, "seed": self.seed, "policy": self.policy, "alpha": _ALPHAS["alpha_1"]}
+        iterations = self.iterations or _DEFAULTS[there.preset][0]
+        now = resumed(path, there, robot, {**asked, "iterations": iterations}, moved)
+        refuse_changes(path, "run", as_settings(there), as_settings(now))
         return now
 
 
@@ -171,32 +153,28 @@ def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
 
 
 def _show(report: dict[str, Any]) -> None:
-    from qd.fresh import FRESH_EPISODES
-
     print(f"\nmean STD of elites over {FRESH_EPISODES} fresh episodes, 95 % interval over elites")
     for k, iteration in enumerate(report["iterations"]):
         cells = []
-        for name, label in (("alpha_1", "alpha 1"), ("alpha_0", "alpha 0")):
+        for name in _ALPHAS:
             low, high = report["intervals"][name][k]
-            cells.append(f"{label}: {report['mean_std'][name][k]:.2f} ({low:.2f}-{high:.2f})")
+            cells.append(f"{name.replace('_', ' ')}: {report['mean_std'][name][k]:.2f} ({low:.2f}-{high:.2f})")
         print(f"  iteration {iteration}: {', '.join(cells)}")
 
 
 def draw_ablation(report: dict[str, Any]) -> "Figure":
     """Mean STD over the iterations with its intervals, and the number of elites (the paper's ablation figure)."""
-    from qd.fresh import FRESH_EPISODES
     from qd.show.figures import new_figure
-    from qd.studies.study import LOOKS
 
     figure = new_figure(8.5, 3.6)
     figure.suptitle(f"{report['robot']}: the standard deviations in the fitness (alpha 1) and left out (alpha 0)")
     left, right = figure.subplots(1, 2)
-    for (name, label), (color, style) in zip((("alpha_1", "alpha 1"), ("alpha_0", "alpha 0")), LOOKS, strict=False):
+    for name, (color, style) in zip(_ALPHAS, LOOKS, strict=False):
         means, limits = np.array(report["mean_std"][name]), np.array(report["intervals"][name])
         lengths = np.maximum([means - limits[:, 0], limits[:, 1] - means], 0.0)
-        marks = {"color": color, "linestyle": style, "marker": "o", "markersize": 4}
-        left.errorbar(report["iterations"], means, lengths, capsize=3, label=label, **marks)
-        right.plot(report["iterations"], report["elites"][name], label=label, **marks)
+        marks = {"color": color, "linestyle": style, "marker": "o", "markersize": 4, "label": name.replace("_", " ")}
+        left.errorbar(report["iterations"], means, lengths, capsize=3, **marks)
+        right.plot(report["iterations"], report["elites"][name], **marks)
     left.set_ylabel(f"mean STD of elites\n({FRESH_EPISODES} fresh episodes)")
     right.set_ylabel("elites")
     for axes in (left, right):

@@ -12,6 +12,7 @@ from qd.archive import Archive, read_archive
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import as_settings, differences
+from sim.files.command import publish
 from sim.files.intervals import bootstrap_interval
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class Beside:
             FileNotFoundError: If there is no run.
             ValueError: If runs cannot be compared, or a file cannot be written.
         """
-        from qd.studies.study import publish_with_figure
+        from qd.show.figures import as_png
         from sim.files.provenance import provenance
 
         sides = sides_of(self.runs)
@@ -53,7 +54,7 @@ class Beside:
             "iterations": sides[0].archive.iterations,
             "runs": {side.name: numbers_of(side) for side in sides},
         }
-        return publish_with_figure(self.out, lambda: report, _show, lambda _: draw_beside(sides))
+        return publish(self.out, lambda: report, _show, draw=lambda _: as_png(draw_beside(sides)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +88,8 @@ def sides_of(runs: Sequence[str]) -> list[Side]:
     for side in sides:
         if len(side.archive) == 0:
             raise ValueError(f"the search against {side.name} has no elites: let it go on")
-        other = {key: value for key, value in side.settings.items() if key not in _MAY_DIFFER}
-        own = {key: value for key, value in first.settings.items() if key not in _MAY_DIFFER}
-        if different := differences(own, other):
+        found = differences(first.settings, side.settings)
+        if different := [line for line in found if line.split()[0] not in _MAY_DIFFER]:
             raise ValueError(f"searches laid side by side must have the same settings, but: {', '.join(different)}")
         if len(side.metrics) != len(first.metrics) or side.archive.iterations != len(side.metrics):
             raise ValueError(
@@ -134,7 +134,7 @@ def draw_beside(sides: Sequence[Side]) -> "Figure":
     archive = sides[0].archive
     names = " and ".join(side.name for side in sides)
     figure.suptitle(f"{archive.robot}: searches of {archive.iterations} iterations against {names}")
-    axes = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1))
+    axes = figure.subplots(1, 4)
     for side, (color, style) in zip(sides, LOOKS, strict=False):
         label = f"{side.name}: {len(side.archive)} elites"
         iterations = [row["iteration"] for row in side.metrics]

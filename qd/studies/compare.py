@@ -4,21 +4,22 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from qd.fitness import FITNESS_FLOOR
-from qd.run.directory import RUNS, Metrics
+from qd.fresh import Open
+from qd.run.directory import Metrics
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
-from sim.files.command import Where, Who
-from sim.files.intervals import MAX_T_VALUES, t_interval
+from qd.studies.study import StudyFlags, run_study, study_of
+from qd.workers.evaluator import open_evaluator, resolve_device
+from sim.files.command import publish
+from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
+from sim.files.settings import check, setting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from qd.fresh import Open
 
 METHODS: dict[str, dict[str, Any]] = {
     "uniform_random": {"method": "uniform_random"},
@@ -60,33 +61,27 @@ _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called,
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(Who, Where):
+class Compare(StudyFlags):
     """Compare ways to search on the same number of terrains, several seeds each, all in lock-step.
 
     Every search is an ordinary run in its own folder METHOD-SEED. State is saved after every iteration: stop with
     Ctrl-C whenever you like, and the same command goes on.
     """
 
-    preset: str | None = None
-    """Size of an iteration: paper (a GPU's work) or small; by default what the device can do."""
     methods: tuple[str, ...] = tuple(METHODS)
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
     size .5), mixed (cma_mae+map_elites); all. Settings of the search after a colon make another one of it:
     cma_mae:restart-rule=20,learning-rate=0.3."""
-    seeds: int = 3
+    seeds: int = setting(3, least=1, most=MAX_T_VALUES)
     """Runs of each method, with seeds from --seed on."""
     seed: int = 0
     """The first seed."""
     iterations: int = 33
     """Iterations of every run; more than before extend a comparison that is there."""
-    reevaluate_every: int = 11
+    reevaluate_every: int = setting(11, least=1)
     """Every so many iterations, and at the end, all elites cross 40 fresh episodes."""
-    run_dir: Path | None = None
-    """The comparison's folder, new or to go on with; runs/<robot>-compare."""
-    out: Path | None = None
-    """Where to write the numbers, with a figure beside them; compare.json in that folder."""
 
-    def execute(self, *, open_evaluator: "Open | None" = None) -> dict[str, Any]:
+    def execute(self, *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
         """Runs the searches that are not done and publishes the comparison.
 
         Args:
@@ -97,11 +92,10 @@ class Compare(Who, Where):
             Interrupted: On Ctrl-C; all iterations that ended are saved.
             EvaluatorError: If a worker is lost; likewise.
         """
-        from qd.studies.study import Study, publish_with_figure, run_study
-        from qd.workers.evaluator import open_evaluator as opened
-        from qd.workers.evaluator import resolve_device
+        from qd.show.figures import as_png
         from sim.robots.robot import get_robot
 
+        check(self)
         robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device, self.workers)
         size = self.preset or ("paper" if device.startswith("cuda") else "small")
         asked = {name: getattr(self, name) for name in ("seed", "iterations", "reevaluate_every", "policy")}
@@ -109,11 +103,10 @@ class Compare(Who, Where):
         methods = self._methods(shared)
         seeds = range(self.seed, self.seed + self.seeds)
         runs = {f"{name}-{seed}": replace(cfg, seed=seed) for name, cfg in methods.items() for seed in seeds}
-        path = self.run_dir or RUNS / f"{robot.name}-compare"
-        study = Study.of(path, runs, robot, device=device, workers=self.workers, sampled=False)
+        study = study_of(self, "compare", runs, robot, device, sampled=False)
 
         def measure() -> dict[str, Any]:
-            found = run_study(study, open_evaluator or opened)
+            found = run_study(study, open_evaluator)
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds] for name in methods}
             return {
                 **study.origin,
@@ -125,7 +118,7 @@ class Compare(Who, Where):
                 **report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()}),
             }
 
-        return publish_with_figure(self.out or path / "compare.json", measure, _show, draw_comparison)
+        return publish(study.out, measure, _show, draw=lambda report: as_png(draw_comparison(report)))
 
     def _methods(self, shared: SearchCfg) -> dict[str, SearchCfg]:
         """Settings of each method: different searches on the same number of terrains.
@@ -136,10 +129,6 @@ class Compare(Who, Where):
         unknown = [name for name in self.methods if name.split(":")[0] not in METHODS]
         if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
             raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(self.methods)}")
-        if not 1 <= self.seeds <= MAX_T_VALUES:
-            raise ValueError(f"seeds must be 1 to {MAX_T_VALUES}, got {self.seeds}")
-        if self.reevaluate_every < 1:
-            raise ValueError(f"reevaluate_every must be at least 1, got {self.reevaluate_every}")
         names: dict[SearchCfg, str] = {}
         for name in self.methods:
             if not _NAME.fullmatch(name):
@@ -272,7 +261,4 @@ def _show(report: dict[str, Any]) -> None:
     print(f"\ncorrected QD score after {report['corrected_at'][-1]:,} terrains, 95 % interval over seeds")
     for name, method in report["methods"].items():
         last = method["corrected_qd_score"][-1]
-        words = "none" if last["mean"] is None else f"{last['mean']:.0f}"
-        if last["interval"]:
-            words += " ({:.0f} to {:.0f})".format(*last["interval"])
-        print(f"  {name}: {words}")
+        print(f"  {name}: {value_words(last['mean'], last['interval'], '.0f')}")

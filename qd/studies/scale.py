@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from qd.run.arguments import evaluator_of
 from qd.run.settings import preset
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device, worker_status
 from sim.files.command import OfRobot, OnDevice, publish, show_json
@@ -78,18 +79,9 @@ def measure(args: Scale) -> dict[str, Any]:
     device = resolve_device(args.device)
     on_gpu = device.startswith("cuda")
     search = preset(args.preset or ("paper" if on_gpu else "small"), robot)
-    policy = str(robot.policy_file)
     terrains, replicas = args.terrains or (256 if on_gpu else 4), args.replicas or (16 if on_gpu else 4)
-    alone = EvaluatorCfg(
-        robot=robot,
-        policy=policy,
-        num_terrains=terrains,
-        num_replicas=replicas,
-        device=device,
-        workers="1",
-        space=search.space,
-    )
-    shared = replace(alone, num_terrains=search.scheduler.num_terrains, num_replicas=search.replicas)
+    shared = evaluator_of(search, robot, str(robot.policy_file), device, "1")
+    alone = replace(shared, num_terrains=terrains, num_replicas=replicas)
     alone_s, shared_alone_s = (time_evaluation(cfg, args.rounds, args.seed) for cfg in (alone, shared))
     one = terrains * replicas / alone_s
     print(f"without Ray: {one:,.1f} episodes/s; {shared_alone_s:.2f} s an iteration of {search.preset}", flush=True)

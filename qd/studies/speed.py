@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.run.arguments import evaluator_of
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.progress import ProgressBar
 from qd.run.settings import SearchCfg, changed, policy_spec, preset, refuse_unnamed_code
 from qd.search import begin, search_terrains
-from qd.workers.evaluator import Evaluate, EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
+from qd.workers.evaluator import EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
 from sim.files.atomic import read_json
 from sim.files.command import OfRobot, OnDevice, publish, show_json
 from sim.files.provenance import provenance
@@ -54,29 +55,21 @@ class Speed(OfRobot, OnDevice):
         publish(self.out, lambda: measure(self), show_json)
 
 
-class _Recorder:
-    """Evaluates, and remembers the terrains of the last evaluation."""
-
-    def __init__(self, evaluate: Evaluate) -> None:
-        self._evaluate = evaluate
-        self.terrains: NDArray[Any] = np.zeros((0, 0))
-
-    def __call__(self, terrains: NDArray, seeds: NDArray, progress: Any = None) -> Any:
-        self.terrains = terrains
-        return self._evaluate(terrains, seeds, progress)
-
-
 def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, NDArray[Any]]:
     """Runs a search from the start; its metrics rows, and the terrains of its last iteration."""
-    search, metrics = begin(cfg), list[dict[str, Any]]()
+    search, metrics, crossed = begin(cfg), list[dict[str, Any]](), list[NDArray[Any]]()
     with (
         tempfile.TemporaryDirectory() as folder,
         open_evaluator(evaluator) as evaluate,
         ProgressBar(cfg.iterations, 0) as bar,
     ):
-        recorder = _Recorder(evaluate)
-        search_terrains(cfg, RunDirectory(Path(folder)), search, metrics, recorder, bar)
-    return metrics, recorder.terrains
+
+        def remembering(terrains: NDArray, seeds: NDArray, progress: Any = None) -> Any:
+            crossed[:] = [terrains]
+            return evaluate(terrains, seeds, progress)
+
+        search_terrains(cfg, RunDirectory(Path(folder)), search, metrics, remembering, bar)
+    return metrics, crossed[0]
 
 
 def read_iterations(folder: Path, count: int, device_name: str) -> tuple[SearchCfg, Metrics, NDArray[Any]]:
@@ -153,15 +146,8 @@ def measure(args: Speed) -> dict[str, Any]:
     else:
         cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
         metrics, terrains = [], None
-    evaluator = EvaluatorCfg(
-        robot=robot,
-        policy=policy_spec(cfg, robot),
-        num_terrains=cfg.scheduler.num_terrains,
-        num_replicas=cfg.replicas,
-        device=device,
-        space=cfg.space,
-        workers="1",  # bare physics is measured in one process too
-    )
+    # In one process, as bare physics is measured.
+    evaluator = evaluator_of(cfg, robot, policy_spec(cfg, robot), device, "1")
     if terrains is None:
         metrics, terrains = time_iterations(cfg, evaluator)
         metrics = metrics[_WARM_UP:]

@@ -5,7 +5,7 @@ The same command goes on where it was stopped.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,19 +14,30 @@ from typing import TYPE_CHECKING, Any
 from qd.archive import Archive
 from qd.fresh import Open, drawn_elites, numbers_of, reevaluate
 from qd.run.arguments import evaluator_of, own_file
-from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, origin_in, write_results
+from qd.run.directory import CONFIG_FILE, RUNS, Metrics, RunDirectory, archive_of, claimed, origin_in, write_results
 from qd.run.progress import ProgressBar
 from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, refuse_changes
 from qd.search import MOST_DRAWN, begin, crossed_iterations, looks_again, row_of
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, origin_of, worker_status
-from sim.files.atomic import is_leftover, prepare_output
-from sim.files.command import naming_what_is_next, publish
+from sim.files.atomic import is_leftover
+from sim.files.command import Where, Who, naming_what_is_next
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from qd.scheduler import Scheduler
     from sim.robots.robot import RobotCfg
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyFlags(Who, Where):
+    """The flags of every study."""
+
+    preset: str | None = None
+    """Size of the searches: paper (a GPU's work) or small; left out, what the device can do."""
+    run_dir: Path | None = None
+    """The study's folder, new or to go on with; runs/<robot>-<the command's name>."""
+    out: Path | None = None
+    """Where to write the numbers, with a figure beside them; <the command's name>.json in that folder."""
+
 
 LOOKS = (("#0072b2", "-"), ("#d55e00", "--"), ("#009e73", "-."), ("#cc79a7", ":"))
 """Colour and line of each search in a figure."""
@@ -38,6 +49,8 @@ class Study:
 
     path: Path
     """The study's folder."""
+    out: Path
+    """File of the numbers; the figure goes beside it."""
     runs: dict[str, SearchCfg]
     """Settings of each search, by the name of its folder."""
     evaluator: EvaluatorCfg
@@ -47,41 +60,42 @@ class Study:
     sampled: bool
     """Whether up to 200 drawn elites cross fresh episodes every so many iterations; else all do, and at the end too."""
 
-    @classmethod
-    def of(
-        cls,
-        path: Path,
-        runs: dict[str, SearchCfg],
-        robot: "RobotCfg",
-        *,
-        device: str,
-        workers: str | None,
-        sampled: bool,
-        moved: str | None = None,
-    ) -> "Study":
-        """A study whose controller was tried.
 
-        Args:
-            path: Its folder.
-            runs: Settings of each search, by the name of its folder.
-            robot: The robot.
-            device: Warp device name.
-            workers: Who crosses terrains, as on a command line.
-            sampled: As of the field.
-            moved: Where the controller is, if not where the settings say.
+def study_of(
+    flags: StudyFlags,
+    name: str,
+    runs: dict[str, SearchCfg],
+    robot: "RobotCfg",
+    device: str,
+    *,
+    sampled: bool,
+    moved: str | None = None,
+) -> Study:
+    """A study whose controller was tried.
 
-        Raises:
-            ValueError: If the controller cannot be loaded or does not fit the robot.
-        """
-        cfg = next(iter(runs.values()))
-        controller = moved or policy_spec(cfg, robot)
-        return cls(
-            path=path,
-            runs=runs,
-            evaluator=evaluator_of(cfg, robot, controller, device, workers, runs=len(runs)),
-            origin={**origin_of(device, cfg.seed, workers), **own_file(robot)},
-            sampled=sampled,
-        )
+    Args:
+        flags: Where to work and write.
+        name: What the study is called: compare or ablation.
+        runs: Settings of each search, by the name of its folder.
+        robot: The robot.
+        device: Warp device name.
+        sampled: As of the field.
+        moved: Where the controller is, if not where the settings say.
+
+    Raises:
+        ValueError: If the controller cannot be loaded or does not fit the robot.
+    """
+    cfg = next(iter(runs.values()))
+    path = flags.run_dir or RUNS / f"{robot.name}-{name}"
+    controller = moved or policy_spec(cfg, robot)
+    return Study(
+        path=path,
+        out=flags.out or path / f"{name}.json",
+        runs=runs,
+        evaluator=evaluator_of(cfg, robot, controller, device, flags.workers, runs=len(runs)),
+        origin={**origin_of(device, cfg.seed, flags.workers), **own_file(robot)},
+        sampled=sampled,
+    )
 
 
 @dataclass(kw_only=True)
@@ -202,26 +216,3 @@ def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) 
         )
         rows |= {k: numbers_of(one, cfg.cells, sampled=sampled) for k, one in zip(own, again, strict=True)}
     return [rows[k] for k in range(len(active))]
-
-
-def publish_with_figure(
-    out: Path,
-    measure: Callable[[], dict[str, Any]],
-    show: Callable[[dict[str, Any]], None],
-    draw: Callable[[dict[str, Any]], "Figure"],
-) -> dict[str, Any]:
-    """Publishes a report (:func:`sim.files.command.publish`) and a figure of it, ``.png`` in place of ``.json``.
-
-    Raises:
-        ValueError: If a file cannot be written, or ``out`` has another ending: the figure would take its place.
-    """
-    from qd.show.figures import save_figure
-
-    figure = out.with_suffix(".png")
-    if out.suffix != ".json":
-        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
-    prepare_output(figure)
-    report = publish(out, measure, show)
-    save_figure(figure, draw(report))
-    print(f"written to {figure}")
-    return report

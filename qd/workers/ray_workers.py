@@ -40,7 +40,7 @@ _ROOMS = ("kernels", "sim", "qd")
 _WATCH = "watch"
 _POLL_S = 0.25
 _GROW_EVERY_S = 2.0
-_GATHER_S = 60.0  # how long the others are waited for once one worker is there
+_GATHER_S = 60.0  # how long the others are waited for where one worker is there
 _PATIENCE_S = 300.0  # how long the evaluation waits when no worker is there
 _HANG_S = 1800.0  # a busy worker without progress for so long is restarted; building and compiling take minutes
 _MOST_TRIES = 5  # of which three may be bad luck
@@ -218,10 +218,14 @@ class RayWorkers:
             ValueError: If the simulation cannot be built as asked for.
             EvaluatorError: If no worker comes, or none that can be used.
         """
-        self._gather(1, _PATIENCE_S)
+        began = time.monotonic()
+        while len(self._ready) < max(1, len(self._workers)):
+            self._start_missing()
+            self._wait()
+            if time.monotonic() - began > (_GATHER_S if self._ready else _PATIENCE_S):
+                break
         if not self._ready:
             raise self._nobody_came()
-        self._gather(self._wanted, _GATHER_S)
         first = self._ready[0]
         try:
             ray.get(first.actor.prepare.options(max_task_retries=_MOST_TRIES - 1).remote(self._shard_size()))
@@ -296,14 +300,6 @@ class RayWorkers:
     def _shard_size(self) -> int:
         """Terrains of a shard: an equal part of those that are crossed at once."""
         return max(-(-self._cfg.num_terrains // self._wanted), -(-MIN_ROWS // self._cfg.num_replicas))
-
-    def _gather(self, count: int, limit_s: float) -> None:
-        """Waits for so many workers, or so long."""
-        end = time.monotonic() + limit_s
-        self._start_missing()
-        while len(self._ready) < min(count, len(self._workers)) and time.monotonic() < end:
-            self._wait()
-            self._start_missing()
 
     def _start_missing(self) -> None:
         """Starts workers for the devices that have none; one whose worker could not be used gets no other."""

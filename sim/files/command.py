@@ -223,20 +223,35 @@ def chosen_elites(text: str, count: int, whose: object) -> list[int]:
 
 
 def publish(
-    out: Path | None, measure: Callable[[], dict[str, Any]], show: Callable[[dict[str, Any]], None]
+    out: Path | None,
+    measure: Callable[[], dict[str, Any]],
+    show: Callable[[dict[str, Any]], None],
+    *,
+    draw: Callable[[dict[str, Any]], bytes] | None = None,
 ) -> dict[str, Any]:
     """Measures, shows and writes a report, which is returned; where to write is tried before the work.
 
+    Args:
+        out: File of the report; it is shown alone if left out.
+        measure: Makes the report.
+        show: Prints it.
+        draw: Makes a PNG of it, which is written beside it, ``.png`` in place of ``.json``.
+
     Raises:
-        ValueError: If the file cannot be written to.
+        ValueError: If a file cannot be written to, or ``out`` has another ending: the figure would take its place.
     """
-    if out is not None:
-        prepare_output(out)
+    makers: dict[Path, Callable[[dict[str, Any]], bytes]] = {} if out is None else {out: to_json}
+    if out is not None and draw is not None:
+        if out.suffix != ".json":
+            raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
+        makers[out.with_suffix(".png")] = draw
+    for file in makers:
+        prepare_output(file)
     report = measure()
     show(report)
-    if out is not None:
-        write_atomically(out, to_json(report))
-        print(f"written to {out}")
+    for file, make in makers.items():
+        write_atomically(file, make(report))
+        print(f"written to {file}")
     return report
 
 

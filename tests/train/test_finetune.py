@@ -20,7 +20,7 @@ from train import tuning
 from train.finetune import Finetune
 from train.ppo.learner import read_checkpoint
 from train.ppo.ppo import CapturedPPO
-from train.ppo.run import CommandTask, read_saved
+from train.ppo.run import CommandTask, read_saved, sizes_of
 
 ROBOT = get_robot("anymal")
 
@@ -168,9 +168,9 @@ def test_it_says_which_rewards_weigh_otherwise_than_the_robots_own(places, capsy
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        ({"num_envs": "x"}, "num_envs must be of type int, got 'x'"),
-        ({"iterations": 2.5}, "iterations must be of type int, got 2.5"),
-        ({"seed": True}, "seed must be of type int, got True"),
+        ({"num_envs": "x"}, "num_envs must be a whole number or None, got 'x'"),
+        ({"iterations": 2.5}, "iterations must be a whole number or None, got 2.5"),
+        ({"seed": True}, "seed must be a whole number, got True"),
         ({"mix": {"draw": 3}}, "draw must be"),
         ({"mix": {"terrains": -1}}, "terrains must be at least 1"),
         ({"ppo": {"gamma": "all"}}, "gamma must be"),
@@ -189,10 +189,10 @@ def test_a_damaged_setting_of_the_resumed_run_is_named(damage, message, finished
     [("cassie", (600, 100, 200, 3000)), ("anymal", (1500, 500, 400, 1200)), ("mine", (1500, 500, 400, 1200))],
 )
 def test_on_a_gpu_the_sizes_are_the_papers(robot, paper):
-    sizes = tuning.sizes_of(Finetune.defaults([]), robot, on_gpu=True)
+    sizes = sizes_of(Finetune.defaults([]), tuning.paper_sizes(robot), {}, device="cuda:0")
     assert tuple(sizes[name] for name in ("num_envs", "terrains", "swap_every", "iterations")) == paper
     given = replace(Finetune.defaults([]), swap_every=7)
-    assert tuning.sizes_of(given, robot, on_gpu=True)["swap_every"] == 7
+    assert sizes_of(given, tuning.paper_sizes(robot), {}, device="cuda:0")["swap_every"] == 7
 
 
 def test_terrains_are_exchanged_when_due(places, monkeypatch, device):
@@ -253,7 +253,7 @@ def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
     with pytest.raises(ValueError, match=r"training of a base controller.*go on with .*train --robot anymal --resume"):
         finetune(resumed(run, iterations=4))
     with pytest.raises(ValueError, match=r"is a fine-tuning: go on with .*finetune --robot anymal --resume"):
-        read_saved(finished, "anymal", finetuning=False)
+        read_saved(finished, "anymal", "train")
 
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):

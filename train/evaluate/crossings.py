@@ -5,24 +5,23 @@ numbers depend on: controller, terrains, seeds, episodes, kind of device, code a
 date, whichever command asks for it.
 """
 
-import dataclasses
 import hashlib
 import io
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from kernels.episode import Outcome
+from qd.fresh import Open
 from qd.workers.evaluator import Evaluate, EvaluatorCfg
 from qd.workers.invalid import tell_invalid
+from qd.workers.shards import flaw_of
 from sim.files.atomic import check_zip, write_atomically
 from sim.files.provenance import code_fingerprint
 from sim.policy.spec import controller_hash
@@ -32,20 +31,16 @@ from sim.rollout import RolloutResult
 from train.evaluate.measures import terrain_rates
 from train.evaluate.sets import TerrainSet
 
-Open = Callable[[EvaluatorCfg], AbstractContextManager[Evaluate]]
-"""Opens what crosses terrains."""
-
 _MOST_ENVS = 16_384  # at once, so that any number of terrains fits a GPU
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
 _ROOMS = ("kernels", "sim")
-_ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_position", "reward")
-_SETTINGS = ("penalty_names", "physics_steps", "robot_steps", "busy_steps", "wall_s")
+_FIELDS = tuple(field.name for field in fields(RolloutResult))
 
 
 def take_terrains(result: RolloutResult, places: np.ndarray) -> RolloutResult:
     """Crossings of some of the terrains, shape (num_places,) of integers, in the order given."""
-    arrays = {name: getattr(result, name) for name in _ARRAYS}
-    return dataclasses.replace(result, **{name: array[places] for name, array in arrays.items() if array is not None})
+    values = {name: getattr(result, name) for name in _FIELDS}
+    return replace(result, **{name: value[places] for name, value in values.items() if isinstance(value, np.ndarray)})
 
 
 class KeptCrossings:
@@ -79,18 +74,17 @@ class KeptCrossings:
         try:
             check_zip(file)
             with np.load(file, allow_pickle=False) as content:
-                arrays = {name: content[name] for name in _ARRAYS}
-                names, *steps, wall_s = (content[name] for name in _SETTINGS)
-            self._check(arrays, len(terrains), len(names))
+                found: dict[str, Any] = {name: content[name] for name in _FIELDS}
+            found["penalty_names"] = tuple(found["penalty_names"].tolist())
+            numbers = {name: value.item() for name, value in found.items() if isinstance(value, np.ndarray) and not value.ndim}
+            result = RolloutResult(**found | numbers)
+            # Bits that flipped before they were written have no checksum.
+            if flaw := flaw_of(result, len(terrains), self._episodes):
+                raise ValueError(flaw)
+            return result
         except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
             print(f"{file} is damaged ({' '.join(str(error).split())}): its terrains are crossed again", flush=True)
             return None
-        return RolloutResult(
-            **arrays,
-            **dict(zip(_SETTINGS[1:-1], map(int, steps), strict=True)),
-            penalty_names=tuple(names.tolist()),
-            wall_s=float(wall_s),
-        )
 
     def write(self, policy: str, terrains: TerrainSet, result: RolloutResult) -> None:
         """Keep crossings.
@@ -100,20 +94,9 @@ class KeptCrossings:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         buffer = io.BytesIO()
-        content: dict[str, Any] = {name: np.asarray(getattr(result, name)) for name in (*_ARRAYS, *_SETTINGS)}
+        content: dict[str, Any] = {name: np.asarray(getattr(result, name)) for name in _FIELDS}
         np.savez_compressed(buffer, **content)
         write_atomically(self.file(policy, terrains), buffer.getvalue())
-
-    def _check(self, arrays: dict[str, np.ndarray], num_terrains: int, num_penalties: int) -> None:
-        """That arrays are such as a rollout gives; bits that flipped before they were written have no checksum."""
-        shape = (num_terrains, self._episodes)
-        widths = {"penalties": (num_penalties,), "final_position": (3,)}
-        for name, array in arrays.items():
-            if array.shape != (*shape, *widths.get(name, ())):
-                raise ValueError(f"{name} of shape {array.shape} for {shape[0]} terrains of {shape[1]} episodes")
-        valid = arrays["outcome"] != Outcome.INVALID
-        if not all(np.isfinite(arrays[name][valid]).all() for name in ("penalties", "reward")):
-            raise ValueError("valid episodes with numbers that are not finite")
 
 
 def cross_all(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
+from qd.fresh import Open
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import Where, Who, naming_what_is_next, publish, split_words
@@ -17,8 +18,7 @@ from sim.policy.spec import ControllerSpec, controller_hash, controllers_of, who
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
-    from train.evaluate.crossings import Open
-    from train.evaluate.sets import EliteSplit, TerrainSet
+    from train.evaluate.sets import EliteSplit
 
 _FULL = (300, 20)  # terrains a set and episodes a terrain of the published rates; tables take the paper's terrains
 _SMALL = (24, 4)  # on a machine without a GPU
@@ -122,68 +122,7 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     return publish(out, measure, print_rates)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Plan:
-    """Tables that can be made: everything a user may have got wrong has been checked."""
-
-    robot: "RobotCfg"
-    evaluator: EvaluatorCfg
-    """All but the controller."""
-    scales: tuple[float, ...]
-    controllers: dict[str, str]
-    sets: "dict[str, TerrainSet]"
-    archive: dict[str, Any]
-    """What the tables say of the archive, as JSON values."""
-    kept: Path
-    """Folder of crossings."""
-    out: Path
-    """File of the numbers."""
-
-
-def _plan_of(flags: Evaluate) -> _Plan:
-    from sim.robots.robot import get_robot
-    from train.evaluate.sets import FROM_ARCHIVE, SETS, check_held_out, make_sets, split_elites
-    from train.evaluate.tables import check_seeds
-
-    if flags.policy is not None:
-        raise ValueError(f"tables are of named controllers: give --policies NAME={flags.policy} instead of --policy")
-    robot = get_robot(flags.robot)
-    evaluator = replace(evaluator_of(flags, robot), reward=True)
-    controllers = controllers_of(flags.policies, robot)
-    archive = None if flags.archive is None else read_archive(flags.archive)
-    split = None if archive is None else split_elites(archive, robot.name, flags.split_seed)
-    names = split_words(flags.sets) or [name for name in SETS if archive is not None or name not in FROM_ARCHIVE]
-    run_dir = flags.run_dir or Path("runs") / f"{robot.name}-tables"
-    kept, out = run_dir / "crossings", flags.out or run_dir / "tables.json"
-    if out.suffix != ".json":
-        raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
-    for file in (out, out.with_suffix(".png"), kept / "any"):
-        prepare_output(file)
-    scales = robot.read_penalty_scales()
-    for policy in controllers.values():
-        check_policy(policy, robot, evaluator.device)
-    check_seeds(controllers)
-    sets = make_sets(names, evaluator.num_terrains, flags.seed, archive=archive, split=split)
-    for name in FROM_ARCHIVE:
-        if name in sets:
-            check_held_out(controllers, sets[name].terrains, flags.split_seed)
-    return _Plan(
-        robot=robot, evaluator=evaluator, scales=scales, controllers=controllers, sets=sets,
-        archive=_about(flags, archive, split), kept=kept, out=out,
-    )  # fmt: skip
-
-
-def _about(flags: Evaluate, archive: Archive | None, split: "EliteSplit | None") -> dict[str, Any]:
-    """Where the generated terrains come from."""
-    if flags.archive is None or archive is None or split is None:
-        return {"archive": None, "archive_sha256": None}
-    parts = {"train": len(split.train), "test": len(split.test), "split_seed": flags.split_seed}
-    about = {"path": str(flags.archive), "elites": len(archive), "iterations": archive.iterations, **parts}
-    file = flags.archive / ARCHIVE_FILE if flags.archive.is_dir() else flags.archive
-    return {"archive": about, "archive_sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
-
-
-def evaluate_tables(flags: Evaluate, *, open_evaluator: "Open" = open_evaluator) -> dict[str, Any]:
+def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
     """Cross every set with every controller, print the tables, write them and their figure; returns their content.
 
     Args:
@@ -195,28 +134,56 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: "Open" = open_evaluator)
         FileNotFoundError: If there is no archive; likewise.
         EvaluatorError: If a worker is lost; what was crossed is kept.
     """
+    from sim.robots.robot import get_robot
     from train.evaluate.crossings import cross_all
     from train.evaluate.measures import measure
-    from train.evaluate.show import print_tables, write_figure
-    from train.evaluate.tables import make_tables
+    from train.evaluate.sets import FROM_ARCHIVE, SETS, check_held_out, make_sets, split_elites
+    from train.evaluate.show import picture_of, print_tables
+    from train.evaluate.tables import check_seeds, make_tables
 
-    plan = _plan_of(flags)
+    if flags.policy is not None:
+        raise ValueError(f"tables are of named controllers: give --policies NAME={flags.policy} instead of --policy")
+    robot = get_robot(flags.robot)
+    evaluator = replace(evaluator_of(flags, robot), reward=True)
+    controllers = controllers_of(flags.policies, robot)
+    archive = None if flags.archive is None else read_archive(flags.archive)
+    split = None if archive is None else split_elites(archive, robot.name, flags.split_seed)
+    names = split_words(flags.sets) or [name for name in SETS if archive is not None or name not in FROM_ARCHIVE]
+    run_dir = flags.run_dir or Path("runs") / f"{robot.name}-tables"
+    kept = run_dir / "crossings"
+    prepare_output(kept / "any")
+    scales = robot.read_penalty_scales()
+    for policy in controllers.values():
+        check_policy(policy, robot, evaluator.device)
+    check_seeds(controllers)
+    sets = make_sets(names, evaluator.num_terrains, flags.seed, archive=archive, split=split)
+    for name in FROM_ARCHIVE:
+        if name in sets:
+            check_held_out(controllers, sets[name].terrains, flags.split_seed)
+    about = _about(flags, archive, split)  # before the long work: the file may be another afterwards
 
     def tables() -> dict[str, Any]:
-        results = cross_all(plan.controllers, plan.sets, plan.evaluator, plan.kept, open_evaluator=open_evaluator)
-        crossed = {name: {who: measure(one, plan.scales) for who, one in row.items()} for name, row in results.items()}
-        about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in plan.controllers.items()}
+        results = cross_all(controllers, sets, evaluator, kept, open_evaluator=open_evaluator)
+        crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
         return {
-            **origin_of(plan.evaluator.device, flags.seed, flags.workers),
-            "robot": plan.robot.name,
-            "episodes": plan.evaluator.num_replicas,
-            "controllers": about,
-            **plan.archive,
-            **make_tables(crossed, plan.sets, plan.robot, flags.seed),
+            **origin_of(evaluator.device, flags.seed, flags.workers),
+            "robot": robot.name,
+            "episodes": evaluator.num_replicas,
+            "controllers": {
+                who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()
+            },
+            **about,
+            **make_tables(crossed, sets, robot, flags.seed),
         }
 
-    report = publish(plan.out, tables, print_tables)
-    figure = plan.out.with_suffix(".png")
-    write_figure(figure, report)
-    print(f"figure written to {figure}")
-    return report
+    return publish(flags.out or run_dir / "tables.json", tables, print_tables, draw=picture_of)
+
+
+def _about(flags: Evaluate, archive: Archive | None, split: "EliteSplit | None") -> dict[str, Any]:
+    """Where the generated terrains come from."""
+    if flags.archive is None or archive is None or split is None:
+        return {"archive": None, "archive_sha256": None}
+    parts = {"train": len(split.train), "test": len(split.test), "split_seed": flags.split_seed}
+    about = {"path": str(flags.archive), "elites": len(archive), "iterations": archive.iterations, **parts}
+    file = flags.archive / ARCHIVE_FILE if flags.archive.is_dir() else flags.archive
+    return {"archive": about, "archive_sha256": hashlib.sha256(file.read_bytes()).hexdigest()}

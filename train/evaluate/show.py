@@ -2,12 +2,10 @@
 
 import io
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim.files.atomic import write_atomically
 from sim.files.intervals import value_words
 from sim.policy.spec import firsts, kind_of
 from train.evaluate.measures import invalid_lines
@@ -145,11 +143,11 @@ def _print_over_seeds(found: dict[str, Any]) -> None:
             print(f"  {name}, {kind}: " + ", ".join(words))
 
 
-def write_figure(path: Path, report: dict[str, Any]) -> None:
-    """Draws the tables, as ``tables.json`` has them, and writes them as PNG, atomically."""
+def picture_of(report: dict[str, Any]) -> bytes:
+    """The tables, as ``tables.json`` has them, as PNG."""
     buffer = io.BytesIO()
     draw_tables(report).savefig(buffer, format="png", dpi=150)
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def draw_tables(report: dict[str, Any]) -> "Figure":

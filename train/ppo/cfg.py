@@ -4,10 +4,10 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from sim.files.command import OnDevice
-from sim.files.settings import problems, setting
+from sim.files.settings import built, check, problems, setting
 from sim.robots.training import PaceCfg
 
 if TYPE_CHECKING:
@@ -72,6 +72,8 @@ def ppo_problems(cfg: PpoCfg, num_envs: int) -> list[str]:
 class TrainingFlags(OnDevice):
     """The flags of every training; a run that is resumed has its own settings as defaults."""
 
+    command: ClassVar[str]
+    """The word that calls it: train or finetune."""
     robot: str = _ROBOT
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
     num_envs: int | None = setting(None, least=1)
@@ -95,11 +97,37 @@ class TrainingFlags(OnDevice):
     """Progress rows over the whole training."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
 
+    @classmethod
+    def defaults(cls, argv: Sequence[str]) -> Self:
+        """The settings that a command line leaves out: those of the run that it resumes, or of the robot that it names.
 
-def named_robot_and_run(flags: Sequence[str]) -> tuple[str, Path | None]:
-    """The robot and the run to resume that a command line names: the defaults of all other flags follow from them."""
-    named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    named.add_argument("--robot", default=_ROBOT)
-    named.add_argument("--resume", type=Path)
-    known = named.parse_known_args(flags)[0]
-    return known.robot, known.resume
+        Raises:
+            ValueError: If there is no such robot, no such run, or one whose settings cannot be read.
+        """
+        from sim.robots.robot import get_robot
+
+        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        parser.add_argument("--robot", default=_ROBOT)
+        parser.add_argument("--resume", type=Path)
+        named = parser.parse_known_args(argv)[0]
+        robot = get_robot(named.robot)
+        if named.resume is None:
+            return cls(robot=named.robot, **cls.begun(robot, None))
+        from train.ppo.run import CHECKPOINT, read_saved
+
+        saved = read_saved(named.resume, robot.name, cls.command)
+        try:
+            values = cls.begun(robot, saved["extra"]["settings"])
+            flags = built(cls, {**values, "robot": named.robot, "resume": named.resume}, "a training")
+            check(flags)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{named.resume / CHECKPOINT} is damaged, or of another version: {error}; put a copy of it back, or "
+                "begin a new run"
+            ) from None
+        return flags
+
+    @classmethod
+    def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
+        """The flags that follow from a robot, or with the ``settings`` of a checkpoint those that it was begun with."""
+        raise NotImplementedError

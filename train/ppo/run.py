@@ -4,7 +4,7 @@ import io
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ from qd.run.settings import differences
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import command_line
 from sim.files.provenance import provenance
-from sim.files.settings import built, problems
+from sim.files.settings import problems
+from sim.robots.own import own_hash
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
 from train.evaluate.sets import TRAINED_ON
@@ -57,8 +58,6 @@ class StopRequest:
 class Job:
     """A training that can begin: everything that a user may have got wrong has been checked."""
 
-    command: str
-    """The word that calls it: train or finetune."""
     flags: TrainingFlags
     robot: RobotCfg
     device: str
@@ -91,16 +90,39 @@ def device_of(flags: TrainingFlags) -> str:
     return device
 
 
-def check_training(flags: TrainingFlags, task: TaskCfg, ppo: PpoCfg, *, robot: RobotCfg, num_envs: int) -> None:
-    """Refuses flags and settings that nothing can be learned with.
+def sizes_of(flags: TrainingFlags, on_gpu: dict[str, int], small: dict[str, int], *, device: str) -> dict[str, int]:
+    """Sizes of a training: those of its flags; left out, those ``on_gpu``, or the ``small`` ones of the CPU."""
+    on_cuda = device.startswith("cuda")
+    sizes = on_gpu if on_cuda else small
+    if not on_cuda and flags.num_envs is None and flags.iterations is None:
+        print(
+            f"No GPU: a small training of {sizes['num_envs']} robots and {sizes['iterations']} iterations, enough to "
+            "see that it runs. A whole one takes minutes on one GPU."
+        )
+    given = {name: getattr(flags, name) for name in sizes}
+    return {**sizes, **{name: value for name, value in given.items() if value is not None}}
+
+
+def settings_of(
+    flags: TrainingFlags, robot: RobotCfg, size: dict[str, int], task: TaskCfg, ppo: PpoCfg
+) -> dict[str, Any]:
+    """The settings that every training has, checked, as plain values.
 
     Raises:
-        ValueError: Naming all that are wrong.
+        ValueError: If nothing can be learned with flags or settings, naming all that are wrong.
     """
     own = [line for line in problems(flags) if not line.startswith(("task.", "ppo."))]
-    found = [*own, *task_problems(task, robot.control_dt), *ppo_problems(ppo, num_envs)]
+    found = [*own, *task_problems(task, robot.control_dt), *ppo_problems(ppo, size["num_envs"])]
     if found:
         raise ValueError("; ".join(found))
+    return {
+        "seed": flags.seed,
+        "num_envs": size["num_envs"],
+        "iterations": size["iterations"],
+        "task": asdict(task),
+        "ppo": asdict(ppo),
+        **own_hash(robot),
+    }
 
 
 def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
@@ -130,55 +152,29 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
 # Going on with a run ---------------------------------------------------------------------------------------------
 
 
-def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
-    """The checkpoint of a run of this robot, with the progress it had made: a fine-tuning, or the training of a base.
+def read_saved(run: Path, robot: str, command: str) -> dict[str, Any]:
+    """The checkpoint of a run of this robot, with the progress it had made.
+
+    Args:
+        run: Its directory.
+        robot: Name of the robot.
+        command: What goes on with it: train or finetune.
 
     Raises:
-        ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is of the other kind.
+        ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is the run of the other command.
     """
     path = run / CHECKPOINT
     saved = read_checkpoint(path, robot)
     extra = saved["extra"]
     check_entries(extra, STATE, path)
-    found = "mix" in extra or "mix" in extra["settings"]
-    if found and not finetuning:
-        raise ValueError(f"{run} is a fine-tuning: go on with {command_line('finetune', robot=robot, resume=run)}")
-    if finetuning and not found:
-        raise ValueError(
-            f"{run} is the training of a base controller, not a fine-tuning: go on with "
-            f"{command_line('train', robot=robot, resume=run)}, or fine-tune what it made with --policy {path}"
-        )
-    if finetuning:
+    made_by = "finetune" if "mix" in extra or "mix" in extra["settings"] else "train"
+    if made_by != command:
+        kind = "a fine-tuning" if made_by == "finetune" else "the training of a base controller, not a fine-tuning"
+        other = f", or fine-tune what it made with --policy {path}" if command == "finetune" else ""
+        raise ValueError(f"{run} is {kind}: go on with {command_line(made_by, robot=robot, resume=run)}{other}")
+    if command == "finetune":
         check_entries(extra, {"mix": (dict,)}, path)
     return saved
-
-
-def settings_of(run: Path, saved: dict[str, Any], kinds: dict[str, type]) -> dict[str, Any]:
-    """The settings that a run was begun with.
-
-    Args:
-        run: Its directory.
-        saved: Its checkpoint.
-        kinds: Type of each setting asked for; settings classes are built.
-
-    Raises:
-        ValueError: If one is missing or damaged.
-    """
-    settings, found = saved["extra"]["settings"], {}
-    for name, kind in kinds.items():
-        try:
-            if is_dataclass(kind):
-                found[name] = built(kind, settings[name], name)
-            elif type(settings[name]) is not kind:
-                raise ValueError(f"{name} must be of type {kind.__name__}, got {settings[name]!r}")
-            else:
-                found[name] = settings[name]
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{run / CHECKPOINT} is damaged, or of another version: {error}; put a copy of it back, or begin a new "
-                "run"
-            ) from None
-    return found
 
 
 def check_resumed(flags: TrainingFlags, saved: dict[str, Any], settings: dict[str, Any]) -> list[str]:
@@ -294,7 +290,7 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
         OSError: If a file cannot be written.
     """
     run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
-    go_on = f"Go on with: {command_line(job.command, robot=job.robot.spec, resume=run_dir)}"
+    go_on = f"Go on with: {command_line(job.flags.command, robot=job.robot.spec, resume=run_dir)}"
     busy = f"another training works in {run_dir}: let it end, or name another --run-dir"
     with StopRequest() as stop, locked(run_dir, busy):
         training = begin()

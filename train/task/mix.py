@@ -1,7 +1,7 @@
 """Which terrains a controller is fine-tuned on: half of one kind and half of another, exchanged every so often."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,6 @@ from sim.terrain import (
 )
 from train.task.curriculum import Tiles
 
-MIXES = ("generated", "hard-random", "hand-crafted")
-"""What a controller is fine-tuned on, the paper's C-G, C-HR and C-HC: hand-crafted terrains and, but for the last, half
-of the kind that it is named after."""
-DRAWS = ("uniform", "failing")
-
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
 _LEAST_WEIGHT = 0.1  # of a terrain that is always crossed, beside 1 more for one that never is
 
@@ -34,13 +29,14 @@ _LEAST_WEIGHT = 0.1  # of a terrain that is always crossed, beside 1 more for on
 class MixCfg:
     """The terrains of a fine-tuning."""
 
-    mix: str = setting("generated", one_of=MIXES)
-    """generated (hand-crafted terrains and elites in equal shares), hard-random (likewise) or hand-crafted alone."""
+    mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
+    """What a controller is fine-tuned on, the paper's C-G, C-HR and C-HC: hand-crafted terrains and, but for the last,
+    half of the kind that it is named after."""
     terrains: int = setting(500, least=1)
     """Terrains trained on at a time."""
     swap_every: int = setting(400, least=1)
     """They are exchanged for others every so many iterations."""
-    draw: str = setting("uniform", one_of=DRAWS)
+    draw: Literal["uniform", "failing"] = "uniform"
     """How elites are drawn: uniform, or failing: the likelier, the less often they were crossed the last time."""
 
     def __post_init__(self) -> None:

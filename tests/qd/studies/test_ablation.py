@@ -91,9 +91,9 @@ def test_stopped_the_same_command_goes_on(finished, tmp_path):
     ("changes", "message"),
     [
         ({"run": "{folder}/nowhere"}, "no run at"),
-        ({"run": "{folder}/both/alpha_0"}, "alpha 1; it has 0.0, got 1.0"),
+        ({"run": "{folder}/both/alpha_0"}, "fitness.alpha (0.0 there, 1.0 wanted)"),
         ({"run": "{folder}/both/alpha_1", "robot": "cassie"}, "is of anymal, got --robot cassie"),
-        ({"run": "{folder}/both/alpha_1", "preset": "paper"}, "preset small, got paper"),
+        ({"run": "{folder}/both/alpha_1", "preset": "paper"}, 'preset ("small" there, "paper" wanted)'),
         ({"preset": "huge"}, "unknown preset 'huge'"),
         ({"out": Path("numbers.png")}, "out must be a file named *.json"),
         ({"iterations": 1}, "no iteration up to 1 at which elites"),

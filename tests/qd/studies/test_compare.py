@@ -37,7 +37,7 @@ ASKED = {
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self: stand_in.SCALES)
-    monkeypatch.setattr("qd.show.figures.save_figure", lambda path, figure: path.write_bytes(b"a figure"))
+    monkeypatch.setattr("qd.show.figures.as_png", lambda figure: b"a figure")
     monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
 
 
@@ -253,8 +253,8 @@ def test_numbers_go_where_they_are_asked_for():
         ),
         ({"methods": ("mixed", "mixed")}, "each once, got mixed, mixed"),
         ({"methods": ()}, "methods must be some of"),
-        ({"seeds": 0}, "seeds must be 1 to 10, got 0"),
-        ({"seeds": 11}, "seeds must be 1 to 10, got 11"),
+        ({"seeds": 0}, "seeds must be at least 1 and at most 10, got 0"),
+        ({"seeds": 11}, "seeds must be at least 1 and at most 10, got 11"),
         ({"iterations": 0}, "iterations must be at least 1, got 0"),
         ({"reevaluate_every": 0}, "reevaluate_every must be at least 1, got 0"),
         ({"seed": -1}, "seed must be at least 0, got -1"),

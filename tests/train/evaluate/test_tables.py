@@ -11,7 +11,7 @@ from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 from train.evaluate.measures import measure
 from train.evaluate.publish import published
 from train.evaluate.sets import plain_set
-from train.evaluate.show import draw_tables, print_tables, write_figure
+from train.evaluate.show import draw_tables, picture_of, print_tables
 from train.evaluate.tables import KINDS, check_seeds, difference, differences, make_tables, over_seeds, split_by_goal
 
 SEED = 0
@@ -99,7 +99,7 @@ def test_the_terminal_shows_everything(report, capsys):
     assert "C-G on generated: 4 of 12 episodes are invalid (33.3%) and left out; counted as failures, success" in said
 
 
-def test_the_figure_shows_the_tables(report, tmp_path):
+def test_the_figure_shows_the_tables(report):
     figure = draw_tables(report)
     success, goal, reward, changes = figure.axes
     assert "%" in success.get_ylabel() and "%" in goal.get_ylabel() and "20 s" in reward.get_ylabel()
@@ -111,8 +111,7 @@ def test_the_figure_shows_the_tables(report, tmp_path):
     diamonds = next(line for line in success.lines if line.get_marker() == "D")
     np.testing.assert_allclose(diamonds.get_ydata(), [98.0, 91.4])
     assert len({points.get_color() for points in reward.lines}) >= 2
-    write_figure(tmp_path / "tables.png", report)
-    assert (tmp_path / "tables.png").read_bytes().startswith(b"\x89PNG")
+    assert picture_of(report).startswith(b"\x89PNG")
 
 
 def test_one_controller_alone_can_be_shown(report, anymal, capsys):
