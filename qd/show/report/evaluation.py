@@ -1,12 +1,12 @@
 """The page's chapters about an evaluation: the tables, and the same terrain before and after fine-tuning."""
 
+from pathlib import Path
 from typing import Any
 
 from qd.show.crossed import ARRIVED, FAILED, Crossed
 from qd.show.crossing_figures import draw_maps
-from qd.show.report.figures import draw_tables
 from qd.show.report.material import Shown
-from qd.show.report.page import Absent, Block, Heading, Section, Table, Text, counted, percent, picture
+from qd.show.report.page import Absent, Block, Heading, Picture, Section, Table, Text, counted, percent, picture
 from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, Change, Changes, by_kind
 from sim.files.command import plain_command
 
@@ -30,11 +30,17 @@ def tables_section(shown: Shown) -> Section:
     section.blocks += [
         Text(_told(tables, kinds)),
         *([Text(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
-        picture("tables", draw_tables(kinds), "Success, goal rate and reward of every controller on every set"),
+        *_drawn(shown.material.tables_file.with_suffix(".png")),
         *(_measure_table(kinds, measure) for measure in MEASURES),
         *_changes_tables(tables),
     ]
     return section
+
+
+def _drawn(figure: Path) -> list[Block]:
+    """The figure that the evaluation drew beside its tables, if it is there."""
+    shows = "Success, goal rate and reward of every controller on every set, and what became of terrains"
+    return [Picture("tables.png", figure.read_bytes(), shows)] if figure.exists() else []
 
 
 def _from_first(tables: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -9,7 +9,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from qd.show.report.evaluation import fates, most_mended
-from qd.show.report.figures import draw_tables
 from qd.show.report.tables import by_kind, changes_of, read_tables
 from sim.files.atomic import to_json
 from sim.robots.robot import get_robot
@@ -53,6 +52,7 @@ def tables(run):
         about[who] = {"policy": str(policy), "sha256": hashlib.sha256(who.encode()).hexdigest()}
     archive = {"path": str(run), "elites": 20, "iterations": 4}
     file = run.parent / "tables.json"
+    file.with_suffix(".png").write_bytes(DOT)
     file.write_bytes(to_json({"robot": "anymal", "episodes": 4, "controllers": about, "archive": archive, **made}))
     return file
 
@@ -83,7 +83,7 @@ def test_tables_and_the_same_terrain_before_and_after(reported, tables):
         f"elite {number} with {who}" for who in ("base", "C-G") for number in (7, 5, 9)
     ]
     assert (out.parent / "report-figures" / "change-7.png").exists()
-    assert (out.parent / "report-figures" / "tables.png").exists()
+    assert (out.parent / "report-figures" / "tables.png").read_bytes() == DOT
 
 
 def test_published_tables_are_taken_by_themselves(reported, tables):
@@ -159,10 +159,6 @@ def test_of_several_trainings_the_mean_over_their_seeds_is_shown():
     assert kinds["goal"]["near"] == {"base": 0.5, "C-G (2 seeds)": 0.7, "C-R@1": None}
     assert kinds["intervals"]["goal"]["near"] == {"base": [0.4, 0.6], "C-G (2 seeds)": None, "C-R@1": None}
     assert list(kinds["controllers"]) == ["base", "C-G (2 seeds)", "C-R@1"]
-    points = [line for line in draw_tables(kinds).axes[1].lines if line.get_marker() in ("s", "^")]
-    assert [np.array(line.get_ydata()).tolist() for line in points] == [[70.0], []]
-    del tables["over_seeds"]  # as tables were before
-    assert by_kind(tables)["goal"]["near"]["C-G (2 seeds)"] is None
 
 
 @pytest.mark.parametrize(
@@ -197,9 +193,10 @@ def test_without_what_they_need_terrains_before_and_after_are_left_out(reported,
         ({"goal": {}}, "its goal"),
         ({"goal": {"generated": {"base": "x", "C-G": 1.0}}}, "its goal"),
         ({"goal": {"generated": {"base": 1.0}}}, "its goal"),
-        ({"goal": {"<b>": {"base": 1.0}}}, "its goal"),
-        ({"over_seeds": {"goal": {"generated": {"C-G": 1.0}}}}, "its means over seeds"),
-        ({"over_seeds": {"goal": {"generated": {"C-G": {"mean": "<b>", "interval": None}}}}}, "its means over seeds"),
+        ({"goal": {"<b>": {"base": 1.0, "C-G": 1.0}}}, "its goal"),
+        ({"intervals": {}}, "its intervals"),
+        ({"over_seeds": {"goal": {"generated": {"C-G": 1.0}}}}, "its over_seeds"),
+        ({"over_seeds": {"goal": {"generated": {"C-G": {"mean": "<b>", "interval": None}}}}}, "its over_seeds"),
     ],
 )
 def test_tables_that_are_none_are_refused(reported, run, tables, changes, message):
