@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from qd.run.directory import RUNS
 from qd.show.elites import robot_named
-from qd.show.figures import PENALTY_UNITS, save_figure
+from qd.show.figures import look_of, save_figure
 from qd.workers.evaluator import check_policy, origin_of, resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OnDevice, Who, split_words
@@ -178,7 +178,7 @@ def numbers_of(result: "RolloutResult") -> dict[str, Any]:
         "outcomes": {o.name.lower(): int((result.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT},
         "duration_s": float(result.duration_s[0, valid].mean()) if valid.any() else None,
         "penalties": {
-            name: {"mean": float(column.mean()), "std": float(column.std()), "unit": PENALTY_UNITS.get(name, "")}
+            name: {"mean": float(column.mean()), "std": float(column.std()), "unit": look_of(name).unit}
             for name, column in zip(result.penalty_names, values.T, strict=True)
             if len(column)
         },

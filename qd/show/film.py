@@ -198,10 +198,10 @@ def _film(order: Order, cfg: Film) -> None:
     replicas = recording.replicas.tolist()
     if cfg.replica is not None and cfg.replica not in replicas:
         raise ValueError(f"episode {cfg.replica} was not recorded, expected one of {', '.join(map(str, replicas))}")
-    typical = typical_episode(recording, 0, order.scales)
+    typical = typical_episode(recording, order.scales)
     episode = typical if cfg.replica is None else replicas.index(cfg.replica)
     ghosts = tuple(k for k in range(len(replicas)) if k != episode)[: cfg.ghosts]
-    shot = Shot(recording=recording, terrain=0, episode=episode, ghosts=ghosts, scales=order.scales)
+    shot = Shot(recording=recording, episode=episode, ghosts=ghosts, scales=order.scales)
     cameras = follow(shot, _DISTANCE * robot.default_base_height)
     heights = recording.heights[0]
     total = num_pictures(shot, cfg.fps)

@@ -3,7 +3,7 @@
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
 from qd.show.crossing_figures import draw_crossing, draw_maps
 from qd.show.elites import Elites
-from qd.show.figures import PENALTY_UNITS, label_of
+from qd.show.figures import label_of, look_of
 from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
 from qd.show.report.modes import MAX_MODES, TOLERANCE, Mode
@@ -182,7 +182,7 @@ def _penalty_table(shown: Shown, crossed: Crossed) -> Table:
     total = max(float(scaled.mean(axis=0).sum()), 1e-12)
     rows = [
         [
-            label_of(name) + (f" [{PENALTY_UNITS[name]}]" if name in PENALTY_UNITS else ""),
+            label_of(name) + (f" [{look_of(name).unit}]" if look_of(name).unit else ""),
             f"{raw.mean():.2f}",
             f"{raw.std():.2f}",
             f"{own.mean():.2f}",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qd.show.elites import Elites
-from qd.show.figures import PENALTY_LABELS, label_of, look_of, new_figure
+from qd.show.figures import label_of, look_of, new_figure
 from qd.show.report.modes import TOLERANCE, Modes
 
 if TYPE_CHECKING:
@@ -58,9 +58,9 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
         if row == count - 2:
-            axes.set_xlabel(PENALTY_LABELS.get(elites.penalties[column], elites.penalties[column]), fontsize=9)
+            axes.set_xlabel(look_of(elites.penalties[column]).label, fontsize=9)
         if column == 0:
-            axes.set_ylabel(PENALTY_LABELS.get(elites.penalties[row + 1], elites.penalties[row + 1]), fontsize=9)
+            axes.set_ylabel(look_of(elites.penalties[row + 1]).label, fontsize=9)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     place: dict[str, Any] = (
         {"loc": "upper right"} if count > 3 else {"loc": "outside lower center", "ncols": len(labels)}
@@ -89,9 +89,7 @@ def draw_modes(elites: Elites, modes: Modes) -> "Figure":
     start = np.zeros(len(places))
     for column, penalty in enumerate(elites.penalties):
         shares = 100.0 * np.array([mode.ratios[column] for mode in modes.modes])
-        colour, hatch = look_of(penalty)
-        style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5, "label": label_of(penalty)}
-        left.barh(places, shares, left=start, **style)
+        left.barh(places, shares, left=start, label=label_of(penalty), **look_of(penalty).bar)
         start += shares
     for shift, (name, label, colour, marker) in zip((-0.22, 0.0, 0.22), _ENDS, strict=True):
         rates = [100.0 * getattr(mode, name) for mode in modes.modes]
