@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome
-from qd.show.crossed import ARRIVED, ENDINGS, crossed_of
+from qd.show.crossed import ARRIVED, crossed_of, ending_of
 from qd.show.figures import label_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
@@ -28,7 +27,6 @@ _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 _DPI = 100
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # apart for every kind of colour blindness
 _FUTURE = 0.25  # how much is left to see of what has not happened yet
-_OUTCOMES = {Outcome.INVALID: "invalid", **{outcome: ending.words for outcome, ending in ENDINGS.items()}}
 
 Image = NDArray[np.uint8]
 
@@ -79,7 +77,7 @@ def caption(shot: Shot) -> tuple[str, str]:
     recording, k = shot.recording, shot.episode
     first = (
         f"{recording.robot} on {recording.labels[0]}: episode {recording.replicas[k]}, "
-        f"{_OUTCOMES[Outcome(recording.outcome[0, k])]} after {recording.duration_s[0, k]:.1f} s"
+        f"{ending_of(recording.outcome[0, k]).words} after {recording.duration_s[0, k]:.1f} s"
     )
     crossed = crossed_of(recording, (), ())
     shown = {"base collision": "base collision", "goal": ARRIVED, "fallen": "fallen"}

@@ -19,6 +19,7 @@ MAX_MODES = 7
 TOLERANCE = 0.05
 """How far below the best silhouette that of a finer division may lie."""
 _COMMON = 0.25  # share of the crossings from which on an end is named
+_MEANS = ("goal_rate", "collision_rate", "other_rate", "fallen_rate", "fitness")
 _MIN_ELITES = 10  # of fewer a silhouette says nothing
 
 
@@ -121,10 +122,6 @@ def _mode(number: int, rows: NDArray[np.int64], elites: Elites, distances: NDArr
         members=rows,
         typical=int(elites.numbers[rows[distances[np.ix_(rows, rows)].sum(axis=1).argmin()]]),
         ratios=ratios,
-        goal_rate=float(elites.goal_rate[rows].mean()),
-        collision_rate=float(elites.collision_rate[rows].mean()),
-        other_rate=float(elites.other_rate[rows].mean()),
-        fallen_rate=float(elites.fallen_rate[rows].mean()),
-        fitness=float(elites.fitness[rows].mean()),
         marked_by=elites.penalties[int(standing_out.argmax())],
+        **{name: float(getattr(elites, name)[rows].mean()) for name in _MEANS},
     )
