@@ -160,15 +160,22 @@ def _lead(material: "Material") -> str:
 def _write(shown: "Shown") -> Path:
     """Writes figures and page, the page last: it is whole or as it was."""
     from qd.show.report import elites, evaluation, search
-    from qd.show.report.page import counted, pictures_of, render
+    from qd.show.report.page import Section, counted, pictures_of, render
 
     material = shown.material
-    makers = (
-        search.outcome_section, search.curves_section, search.archive_section, search.pairs_section,
-        elites.modes_section, elites.detail_section, evaluation.tables_section, evaluation.before_after_section,
-        elites.all_section, search.origin_section,
-    )  # fmt: skip
-    sections = [section for make in makers if (section := make(shown)) is not None]
+    chapters = {
+        ("What breaks the controller", "outcome"): search.outcome_section,
+        ("The search", "search"): search.curves_section,
+        ("The archive", "archive"): search.archive_section,
+        ("Shares against each other", "pairs"): search.pairs_section,
+        ("Failure modes", "modes"): elites.modes_section,
+        ("Terrains worth a look", "terrains"): elites.detail_section,
+        ("Controllers compared", "tables"): evaluation.tables_section,
+        ("The same terrain before and after", "before-after"): evaluation.before_after_section,
+        ("All elites", "all"): elites.all_section,
+        ("Where this comes from", "origin"): search.origin_section,
+    }
+    sections = [Section(*name, blocks) for name, make in chapters.items() if (blocks := make(shown))]
     page = render(f"How {material.archive.robot} breaks: a search's report", _lead(material), sections)
     if len(page) > MAX_BYTES:
         raise ValueError(
