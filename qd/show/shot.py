@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.show.crossed import ARRIVED, crossed_of, ending_of
-from qd.show.figures import label_of
+from qd.show.figures import label_of, look_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
 from sim.policy.spec import ControllerSpec
@@ -25,7 +25,6 @@ _HOLD_S = 1.0  # of the last frame
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
 _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 _DPI = 100
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # apart for every kind of colour blindness
 _FUTURE = 0.25  # how much is left to see of what has not happened yet
 
 Image = NDArray[np.uint8]
@@ -240,9 +239,9 @@ def _draw_map(axes: Any, shot: Shot) -> None:
 
 def _draw_curves(axes: Any, shot: Shot) -> None:
     times = shot.recording.times_s[: shot.num_frames]
-    for (name, values), color in zip(shot.penalties.items(), _COLORS, strict=False):
+    for name, values in shot.penalties.items():
         label = f"{label_of(name)} {values[-1]:.1f}"
-        axes.plot(times, values, color=color, linewidth=1.8, label=label)
+        axes.plot(times, values, color=look_of(name).color, linewidth=1.8, label=label)
     axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")

@@ -85,20 +85,24 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
 def _with_crossings(shown: "Shown", cross: "Cross | None") -> "Shown":
     """Crosses the elites to be shown, and the terrains to be shown before and after."""
     from qd.show.recordings import Recordings
-    from qd.show.report.tables import Changes, changes_of
+    from qd.show.report.tables import changes_of
 
     material = shown.material
     device = resolve_device(material.cfg.device)
     if reason := _uncrossable(material, device):
-        changes = None if material.tables is None else Changes(reason="The controller of the search cannot be loaded.")
-        return replace(shown, changes=changes, not_crossed=reason)
+        no_changes = "" if material.tables is None else "The controller of the search cannot be loaded."
+        return replace(shown, no_changes=no_changes, not_crossed=reason)
     recordings = Recordings(material.robot, device=device, cross=cross)
     wanted = [_wanted(material, material.archive, number, material.policy) for number in shown.numbers]
     crossed = dict(zip(shown.numbers, _crossed(material, recordings, wanted), strict=True))
+    shown = replace(shown, crossed=crossed)
     if material.tables is None:
-        return replace(shown, crossed=crossed)
-    changes = changes_of(material.tables, material.tables_file, material.robot)
-    return replace(shown, crossed=crossed, changes=changes, pairs=_pairs(material, changes, recordings))
+        return shown
+    try:
+        changes = changes_of(material.tables, material.tables_file, material.robot)
+    except ValueError as error:
+        return replace(shown, no_changes=str(error))
+    return replace(shown, changes=changes, pairs=_pairs(material, changes, recordings))
 
 
 def _uncrossable(material: "Material", device: str) -> str:
@@ -135,8 +139,6 @@ def _pairs(
     material: "Material", changes: "Changes", recordings: "Recordings"
 ) -> "dict[Change, tuple[Crossed, Crossed]]":
     """What the two controllers of each change make of its terrain."""
-    if changes.archive is None or changes.policies is None:
-        return {}
     wanted = [
         _wanted(material, changes.archive, change.number, spec_of(changes.policies[who], material.robot), who)
         for change in changes.chosen

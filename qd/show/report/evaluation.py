@@ -161,18 +161,17 @@ def _changes_tables(tables: dict[str, Any]) -> list[Block]:
 
 def before_after_section(shown: Shown) -> list[Block]:
     """Two controllers' paths on the same terrains; nothing without tables."""
+    if shown.no_changes:
+        return [absent(f"Left out. {shown.no_changes} New tables are made by", _command(shown))]
     if shown.changes is None:
         return []
-    if not shown.pairs:
-        reason = shown.changes.reason or shown.not_crossed
-        return [absent(f"Left out. {reason} New tables are made by", _command(shown))]
     introduced = paragraph(_introduced(shown, shown.changes))
     return [introduced, *(block for pair in shown.pairs.items() for block in _change(shown, *pair))]
 
 
 def _introduced(shown: Shown, changes: Changes) -> str:
     """Who crosses what, and how to see it move."""
-    change, policies = changes.chosen[0], changes.policies or {}
+    change, policies = changes.chosen[0], changes.policies
     files = " and ".join(f"{who} ({policy})" for who, policy in policies.items())
     view = plain_command("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
                         policies=[f"{who}={policy}" for who, policy in policies.items()])  # fmt: skip

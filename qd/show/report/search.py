@@ -9,7 +9,7 @@ from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
 from qd.show.elites import Elites
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
-from qd.show.report.evaluation import fates, most_mended
+from qd.show.report.evaluation import most_mended
 from qd.show.report.figures import draw_pairs
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, absent, at_a_glance, counted, hours, paragraph, percent, picture, table
@@ -59,8 +59,8 @@ def outcome_section(shown: Shown) -> list[Block]:
         f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal. The rates are means over terrains"
         f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
-    told = (_common(shown), text, _others(tables) if tables else "", explained)
-    return [_searched(shown), facts, *(paragraph(words) for words in told if words)]
+    told = (_common(shown), text, explained)
+    return [_searched(shown), facts, *map(paragraph, told)]
 
 
 def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
@@ -68,17 +68,6 @@ def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
     tables, archive = shown.material.tables, shown.material.archive
     about = (tables or {}).get("archive") or {}
     return tables if (about.get("elites"), about.get("iterations")) == (len(archive), archive.iterations) else None
-
-
-def _others(tables: dict[str, Any]) -> str:
-    """What other controllers make of elites of this archive, and where that is shown; may be empty."""
-    told = fates(tables)
-    if not told:
-        return ""
-    return (
-        f"Other controllers crossed some of these terrains too. {told} The chapter Controllers compared says who they "
-        "are, The same terrain before and after shows how they fare."
-    )
 
 
 def _common(shown: Shown) -> str:

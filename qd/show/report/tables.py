@@ -137,17 +137,15 @@ class Change:
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """Terrains to show before and after, or why there are none to show."""
+    """Terrains to show before and after."""
 
-    archive: Archive | None = None
+    archive: Archive
     """That the numbers count in."""
-    run: Path | None = None
+    run: Path
     """Where that lies."""
-    chosen: tuple[Change, ...] = ()
-    policies: dict[str, str] | None = None
-    """File of each controller by its name; the robot's own is called shipped."""
-    reason: str = ""
-    """Why there are none."""
+    chosen: tuple[Change, ...]
+    policies: dict[str, str]
+    """File of both controllers by their names; the robot's own is called shipped."""
 
 
 def changes_of(tables: dict[str, Any], file: Path, robot: RobotCfg) -> Changes:
@@ -159,23 +157,27 @@ def changes_of(tables: dict[str, Any], file: Path, robot: RobotCfg) -> Changes:
         tables: As :func:`read_tables` gives them.
         file: Where they lie: controllers and archive may have been put beside them since.
         robot: The robot, whose own controller is one of them as a rule.
+
+    Raises:
+        ValueError: If there are none to show, which says why.
     """
     first, *others = tables["controllers"]
     known = tables["differences"].get(GENERATED) or {}
     pairs = {who: known[f"{first} -> {who}"] for who in others if f"{first} -> {who}" in known}
     pairs = {who: pair for who, pair in pairs.items() if pair["mended"]["count"] + pair["newly_broken"]["count"]}
     if not pairs:
-        return Changes(reason="No generated terrain of the tables is mended or newly broken between their controllers.")
+        raise ValueError("No generated terrain of the tables is mended or newly broken between their controllers.")
     most_first = sorted(pairs, key=lambda who: -pairs[who]["mended"]["count"])
     files = {who: _file_of(tables["controllers"][who], file.parent, robot) for who in (first, *most_first)}
     after = next((who for who in most_first if files[who] is not None), most_first[0])
+    policies = {}
     for who in (first, after):
-        if files[who] is None:
-            return Changes(reason=_why_not(who, tables["controllers"][who]["policy"], file.parent))
+        if (policy := files[who]) is None:
+            raise ValueError(_why_not(who, tables["controllers"][who]["policy"], file.parent))
+        policies[who] = policy
     chosen = _chosen(tables, first, after)
-    archive, run, reason = _archive_of(tables, chosen, file.parent)
-    policies = {who: str(files[who]) for who in (first, after)}
-    return Changes(archive=archive, run=run, chosen=chosen if archive else (), policies=policies, reason=reason)
+    archive, run = _archive_of(tables, chosen, file.parent)
+    return Changes(archive=archive, run=run, chosen=chosen, policies=policies)
 
 
 def _file_of(about: dict[str, Any], beside: Path, robot: RobotCfg) -> str | None:
@@ -210,23 +212,21 @@ def _chosen(tables: dict[str, Any], before: str, after: str) -> tuple[Change, ..
     )
 
 
-def _archive_of(
-    tables: dict[str, Any], chosen: tuple[Change, ...], beside: Path
-) -> tuple[Archive | None, Path | None, str]:
-    """The archive that the tables' terrains are numbered in and its place, or why it cannot be had.
+def _archive_of(tables: dict[str, Any], chosen: tuple[Change, ...], beside: Path) -> tuple[Archive, Path]:
+    """The archive that the tables' terrains are numbered in, and its place.
 
     One beside the tables comes first: it is published with them, where the path may be that of another machine.
     """
     about = tables.get("archive") or {}
-    reasons = []
+    reason = ""
     for path in (beside / "archive", Path(about.get("path", ""))):
         try:
             archive = read_archive(path)
         except (OSError, ValueError) as error:
-            reasons.append(f"The archive of the tables cannot be read: {error}")
+            reason = f"The archive of the tables cannot be read: {error}"
             continue
         same = (len(archive), archive.iterations) == (about.get("elites"), about.get("iterations"))
         if same and all(0 <= change.number < len(archive) for change in chosen):
-            return archive, path, ""
-        reasons.append(f"The archive at {path} has changed since the tables were made.")
-    return None, None, reasons[-1]
+            return archive, path
+        reason = f"The archive at {path} has changed since the tables were made."
+    raise ValueError(reason)

@@ -235,7 +235,7 @@ class App:
             self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
         else:
             self._clock.load(crossing.duration_s)
-            self._curves = Curves(crossing.times_s, crossing.penalties, self._axes.labels)
+            self._curves = Curves(crossing.times_s, crossing.penalties, self._archive.penalties)
             ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
             self._panel.show_status(f"{ended} {all_of_them}")
             self._show_frame()
@@ -250,5 +250,7 @@ class App:
         crossing, curves = self._crossing, self._curves
         if crossing is not None and curves is not None:
             frame = self._clock.frame(crossing.dt, crossing.num_frames)
-            self._panel.show_moment(curves.at(self._clock.time_s), moment_text(crossing, frame, self._axes.labels))
+            self._panel.show_moment(
+                curves.at(self._clock.time_s), moment_text(crossing, frame, self._archive.penalties)
+            )
         self._panel.show_time(self._clock)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 
 from qd.show.crossed import ending_of
+from qd.show.figures import label_of
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
@@ -151,12 +152,13 @@ def moment_text(crossing: Crossing, frame: int, penalties: Sequence[str]) -> str
     Args:
         crossing: The crossing.
         frame: Which frame.
-        penalties: Each penalty in words.
+        penalties: Names of the penalties.
     """
     v_x, v_y, yaw_rate = crossing.command_values[frame]
     forces = " · ".join(f"{newtons:,.0f}" for newtons in crossing.force_newtons[frame])
     x, y, z = crossing.positions[frame, 0]
-    rows = [f"| {name} | {value:.2f} |" for name, value in zip(penalties, crossing.penalties[frame], strict=True)]
+    sums = zip(penalties, crossing.penalties[frame], strict=True)
+    rows = [f"| {label_of(name)} | {value:.2f} |" for name, value in sums]
     return "\n".join(
         [
             "| penalty so far | multiples of its scale |",

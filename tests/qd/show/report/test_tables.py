@@ -69,7 +69,7 @@ def test_tables_and_the_same_terrain_before_and_after(reported, tables):
     assert "generated, held out: base -> C-G 1 1 1 1 4" in text  # mended, still failing, newly broken, fine, compared
     first = text[: text.index("From iteration 1")]
     assert "elites held out of training that base fails and C-G mends 1 of 2" in first
-    assert "Of 4 elites held out of training C-G mends 1 of 2 that base fails; newly broken are 1 by C-G." in first
+    assert "Of 4 elites held out of training C-G mends 1 of 2 that base fails; newly broken are 1 by C-G." in text
     for number, kind in ((7, "mended by"), (5, "newly broken by"), (9, "still failing with")):
         assert f"Elite {number}: {kind} C-G" in text
     one = "1 of 4 (25%, 5 to 70%) reach the goal (base collision 1, out of time 1, left the terrain 1; the middle"
@@ -108,14 +108,15 @@ def test_controllers_and_archive_are_found_beside_the_tables_by_what_they_are(ta
     about = {"path": "/another/machine/archive", "elites": 20, "iterations": 4}
     controllers = {"base": {"policy": far, "sha256": shipped}, "C-G": {"policy": far, "sha256": tuned}}
     changed(tables, controllers=controllers, archive=about)
-    assert "The archive of the tables cannot" in changes_of(read_tables(tables, "anymal"), tables, robot).reason
+    with pytest.raises(ValueError, match="The archive of the tables cannot"):
+        changes_of(read_tables(tables, "anymal"), tables, robot)
     run.rename(tables.parent / "archive")
     found = changes_of(read_tables(tables, "anymal"), tables, robot)
     assert found.policies == {"base": "shipped", "C-G": str(tables.parent / "C-G.pt")}
-    assert found.run == tables.parent / "archive" and found.archive is not None and found.reason == ""
+    assert found.run == tables.parent / "archive" and len(found.archive) == 20
     (tables.parent / "C-G.pt").write_text("another one")
-    reason = changes_of(read_tables(tables, "anymal"), tables, robot).reason
-    assert reason.startswith("Controller C-G of the tables is not at /another/machine/policy.pt")
+    with pytest.raises(ValueError, match="Controller C-G of the tables is not at /another/machine/policy"):
+        changes_of(read_tables(tables, "anymal"), tables, robot)
 
 
 def fate(**terrains):
