@@ -14,7 +14,7 @@ from sim.policy.spec import controller_hash, spec_of
 if TYPE_CHECKING:
     from qd.archive import Archive
     from qd.show.crossed import Crossed
-    from qd.show.recordings import Cross, Recordings, Wanted
+    from qd.show.recordings import Cross, Recordings
     from qd.show.report.material import Material, Shown
     from qd.show.report.tables import Change, Changes
 
@@ -93,9 +93,9 @@ def _with_crossings(shown: "Shown", cross: "Cross | None") -> "Shown":
         no_changes = "" if material.tables is None else "The controller of the search cannot be loaded."
         return replace(shown, no_changes=no_changes, not_crossed=reason)
     recordings = Recordings(material.robot, device=device, cross=cross)
-    wanted = [_wanted(material, material.archive, number, material.policy) for number in shown.numbers]
-    crossed = dict(zip(shown.numbers, _crossed(material, recordings, wanted), strict=True))
-    shown = replace(shown, crossed=crossed)
+    wanted = [(number, material.policy, None) for number in shown.numbers]
+    crossed = _crossings(material, recordings, material.archive, wanted)
+    shown = replace(shown, crossed=dict(zip(shown.numbers, crossed, strict=True)))
     if material.tables is None:
         return shown
     try:
@@ -121,18 +121,19 @@ def _uncrossable(material: "Material", device: str) -> str:
     return ""
 
 
-def _wanted(material: "Material", archive: "Archive", number: int, policy: str, by: str = "") -> "Wanted":
+def _crossings(
+    material: "Material", recordings: "Recordings", archive: "Archive", wanted: Sequence[tuple[int, str, str | None]]
+) -> "list[Crossed]":
+    """Crossings of elites of an archive, each given by its number, the controller and a label."""
+    from qd.show.crossed import crossed_of
     from qd.show.recordings import on_elite
 
-    label = f"elite {number} with {by}" if by else None
-    return on_elite(archive, number, policy=policy, replicas=material.cfg.episodes, label=label)
-
-
-def _crossed(material: "Material", recordings: "Recordings", wanted: "Sequence[Wanted]") -> "list[Crossed]":
-    from qd.show.crossed import crossed_of
-
+    asked = [
+        on_elite(archive, number, policy=policy, replicas=material.cfg.episodes, label=label)
+        for number, policy, label in wanted
+    ]
     penalties, scales = material.archive.penalties, material.archive.scales
-    return [crossed_of(recording, penalties, scales) for recording in recordings.all_of(wanted)]
+    return [crossed_of(recording, penalties, scales) for recording in recordings.all_of(asked)]
 
 
 def _pairs(
@@ -140,11 +141,11 @@ def _pairs(
 ) -> "dict[Change, tuple[Crossed, Crossed]]":
     """What the two controllers of each change make of its terrain."""
     wanted = [
-        _wanted(material, changes.archive, change.number, spec_of(changes.policies[who], material.robot), who)
+        (change.number, spec_of(changes.policies[who], material.robot), f"elite {change.number} with {who}")
         for change in changes.chosen
         for who in (change.before, change.after)
     ]
-    found = _crossed(material, recordings, wanted)
+    found = _crossings(material, recordings, changes.archive, wanted)
     return dict(zip(changes.chosen, zip(found[::2], found[1::2], strict=True), strict=True))
 
 
