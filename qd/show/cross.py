@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from qd.run.directory import RUNS
 from qd.show.elites import robot_named
-from qd.show.figures import PENALTY_UNITS, save_figure
+from qd.show.figures import look_of, save_figure
 from qd.workers.evaluator import check_policy, origin_of, resolve_device
 from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
 from sim.files.atomic import prepare_output, to_json, write_atomically
@@ -20,7 +20,7 @@ from sim.files.intervals import rate_words, wilson_interval
 from sim.policy.spec import ControllerSpec, who_crossed
 
 if TYPE_CHECKING:
-    from sim.rollout import RolloutResult
+    from qd.show.crossed import Crossed
 
 OWN_FOLDER = RUNS / "terrains"
 """Where what is made of a user's own terrains goes."""
@@ -127,12 +127,11 @@ def cross(cfg: Cross) -> dict[str, Any]:
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)
     (recording,) = Recordings(robot, device=device).all_of([wanted])
     origin, about = origin_of(device, cfg.seed, None), _about(cfg, robot.name, terrain, policy)
-    result = recording.result()
-    refuse_all_invalid(result)
-    report = {**origin, **about, **numbers_of(result)}
+    refuse_all_invalid(recording.result())
+    crossed = crossed_of(recording, recording.penalty_names, (1.0,) * len(recording.penalty_names))
+    report = {**origin, **about, **numbers_of(crossed)}
     print(describe(report))
     write_atomically(out, to_json(report))
-    crossed = crossed_of(recording, robot.penalties, (1.0,) * len(robot.penalties))
     save_figure(figure, draw_paths(crossed, f"{who} on {terrain.label}: {_headline(report)}"))
     print(f"Numbers: {out}\nFigure: {figure}")
     return report
@@ -164,36 +163,37 @@ def _about(cfg: Cross, robot: str, terrain: OwnTerrain, policy: str) -> dict[str
     }
 
 
-def numbers_of(result: "RolloutResult") -> dict[str, Any]:
+def numbers_of(crossed: "Crossed") -> dict[str, Any]:
     """Rates with 95 % intervals (Wilson), how episodes ended, and raw penalties, over the valid episodes of a terrain.
 
     Args:
-        result: Crossings of one terrain.
+        crossed: The crossings, with every penalty recorded.
     """
     from kernels.episode import Outcome
 
-    valid = ~result.invalid[0]
-    flags = {"success": ~result.base_collision[0], "goal": result.reached_goal[0], "fallen": result.fallen[0]}
-    values = result.penalties[0, valid]
+    recording, count = crossed.recording, len(crossed.chosen)
+    ended = {o.name.lower(): int((recording.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT}
+    hits = {"success": count - ended["base_collision"], "goal": ended["goal"], "fallen": crossed.rates["fallen"].hits}
     return {
-        "episodes": len(valid),
-        "invalid_episodes": int((~valid).sum()),
-        "invalid_reasons": invalid_reasons(result),
-        "rates": {name: _rate(int((hit & valid).sum()), int(valid.sum())) for name, hit in flags.items()},
-        "outcomes": {o.name.lower(): int((result.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT},
-        "duration_s": float(result.duration_s[0, valid].mean()) if valid.any() else None,
+        "episodes": recording.num_episodes,
+        "invalid_episodes": recording.num_episodes - count,
+        "invalid_reasons": invalid_reasons(recording.result()),
+        "rates": {
+            name: {
+                "rate": number / count if count else None,
+                "hits": number,
+                "interval": list(wilson_interval(number, count)) if count else None,
+            }
+            for name, number in hits.items()
+        },
+        "outcomes": ended,
+        "duration_s": float(recording.duration_s[0, crossed.chosen].mean()) if count else None,
         "penalties": {
-            name: {"mean": float(column.mean()), "std": float(column.std()), "unit": PENALTY_UNITS.get(name, "")}
-            for name, column in zip(result.penalty_names, values.T, strict=True)
-            if len(column)
+            name: {"mean": float(column.mean()), "std": float(column.std()), "unit": look_of(name).unit}
+            for name, column in zip(recording.penalty_names, crossed.penalties.T, strict=True)
+            if count
         },
     }
-
-
-def _rate(hits: int, count: int) -> dict[str, Any]:
-    if not count:
-        return {"rate": None, "hits": 0, "interval": None}
-    return {"rate": hits / count, "hits": hits, "interval": list(wilson_interval(hits, count))}
 
 
 _LABELS = {"success": "success (no base collision)", "goal": "goal reached", "fallen": "fallen"}

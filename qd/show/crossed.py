@@ -30,8 +30,14 @@ ENDINGS = {
     Outcome.OUT: Ending("left the terrain", "#cc79a7", "^", ":"),
 }
 """How a valid episode may end, the good way first."""
+_INVALID = Ending("invalid: the simulation broke", "#5a5a5a", "", "")
 ARRIVED, *FAILED = (ending.words for ending in ENDINGS.values())
 """The good way in words, and the others."""
+
+
+def ending_of(outcome: int) -> Ending:
+    """How an episode of an outcome ended, a valid one or not."""
+    return ENDINGS.get(Outcome(outcome), _INVALID)
 
 
 class Rate(NamedTuple):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qd.show.crossed import ENDINGS, Crossed, penalties_by_place
-from qd.show.figures import PENALTY_LABELS, look_of, new_figure
+from qd.show.figures import look_of, new_figure
 from sim.crossing import CrossingCfg
 
 if TYPE_CHECKING:
@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
+_WHITE: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
+_START = {"marker": ">", "markersize": 11, "label": "start", **_WHITE}
+_GOAL = {"marker": "*", "markersize": 16, "label": "goal", **_WHITE}
+_BELOW: dict[str, Any] = {"loc": "outside lower center", "ncols": 6, "frameon": False, "handlelength": 3}  # a legend
 _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
 
@@ -37,7 +41,10 @@ def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> "
     _draw_penalties(figure.add_subplot(grid[1:, 1]), crossed, penalties)
     legend = figure.add_subplot(grid[0, 1])
     legend.set_axis_off()
-    legend.legend(*_legend(top), loc="center left", frameon=False, title="crossings", alignment="left", handlelength=3)
+    handles = _legend([crossed])
+    legend.legend(
+        handles=handles, loc="center left", frameon=False, title="crossings", alignment="left", handlelength=3
+    )
     for axes in (top, profile):
         axes.tick_params(labelbottom=False)
     top.set_xlim(*_x_limits([crossed]))
@@ -52,7 +59,7 @@ def draw_paths(crossed: Crossed, title: str) -> "Figure":
     axes.set_title(title)
     axes.set_xlabel("x [m]")
     axes.set_xlim(*_x_limits([crossed]))
-    figure.legend(*_legend(axes), loc="outside lower center", ncols=6, frameon=False, handlelength=3)
+    figure.legend(handles=_legend([crossed]), **_BELOW)
     return figure
 
 
@@ -78,35 +85,26 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
             axes.plot(*crossed.path(int(k))[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
         if len(chosen):
             places = crossed.ends[chosen]
-            looks: dict[str, Any] = {
-                "color": end.color,
-                "marker": end.marker,
-                "s": 55,
-                "edgecolors": "white",
-                "zorder": 3,
-            }
-            axes.scatter(*places[:, :2].T, label=f"{end.words} ({len(chosen)})", **looks)
-    white = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
-    axes.plot(*CrossingCfg.start, marker=">", markersize=11, label="start", **white)
-    axes.plot(*CrossingCfg.goal, marker="*", markersize=16, label="goal", **white)
+            axes.scatter(*places[:, :2].T, color=end.color, marker=end.marker, s=55, edgecolors="white", zorder=3)
+    for place, look in ((CrossingCfg.start, _START), (CrossingCfg.goal, _GOAL)):
+        axes.plot(*place, **look)
     axes.set_ylabel("y [m]")
     axes.set_aspect("equal")
     return image
 
 
-def _legend(axes: "Axes") -> tuple[list[Any], list[str]]:
-    """Markers with the lines of the paths that lead to them."""
+def _legend(drawn: Sequence[Crossed]) -> list[Any]:
+    """Marks of the ends there are, with the lines of the paths to them, of start and goal; counts of a single map."""
     from matplotlib.lines import Line2D
 
-    lines = {end.words: end for end in ENDINGS.values()}
-    handles, labels = axes.get_legend_handles_labels()
-    shown = []
-    for handle, label in zip(handles, labels, strict=True):
-        if end := lines.get(label.rpartition(" (")[0]):
-            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line}
-            handle = Line2D([], [], **looks, markeredgecolor="white", markersize=9)
-        shown.append(handle)
-    return shown, labels
+    handles = []
+    for outcome, end in ENDINGS.items():
+        count = sum(int((crossed.outcome == outcome).sum()) for crossed in drawn)
+        if count:
+            label = f"{end.words} ({count})" if len(drawn) == 1 else end.words
+            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line, "label": label}
+            handles.append(Line2D([], [], **looks, markeredgecolor="white", markersize=9))
+    return handles + [Line2D([], [], **look) for look in (_START, _GOAL)]
 
 
 def _x_limits(drawn: Sequence[Crossed]) -> tuple[float, float]:
@@ -132,9 +130,7 @@ def _draw_places(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) -> 
     amounts = penalties_by_place(crossed, penalties, edges)
     bottom = np.zeros(len(amounts))
     for penalty, amount in zip(penalties, amounts.T, strict=True):
-        colour, hatch = look_of(penalty)
-        style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.0}
-        axes.bar(edges[:-1], amount, width=_PLACE, align="edge", bottom=bottom, **style)
+        axes.bar(edges[:-1], amount, width=_PLACE, align="edge", bottom=bottom, **look_of(penalty).bar)
         bottom += amount
     axes.set_xlabel("x [m]")
     axes.set_ylabel(f"penalties per\n{_PLACE} m (scaled)", fontsize=9)
@@ -147,10 +143,9 @@ def _draw_penalties(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) 
     places = np.arange(len(penalties))
     means, stds = crossed.scaled.mean(axis=0), crossed.scaled.std(axis=0)
     for place, penalty in zip(places, penalties, strict=True):
-        colour, hatch = look_of(penalty)
-        axes.barh(place, means[place], color=colour, hatch=hatch, edgecolor="white", linewidth=0.0)
+        axes.barh(place, means[place], **look_of(penalty).bar)
     axes.errorbar(means, places, xerr=stds, linestyle="", color="0.3", capsize=3)
-    axes.set_yticks(places, [PENALTY_LABELS.get(name, name) for name in penalties], fontsize=9)
+    axes.set_yticks(places, [look_of(name).label for name in penalties], fontsize=9)
     axes.invert_yaxis()
     axes.set_xlim(left=0.0)
     axes.set_xlabel("penalty an episode (scaled),\nmean and standard deviation", fontsize=9)
@@ -180,17 +175,5 @@ def draw_maps(crossings: Mapping[str, Crossed], title: str) -> "Figure":
     for axes in panels[len(crossings) :]:
         axes.set_axis_off()
     figure.colorbar(panels[0].images[0], ax=list(panels), label="height [m]", shrink=0.6)
-    figure.legend(
-        *_common_legend(panels[: len(crossings)]), loc="outside lower center", ncols=6, frameon=False, handlelength=3
-    )
+    figure.legend(handles=_legend([*crossings.values()]), **_BELOW)
     return figure
-
-
-def _common_legend(panels: Sequence["Axes"]) -> tuple[list[Any], list[str]]:
-    """One entry for each mark in any of the panels, without counts."""
-    entries: dict[str, Any] = {}
-    for axes in panels:
-        for handle, label in zip(*_legend(axes), strict=True):
-            entries.setdefault(label.rpartition(" (")[0] or label, handle)
-    order = [label for label in (*(end.words for end in ENDINGS.values()), "start", "goal") if label in entries]
-    return [entries[label] for label in order], order

@@ -3,7 +3,7 @@
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,46 +19,45 @@ CURVES_FILE = "curves.png"
 ARCHIVE_FIGURE_FILE = "archive.png"
 SPREAD_FILE = "spread.png"
 
-PENALTY_LABELS = {
-    "yaw_rate": "yaw-rate error",
-    "vel_x": "forward-\nvelocity error",
-    "vel_y": "sideways-\nvelocity error",
-    "contact_force": "high contact\nforce",
-    "stumble": "stumble",
-    "collision": "collisions of\nbase and legs",
-}
-"""Penalties as axis labels."""
-PENALTY_UNITS = {
-    "yaw_rate": "rad",
-    "vel_x": "m",
-    "vel_y": "m",
-    "contact_force": "N s",
-    "stumble": "s",
-    "collision": "s",
-}
-"""Units of the raw penalties."""
+_BLUE, _RED = "#0072b2", "#d55e00"  # apart for every kind of colour blindness
+
+
+class PenaltyLook(NamedTuple):
+    """How a penalty is written and drawn."""
+
+    label: str
+    """Of an axis, broken into lines."""
+    unit: str = ""
+    """Of its raw sum."""
+    color: str = "#999999"
+    """One of Okabe and Ito's."""
+    hatch: str = ""
+    """Tells it apart in grey."""
+
+    @property
+    def bar(self) -> dict[str, Any]:
+        """Style of its bars."""
+        return {"color": self.color, "hatch": self.hatch, "edgecolor": "white", "linewidth": 0.0}
+
+
 _PENALTY_LOOKS = {
-    "yaw_rate": ("#cc79a7", "//"),
-    "vel_x": ("#0072b2", ""),
-    "vel_y": ("#56b4e9", "\\\\"),
-    "contact_force": ("#000000", ""),
-    "stumble": ("#e69f00", ".."),
-    "collision": ("#d55e00", ""),
+    "yaw_rate": PenaltyLook("yaw-rate error", "rad", "#cc79a7", "//"),
+    "vel_x": PenaltyLook("forward-\nvelocity error", "m", "#0072b2"),
+    "vel_y": PenaltyLook("sideways-\nvelocity error", "m", "#56b4e9", "\\\\"),
+    "contact_force": PenaltyLook("high contact\nforce", "N s", "#000000"),
+    "stumble": PenaltyLook("stumble", "s", "#e69f00", ".."),
+    "collision": PenaltyLook("collisions of\nbase and legs", "s", "#d55e00"),
 }
-_PLAIN = ("#999999", "")  # of a penalty that the figures do not know
 
 
-def look_of(penalty: str) -> tuple[str, str]:
-    """Colour (Okabe and Ito's) and hatch of a penalty, which tells it apart in grey."""
-    return _PENALTY_LOOKS.get(penalty, _PLAIN)
+def look_of(penalty: str) -> PenaltyLook:
+    """How a penalty is shown; one that the figures do not know by its name, in grey."""
+    return _PENALTY_LOOKS.get(penalty, PenaltyLook(penalty))
 
 
 def label_of(penalty: str) -> str:
     """A penalty in words, on one line; a word broken at a hyphen stays one."""
-    return PENALTY_LABELS.get(penalty, penalty).replace("-\n", "-").replace("\n", " ")
-
-
-_BLUE, _RED = "#0072b2", "#d55e00"  # apart for every kind of colour blindness
+    return look_of(penalty).label.replace("-\n", "-").replace("\n", " ")
 
 
 def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, Any]]) -> list[Path]:
@@ -187,7 +186,7 @@ def draw_archive(archive: Archive) -> "Figure":
     axes.add_collection(lines)
     for position in range(count):
         axes.axvline(position, color="0.25", linewidth=1.0)
-    axes.set_xticks(positions, [PENALTY_LABELS.get(name, name) for name in archive.penalties])
+    axes.set_xticks(positions, [look_of(name).label for name in archive.penalties])
     axes.set_yticks(np.linspace(0, 1, 11))
     axes.set_xlim(-0.15, count - 0.85)
     axes.set_ylim(-0.02, 1.02)
@@ -231,7 +230,7 @@ def draw_spread(archive: Archive) -> "Figure":
         axes.bar(lows, collides, bottom=without, color=_RED, label="with base collision", **style)
         axes.set_xlim(0, 1)
         axes.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
-        axes.set_xlabel(f"share of\n{PENALTY_LABELS.get(name, name)}")
+        axes.set_xlabel(f"share of\n{look_of(name).label}")
         axes.grid(axis="y", alpha=0.3)
         axes.set_axisbelow(True)
     panels[0].set_ylabel("elites")

@@ -89,21 +89,18 @@ def make_films(cfg: Film) -> list[Path]:
     if sum(given is not None for given in (cfg.run, cfg.terrain, cfg.recording)) > 1:
         raise ValueError("give one of --run, --terrain and --recording")
     open_context(64, 64).free()  # before minutes of crossing
+    if cfg.recording is not None:
+        orders = _kept_orders(cfg, cfg.recording)
+    elif cfg.terrain is not None:
+        orders = iter([_own_order(cfg, cfg.terrain)])
+    else:
+        orders = _elite_orders(cfg)
     films = []
-    for order in _orders(cfg):
+    for order in orders:
         _film(order, cfg)
         print(f"Film: {order.out}", flush=True)
         films.append(order.out)
     return films
-
-
-def _orders(cfg: Film) -> Iterator[Order]:
-    if cfg.recording is not None:
-        yield from _kept_orders(cfg, cfg.recording)
-    elif cfg.terrain is not None:
-        yield _own_order(cfg, cfg.terrain)
-    else:
-        yield from _elite_orders(cfg)
 
 
 def _elite_orders(cfg: Film) -> Iterator[Order]:
@@ -198,10 +195,10 @@ def _film(order: Order, cfg: Film) -> None:
     replicas = recording.replicas.tolist()
     if cfg.replica is not None and cfg.replica not in replicas:
         raise ValueError(f"episode {cfg.replica} was not recorded, expected one of {', '.join(map(str, replicas))}")
-    typical = typical_episode(recording, 0, order.scales)
+    typical = typical_episode(recording, order.scales)
     episode = typical if cfg.replica is None else replicas.index(cfg.replica)
     ghosts = tuple(k for k in range(len(replicas)) if k != episode)[: cfg.ghosts]
-    shot = Shot(recording=recording, terrain=0, episode=episode, ghosts=ghosts, scales=order.scales)
+    shot = Shot(recording=recording, episode=episode, ghosts=ghosts, scales=order.scales)
     cameras = follow(shot, _DISTANCE * robot.default_base_height)
     heights = recording.heights[0]
     total = num_pictures(shot, cfg.fps)

@@ -8,7 +8,7 @@ from qd.archive import Archive
 from qd.fitness import Evaluation, evaluation_of
 from qd.run.directory import elite_name, folder_for
 from qd.show.elites import Found, find_archive
-from qd.show.figures import PENALTY_UNITS, save_figure
+from qd.show.figures import look_of, save_figure
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import OnDevice, Which, Who
@@ -104,7 +104,7 @@ def describe(replay: Replay) -> str:
         "fitness": [f"{values.fitness[k]:.2f}" for _, values, k in columns],
     }
     for p, name in enumerate(archive.penalties):
-        rows[f"{name} [{PENALTY_UNITS.get(name, '')}]"] = [
+        rows[f"{name} [{look_of(name).unit}]"] = [
             _penalty(values.penalty_mean[k, p], values.penalty_std[k, p], archive.scales[p], values.ratios[k, p])
             for _, values, k in columns
         ]

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome
-from qd.show.crossed import ENDINGS
-from qd.show.figures import label_of
+from qd.show.crossed import ARRIVED, crossed_of, ending_of
+from qd.show.figures import label_of, look_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
 from sim.policy.spec import ControllerSpec
@@ -26,9 +25,7 @@ _HOLD_S = 1.0  # of the last frame
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
 _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 _DPI = 100
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # apart for every kind of colour blindness
 _FUTURE = 0.25  # how much is left to see of what has not happened yet
-_OUTCOMES = {Outcome.INVALID: "invalid", **{outcome: ending.words for outcome, ending in ENDINGS.items()}}
 
 Image = NDArray[np.uint8]
 
@@ -38,8 +35,7 @@ class Shot:
     """What a film shows: one episode of a recording, and others of the same terrain as ghosts."""
 
     recording: "Recording"
-    terrain: int
-    """Index of the terrain."""
+    """Of one terrain."""
     episode: int
     """Index of the episode."""
     ghosts: tuple[int, ...] = ()
@@ -51,54 +47,43 @@ class Shot:
     @property
     def num_frames(self) -> int:
         """Frames of the episode."""
-        return int(self.recording.num_frames[self.terrain, self.episode])
+        return int(self.recording.num_frames[0, self.episode])
 
     @property
     def penalties(self) -> dict[str, NDArray[np.float64]]:
         """Scaled penalty sums so far by name, shape (frames,) each."""
-        sums = self.recording.penalties[self.terrain, self.episode, : self.num_frames].astype(np.float64)
+        sums = self.recording.penalties[0, self.episode, : self.num_frames].astype(np.float64)
         names = self.recording.penalty_names
         return {name: sums[:, names.index(name)] / scale for name, scale in self.scales.items() if name in names}
 
 
-def typical_episode(recording: "Recording", terrain: int, scales: dict[str, float]) -> int:
+def typical_episode(recording: "Recording", scales: dict[str, float]) -> int:
     """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties.
 
     Args:
-        recording: The crossings.
-        terrain: Index of the terrain.
+        recording: Of one terrain.
         scales: What each penalty is divided by.
     """
-    outcome = recording.outcome[terrain]
-    most = np.bincount(outcome).argmax()
-    candidates = np.flatnonzero(outcome == most)
-    sums = [
-        sum(
-            values[-1]
-            for values in Shot(recording=recording, terrain=terrain, episode=k, scales=scales).penalties.values()
-        )
-        for k in candidates.tolist()
-    ]
+    outcome = recording.outcome[0]
+    candidates = np.flatnonzero(outcome == np.bincount(outcome).argmax())
+    shots = [Shot(recording=recording, episode=k, scales=scales) for k in candidates.tolist()]
+    sums = [sum(values[-1] for values in shot.penalties.values()) for shot in shots]
     return int(candidates[np.argsort(sums, kind="stable")[(len(sums) - 1) // 2]])
 
 
 def caption(shot: Shot) -> tuple[str, str]:
     """Two lines: what is shown, and how all recorded episodes of the terrain ended, with 95 % intervals (Wilson)."""
-    recording, t, k = shot.recording, shot.terrain, shot.episode
+    recording, k = shot.recording, shot.episode
     first = (
-        f"{recording.robot} on {recording.labels[t]}: episode {recording.replicas[k]}, "
-        f"{_OUTCOMES[Outcome(recording.outcome[t, k])]} after {recording.duration_s[t, k]:.1f} s"
+        f"{recording.robot} on {recording.labels[0]}: episode {recording.replicas[k]}, "
+        f"{ending_of(recording.outcome[0, k]).words} after {recording.duration_s[0, k]:.1f} s"
     )
-    valid = recording.outcome[t] != Outcome.INVALID
-    count = int(valid.sum())
-    hits = {
-        "base collision": recording.outcome[t] == Outcome.BASE_COLLISION,
-        "goal": recording.outcome[t] == Outcome.GOAL,
-        "fallen": recording.fallen[t] & valid,
-    }
-    rates = [f"{name} {rate_words(int(flags.sum()), count, short=True)}" for name, flags in hits.items()]
-    rates = rates if count else ["none valid"]
-    of = f"{len(valid)} episode{'s' * (len(valid) != 1)}" + f", {len(valid) - count} invalid" * (count < len(valid))
+    crossed = crossed_of(recording, (), ())
+    shown = {"base collision": "base collision", "goal": ARRIVED, "fallen": "fallen"}
+    rates = [f"{name} {rate_words(*crossed.rates[words], short=True)}" for name, words in shown.items()]
+    count, valid = recording.num_episodes, len(crossed.chosen)
+    rates = rates if valid else ["none valid"]
+    of = f"{count} episode{'s' * (count != 1)}" + f", {count - valid} invalid" * (valid < count)
     if policy := recording.origin.get("policy"):
         of += f" with {ControllerSpec.parse(str(policy)).label}"
     return first, f"{of}: {', '.join(rates)}; in brackets 95 % intervals"
@@ -114,8 +99,8 @@ def follow(shot: Shot, distance: float) -> list["Camera"]:
     from sim.mujoco_c.model import surface_heights
     from sim.recording.renderer import Camera
 
-    recording, t = shot.recording, shot.terrain
-    base = recording.base_position[t, shot.episode, : shot.num_frames].astype(np.float64)
+    recording = shot.recording
+    base = recording.base_position[0, shot.episode, : shot.num_frames].astype(np.float64)
     width = max(1, round(_SMOOTH_S / recording.dt)) | 1
     padded = np.pad(base, ((width // 2, width // 2), (0, 0)), mode="edge")
     sums = np.cumsum(np.vstack([np.zeros(3), padded]), axis=0)
@@ -126,7 +111,7 @@ def follow(shot: Shot, distance: float) -> list["Camera"]:
         azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(elevation)
         back = -distance * np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
         sight = targets[:, None] + along * back
-        ground = surface_heights(recording.heights[t].astype(np.float64), sight[..., 0], sight[..., 1])
+        ground = surface_heights(recording.heights[0].astype(np.float64), sight[..., 0], sight[..., 1])
         if (sight[..., 2] > ground + _CLEARANCE).all() or elevation == _ELEVATIONS[-1]:
             break
     return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
@@ -145,13 +130,13 @@ def frames_of(shot: Shot, renderer: "Renderer", cameras: Sequence["Camera"], fps
         RGB, shape (720, 1280, 3).
     """
     panel, lines = Panel(shot, WIDTH, PANEL_HEIGHT), caption(shot)
-    recording, t = shot.recording, shot.terrain
-    poses = recording.qpos(t, shot.episode)
-    others = [recording.qpos(t, k) for k in shot.ghosts]
+    recording = shot.recording
+    poses = recording.qpos(0, shot.episode)
+    others = [recording.qpos(0, k) for k in shot.ghosts]
     picture = np.zeros(0, np.uint8)
     for frame in shown_frames(shot, fps):
         ghosts = [other[min(frame, len(other) - 1)] for other in others]
-        force = recording.foot_force[t, shot.episode, frame]
+        force = recording.foot_force[0, shot.episode, frame]
         view = renderer.render(poses[frame], cameras[frame], ghosts=ghosts, foot_force=force)
         time_s = frame * recording.dt
         lettered = _lettered(view, lines, f"{time_s:.1f} s")
@@ -236,12 +221,12 @@ class Panel:
 
 
 def _draw_map(axes: Any, shot: Shot) -> None:
-    recording, t = shot.recording, shot.terrain
-    heights = recording.heights[t]
+    recording = shot.recording
+    heights = recording.heights[0]
     extent = (-0.025, 0.05 * heights.shape[1] - 0.025, -0.025, 0.05 * heights.shape[0] - 0.025)
     axes.imshow(heights, origin="lower", extent=extent, cmap="gray", alpha=0.9)
     for k in range(recording.num_episodes):
-        path = recording.base_position[t, k, : recording.num_frames[t, k]]
+        path = recording.base_position[0, k, : recording.num_frames[0, k]]
         style = ("#d55e00", 1.6) if k == shot.episode else ("white", 0.5)
         axes.plot(path[:, 0], path[:, 1], color=style[0], linewidth=style[1], zorder=2 + (k == shot.episode))
     axes.plot(*CrossingCfg.goal, marker="*", color="#009e73", markeredgecolor="black", markersize=13, zorder=4)
@@ -254,9 +239,9 @@ def _draw_map(axes: Any, shot: Shot) -> None:
 
 def _draw_curves(axes: Any, shot: Shot) -> None:
     times = shot.recording.times_s[: shot.num_frames]
-    for (name, values), color in zip(shot.penalties.items(), _COLORS, strict=False):
+    for name, values in shot.penalties.items():
         label = f"{label_of(name)} {values[-1]:.1f}"
-        axes.plot(times, values, color=color, linewidth=1.8, label=label)
+        axes.plot(times, values, color=look_of(name).color, linewidth=1.8, label=label)
     axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")

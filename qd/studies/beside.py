@@ -152,7 +152,7 @@ def draw_beside(sides: Sequence[Side]) -> "Figure":
 
 
 def _label(axes: "NDArray[Any] | Sequence[Axes]", archive: Archive) -> None:
-    from qd.show.figures import PENALTY_LABELS
+    from qd.show.figures import look_of
 
     labels = (
         ("iteration", "elites"),
@@ -167,7 +167,7 @@ def _label(axes: "NDArray[Any] | Sequence[Axes]", archive: Archive) -> None:
     axes[0].set_ylim(bottom=0)
     axes[1].set_ylim(0, 102)
     axes[2].set_ylim(0, 102)
-    names = [PENALTY_LABELS.get(name, name) for name in archive.penalties]
+    names = [look_of(name).label for name in archive.penalties]
     axes[3].set_xlim(left=0)
     axes[3].set_yticks(range(len(names)), names)
 

@@ -10,7 +10,7 @@ from kernels.episode import Outcome
 from qd.archive import read_archive
 from qd.fitness import FitnessCfg, evaluation_of
 from qd.show.elites import Found
-from qd.show.figures import PENALTY_LABELS, draw_archive
+from qd.show.figures import draw_archive, look_of
 from qd.show.replay import Replay, describe
 from sim.robots.robot import get_robot
 from tests.qd import stand_in
@@ -43,7 +43,7 @@ def test_a_search_of_four_penalties_and_five_intervals_runs_saves_and_resumes():
 def test_figure_and_replay_show_the_penalties_that_are_kept():
     found = run(Path("a"), fitness=FITNESS, intervals=5)
     axes = draw_archive(found).axes[0]
-    assert [label.get_text() for label in axes.get_xticklabels()] == [PENALTY_LABELS[k] for k in FITNESS.penalties]
+    assert [label.get_text() for label in axes.get_xticklabels()] == [look_of(k).label for k in FITNESS.penalties]
     result = stand_in.evaluate(found.genes[:1], np.zeros(1, np.uint32))
     fresh = evaluation_of(result, found.cells, FITNESS)
     recording = recording_of([Outcome.GOAL], [14.0])

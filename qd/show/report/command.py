@@ -14,7 +14,7 @@ from sim.policy.spec import controller_hash, spec_of
 if TYPE_CHECKING:
     from qd.archive import Archive
     from qd.show.crossed import Crossed
-    from qd.show.recordings import Cross, Recordings, Wanted
+    from qd.show.recordings import Cross, Recordings
     from qd.show.report.material import Material, Shown
     from qd.show.report.tables import Change, Changes
 
@@ -85,20 +85,24 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
 def _with_crossings(shown: "Shown", cross: "Cross | None") -> "Shown":
     """Crosses the elites to be shown, and the terrains to be shown before and after."""
     from qd.show.recordings import Recordings
-    from qd.show.report.tables import Changes, changes_of
+    from qd.show.report.tables import changes_of
 
     material = shown.material
     device = resolve_device(material.cfg.device)
     if reason := _uncrossable(material, device):
-        changes = None if material.tables is None else Changes(reason="The controller of the search cannot be loaded.")
-        return replace(shown, changes=changes, not_crossed=reason)
+        no_changes = "" if material.tables is None else "The controller of the search cannot be loaded."
+        return replace(shown, no_changes=no_changes, not_crossed=reason)
     recordings = Recordings(material.robot, device=device, cross=cross)
-    wanted = [_wanted(material, material.archive, number, material.policy) for number in shown.numbers]
-    crossed = dict(zip(shown.numbers, _crossed(material, recordings, wanted), strict=True))
+    wanted = [(number, material.policy, None) for number in shown.numbers]
+    crossed = _crossings(material, recordings, material.archive, wanted)
+    shown = replace(shown, crossed=dict(zip(shown.numbers, crossed, strict=True)))
     if material.tables is None:
-        return replace(shown, crossed=crossed)
-    changes = changes_of(material.tables, material.tables_file, material.robot)
-    return replace(shown, crossed=crossed, changes=changes, pairs=_pairs(material, changes, recordings))
+        return shown
+    try:
+        changes = changes_of(material.tables, material.tables_file, material.robot)
+    except ValueError as error:
+        return replace(shown, no_changes=str(error))
+    return replace(shown, changes=changes, pairs=_pairs(material, changes, recordings))
 
 
 def _uncrossable(material: "Material", device: str) -> str:
@@ -117,32 +121,31 @@ def _uncrossable(material: "Material", device: str) -> str:
     return ""
 
 
-def _wanted(material: "Material", archive: "Archive", number: int, policy: str, by: str = "") -> "Wanted":
+def _crossings(
+    material: "Material", recordings: "Recordings", archive: "Archive", wanted: Sequence[tuple[int, str, str | None]]
+) -> "list[Crossed]":
+    """Crossings of elites of an archive, each given by its number, the controller and a label."""
+    from qd.show.crossed import crossed_of
     from qd.show.recordings import on_elite
 
-    label = f"elite {number} with {by}" if by else None
-    return on_elite(archive, number, policy=policy, replicas=material.cfg.episodes, label=label)
-
-
-def _crossed(material: "Material", recordings: "Recordings", wanted: "Sequence[Wanted]") -> "list[Crossed]":
-    from qd.show.crossed import crossed_of
-
+    asked = [
+        on_elite(archive, number, policy=policy, replicas=material.cfg.episodes, label=label)
+        for number, policy, label in wanted
+    ]
     penalties, scales = material.archive.penalties, material.archive.scales
-    return [crossed_of(recording, penalties, scales) for recording in recordings.all_of(wanted)]
+    return [crossed_of(recording, penalties, scales) for recording in recordings.all_of(asked)]
 
 
 def _pairs(
     material: "Material", changes: "Changes", recordings: "Recordings"
 ) -> "dict[Change, tuple[Crossed, Crossed]]":
     """What the two controllers of each change make of its terrain."""
-    if changes.archive is None or changes.policies is None:
-        return {}
     wanted = [
-        _wanted(material, changes.archive, change.number, spec_of(changes.policies[who], material.robot), who)
+        (change.number, spec_of(changes.policies[who], material.robot), f"elite {change.number} with {who}")
         for change in changes.chosen
         for who in (change.before, change.after)
     ]
-    found = _crossed(material, recordings, wanted)
+    found = _crossings(material, recordings, changes.archive, wanted)
     return dict(zip(changes.chosen, zip(found[::2], found[1::2], strict=True), strict=True))
 
 
@@ -160,15 +163,22 @@ def _lead(material: "Material") -> str:
 def _write(shown: "Shown") -> Path:
     """Writes figures and page, the page last: it is whole or as it was."""
     from qd.show.report import elites, evaluation, search
-    from qd.show.report.page import counted, pictures_of, render
+    from qd.show.report.page import Section, counted, pictures_of, render
 
     material = shown.material
-    makers = (
-        search.outcome_section, search.curves_section, search.archive_section, search.pairs_section,
-        elites.modes_section, elites.detail_section, evaluation.tables_section, evaluation.before_after_section,
-        elites.all_section, search.origin_section,
-    )  # fmt: skip
-    sections = [section for make in makers if (section := make(shown)) is not None]
+    chapters = {
+        ("What breaks the controller", "outcome"): search.outcome_section,
+        ("The search", "search"): search.curves_section,
+        ("The archive", "archive"): search.archive_section,
+        ("Shares against each other", "pairs"): search.pairs_section,
+        ("Failure modes", "modes"): elites.modes_section,
+        ("Terrains worth a look", "terrains"): elites.detail_section,
+        ("Controllers compared", "tables"): evaluation.tables_section,
+        ("The same terrain before and after", "before-after"): evaluation.before_after_section,
+        ("All elites", "all"): elites.all_section,
+        ("Where this comes from", "origin"): search.origin_section,
+    }
+    sections = [Section(*name, blocks) for name, make in chapters.items() if (blocks := make(shown))]
     page = render(f"How {material.archive.robot} breaks: a search's report", _lead(material), sections)
     if len(page) > MAX_BYTES:
         raise ValueError(

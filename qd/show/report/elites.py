@@ -3,11 +3,11 @@
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
 from qd.show.crossing_figures import draw_crossing, draw_maps
 from qd.show.elites import Elites
-from qd.show.figures import PENALTY_UNITS, label_of
+from qd.show.figures import label_of, look_of
 from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
 from qd.show.report.modes import MAX_MODES, TOLERANCE, Mode
-from qd.show.report.page import Absent, Block, Heading, Section, Table, Text, counted, percent, picture
+from qd.show.report.page import Block, absent, counted, heading, paragraph, percent, picture, table
 from sim.files.command import plain_command
 from sim.files.intervals import wilson_interval
 
@@ -17,7 +17,7 @@ def anchor_of(number: int) -> str:
     return f"elite-{number}"
 
 
-def modes_section(shown: Shown) -> Section:
+def modes_section(shown: Shown) -> list[Block]:
     """The groups of elites, each with a typical terrain."""
     modes, elites = shown.modes, shown.elites
     largest = max(modes.modes, key=lambda mode: len(mode.members))
@@ -26,25 +26,25 @@ def modes_section(shown: Shown) -> Section:
         f"struggles and how its crossings end. The largest, mode {largest.number}, has {len(largest.members):,} "
         f"({percent(len(largest.members) / len(elites))}): {_described(largest)}."
     )
-    section = Section("Failure modes", "modes", [Text(text), Text(_how(shown))])
     shows = "Mean shares of the penalties and of the ends of crossings by group; silhouette by number of groups"
-    section.blocks += [picture("modes", draw_modes(elites, modes), shows), _modes_table(shown)]
+    drawn = picture("modes", draw_modes(elites, modes), shows)
+    blocks = [paragraph(text), paragraph(_how(shown)), drawn, _modes_table(shown)]
     typical = {
         f"mode {mode.number}: elite {mode.typical}, {mode.ending}": shown.crossed[mode.typical]
         for mode in modes.modes
         if mode.typical in shown.crossed
     }
     if not typical:
-        return section
+        return blocks
     arrived = [shown.crossed[mode.typical].rates[ARRIVED] for mode in modes.modes]
     reached = "; ".join(f"mode {mode.number}: {rate}" for mode, rate in zip(modes.modes, arrived, strict=True))
-    section.blocks += [
-        Text(f"A typical terrain of each, the elite nearest to all others of its mode, crossed again. Robots that "
-             f"reached the goal, with 95 % intervals: {reached}."),
-        picture("modes-terrains", draw_maps(typical, f"{shown.material.archive.robot}: a typical terrain of each mode"),
-                "Height map of a typical terrain of each mode with the robots' paths"),
-    ]  # fmt: skip
-    return section
+    text = (
+        "A typical terrain of each, the elite nearest to all others of its mode, crossed again. Robots that reached "
+        f"the goal, with 95 % intervals: {reached}."
+    )
+    maps = draw_maps(typical, f"{shown.material.archive.robot}: a typical terrain of each mode")
+    shows = "Height map of a typical terrain of each mode with the robots' paths"
+    return [*blocks, paragraph(text), picture("modes-terrains", maps, shows)]
 
 
 def _described(mode: Mode) -> str:
@@ -72,7 +72,7 @@ def _how(shown: Shown) -> str:
     )
 
 
-def _modes_table(shown: Shown) -> Table:
+def _modes_table(shown: Shown) -> str:
     head = ["mode", "elites", "of all", "goal", "base collision", "neither", "fallen", "fitness",
             "share that stands out", "typical elite"]  # fmt: skip
     rows = [
@@ -88,15 +88,13 @@ def _modes_table(shown: Shown) -> Table:
         for mode in shown.modes.modes
     ]
     links = [anchor_of(mode.typical) if mode.typical in shown.crossed else "" for mode in shown.modes.modes]
-    return Table(head, rows, links=links)
+    return table(head, rows, links=links)
 
 
-def detail_section(shown: Shown) -> Section:
+def detail_section(shown: Shown) -> list[Block]:
     """The worst, the most reproducible and the typical elites, each with figure and numbers."""
-    section = Section("Terrains worth a look", "terrains")
     if shown.not_crossed:
-        section.blocks.append(Absent(shown.not_crossed))
-        return section
+        return [absent(shown.not_crossed)]
     stubborn = sum(shown.crossed[number].rates[ARRIVED].hits == 0 for number in shown.worst)
     text = (
         f"{choice_told(shown.elites, shown.worst, shown.steady)} Each was crossed {shown.material.cfg.episodes} times "
@@ -104,10 +102,7 @@ def detail_section(shown: Shown) -> Section:
         f"{stubborn} of the first {len(shown.worst)} no robot reached the goal. Scaled penalties: 1 is what a common "
         "one comes to on hard-random terrain."
     )
-    section.blocks.append(Text(text))
-    for number in shown.numbers:
-        section.blocks += _elite(shown, number)
-    return section
+    return [paragraph(text), *(block for number in shown.numbers for block in _elite(shown, number))]
 
 
 def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
@@ -143,15 +138,21 @@ def _elite(shown: Shown, number: int) -> list[Block]:
     ranked = (("worst failed" if failed else "high fitness", shown.worst), ("most reproducible", shown.steady))
     roles = [f"{what}, rank {numbers.index(number) + 1}" for what, numbers in ranked if number in numbers]
     roles += [f"typical of mode {mode.number}" for mode in shown.modes.modes if mode.typical == number]
-    heading = Heading(f"Elite {number}: {'; '.join(roles)}", anchor_of(number))
+    headed = heading(f"Elite {number}: {'; '.join(roles)}", anchor_of(number))
     if not len(crossed.chosen):
-        return [heading, Absent("All its episodes were invalid this time: there is nothing to draw.")]
+        return [headed, absent("All its episodes were invalid this time: there is nothing to draw.")]
     title = f"{archive.robot}, elite {number} of {len(archive):,}: {len(crossed.chosen)} crossings"
     drawn = picture(
         f"elite-{number}", draw_crossing(crossed, archive.penalties, title),
         f"Height map of elite {number} with the paths of {len(crossed.chosen)} robots, profile, and penalties",
     )  # fmt: skip
-    return [heading, Text(_told(shown, crossed, place)), drawn, _penalty_table(shown, crossed), _rate_table(crossed)]
+    return [
+        headed,
+        paragraph(_told(shown, crossed, place)),
+        drawn,
+        _penalty_table(shown, crossed),
+        _rate_table(crossed),
+    ]
 
 
 def _told(shown: Shown, crossed: Crossed, place: int) -> str:
@@ -177,12 +178,12 @@ def _told(shown: Shown, crossed: Crossed, place: int) -> str:
     )
 
 
-def _penalty_table(shown: Shown, crossed: Crossed) -> Table:
+def _penalty_table(shown: Shown, crossed: Crossed) -> str:
     names, scaled = shown.material.archive.penalties, crossed.scaled
     total = max(float(scaled.mean(axis=0).sum()), 1e-12)
     rows = [
         [
-            label_of(name) + (f" [{PENALTY_UNITS[name]}]" if name in PENALTY_UNITS else ""),
+            label_of(name) + (f" [{look_of(name).unit}]" if look_of(name).unit else ""),
             f"{raw.mean():.2f}",
             f"{raw.std():.2f}",
             f"{own.mean():.2f}",
@@ -191,18 +192,18 @@ def _penalty_table(shown: Shown, crossed: Crossed) -> Table:
         ]
         for name, raw, own in zip(names, crossed.penalties.T, scaled.T, strict=True)
     ]
-    return Table(["penalty an episode", "mean", "std", "mean, scaled", "std, scaled", "share"], rows)
+    return table(["penalty an episode", "mean", "std", "mean, scaled", "std, scaled", "share"], rows)
 
 
-def _rate_table(crossed: Crossed) -> Table:
+def _rate_table(crossed: Crossed) -> str:
     rows = [
         [label, f"{rate.hits} of {rate.count}", f"{100 * rate.hits / rate.count:.0f} %", rate.limits]
         for label, rate in crossed.rates.items()
     ]
-    return Table(["crossings", "", "rate", "95 % interval (Wilson)"], rows)
+    return table(["crossings", "", "rate", "95 % interval (Wilson)"], rows)
 
 
-def all_section(shown: Shown) -> Section:
+def all_section(shown: Shown) -> list[Block]:
     """Every elite in a table that can be sorted."""
     elites, archive = shown.elites, shown.material.archive
     head = ["elite", "fitness", "mode", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]", "std / mean",
@@ -223,9 +224,9 @@ def all_section(shown: Shown) -> Section:
         keys.append([f"{value:.5g}" for value in values])
     links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers.tolist()]
     again = plain_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
-    table = Table(head, rows, sortable=True, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
+    listed = table(head, rows, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
     text = (
         f"All {counted(len(rows), 'elite')}, the highest fitness first; a click on a heading sorts. `{again}` crosses "
         "one again."
     )
-    return Section("All elites", "all", [Text(text), table])
+    return [paragraph(text), listed]

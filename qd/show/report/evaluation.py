@@ -1,12 +1,12 @@
 """The page's chapters about an evaluation: the tables, and the same terrain before and after fine-tuning."""
 
+from pathlib import Path
 from typing import Any
 
 from qd.show.crossed import ARRIVED, FAILED, Crossed
 from qd.show.crossing_figures import draw_maps
-from qd.show.report.figures import draw_tables
 from qd.show.report.material import Shown
-from qd.show.report.page import Absent, Block, Heading, Section, Table, Text, counted, percent, picture
+from qd.show.report.page import Block, Picture, absent, counted, heading, paragraph, percent, picture, table
 from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, Change, Changes, by_kind
 from sim.files.command import plain_command
 
@@ -19,22 +19,26 @@ _TRAINED_ON = {
 """What controllers are trained further on that are named as the paper and docs/results-anymal.md name them."""
 
 
-def tables_section(shown: Shown) -> Section:
+def tables_section(shown: Shown) -> list[Block]:
     """Controllers on the evaluation's sets."""
-    section, tables = Section("Controllers compared", "tables"), shown.material.tables
+    tables = shown.material.tables
     if tables is None:
         about = f"Left out: there are no evaluation tables at {shown.material.tables_file}. They are made by"
-        section.blocks.append(Absent(about, _command(shown)))
-        return section
+        return [absent(about, _command(shown))]
     kinds = by_kind(tables)
-    section.blocks += [
-        Text(_told(tables, kinds)),
-        *([Text(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
-        picture("tables", draw_tables(kinds), "Success, goal rate and reward of every controller on every set"),
+    return [
+        paragraph(_told(tables, kinds)),
+        *([paragraph(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
+        *_drawn(shown.material.tables_file.with_suffix(".png")),
         *(_measure_table(kinds, measure) for measure in MEASURES),
         *_changes_tables(tables),
     ]
-    return section
+
+
+def _drawn(figure: Path) -> list[Block]:
+    """The figure that the evaluation drew beside its tables, if it is there."""
+    shows = "Success, goal rate and reward of every controller on every set, and what became of terrains"
+    return [Picture("tables.png", figure.read_bytes(), shows)] if figure.exists() else []
 
 
 def _from_first(tables: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -129,10 +133,10 @@ def _value(tables: dict[str, Any], measure: str, name: str, who: str) -> str:
     return percent(value) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
 
 
-def _measure_table(tables: dict[str, Any], measure: str) -> Table:
+def _measure_table(tables: dict[str, Any], measure: str) -> str:
     controllers = list(tables["controllers"])
     rows = [[_label(name), *(_value(tables, measure, name, who) for who in controllers)] for name in tables[measure]]
-    return Table([MEASURES[measure], *controllers], rows)
+    return table([MEASURES[measure], *controllers], rows)
 
 
 def _changes_tables(tables: dict[str, Any]) -> list[Block]:
@@ -151,28 +155,23 @@ def _changes_tables(tables: dict[str, Any]) -> list[Block]:
         "Terrains that a controller fails, under half of its episodes reaching the goal, from the first controller to "
         "the second; of several trainings the first one:"
     )
-    blocks: list[Block] = [Text(text), Table(head, from_first)]
-    return [*blocks, Table(head, others, folded=f"Show {counted(len(others), 'other pair')}")] if others else blocks
+    blocks: list[Block] = [paragraph(text), table(head, from_first)]
+    return [*blocks, table(head, others, folded=f"Show {counted(len(others), 'other pair')}")] if others else blocks
 
 
-def before_after_section(shown: Shown) -> Section | None:
-    """Two controllers' paths on the same terrains; None without tables."""
+def before_after_section(shown: Shown) -> list[Block]:
+    """Two controllers' paths on the same terrains; nothing without tables."""
+    if shown.no_changes:
+        return [absent(f"Left out. {shown.no_changes} New tables are made by", _command(shown))]
     if shown.changes is None:
-        return None
-    section = Section("The same terrain before and after", "before-after")
-    if not shown.pairs:
-        reason = shown.changes.reason or shown.not_crossed
-        section.blocks.append(Absent(f"Left out. {reason} New tables are made by", _command(shown)))
-        return section
-    section.blocks.append(Text(_introduced(shown, shown.changes)))
-    for change, crossed in shown.pairs.items():
-        section.blocks += _change(shown, change, crossed)
-    return section
+        return []
+    introduced = paragraph(_introduced(shown, shown.changes))
+    return [introduced, *(block for pair in shown.pairs.items() for block in _change(shown, *pair))]
 
 
 def _introduced(shown: Shown, changes: Changes) -> str:
     """Who crosses what, and how to see it move."""
-    change, policies = changes.chosen[0], changes.policies or {}
+    change, policies = changes.chosen[0], changes.policies
     files = " and ".join(f"{who} ({policy})" for who, policy in policies.items())
     view = plain_command("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
                         policies=[f"{who}={policy}" for who, policy in policies.items()])  # fmt: skip
@@ -195,7 +194,7 @@ def _change(shown: Shown, change: Change, crossed: tuple[Crossed, Crossed]) -> l
     shows = f"Paths of {change.before} and of {change.after} on elite {change.number}"
     drawn = picture(f"change-{change.number}", draw_maps(maps, title), shows)
     by = "with" if change.kind == "still failing" else "by"
-    return [Heading(f"Elite {change.number}: {change.kind} {by} {change.after}"), Text(text), drawn]
+    return [heading(f"Elite {change.number}: {change.kind} {by} {change.after}"), paragraph(text), drawn]
 
 
 def _ended(crossed: Crossed) -> str:

@@ -1,4 +1,4 @@
-"""Figures of all elites and of the evaluation: shares against each other, failure modes, controllers compared.
+"""Figures of all elites: shares against each other, and failure modes.
 
 Okabe and Ito's colours, apart for every kind of colour blindness; markers and hatches tell the same apart in grey.
 """
@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qd.show.elites import Elites
-from qd.show.figures import PENALTY_LABELS, label_of, look_of, new_figure
+from qd.show.figures import label_of, look_of, new_figure
 from qd.show.report.modes import TOLERANCE, Modes
-from qd.show.report.tables import LABELS, MEASURES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,10 +21,6 @@ _MODE_LOOKS = {
     "goal_rate": (("#009e73", "o"), ("#000000", "P")),
 }
 """Colours and markers of failure modes by how most of their crossings end, as of the ends themselves."""
-_CONTROLLER_LOOKS = (
-    ("#000000", "o"), ("#0072b2", "s"), ("#e69f00", "^"), ("#009e73", "v"), ("#cc79a7", "P"), ("#56b4e9", "X"),
-    ("#d55e00", "D"),
-)  # fmt: skip
 _ENDS = (("goal_rate", "goal", "#009e73", "o"), ("collision_rate", "base collision", "#d55e00", "X"),
          ("other_rate", "stuck, late or off", "#0072b2", "s"))  # fmt: skip
 
@@ -63,9 +58,9 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
         if row == count - 2:
-            axes.set_xlabel(PENALTY_LABELS.get(elites.penalties[column], elites.penalties[column]), fontsize=9)
+            axes.set_xlabel(look_of(elites.penalties[column]).label, fontsize=9)
         if column == 0:
-            axes.set_ylabel(PENALTY_LABELS.get(elites.penalties[row + 1], elites.penalties[row + 1]), fontsize=9)
+            axes.set_ylabel(look_of(elites.penalties[row + 1]).label, fontsize=9)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     place: dict[str, Any] = (
         {"loc": "upper right"} if count > 3 else {"loc": "outside lower center", "ncols": len(labels)}
@@ -94,9 +89,7 @@ def draw_modes(elites: Elites, modes: Modes) -> "Figure":
     start = np.zeros(len(places))
     for column, penalty in enumerate(elites.penalties):
         shares = 100.0 * np.array([mode.ratios[column] for mode in modes.modes])
-        colour, hatch = look_of(penalty)
-        style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5, "label": label_of(penalty)}
-        left.barh(places, shares, left=start, **style)
+        left.barh(places, shares, left=start, label=label_of(penalty), **look_of(penalty).bar)
         start += shares
     for shift, (name, label, colour, marker) in zip((-0.22, 0.0, 0.22), _ENDS, strict=True):
         rates = [100.0 * getattr(mode, name) for mode in modes.modes]
@@ -140,39 +133,3 @@ def _draw_silhouettes(axes: "Axes", modes: Modes) -> None:
     axes.set_ylim(bottom=min(0.0, *values))
     axes.grid(alpha=0.3)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False, fontsize=9)
-
-
-def draw_tables(tables: dict[str, Any]) -> "Figure":
-    """Success, goal rate and reward of every controller by set, with 95 % intervals over terrains.
-
-    Args:
-        tables: As :func:`qd.show.report.tables.by_kind` gives them.
-    """
-    figure = new_figure(13.0, 4.4)
-    for axes, (measure, label) in zip(figure.subplots(1, 3), MEASURES.items(), strict=True):
-        _draw_measure(axes, tables, measure)
-        axes.set_ylabel(f"{label}\n{'[sum over 20 s]' if measure == 'reward' else '[% of episodes]'}")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=7, frameon=False)
-    return figure
-
-
-def _draw_measure(axes: "Axes", tables: dict[str, Any], measure: str) -> None:
-    names: list[str] = list(tables[measure])
-    controllers = list(tables["controllers"])
-    factor = 1.0 if measure == "reward" else 100.0
-    step = min(0.16, 0.7 / len(controllers))
-    for index, who in enumerate(controllers):
-        there = [place for place, name in enumerate(names) if tables[measure][name][who] is not None]
-        values = factor * np.array([tables[measure][names[place]][who] for place in there])
-        rows = [tables["intervals"][measure][names[place]][who] for place in there]
-        limits = np.array([row or 2 * [value] for row, value in zip(rows, values / factor, strict=True)]).reshape(-1, 2)
-        limits *= factor
-        lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)  # equal limits may be off by rounding
-        shift = step * (index - (len(controllers) - 1) / 2)
-        colour, marker = _CONTROLLER_LOOKS[index % len(_CONTROLLER_LOOKS)]
-        style = {"linestyle": "", "marker": marker, "color": colour, "capsize": 3, "label": who}
-        axes.errorbar(np.array(there) + shift, values, lengths, **style)
-    labels = [LABELS.get(name, name).replace(", ", ",\n").replace("-", "-\n") for name in names]
-    axes.set_xticks(range(len(names)), labels)
-    axes.set_xlim(-0.5, len(names) - 0.5)
-    axes.grid(axis="y", alpha=0.3)

@@ -80,7 +80,9 @@ class Shown:
     not_crossed: str = ""
     """Why there are none, if so."""
     changes: Changes | None = None
-    """Terrains to show before and after fine-tuning; None without tables."""
+    """Terrains to show before and after fine-tuning."""
+    no_changes: str = ""
+    """Why there are none, if there are tables."""
     pairs: Mapping[Change, tuple[Crossed, Crossed]] = field(default_factory=dict)
     """What both controllers make of each."""
 

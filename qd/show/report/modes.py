@@ -19,6 +19,7 @@ MAX_MODES = 7
 TOLERANCE = 0.05
 """How far below the best silhouette that of a finer division may lie."""
 _COMMON = 0.25  # share of the crossings from which on an end is named
+_MEANS = ("goal_rate", "collision_rate", "other_rate", "fallen_rate", "fitness")
 _MIN_ELITES = 10  # of fewer a silhouette says nothing
 
 
@@ -83,16 +84,21 @@ def find_modes(elites: Elites) -> Modes:
     Args:
         elites: At least one.
     """
-    features = features_of(elites)
-    distances = _distances(features)
+    from scipy.spatial.distance import pdist, squareform
+
+    features = np.column_stack([elites.ratios, elites.goal_rate, elites.collision_rate, elites.fallen_rate])
+    distances = squareform(pdist(features))
     labels, silhouettes = np.ones(len(elites), np.int64), {}
     if len(elites) >= _MIN_ELITES and distances.any():
         from scipy.cluster.hierarchy import fcluster, linkage
+        from sklearn.metrics import silhouette_score
 
         tree = linkage(features, "ward")
         divisions = {count: fcluster(tree, count, "maxclust") for count in range(2, MAX_MODES + 1)}
         silhouettes = {
-            count: silhouette(distances, own) for count, own in divisions.items() if len(np.unique(own)) == count
+            count: float(silhouette_score(distances, own, metric="precomputed"))
+            for count, own in divisions.items()
+            if len(np.unique(own)) == count
         }
         enough = max(silhouettes.values(), default=0.0) - TOLERANCE
         good = [count for count, value in silhouettes.items() if value >= enough]
@@ -106,36 +112,6 @@ def find_modes(elites: Elites) -> Modes:
     return Modes(modes=modes, labels=numbered, silhouettes=silhouettes)
 
 
-def features_of(elites: Elites) -> NDArray[np.float64]:
-    """What elites are grouped by: shares of the penalties; goal, collision and fallen rates; shape (N, P + 3)."""
-    return np.column_stack([elites.ratios, elites.goal_rate, elites.collision_rate, elites.fallen_rate])
-
-
-def _distances(features: NDArray[np.float64]) -> NDArray[np.float64]:
-    from scipy.spatial.distance import pdist, squareform
-
-    return squareform(pdist(features))
-
-
-def silhouette(distances: NDArray[np.float64], labels: NDArray[np.integer]) -> float:
-    """Mean silhouette of a division: 1 where groups are tight and far apart, 0 where they touch.
-
-    Args:
-        distances: Between all N, shape (N, N).
-        labels: Group of each, shape (N,); at least two groups. One alone in its group counts 0.
-    """
-    names, own = np.unique(labels, return_inverse=True)
-    sizes = np.bincount(own)
-    rows = np.arange(len(own))
-    sums = np.stack([distances[:, own == group].sum(axis=1) for group in range(len(names))], axis=1)
-    within = sums[rows, own] / np.maximum(sizes[own] - 1, 1)
-    to_others = sums / sizes
-    to_others[rows, own] = np.inf
-    nearest = to_others.min(axis=1)
-    larger = np.maximum(np.maximum(within, nearest), np.finfo(float).tiny)
-    return float(np.where(sizes[own] > 1, (nearest - within) / larger, 0.0).mean())
-
-
 def _mode(number: int, rows: NDArray[np.int64], elites: Elites, distances: NDArray[np.float64]) -> Mode:
     ratios = elites.ratios[rows].mean(axis=0)
     spread = np.maximum(elites.ratios.std(axis=0), np.finfo(float).tiny)
@@ -146,10 +122,6 @@ def _mode(number: int, rows: NDArray[np.int64], elites: Elites, distances: NDArr
         members=rows,
         typical=int(elites.numbers[rows[distances[np.ix_(rows, rows)].sum(axis=1).argmin()]]),
         ratios=ratios,
-        goal_rate=float(elites.goal_rate[rows].mean()),
-        collision_rate=float(elites.collision_rate[rows].mean()),
-        other_rate=float(elites.other_rate[rows].mean()),
-        fallen_rate=float(elites.fallen_rate[rows].mean()),
-        fitness=float(elites.fitness[rows].mean()),
         marked_by=elites.penalties[int(standing_out.argmax())],
+        **{name: float(getattr(elites, name)[rows].mean()) for name in _MEANS},
     )

@@ -3,10 +3,9 @@
 import base64
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from qd.run.progress import clock
 from qd.show.figures import as_png
@@ -19,39 +18,7 @@ _FOLDER = Path(__file__).parent
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
-@dataclass(frozen=True)
-class Text:
-    """A paragraph."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Heading:
-    """Of a part of a section."""
-
-    text: str
-    anchor: str = ""
-    """What a link to it says after ``#``."""
-
-
-@dataclass(frozen=True)
-class Absent:
-    """What is not there, and the command that makes it."""
-
-    text: str
-    command: str = ""
-
-
-@dataclass(frozen=True)
-class Facts:
-    """Numbers at a glance: each with what it counts."""
-
-    facts: Sequence[tuple[str, str]]
-
-
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A figure: its PNG is in the page, and beside it under the same name."""
 
     name: str
@@ -60,33 +27,73 @@ class Picture:
     """What it shows, for who cannot see it."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of cells; the first of each names the row."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    sortable: bool = False
-    keys: Sequence[Sequence[float | str]] | None = None
-    """What rows are sorted by, cell by cell, where the text would not do."""
-    links: Sequence[str] | None = None
-    """Anchor that the first cell of each row leads to; empty: none."""
-    words: bool = False
-    """Whether cells are sentences and not numbers: they are broken into lines."""
-    folded: str = ""
-    """If any, what stands on the fold that hides it at first."""
+Block = str | Picture
+"""A part of a section: HTML, in which what was put in is escaped, or a figure."""
 
 
-Block = Text | Heading | Absent | Facts | Picture | Table
-
-
-@dataclass
-class Section:
+class Section(NamedTuple):
     """A chapter."""
 
     title: str
     anchor: str
-    blocks: list[Block] = field(default_factory=list)
+    blocks: Sequence[Block]
+
+
+def paragraph(text: str) -> str:
+    """A paragraph; what stands between backticks in it is a command."""
+    words = re.sub(r"`([^`]*)`", r"<code>\1</code>", escape(text))
+    return f"<p>{words}</p>"
+
+
+def heading(text: str, anchor: str = "") -> str:
+    """Of a part of a section, with what a link to it says after ``#``."""
+    return f'<h3 id="{escape(anchor)}">{escape(text)}</h3>' if anchor else f"<h3>{escape(text)}</h3>"
+
+
+def absent(text: str, command: str = "") -> str:
+    """What is not there, and the command that makes it."""
+    return f'<p class="absent">{escape(text)}{f" <code>{escape(command)}</code>" if command else ""}</p>'
+
+
+def at_a_glance(facts: Sequence[tuple[str, str]]) -> str:
+    """Numbers in large print: what each counts, and the number."""
+    cells = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in facts)
+    return f'<dl class="facts">{cells}</dl>'
+
+
+def table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    keys: Sequence[Sequence[str]] | None = None,
+    links: Sequence[str] | None = None,
+    words: bool = False,
+    folded: str = "",
+) -> str:
+    """A table, whose first cells name the rows.
+
+    Args:
+        head: Of each column.
+        rows: Of cells.
+        keys: What rows are sorted by at a click, cell by cell; without them they are not.
+        links: Anchor that the first cell of each row leads to; empty: none.
+        words: Whether cells are sentences and not numbers: they are broken into lines.
+        folded: If any, what stands on the fold that hides it at first.
+    """
+    titles = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+    kind = ' class="sortable"' if keys else ' class="words"' if words else ""
+    body = "".join(_row(row, keys[k] if keys else None, links[k] if links else "") for k, row in enumerate(rows))
+    text = f'<div class="scroll"><table{kind}><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f"<details><summary>{escape(folded)}</summary>{text}</details>" if folded else text
+
+
+def _row(row: Sequence[str], keys: Sequence[str] | None, link: str) -> str:
+    name, *cells = map(escape, row)
+    if link:
+        name = f'<a href="#{escape(link)}">{name}</a>'
+    first, *others = [f' data-key="{escape(key)}"' for key in keys] if keys else [""] * len(row)
+    data = "".join(f"<td{key}>{cell}</td>" for key, cell in zip(others, cells, strict=True))
+    return f'<tr><th scope="row"{first}>{name}</th>{data}</tr>'
 
 
 def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
@@ -99,7 +106,7 @@ def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
     """
     links = "".join(f'<li><a href="#{escape(one.anchor)}">{escape(one.title)}</a></li>' for one in sections)
     body = "".join(
-        f'<section id="{escape(one.anchor)}"><h2>{escape(one.title)}</h2>{"".join(map(_block, one.blocks))}</section>\n'
+        f'<section id="{escape(one.anchor)}"><h2>{escape(one.title)}</h2>{"".join(map(_html, one.blocks))}</section>\n'
         for one in sections
     )
     style, script = ((_FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
@@ -148,41 +155,8 @@ def pictures_of(sections: Sequence[Section]) -> list[Picture]:
     return [block for section in sections for block in section.blocks if isinstance(block, Picture)]
 
 
-def _block(block: Block) -> str:
-    match block:
-        case Text(text):
-            return f"<p>{_with_commands(text)}</p>"
-        case Heading(text, anchor):
-            return f'<h3 id="{escape(anchor)}">{escape(text)}</h3>' if anchor else f"<h3>{escape(text)}</h3>"
-        case Absent(text, command):
-            return f'<p class="absent">{escape(text)}{f" <code>{escape(command)}</code>" if command else ""}</p>'
-        case Facts(facts):
-            cells = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in facts)
-            return f'<dl class="facts">{cells}</dl>'
-        case Picture(_, png, shows):
-            data = base64.b64encode(png).decode()
-            return f'<figure><img alt="{escape(shows)}" src="data:image/png;base64,{data}"></figure>'
-        case Table():
-            return _table(block)
-
-
-def _with_commands(text: str) -> str:
-    """Escaped text; what stands between backticks is a command."""
-    return re.sub(r"`([^`]*)`", r"<code>\1</code>", escape(text))
-
-
-def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.head)
-    rows = "".join(_row(table, k) for k in range(len(table.rows)))
-    kind = ' class="sortable"' if table.sortable else ' class="words"' if table.words else ""
-    text = f'<div class="scroll"><table{kind}><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
-    return f"<details><summary>{escape(table.folded)}</summary>{text}</details>" if table.folded else text
-
-
-def _row(table: Table, k: int) -> str:
-    cells = [escape(cell) for cell in table.rows[k]]
-    if table.links and table.links[k]:
-        cells[0] = f'<a href="#{escape(table.links[k])}">{cells[0]}</a>'
-    keys = [""] * len(cells) if table.keys is None else [f' data-key="{escape(str(key))}"' for key in table.keys[k]]
-    first = f'<th scope="row"{keys[0]}>{cells[0]}</th>'
-    return f"<tr>{first}{''.join(f'<td{key}>{cell}</td>' for key, cell in zip(keys[1:], cells[1:], strict=True))}</tr>"
+def _html(block: Block) -> str:
+    if isinstance(block, str):
+        return block
+    data = base64.b64encode(block.png).decode()
+    return f'<figure><img alt="{escape(block.shows)}" src="data:image/png;base64,{data}"></figure>'

@@ -9,10 +9,10 @@ from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
 from qd.show.elites import Elites
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
-from qd.show.report.evaluation import fates, most_mended
+from qd.show.report.evaluation import most_mended
 from qd.show.report.figures import draw_pairs
 from qd.show.report.material import Shown
-from qd.show.report.page import Absent, Block, Facts, Section, Table, Text, counted, hours, percent, picture
+from qd.show.report.page import Block, absent, at_a_glance, counted, hours, paragraph, percent, picture, table
 from sim.files.command import plain_command
 from sim.files.intervals import bootstrap_interval
 from sim.policy.spec import SHIPPED, ControllerSpec
@@ -21,7 +21,7 @@ _AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh ep
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
-def outcome_section(shown: Shown) -> Section:
+def outcome_section(shown: Shown) -> list[Block]:
     """What was searched, at what cost, and in how many ways the controller breaks how often."""
     elites, archive = shown.elites, shown.material.archive
     failing, ways = int(elites.failing.sum()), elites.failing_cells
@@ -32,7 +32,7 @@ def outcome_section(shown: Shown) -> Section:
     )
     tables = _tables_of_these(shown)
     mended = most_mended(tables) if tables else None
-    facts = Facts(
+    facts = at_a_glance(
         [
             ("terrains, the hardest of each cell, that under half of the robots cross", f"{failing:,}"),
             ("different ways of failing: cells that these fall into", f"{ways:,}"),
@@ -59,9 +59,8 @@ def outcome_section(shown: Shown) -> Section:
         f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal. The rates are means over terrains"
         f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
-    told = (_common(shown), text, _others(tables) if tables else "", explained)
-    blocks = [_searched(shown), facts, *(Text(words) for words in told if words)]
-    return Section("What breaks the controller", "outcome", blocks)
+    told = (_common(shown), text, explained)
+    return [_searched(shown), facts, *map(paragraph, told)]
 
 
 def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
@@ -69,17 +68,6 @@ def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
     tables, archive = shown.material.tables, shown.material.archive
     about = (tables or {}).get("archive") or {}
     return tables if (about.get("elites"), about.get("iterations")) == (len(archive), archive.iterations) else None
-
-
-def _others(tables: dict[str, Any]) -> str:
-    """What other controllers make of elites of this archive, and where that is shown; may be empty."""
-    told = fates(tables)
-    if not told:
-        return ""
-    return (
-        f"Other controllers crossed some of these terrains too. {told} The chapter Controllers compared says who they "
-        "are, The same terrain before and after shows how they fare."
-    )
 
 
 def _common(shown: Shown) -> str:
@@ -113,26 +101,22 @@ def _searched(shown: Shown) -> Block:
     text += f": {counted(len(archive), 'elite')} in {percent(archive.reachable_coverage)} of the "
     text += f"{archive.cells.num_cells:,} reachable cells"
     if numbers is None or material.metrics is None:
-        return Text(f"{text}. What that cost is not on record: there is no metrics.jsonl beside the archive.")
+        return paragraph(f"{text}. What that cost is not on record: there is no metrics.jsonl beside the archive.")
     text += f", from {counted(numbers['terrains_evaluated'], 'terrain')} and {numbers['episodes']:,} episodes"
     walked = [row["episodes"] * row["mean_duration_s"] for row in material.metrics if "mean_duration_s" in row]
     if len(walked) == len(material.metrics):
         text += f" ({hours(sum(walked))} of walking, simulated)"
     where = f" on {'up to ' if material.gpus > 1 else ''}{counted(material.gpus, 'GPU')}" if material.gpus else ""
     invalid = counted(numbers["invalid_episodes"], "episode was", "episodes were")
-    return Text(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
+    return paragraph(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
 
 
-def curves_section(shown: Shown) -> Section:
+def curves_section(shown: Shown) -> list[Block]:
     """How the search went."""
-    section = Section("The search", "search")
     rows, archive = shown.material.metrics, shown.material.archive
     if not rows:
-        section.blocks.append(
-            Absent("The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:",
-                   plain_command("archive", robot=shown.material.robot.spec))
-        )  # fmt: skip
-        return section
+        left_out = "The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:"
+        return [absent(left_out, plain_command("archive", robot=shown.material.robot.spec))]
     first, last = rows[0], rows[-1]
     half = next(row["iteration"] for row in rows if row["elites"] >= last["elites"] / 2)
     text = (
@@ -153,11 +137,10 @@ def curves_section(shown: Shown) -> Section:
             "95 % interval."
         )
     shows = "QD score, number of elites with reachable coverage, and mean fitness over the iterations"
-    section.blocks += [Text(text), picture("curves", draw_curves(archive, rows), shows)]
-    return section
+    return [paragraph(text), picture("curves", draw_curves(archive, rows), shows)]
 
 
-def archive_section(shown: Shown) -> Section:
+def archive_section(shown: Shown) -> list[Block]:
     """The archive on parallel axes, and its spread over each share."""
     elites, archive = shown.elites, shown.material.archive
     largest = elites.ratios.max(axis=0)
@@ -176,32 +159,25 @@ def archive_section(shown: Shown) -> Section:
         f"{label_of(archive.penalties[widest])}; {int(archive.collided.sum()):,} of "
         f"{counted(len(archive), 'elite')} had a base collision in the episodes that found them."
     )
-    return Section(
-        "The archive",
-        "archive",
-        [
-            Text(lines),
-            picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
-            Text(spread_text),
-            picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
-        ],
-    )
+    return [
+        paragraph(lines),
+        picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
+        paragraph(spread_text),
+        picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
+    ]
 
 
-def pairs_section(shown: Shown) -> Section:
+def pairs_section(shown: Shown) -> list[Block]:
     """Every two shares against each other."""
-    elites, section = shown.elites, Section("Shares against each other", "pairs")
-    if len(elites) < 3 or len(elites.penalties) < 2:
-        section.blocks.append(
-            Absent(f"The projections are left out: they need 3 elites, and there are {len(elites)}. A longer search "
-                   "finds more:", plain_command("archive", resume=shown.material.run, iterations="N"))
-        )  # fmt: skip
-        return section
+    elites = shown.elites
+    if len(elites) < 3:
+        too_few = f"The projections are left out: they need 3 elites, and there are {len(elites)}."
+        longer = plain_command("archive", resume=shown.material.run, iterations="N")
+        return [absent(f"{too_few} A longer search finds more:", longer)]
     text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode (next chapter)."
     text += _related(elites)
     shows = "Scatter plots of every two shares of the penalties, by failure mode"
-    section.blocks += [Text(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]
-    return section
+    return [paragraph(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]
 
 
 def _related(elites: Elites) -> str:
@@ -220,16 +196,12 @@ def _related(elites: Elites) -> str:
     return f"{text}. Two principal directions hold {percent(share)} of their variance."
 
 
-def origin_section(shown: Shown) -> Section:
+def origin_section(shown: Shown) -> list[Block]:
     """Where the numbers come from."""
     origin = shown.material.origin
-    section = Section("Where this comes from", "origin")
     if not origin:
-        section.blocks.append(
-            Absent("The search is not on record: there is no config.json beside the archive. A search writes one:",
-                   plain_command("archive", robot=shown.material.robot.spec))
-        )  # fmt: skip
-        return section
+        lost = "The search is not on record: there is no config.json beside the archive. A search writes one:"
+        return [absent(lost, plain_command("archive", robot=shown.material.robot.spec))]
     rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]
     versions = origin.get("versions")
     if isinstance(versions, dict):
@@ -237,5 +209,4 @@ def origin_section(shown: Shown) -> Section:
     again = shown.material.reproduced_by
     rows += [[f"fresh episodes: {name}", str(again[name])] for name in _AGAIN if name in again]
     text = f"The archive read is {shown.material.run}. Its search began with:"
-    section.blocks += [Text(text), Table(["", ""], rows, words=True)]
-    return section
+    return [paragraph(text), table(["", ""], rows, words=True)]

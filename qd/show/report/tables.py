@@ -1,6 +1,6 @@
 """The evaluation's ``tables.json``, read as data, and the terrains in it that are worth showing before and after."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ LABELS = {
 _KINDS = ("mended", "newly_broken", "still_failing")
 _MENDED = 2  # terrains shown of that kind; of each other one
 _CONTROLLERS = ("*.pt", "*.onnx")  # files beside the tables that may be one
-_KEYS = ("robot", "episodes", "controllers", "terrains", "intervals", "differences", *MEASURES)
+_NUMBER = int | float | None
 
 
 def read_tables(file: Path, robot: str) -> dict[str, Any]:
@@ -45,77 +45,41 @@ def read_tables(file: Path, robot: str) -> dict[str, Any]:
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: {writer} writes them")
     tables = read_json(file)
-    if problem := _problem_of(tables):
-        raise ValueError(f"{file} must hold the tables of {writer}, but {problem}: give that file")
+    for key, shape in _shapes(tables):
+        if not _fits(shape, tables.get(key)):
+            raise ValueError(f"{file} must hold the tables of {writer}, but its {key} cannot be read: give that file")
     if tables["robot"] != robot:
         raise ValueError(f"{file} is of robot {tables['robot']}, got --robot {robot}: give that robot or other tables")
     return tables
 
 
-def _problem_of(tables: dict[str, Any]) -> str:
-    """What keeps the tables from being shown; empty if nothing does."""
-    if missing := [key for key in _KEYS if key not in tables]:
-        return f"it lacks {', '.join(missing)}"
-    checks: dict[str, Callable[[], bool]] = {
-        "number of episodes": lambda: type(tables["episodes"]) is int,
-        "controllers": lambda: _all(_is_controller, tables["controllers"].values()),
-        "terrains": lambda: _all(lambda count: type(count) is int, tables["terrains"].values()),
-        "differences": lambda: all(_all(_is_pair, pairs.values(), 0) for pairs in tables["differences"].values()),
-        "means over seeds": lambda: _are_over_seeds(tables.get("over_seeds", {})),
-        **{measure: lambda measure=measure: _is_measure(tables, measure) for measure in MEASURES},
-    }
-    for what, holds in checks.items():
-        try:
-            if holds():
-                continue
-        except (AttributeError, KeyError, TypeError):  # of values of other kinds
-            pass
-        return f"its {what} cannot be read"
-    return ""
-
-
-def _all(holds: Callable[[Any], bool], values: Any, least: int = 1) -> bool:
-    """Whether there are values, and something holds for all of them."""
-    return len(values) >= least and all(map(holds, values))
-
-
-def _is_controller(about: Any) -> bool:
-    return isinstance(about["policy"], str) and "sha256" in about
-
-
-def _is_pair(pair: Any) -> bool:
-    """Whether this says what became of terrains between two controllers."""
-    kinds = [pair[kind] for kind in CHANGES]
-    return type(pair["compared"]) is int and all(
-        type(kind["count"]) is int
-        and isinstance(kind["terrains"], list)
-        and all(type(number) is int for number in kind["terrains"])
-        for kind in kinds
+def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Every key of the tables that is read, with its shape for :func:`_fits`; later shapes need earlier keys to fit."""
+    terrains = {"count": int, "terrains": [int]}
+    yield "robot", str
+    yield "episodes", int
+    yield "controllers", {...: {"policy": str, "sha256": str | None}}
+    yield "terrains", {...: int}
+    yield "differences", {...: {...: {"compared": int, **dict.fromkeys(CHANGES, terrains)}}}
+    values, intervals = (
+        dict.fromkeys(tables["terrains"], dict.fromkeys(tables["controllers"], kind)) for kind in (_NUMBER, list | None)
     )
+    yield from ((measure, values) for measure in MEASURES)
+    yield "intervals", dict.fromkeys(MEASURES, intervals)
+    yield "over_seeds", {...: {...: {...: {"mean": _NUMBER, "interval": list | None}}}}
 
 
-def _is_measure(tables: dict[str, Any], measure: str) -> bool:
-    """Whether a measure has a value and an interval of every controller on every set."""
-    who, limits = tables["controllers"].keys(), tables["intervals"][measure]
-    return _all(lambda name: name in tables["terrains"], tables[measure]) and all(
-        row.keys() == who == limits[name].keys() and all(_is_measured(row[one], limits[name][one]) for one in who)
-        for name, row in tables[measure].items()
-    )
-
-
-def _is_measured(value: Any, limits: Any) -> bool:
-    """Whether these are a number with two limits, or both nothing."""
-    if value is None or limits is None:
-        return value is None and limits is None
-    return len(limits) == 2 and all(type(number) in (int, float) for number in (value, *limits))
-
-
-def _are_over_seeds(found: Any) -> bool:
-    """Whether these are means over the controllers of a kind: measure -> set -> kind."""
-    kinds = [about for sets in found.values() for row in sets.values() for about in row.values()]
-    pairs = [(about["mean"], about["interval"]) for about in kinds]
-    # of very many seeds no interval is known
-    return all(_is_measured(*pair) or (pair[1] is None and _is_measured(pair[0], [pair[0]] * 2)) for pair in pairs)
+def _fits(shape: Any, value: Any) -> bool:
+    """Whether a JSON value has a shape: a type, [shape of every item], {key: shape} or {...: shape of every value}."""
+    if isinstance(shape, list):
+        return isinstance(value, list) and all(_fits(shape[0], item) for item in value)
+    if not isinstance(shape, dict):
+        return isinstance(value, shape)
+    if not isinstance(value, dict):
+        return False
+    if ... in shape:
+        return all(_fits(shape[...], item) for item in value.values())
+    return all(key in value and _fits(part, value[key]) for key, part in shape.items())
 
 
 def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
@@ -137,7 +101,7 @@ def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
     for measure in MEASURES:
         values, limits = {}, {}
         for name in tables[measure]:
-            several = tables.get("over_seeds", {}).get(measure, {}).get(name, {})
+            several = tables["over_seeds"].get(measure, {}).get(name, {})
             pairs = {label: _of_kind(tables, measure, name, all_, several) for label, all_ in labels.items()}
             values[name] = {label: value for label, (value, _) in pairs.items()}
             limits[name] = {label: interval for label, (_, interval) in pairs.items()}
@@ -173,17 +137,15 @@ class Change:
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """Terrains to show before and after, or why there are none to show."""
+    """Terrains to show before and after."""
 
-    archive: Archive | None = None
+    archive: Archive
     """That the numbers count in."""
-    run: Path | None = None
+    run: Path
     """Where that lies."""
-    chosen: tuple[Change, ...] = ()
-    policies: dict[str, str] | None = None
-    """File of each controller by its name; the robot's own is called shipped."""
-    reason: str = ""
-    """Why there are none."""
+    chosen: tuple[Change, ...]
+    policies: dict[str, str]
+    """File of both controllers by their names; the robot's own is called shipped."""
 
 
 def changes_of(tables: dict[str, Any], file: Path, robot: RobotCfg) -> Changes:
@@ -195,23 +157,27 @@ def changes_of(tables: dict[str, Any], file: Path, robot: RobotCfg) -> Changes:
         tables: As :func:`read_tables` gives them.
         file: Where they lie: controllers and archive may have been put beside them since.
         robot: The robot, whose own controller is one of them as a rule.
+
+    Raises:
+        ValueError: If there are none to show, which says why.
     """
     first, *others = tables["controllers"]
     known = tables["differences"].get(GENERATED) or {}
     pairs = {who: known[f"{first} -> {who}"] for who in others if f"{first} -> {who}" in known}
     pairs = {who: pair for who, pair in pairs.items() if pair["mended"]["count"] + pair["newly_broken"]["count"]}
     if not pairs:
-        return Changes(reason="No generated terrain of the tables is mended or newly broken between their controllers.")
+        raise ValueError("No generated terrain of the tables is mended or newly broken between their controllers.")
     most_first = sorted(pairs, key=lambda who: -pairs[who]["mended"]["count"])
     files = {who: _file_of(tables["controllers"][who], file.parent, robot) for who in (first, *most_first)}
     after = next((who for who in most_first if files[who] is not None), most_first[0])
+    policies = {}
     for who in (first, after):
-        if files[who] is None:
-            return Changes(reason=_why_not(who, tables["controllers"][who]["policy"], file.parent))
+        if (policy := files[who]) is None:
+            raise ValueError(_why_not(who, tables["controllers"][who]["policy"], file.parent))
+        policies[who] = policy
     chosen = _chosen(tables, first, after)
-    archive, run, reason = _archive_of(tables, chosen, file.parent)
-    policies = {who: str(files[who]) for who in (first, after)}
-    return Changes(archive=archive, run=run, chosen=chosen if archive else (), policies=policies, reason=reason)
+    archive, run = _archive_of(tables, chosen, file.parent)
+    return Changes(archive=archive, run=run, chosen=chosen, policies=policies)
 
 
 def _file_of(about: dict[str, Any], beside: Path, robot: RobotCfg) -> str | None:
@@ -246,23 +212,21 @@ def _chosen(tables: dict[str, Any], before: str, after: str) -> tuple[Change, ..
     )
 
 
-def _archive_of(
-    tables: dict[str, Any], chosen: tuple[Change, ...], beside: Path
-) -> tuple[Archive | None, Path | None, str]:
-    """The archive that the tables' terrains are numbered in and its place, or why it cannot be had.
+def _archive_of(tables: dict[str, Any], chosen: tuple[Change, ...], beside: Path) -> tuple[Archive, Path]:
+    """The archive that the tables' terrains are numbered in, and its place.
 
     One beside the tables comes first: it is published with them, where the path may be that of another machine.
     """
     about = tables.get("archive") or {}
-    reasons = []
+    reason = ""
     for path in (beside / "archive", Path(about.get("path", ""))):
         try:
             archive = read_archive(path)
         except (OSError, ValueError) as error:
-            reasons.append(f"The archive of the tables cannot be read: {error}")
+            reason = f"The archive of the tables cannot be read: {error}"
             continue
         same = (len(archive), archive.iterations) == (about.get("elites"), about.get("iterations"))
         if same and all(0 <= change.number < len(archive) for change in chosen):
-            return archive, path, ""
-        reasons.append(f"The archive at {path} has changed since the tables were made.")
-    return None, None, reasons[-1]
+            return archive, path
+        reason = f"The archive at {path} has changed since the tables were made."
+    raise ValueError(reason)

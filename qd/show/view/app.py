@@ -68,12 +68,12 @@ class App:
         gui, show = self.page.gui, self._show
         gui.configure_theme(show_logo=False, show_share_button=False)
         bodies, num_feet = body_meshes(self._skeleton, show.robot), len(show.robot.foot_geoms)
-        self._scene = Scene(self.page, bodies, num_feet, CrossingCfg())
+        self.scene = Scene(self.page, bodies, num_feet, CrossingCfg())
         title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
-        self._list = ArchivePanel(self.page, self._axes, title, self)
+        self._list = ArchivePanel(self.page, self._axes, self._selection, title, self)
         self._panel = CrossingPanel(self.page, list(show.controllers), show.cfg.replicas, self)
         self._selection.pick(show.elite)
-        self._list.show(self._selection)
+        self._list.show()
         self._show_elite()
 
     def post(self, act: Callable[..., None], *args: Any) -> None:
@@ -112,28 +112,13 @@ class App:
                 act, args = self._asked.get(timeout=left)
             except queue.Empty:
                 break
-            key: Any = act if act in only_last else (act, args[0]) if act == self.brush else object()
+            key: Any = act if act in only_last else (act, args[0]) if act == self._list.brush else object()
             found.pop(key, None)
             found[key] = (act, args)
             if not self._clock.playing and self._asked.empty():
                 break
         for act, args in found.values():
             act(*args)
-
-    def brush(self, axis: str, low: float, high: float) -> None:
-        """List the elites in a range of an axis."""
-        self._selection.brush(axis, low, high)
-        self._list.show(self._selection)
-
-    def clear(self) -> None:
-        """Free all axes."""
-        self._selection.clear()
-        self._list.show(self._selection)
-
-    def turn(self, pages: int) -> None:
-        """Turn the list by some pages."""
-        self._selection.turn(pages)
-        self._list.show(self._selection)
 
     def pick_line(self, line: int) -> None:
         """Show the elite on a line of the list."""
@@ -150,7 +135,7 @@ class App:
         if not 0 <= number < len(self._archive):  # a number field can be typed into
             return
         changed = self._selection.pick(number)
-        self._list.show(self._selection)
+        self._list.show()
         if changed:
             self._show_elite()
 
@@ -183,19 +168,10 @@ class App:
         """Play so many simulated seconds in a real one."""
         self._clock.speed = speed
 
-    def set_follow(self, follow: bool) -> None:
-        """Let the camera follow the robot, or stay."""
-        self._scene.set_follow(follow)
-
     def set_forces(self, shown: bool) -> None:
         """Show or hide the forces of the feet."""
-        self._scene.show_forces = shown
-        if self._crossing is not None:
-            self._show_frame()
-
-    def set_paths(self, shown: bool) -> None:
-        """Show or hide the ways of all episodes."""
-        self._scene.set_show_paths(shown)
+        self.scene.show_forces = shown
+        self._show_frame()
 
     def show_report(self, report: Report) -> None:
         """Say how a recording goes on, keep it, and show it if it is still wanted."""
@@ -220,14 +196,14 @@ class App:
 
     def _show_elite(self) -> None:
         elite = self._selection.picked
-        self._scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], get_space(self._archive.space))[0])
+        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], get_space(self._archive.space))[0])
         self._panel.show_elite(self._axes.details(elite))
         self._show_crossings()
 
     def _show_crossings(self) -> None:
         """Show the picked elite's crossings if they are recorded, else have them recorded."""
         self._recording = self._crossing = self._curves = None
-        self._scene.hide_crossing()
+        self.scene.hide_crossing()
         self._clock.load(0.0)
         self._panel.show_controls(self._clock, self._replica, enabled=False)
         self._panel.show_moment("", "")
@@ -243,7 +219,7 @@ class App:
 
     def _show_recording(self, recording: Recording) -> None:
         self._recording = recording
-        self._scene.set_paths(paths_of(recording))
+        self.scene.set_paths(paths_of(recording))
         self._show_episode()
 
     def _show_episode(self) -> None:
@@ -259,7 +235,7 @@ class App:
             self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
         else:
             self._clock.load(crossing.duration_s)
-            self._curves = Curves(crossing.times_s, crossing.penalties, self._axes.labels)
+            self._curves = Curves(crossing.times_s, crossing.penalties, self._archive.penalties)
             ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
             self._panel.show_status(f"{ended} {all_of_them}")
             self._show_frame()
@@ -268,11 +244,13 @@ class App:
 
     def _show_frame(self) -> None:
         if self._crossing is not None:
-            self._scene.show_frame(self._crossing, self._clock.frame(self._crossing.dt, self._crossing.num_frames))
+            self.scene.show_frame(self._crossing, self._clock.frame(self._crossing.dt, self._crossing.num_frames))
 
     def _show_moment(self) -> None:
         crossing, curves = self._crossing, self._curves
         if crossing is not None and curves is not None:
             frame = self._clock.frame(crossing.dt, crossing.num_frames)
-            self._panel.show_moment(curves.at(self._clock.time_s), moment_text(crossing, frame, self._axes.labels))
+            self._panel.show_moment(
+                curves.at(self._clock.time_s), moment_text(crossing, frame, self._archive.penalties)
+            )
         self._panel.show_time(self._clock)

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 SEARCHED = "as searched"
 """What the page calls the controller of the search, if no other is named."""
-_LOOK_AHEAD = 50
-"""Ports looked at for a free one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,16 +146,13 @@ def check_port(host: str, port: int) -> None:
     """Makes sure that a page can be served on a port.
 
     Raises:
-        ValueError: If the port is in use, which names a free one, or the address is none of this machine's.
+        ValueError: If the port is in use, or the address is none of this machine's.
     """
     if not 0 < port < 65536:
         raise ValueError(f"port must lie in 1..65535, got {port}")
     reason = _trouble(host, port)
     if reason is not None and reason.errno == errno.EADDRINUSE:
-        others = range(port + 1, min(port + 1 + _LOOK_AHEAD, 65536))
-        free = next((other for other in others if _trouble(host, other) is None), None)
-        remedy = "close that program" if free is None else f"take --port {free}, which is free"
-        raise ValueError(f"port {port} of {host} is in use by another program: {remedy}")
+        raise ValueError(f"port {port} of {host} is in use by another program: close that, or give another --port")
     if reason is not None:
         raise ValueError(
             f"nothing can be served at port {port} of {host}: {reason.strerror or reason}: give a --port above 1023 "

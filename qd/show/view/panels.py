@@ -35,18 +35,14 @@ class Selection:
             axes: Of at least one elite.
         """
         self._axes = axes
-        self._ranges: dict[str, tuple[float, float]] = {}
+        self.ranges: dict[str, tuple[float, float]] = {}
+        """Brushed ranges by axis; an axis that is open at both ends has none."""
         self.kept: NDArray[np.int64] = axes.within({})
         """Numbers of the elites in all ranges, worst first."""
         self.picked = 0
         """Number of the elite that is shown; it stays when a range leaves it out."""
         self.page = 0
         """Page of the list, from 0."""
-
-    @property
-    def ranges(self) -> dict[str, tuple[float, float]]:
-        """Brushed ranges by axis; an axis that is open at both ends has none."""
-        return dict(self._ranges)
 
     @property
     def num_pages(self) -> int:
@@ -59,28 +55,22 @@ class Selection:
         return self.kept[self.page * PAGE : (self.page + 1) * PAGE].tolist()
 
     def brush(self, name: str, low: float, high: float) -> None:
-        """Keep elites in a range of an axis alone, ends included; the axis's full range frees it.
-
-        Raises:
-            ValueError: If the upper end is below the lower one.
-        """
-        if high < low:
-            raise ValueError(f"a range must go from low to high, got {low} to {high}")
+        """Keep elites in a range of an axis alone, ends included; the axis's full range frees it."""
         axis = self._axes.axis(name)
         half = 0.5 * axis.step
         if low <= axis.low + half and high >= axis.high - half:
-            self._ranges.pop(name, None)
+            self.ranges.pop(name, None)
         else:
-            self._ranges[name] = (low, high)
+            self.ranges[name] = (low, high)
         self._keep()
 
     def clear(self) -> None:
         """Free all axes."""
-        self._ranges.clear()
+        self.ranges.clear()
         self._keep()
 
     def _keep(self) -> None:
-        self.kept = self._axes.within(self._ranges)
+        self.kept = self._axes.within(self.ranges)
         self.page = 0
 
     def turn(self, pages: int) -> None:
@@ -88,16 +78,7 @@ class Selection:
         self.page = int(np.clip(self.page + pages, 0, self.num_pages - 1))
 
     def pick(self, number: int) -> bool:
-        """Show an elite, and the page of the list it is on if it is in the ranges.
-
-        Returns:
-            Whether it is another one than before.
-
-        Raises:
-            ValueError: If there is no such elite.
-        """
-        if not 0 <= number < len(self._axes.elites):
-            raise ValueError(f"there is no elite {number}: expected 0 to {len(self._axes.elites) - 1}")
+        """Show an elite, and its page of the list if it is in the ranges; returns whether it is another one."""
         place = np.searchsorted(self.kept, number)
         if place < len(self.kept) and self.kept[place] == number:
             self.page = int(place) // PAGE
@@ -141,18 +122,11 @@ class Clock:
         if self.playing and self.time_s >= self.duration_s:
             self.time_s = 0.0
 
-    def tick(self, real_s: float) -> bool:
-        """Let real time go by [s]; at its end a crossing stops.
-
-        Returns:
-            Whether the shown time changed.
-        """
-        if not self.playing:
-            return False
-        before = self.time_s
-        self.seek(before + self.speed * real_s)
-        self.playing = self.time_s < self.duration_s
-        return self.time_s != before
+    def tick(self, real_s: float) -> None:
+        """Let real time go by [s]; at its end a crossing stops."""
+        if self.playing:
+            self.seek(self.time_s + self.speed * real_s)
+            self.playing = self.time_s < self.duration_s
 
     def frame(self, dt: float, num_frames: int) -> int:
         """Frame of the shown time among ``num_frames`` that are ``dt`` [s] apart."""
@@ -162,16 +136,17 @@ class Clock:
 class ArchivePanel:
     """The parallel axes, their ranges, and the list of the elites."""
 
-    def __init__(self, server: viser.ViserServer, axes: Axes, title: str, app: "App") -> None:
+    def __init__(self, server: viser.ViserServer, axes: Axes, selection: Selection, title: str, app: "App") -> None:
         """Lay it out.
 
         Args:
             server: The page.
             axes: The elites.
+            selection: Those listed, and the one picked.
             title: What archive it is.
             app: Does what a visitor asks for.
         """
-        self._axes, self._app, self._gui = axes, app, server.gui
+        self._axes, self._selection, self._app, self._gui = axes, selection, app, server.gui
         self._panel = server.gui.add_panel()
         self._panel.dock_left()
         self._panel.set_width(_WIDTH)
@@ -185,20 +160,20 @@ class ArchivePanel:
                 self._add_list()
             with tabs.add_tab("Ranges"):
                 self._sliders = {axis.name: self._add_slider(axis.name) for axis in axes.axes}
-                self._add_button("Free all axes", app.clear)
+                self._add_button("Free all axes", self.change, selection.clear)
 
     def _add_list(self) -> None:
         self._gui.add_markdown("Elite: fitness · base collision · goal reached, with 95 % intervals")
         self._lines = [self._add_button("", self._app.pick_line, k) for k in range(PAGE)]
         pages = self._gui.add_button_group("Page", ("first", "previous", "next", "last"))
         turns = {"first": -len(self._axes.elites), "previous": -1, "next": 1, "last": len(self._axes.elites)}
-        pages.on_click(lambda event: self._app.post(self._app.turn, turns[event.target.value]))
+        pages.on_click(lambda event: self._app.post(self.change, self._selection.turn, turns[event.target.value]))
         steps = self._gui.add_button_group("Elite", ("worse", "milder"))
         steps.on_click(lambda event: self._app.post(self._app.step, -1 if event.target.value == "worse" else 1))
         self._number = self._gui.add_number("Number", 0, min=0, max=len(self._axes.elites) - 1, step=1)
         _on_visit(self._number, lambda value: self._app.post(self._app.pick, int(value)))
 
-    def _add_button(self, label: str, act: Callable[..., None], *args: int) -> Any:
+    def _add_button(self, label: str, act: Callable[..., None], *args: object) -> Any:
         button = self._gui.add_button(label)
         button.on_click(lambda event: self._app.post(act, *args))
         return button
@@ -208,11 +183,21 @@ class ArchivePanel:
         slider = self._gui.add_multi_slider(
             axis.label, min=axis.low, max=axis.high, step=axis.step, initial_value=(axis.low, axis.high)
         )
-        _on_visit(slider, lambda value: self._app.post(self._app.brush, name, *value))
+        _on_visit(slider, lambda value: self._app.post(self.brush, name, *value))
         return slider
 
-    def show(self, selection: Selection) -> None:
+    def change(self, act: Callable[..., object], *args: object) -> None:
+        """Change what is listed, by a method of the selection, and show that."""
+        act(*args)
+        self.show()
+
+    def brush(self, name: str, low: float, high: float) -> None:
+        """List the elites in a range of an axis."""
+        self.change(self._selection.brush, name, low, high)
+
+    def show(self) -> None:
         """Draw plot and list anew."""
+        selection = self._selection
         kept, listed = selection.kept, selection.listed
         self._plot.content = axes_svg(self._axes, kept, selection.ranges, selection.picked)
         pages = f" · page {selection.page + 1} of {selection.num_pages}" if len(kept) else ""
@@ -260,9 +245,9 @@ class CrossingPanel:
         self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 x")
         _on_visit(self._speed, lambda value: app.post(app.set_speed, SPEEDS[value]))
         switches = (
-            ("Follow", app.set_follow, False),
+            ("Follow", app.scene.set_follow, False),
             ("Foot forces (1 m: 1,000 N)", app.set_forces, True),
-            ("All ways", app.set_paths, True),
+            ("All ways", app.scene.set_show_paths, True),
         )
         for label, switch, initial in switches:
             box = gui.add_checkbox(label, initial)

@@ -1,5 +1,6 @@
 """One crossing as it is shown: bodies, forces, command and penalties at every frame, and how it ends."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,16 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageColor
 
-from kernels.episode import Outcome
-from qd.show.crossed import ENDINGS
+from qd.show.crossed import ending_of
+from qd.show.figures import label_of
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
-OUTCOMES = {
-    **{outcome: (ending.words, ImageColor.getrgb(ending.color)) for outcome, ending in ENDINGS.items()},
-    Outcome.INVALID: ("invalid: the simulation broke", (90, 90, 90)),
-}
-"""How an episode may end, in words, and the colour of its path."""
 _FORCE_LENGTH = 1e-3  # of an arrow [m/N]
 _LEAST_FORCE = 5.0  # shown [N]
 _COMMAND_LENGTH = 1.0  # of an arrow [m/(m/s)]
@@ -82,12 +78,12 @@ def crossing_of(
     feet = _foot_positions(recording, skeleton, positions, quaternions)
     command = recording.command[0, replica, :frames].astype(np.float64)
     columns = [recording.penalty_names.index(name) for name in penalties]
-    outcome = Outcome(int(recording.outcome[0, replica]))
+    ending = ending_of(recording.outcome[0, replica])
     fallen = " · fallen" if recording.fallen[0, replica] else ""
     return Crossing(
         dt=recording.dt,
         duration_s=float(recording.duration_s[0, replica]),
-        ending=OUTCOMES[outcome][0] + fallen,
+        ending=ending.words + fallen,
         positions=positions,
         quaternions=quaternions,
         forces=np.stack([feet, feet + arrows], axis=2),
@@ -137,18 +133,16 @@ def paths_of(recording: Recording, every: int = 5) -> list[tuple[NDArray[np.floa
         frames = int(recording.num_frames[0, replica])
         points = recording.base_position[0, replica, :frames]
         chosen = np.unique([*range(0, frames, every), frames - 1]) if frames else []
-        outcome = Outcome(int(recording.outcome[0, replica]))
-        found.append((points[chosen], OUTCOMES[outcome][1]))
+        color = ending_of(recording.outcome[0, replica]).color
+        found.append((points[chosen], ImageColor.getrgb(color)))
     return found
 
 
 def endings(recording: Recording) -> str:
     """How many episodes of one terrain ended how, such as ``12 out of time, 8 base collision``, in colours, as HTML."""
-    counts = [(int((recording.outcome[0] == outcome).sum()), *looks) for outcome, looks in OUTCOMES.items()]
+    counts = Counter(map(ending_of, recording.outcome[0].tolist()))
     return ", ".join(
-        f'<span style="color:rgb{color}">{count} {words}</span>'
-        for count, words, color in sorted(counts, key=lambda entry: -entry[0])
-        if count
+        f'<span style="color:{ending.color}">{count} {ending.words}</span>' for ending, count in counts.most_common()
     )
 
 
@@ -158,12 +152,13 @@ def moment_text(crossing: Crossing, frame: int, penalties: Sequence[str]) -> str
     Args:
         crossing: The crossing.
         frame: Which frame.
-        penalties: Each penalty in words.
+        penalties: Names of the penalties.
     """
     v_x, v_y, yaw_rate = crossing.command_values[frame]
     forces = " · ".join(f"{newtons:,.0f}" for newtons in crossing.force_newtons[frame])
     x, y, z = crossing.positions[frame, 0]
-    rows = [f"| {name} | {value:.2f} |" for name, value in zip(penalties, crossing.penalties[frame], strict=True)]
+    sums = zip(penalties, crossing.penalties[frame], strict=True)
+    rows = [f"| {label_of(name)} | {value:.2f} |" for name, value in sums]
     return "\n".join(
         [
             "| penalty so far | multiples of its scale |",

@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.show.elites import Elites, elites_of
-from qd.show.figures import label_of
+from qd.show.figures import label_of, look_of
 from sim.files.intervals import rate_words
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#666666")
-"""Of curves, one a penalty; readable by most colour-blind people."""
 _SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites by fitness, the worst darkest
 _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
 _WIDTH, _HEIGHT = 460, 350
@@ -52,11 +50,6 @@ class Axes:
     def axis(self, name: str) -> Axis:
         """The axis of a name."""
         return next(axis for axis in self.axes if axis.name == name)
-
-    @property
-    def labels(self) -> list[str]:
-        """The penalties in words, in the archive's order."""
-        return [label_of(name) for name in self.archive.penalties]
 
     def within(self, ranges: dict[str, tuple[float, float]]) -> NDArray[np.int64]:
         """Numbers of the elites that lie in all ranges, limits included, worst first.
@@ -183,13 +176,13 @@ def _svg(height: int, parts: Iterable[str]) -> str:
 class Curves:
     """Running penalties of one crossing, drawn once; only the mark of the shown time moves."""
 
-    def __init__(self, times_s: NDArray[np.floating], sums: NDArray[np.floating], labels: Sequence[str]) -> None:
+    def __init__(self, times_s: NDArray[np.floating], sums: NDArray[np.floating], penalties: Sequence[str]) -> None:
         """Draw the curves.
 
         Args:
             times_s: Time of each frame [s], shape (num_frames,).
             sums: Scaled penalty sums so far, shape (num_frames, num_penalties).
-            labels: Each penalty in words.
+            penalties: Their names.
         """
         self._end = max(float(times_s[-1]), 1e-9)
         most = max(float(np.max(sums)), 1e-9)
@@ -204,11 +197,13 @@ class Curves:
             _text(_MARGIN + 8, bottom + 13, "penalties so far, in multiples of their scales", "start"),
             _text(_WIDTH - 8, bottom + 13, f"{self._end:.1f} s", "end"),
         ]
-        for column, label in enumerate(labels):
-            color = COLORS[column % len(COLORS)]
+        for column, penalty in enumerate(penalties):
+            color = look_of(penalty).color
             y = bottom - np.asarray(sums[chosen, column], dtype=np.float64) / most * (bottom - top)
             parts.append(_lines(x, y[None], color, 1.6, 1.0))
-            parts.append(_text(_MARGIN + 16, top + 12 * column + 4, label, "start", f'style="fill:{color}"'))
+            parts.append(
+                _text(_MARGIN + 16, top + 12 * column + 4, label_of(penalty), "start", f'style="fill:{color}"')
+            )
         self._drawn = "".join(parts)
 
     def _x(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -2,16 +2,16 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.show.recordings import Simulation, Wanted
 from qd.workers.process import EvaluatorError, WorkerProcess
 
-if TYPE_CHECKING:  # they import torch, which a process takes with its simulation
-    from qd.show.recordings import Wanted
+if TYPE_CHECKING:
     from sim.recording.recorder import Recording
     from sim.robots.robot import RobotCfg
 
@@ -24,7 +24,7 @@ _PREPARING = "building the simulation (the very first one compiles its kernels: 
 class Report:
     """How the recording of some crossings goes on."""
 
-    wanted: "Wanted"
+    wanted: Wanted
     text: str
     """In words, without who and what."""
     share: float = 0.0
@@ -35,45 +35,24 @@ class Report:
     """Whether there will be none."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecorderCfg:
-    """What a recording process builds."""
-
-    robot: "RobotCfg"
-    """Robot settings."""
-    policy: str
-    """The controller."""
-    replicas: int
-    """Episodes at once."""
-    space: str = "super_gaussian"
-    """Terrain space of genes."""
-
-
 class _Recording:
-    """A simulation of one terrain that records all its episodes."""
+    """What a recording process has: the simulation of a controller."""
 
-    def __init__(self, cfg: RecorderCfg) -> None:
-        from sim.rollout import Rollout
-        from sim.space import get_space
+    def __init__(self, robot: "RobotCfg", first: Wanted) -> None:
+        self._simulation, self._first = Simulation(robot, "cpu"), first
 
-        self._policy, space = cfg.policy, get_space(cfg.space)
-        self._rollout = Rollout(
-            cfg.robot, cfg.policy, num_terrains=1, num_replicas=cfg.replicas, device="cpu", space=space
-        )
-
-    def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None) -> Any:
-        """The recording of the crossings of one terrain."""
-        from sim.recording.recorder import record
-
-        return record(self._rollout, terrains, seeds, policy=self._policy, progress=progress)[1]
+    def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None]) -> "Recording":
+        """The recording of one terrain, crossed as the first one was."""
+        wanted = replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0]))
+        return self._simulation([wanted], progress)[0]
 
 
-def build_recording(cfg: RecorderCfg, num_terrains: int) -> Any:
-    """The simulation of a recording process, called in it."""
-    return _Recording(cfg)
+def build_recording(cfg: "tuple[RobotCfg, Wanted]", num_terrains: int) -> Any:
+    """What a recording process works with, called in it."""
+    return _Recording(*cfg)
 
 
-Build = Callable[[RecorderCfg, int], Any]
+Build = Callable[["tuple[RobotCfg, Wanted]", int], Any]
 
 
 class Recorder:
@@ -88,14 +67,14 @@ class Recorder:
             build: Makes the simulation; a module-level function, since processes import it by name.
         """
         self._robot, self._report, self._build = robot, report, build
-        self._workers: dict[RecorderCfg, WorkerProcess] = {}
+        self._workers: dict[str, WorkerProcess] = {}  # by controller, the one used last at the end
         self._wish: Wanted | None = None
         self._stopped = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, wanted: "Wanted | None") -> None:
+    def record(self, wanted: Wanted | None) -> None:
         """Record these crossings next; with None, nothing more after those at hand."""
         with self._changed:
             self._wish = wanted
@@ -117,17 +96,16 @@ class Recorder:
                 if self._stopped or self._wish is None:
                     return
                 wanted, self._wish = self._wish, None
-            cfg = RecorderCfg(robot=self._robot, policy=wanted.policy, replicas=wanted.replicas, space=wanted.space)
             try:
-                self._report(self._recorded(wanted, cfg))
+                self._report(self._recorded(wanted))
             except (ValueError, EvaluatorError, OSError) as error:
                 if self._stopped:
                     return
-                self._dismiss(cfg)
+                self._dismiss(wanted.policy)
                 self._report(Report(wanted=wanted, text=str(error), failed=True))
 
-    def _recorded(self, wanted: "Wanted", cfg: RecorderCfg) -> Report:
-        worker = self._worker(wanted, cfg)
+    def _recorded(self, wanted: Wanted) -> Report:
+        worker = self._worker(wanted)
         worker.send(wanted.terrain[None], np.array([wanted.terrain_seed], np.uint32))
         while True:
             message, value = worker.receive()
@@ -135,9 +113,9 @@ class Recorder:
                 return Report(wanted=wanted, text="recorded", share=1.0, recording=value)
             self._report(Report(wanted=wanted, text="crossing", share=float(value)))
 
-    def _worker(self, wanted: "Wanted", cfg: RecorderCfg) -> WorkerProcess:
+    def _worker(self, wanted: Wanted) -> WorkerProcess:
         """The process of a controller, built if there is none; the one longest unused makes room."""
-        worker = self._workers.pop(cfg, None)
+        worker = self._workers.pop(wanted.policy, None)
         if worker is None:
             self._report(Report(wanted=wanted, text=_PREPARING))
             while len(self._workers) >= MAX_PROCESSES:
@@ -145,13 +123,13 @@ class Recorder:
             with self._changed:
                 if self._stopped:
                     raise EvaluatorError("the viewer is stopping")
-                worker = self._workers[cfg] = WorkerProcess(1, self._build, cfg)
+                worker = self._workers[wanted.policy] = WorkerProcess(1, self._build, (self._robot, wanted))
             worker.receive()  # that it is ready
         else:
-            self._workers[cfg] = worker  # used last
+            self._workers[wanted.policy] = worker
         return worker
 
-    def _dismiss(self, cfg: RecorderCfg) -> None:
-        worker = self._workers.pop(cfg, None)
+    def _dismiss(self, policy: str) -> None:
+        worker = self._workers.pop(policy, None)
         if worker is not None:
             worker.stop()

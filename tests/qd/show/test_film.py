@@ -1,5 +1,6 @@
 """film, export and cross from the command line to their files, and every mistake named."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.show.cross import Cross, cross, describe, numbers_of
+from qd.show.crossed import crossed_of
 from qd.show.elites import find_archive
 from qd.show.export import Export, export
 from qd.show.film import Film, make_films
@@ -23,6 +26,7 @@ from sim.recording.recorder import record
 from sim.recording.renderer import open_context
 from sim.rollout import Rollout
 from tests.builders import fresh_values, small_archive
+from tests.qd.recordings import NAMES, recording_of
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
@@ -220,22 +224,18 @@ def test_files_of_another_controller_are_named_after_it():
 
 
 def test_invalid_episodes_are_left_out_of_the_rates():
-    from types import SimpleNamespace
-
-    penalties = np.array([[[1.0], [3.0], [np.nan]]])
-    result = SimpleNamespace(
-        invalid=np.array([[False, False, True]]), base_collision=np.array([[True, False, False]]),
-        reached_goal=np.array([[False, True, False]]), fallen=np.array([[False, False, True]]), penalties=penalties,
-        penalty_names=("vel_x",), outcome=np.array([[2, 1, 5]]), duration_s=np.array([[4.0, 16.0, 1.0]]),
-    )  # fmt: skip
-    numbers = numbers_of(result)
+    ends = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.INVALID]
+    sums = np.repeat([[1.0], [3.0], [np.nan]], 6, axis=1)
+    made = recording_of(ends, [4.0, 14.0, 3.0], penalties=sums, fallen=[False, False, True])
+    made = dataclasses.replace(made, duration_s=np.array([[4.0, 16.0, 1.0]]))
+    numbers = numbers_of(crossed_of(made, NAMES, (1.0,) * 6))
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["duration_s"] == 10.0 and numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "m"}
     assert numbers["invalid_episodes"] == 1 and numbers["outcomes"]["invalid"] == 1
     text = describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
     assert "1 of 2 (50%, 9 to 91%)" in text and "1 invalid episodes are left out" in text
-    result.invalid[:] = True
-    numbers = numbers_of(result)
+    broken = dataclasses.replace(made, outcome=np.full((1, 3), Outcome.INVALID, np.uint8))
+    numbers = numbers_of(crossed_of(broken, NAMES, (1.0,) * 6))
     assert numbers["rates"]["goal"] == {"rate": None, "hits": 0, "interval": None} and numbers["duration_s"] is None
     assert "no valid episode" in describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
 

@@ -99,14 +99,15 @@ def test_of_an_invalid_terrain_no_rate_is_known(done):
 
 def test_the_drawing_has_all_paths_and_how_they_ended(done):
     outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]
-    axes = draw(dataclasses.replace(done, recording=recording_of(outcomes, [5.0, 14.0, 14.0, 9.0]))).axes[0]
+    figure = draw(dataclasses.replace(done, recording=recording_of(outcomes, [5.0, 14.0, 14.0, 9.0])))
+    axes = figure.axes[0]
     paths = [line for line in axes.lines if len(np.asarray(line.get_xdata())) == FRAMES]
     assert len(paths) == 4
     image = axes.images[0]
     assert image.get_array().shape == (161, 321)
     assert tuple(image.get_extent()) == (0.0, 16.0, 0.0, 8.0)
-    labels = [text for text in axes.get_legend_handles_labels()[1] if "(" in text]
-    assert labels == ["reached the goal (2)", "base collision (1)", "out of time (1)"]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["reached the goal (2)", "base collision (1)", "out of time (1)", "start", "goal"]
 
 
 @pytest.mark.parametrize("change", [{"scales": (9.0,) * 6}, {"penalties": stand_in.PENALTIES[::-1]}])

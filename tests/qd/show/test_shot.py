@@ -56,13 +56,13 @@ def recording():
 
 
 def shot_of(recording, episode=2, **fields):
-    return Shot(recording=recording, terrain=0, episode=episode, scales=SCALES, **fields)
+    return Shot(recording=recording, episode=episode, scales=SCALES, **fields)
 
 
 def test_the_typical_episode_ends_like_most_and_costs_the_middle(recording):
     # Out of time are 0, 2 and 3; scaled sums 1/2 + 1, 3/2 + 3 and 2/2 + 6.
-    assert typical_episode(recording, 0, SCALES) == 2
-    assert typical_episode(recording, 0, {"yaw_rate": 1.0}) == 3
+    assert typical_episode(recording, SCALES) == 2
+    assert typical_episode(recording, {"yaw_rate": 1.0}) == 3
 
 
 def test_the_caption_says_what_is_shown_and_how_all_ended(recording):

@@ -9,7 +9,7 @@ from kernels.episode import Outcome
 from qd.show.crossed import crossed_of, penalties_by_place
 from qd.show.elites import elites_of
 from qd.show.report.elites import choice_told
-from qd.show.report.modes import MAX_MODES, find_modes, silhouette
+from qd.show.report.modes import MAX_MODES, find_modes
 from qd.show.report.page import percent
 from tests.builders import fresh_values, small_archive
 from tests.qd.recordings import NAMES, recording_of
@@ -130,13 +130,6 @@ def test_equal_elites_are_one_mode():
     same = {name: np.zeros(12) for name in ("goal_rate", "collision_rate", "fallen_rate")}
     archive = dataclasses.replace(archive, ratios=np.full((12, 2), 0.5), **same)
     assert len(find_modes(elites_of(archive)).modes) == 1
-
-
-def test_silhouette_by_hand():
-    # points 0, 1 and 4: of the first a = 1, b = 4: .75; of the second a = 1, b = 3: 2/3; the third is alone: 0
-    places = np.array([0.0, 1.0, 4.0])
-    distances = np.abs(places[:, None] - places)
-    assert silhouette(distances, np.array([1, 1, 2])) == pytest.approx((0.75 + 2 / 3 + 0.0) / 3)
 
 
 def test_crossings_in_numbers_by_hand():

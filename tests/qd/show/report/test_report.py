@@ -17,7 +17,7 @@ from qd.show.figures import as_png, new_figure, summary
 from qd.show.report import command
 from qd.show.report.command import Report
 from qd.show.report.material import gather
-from qd.show.report.page import Absent, Facts, Heading, Section, Table, Text, render
+from qd.show.report.page import Section, absent, at_a_glance, heading, paragraph, render, table
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
@@ -199,8 +199,9 @@ def test_names_that_are_no_formula_or_no_text_are_drawn_as_they_are(name):
 def test_what_comes_from_files_is_escaped(whole):
     content = whole[0].read_text()
     assert "<script>alert" not in content and "&lt;script&gt;alert(1)" in content
-    blocks = [Text("a < b & `x<y`"), Heading("<h>", "a\"b"), Absent("<i>", "make <x>"), Facts([("<f>", "&")]),
-              Table(["<t>"], [["<r>"]], keys=[['"']], links=["'x"], folded="<s>")]  # fmt: skip
+    sorted_by = table(["<t>"], [["<r>"]], keys=[['"']], links=["'x"], folded="<s>")
+    blocks = [paragraph("a < b & `x<y`"), heading("<h>", 'a"b'), absent("<i>", "make <x>"), sorted_by]
+    blocks.append(at_a_glance([("<f>", "&")]))
     page = Page(render("<title>", "<lead>", [Section("<s>", "<a>", blocks)]))
     assert page.open == []
     for text in ("a < b & x<y", "<h>", "<i>", "make <x>", "<f>", "<t>", "<r>", "<title>", "<lead>"):

@@ -62,7 +62,7 @@ def status(app) -> str:
 def test_the_worst_elite_is_there_with_its_crossing(app):
     assert "Elite 0" in app._panel._details.content
     assert status(app).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
-    assert app._scene._robot.visible and not app._panel._play.disabled
+    assert app.scene._robot.visible and not app._panel._play.disabled
     worst = app._axes.axis("fitness").values[0]
     assert app._list._lines[0].label.startswith(f"0: {worst:.1f} ")
     assert app._clock.duration_s == pytest.approx(20.0)
@@ -81,9 +81,9 @@ def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
 
 
 def test_paths_have_the_colours_of_the_words(app):
-    assert "rgb(0, 114, 178)" in app._panel._status.content and "rgb(213, 94, 0)" in app._panel._status.content
+    assert "#0072b2" in app._panel._status.content and "#d55e00" in app._panel._status.content
     # the browser takes a vertex's colour c as ((c / 255 + 0.055) / 1.055)^2.4 of full light
-    found = np.unique(np.asarray(app._scene._paths.colors).reshape(-1, 3), axis=0)
+    found = np.unique(np.asarray(app.scene._paths.colors).reshape(-1, 3), axis=0)
     assert found.tolist() == [[0, 43, 114], [170, 29, 0]]
 
 
@@ -116,34 +116,39 @@ def test_a_pick_shows_its_terrain_within_a_second(app):
 
 
 def test_the_list_follows_the_ranges(app):
-    done(app, (app.brush, "goal_rate", 0.9, 1.0))
+    done(app, (app._list.brush, "goal_rate", 0.9, 1.0))
     assert (app._axes.axis("goal_rate").values[app._selection.kept] >= 0.9).all()
     assert 0 < len(app._selection.kept) < len(app._archive)
     first = int(app._selection.kept[0])
     assert app._list._lines[0].label.startswith(f"{first}: ")
     done(app, (app.pick_line, 0))
     assert app._selection.picked == first and app._list._number.value == first
-    done(app, (app.clear,), (app.step, 1))
+    done(app, (app._list.change, app._selection.clear), (app.step, 1))
     assert app._selection.picked == first + 1
     assert len(app._selection.kept) == len(app._archive)
 
 
 def test_playing_and_dragging_move_the_robot(app):
-    before = app._scene._bodies[0].position.copy()
+    before = app.scene._bodies[0].position.copy()
     done(app, (app.seek, 5.0))
-    assert app._scene._bodies[0].position[0] > before[0] + 1.0
+    assert app.scene._bodies[0].position[0] > before[0] + 1.0
     assert app._panel._time.value == 5.0
     done(app, (app.play,))
     assert app._clock.playing and app._panel._play.label == "Pause"
     done(
-        app, (app.play,), (app.set_speed, 0.25), (app.set_follow, True), (app.set_forces, False), (app.set_paths, False)
+        app,
+        (app.play,),
+        (app.set_speed, 0.25),
+        (app.scene.set_follow, True),
+        (app.set_forces, False),
+        (app.scene.set_show_paths, False),
     )
     assert not app._clock.playing and app._clock.speed == 0.25
-    assert not any(arrow.visible for arrow in app._scene._forces) and not app._scene._paths.visible
+    assert not any(arrow.visible for arrow in app.scene._forces) and not app.scene._paths.visible
     pushing = app._crossing.force_newtons >= 100.0
     frame = int(np.flatnonzero(pushing.any(axis=1))[0])
     done(app, (app.set_forces, True), (app.seek, 0.02 * frame))
-    seen = np.array([arrow.visible for arrow in app._scene._forces])
+    seen = np.array([arrow.visible for arrow in app.scene._forces])
     assert seen.any() and seen[pushing[frame]].all()
 
 
@@ -166,7 +171,7 @@ def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(app):
     done(app, (app.pick, 7))
     wanted = app.asked[-1]
     assert (wanted.label, wanted.replicas) == ("elite 7 of anymal", 20)
-    assert not app._scene._robot.visible and app._panel._play.disabled
+    assert not app.scene._robot.visible and app._panel._play.disabled
     done(app, (app.show_report, Report(wanted=wanted, text="crossing", share=0.4)))
     assert status(app) == "Recording 20 episodes of base: crossing …" and app._panel._progress.value == 40.0
     other = dataclasses.replace(wanted, terrain_seed=8)
@@ -175,14 +180,14 @@ def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(app):
     done(app, (app.show_report, Report(wanted=wanted, text="it <broke>", failed=True)))
     assert status(app) == "No crossing: it &lt;broke&gt;"
     done(app, (app.show_report, Report(wanted=wanted, text="recorded", recording=recording)))
-    assert status(app).startswith("Episode 1: out of time") and app._scene._robot.visible
+    assert status(app).startswith("Episode 1: out of time") and app.scene._robot.visible
 
 
 def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
     bare = dataclasses.replace(show, controllers={}, note="it is <lost>")
     app = App(bare, Recordings(show.robot, folder=tmp_path))
     try:
-        done(app, (app.pick, 3), (app.play,), (app.seek, 1.0), (app.choose_replica, 2), (app.set_follow, True))
+        done(app, (app.pick, 3), (app.play,), (app.seek, 1.0), (app.choose_replica, 2), (app.scene.set_follow, True))
         assert status(app) == "No crossing: it is &lt;lost&gt;" and "Elite 3" in app._panel._details.content
     finally:
         app.close()
