@@ -149,8 +149,7 @@ def measure_ceiling(device: str, timing: TimingCfg) -> Ceiling:
         "specials": partial(launch, exponentials, out, _STEPS),
     }
     variants = {
-        name: fit_launches(partial(repeat_warp, work, device=device), device, timing)
-        for name, work in launches.items()
+        name: fit_launches(partial(repeat_warp, work, device=device), device, timing) for name, work in launches.items()
     }
     where = wp.to_torch(out).device
     for size in _copy_sizes(device):

@@ -60,9 +60,7 @@ class PolicyRunner:
         shape = tuple(self._action.shape)
         problem = action_problem(action, shape)
         if problem is not None:
-            raise ValueError(
-                f"the controller must return actions of shape {shape}, {problem}, during a crossing"
-            )
+            raise ValueError(f"the controller must return actions of shape {shape}, {problem}, during a crossing")
         self._action.copy_(action)
 
     @torch.inference_mode()
