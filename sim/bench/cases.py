@@ -58,17 +58,6 @@ def _share_within_reach(genes: NDArray) -> float:
     return float(np.mean(within))
 
 
-def rasterise_work(scene: Scene) -> Work:
-    """A node and bump: two rotated, scaled coordinates (7), two comparisons.
-
-    Within reach of the bump two powers, one exponential, and six more flops for signs, product and sum.
-    """
-    genes, nodes = scene.genes[: scene.num_terrains], scene.num_terrains * NUM_ROWS * NUM_COLS
-    pairs = nodes * genes.shape[1] // len(LOWER)
-    near = _share_within_reach(genes) * pairs
-    return Work(bytes=_FLOAT * (genes.size + nodes), flops=9 * pairs + round(6 * near), specials=round(5 * near))
-
-
 def contact_work(scene: Scene, truth: Truth) -> Work:
     """Poses, probes, ground under the probes that could touch, and records; two triangles a cell under such a probe.
 
@@ -93,28 +82,6 @@ def scan_work(scene: Scene) -> Work:
     """A point: three nodes read, one value written; rotation (8), cell and interpolation (10), clip (4)."""
     envs, points = scene.num_envs, scene.robot.num_scan_points
     return Work(bytes=_FLOAT * envs * (points * (3 + 1) + 7 + 1), flops=22 * envs * points)
-
-
-def observation_work(scene: Scene) -> Work:
-    """The scan, the joint coordinates and velocities, command and action; three vectors turned into the base (100)."""
-    envs, scan, joints = scene.num_envs, scan_work(scene), scene.robot.num_joints
-    read, written = (2 * joints + 6) + 3 + joints, 12 + 3 * joints
-    flops = scan.flops + envs * (100 + 3 * joints)
-    return Work(bytes=scan.bytes + _FLOAT * envs * (read + written), flops=flops)
-
-
-def penalties_work(scene: Scene) -> Work:
-    """Base state, command, forces and flag read, six sums read and written; two vectors turned, ten flops a geom."""
-    envs, geoms = scene.num_envs, len(scene.robot.geom_names)
-    values = 4 + 6 + 3 + 3 * geoms + 1 + 2 * len(PENALTIES)
-    return Work(bytes=_FLOAT * envs * values, flops=envs * (80 + 10 * geoms))
-
-
-def geom_forces_work(scene: Scene) -> Work:
-    """The solver's contacts read, the forces written; 18 flops a contact: a vector turned, added."""
-    contacts = min(int(scene.rollout.sim.solver_contacts.count.numpy()[0]), scene.rollout.sim.solver_contacts.capacity)
-    forces = 3 * _FLOAT * scene.num_envs * len(scene.robot.geom_names)
-    return Work(bytes=contacts * _SOLVER_CONTACT + forces, flops=18 * contacts)
 
 
 CONTROL_STEPS_PER_ITERATION = 1000
@@ -163,6 +130,11 @@ def _rasterise_case(scene: Scene, truth: Truth) -> Case:
     where = wp.to_torch(genes).device
     lower, upper = (torch.tensor(bounds, dtype=torch.float32, device=where) for bounds in (LOWER, UPPER))
     x, y = (torch.arange(count, device=where) * SPACING for count in (NUM_COLS, NUM_ROWS))
+    # A node and bump: two rotated, scaled coordinates (7), two comparisons; within reach of the bump two powers, one
+    # exponential, and six more flops for signs, product and sum.
+    pairs = heights.size * genes.shape[1] // len(LOWER)
+    near = _share_within_reach(scene.genes[: scene.num_terrains]) * pairs
+    work = Work(bytes=_FLOAT * (genes.size + heights.size), flops=9 * pairs + round(6 * near), specials=round(5 * near))
     return Case(
         name="rasterise",
         launch=lambda: rasterise(genes, SPACING, heights),
@@ -170,7 +142,7 @@ def _rasterise_case(scene: Scene, truth: Truth) -> Case:
         counterpart=counterparts.rasterise,
         arguments=(wp.to_torch(genes), lower, upper, x, y),
         check=truth.check_rasterise,
-        work=rasterise_work(scene),
+        work=work,
         per_control_step=1.0 / CONTROL_STEPS_PER_ITERATION,
     )
 
@@ -253,6 +225,10 @@ def _observation_case(scene: Scene, truth: Truth) -> Case:
         return torch.tensor(values, dtype=torch.float32, device=tensors[0].device)
 
     scale = constant(LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE)
+    # The scan; joint coordinates and velocities, command and action read; three vectors turned into the base (100).
+    scan, joints = scan_work(scene), scene.robot.num_joints
+    values = (2 * joints + 6) + 3 + joints + (12 + 3 * joints)
+    flops = scan.flops + scene.num_envs * (100 + 3 * joints)
     return Case(
         name="observation",
         launch=lambda: write_observation(*state, sim.bank.terrain, sim.sensors, Noise(), seed, out),
@@ -260,7 +236,7 @@ def _observation_case(scene: Scene, truth: Truth) -> Case:
         counterpart=counterparts.observation,
         arguments=(*tensors, constant(*sim.sensors.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
         check=truth.check_observation,
-        work=observation_work(scene),
+        work=Work(bytes=scan.bytes + _FLOAT * scene.num_envs * values, flops=flops),
         per_control_step=1.0,
     )
 
@@ -274,6 +250,9 @@ def _penalties_case(scene: Scene, truth: Truth) -> Case:
     feet, others = (torch.tensor(np.flatnonzero(roles & role), device=force.device) for role in (FOOT, BASE | LIMB))
     base_com = torch.tensor(list(sim.sensors.base_com), dtype=torch.float32, device=force.device)
     limits = (robot.contact_force_limit, robot.physics_dt)
+    # Base state, command, forces and flag read, six sums read and written; two vectors turned, ten flops a geom.
+    geoms = len(robot.geom_names)
+    values = 4 + 6 + 3 + 3 * geoms + 1 + 2 * len(PENALTIES)
     return Case(
         name="penalties",
         launch=lambda: add_penalties(
@@ -287,7 +266,7 @@ def _penalties_case(scene: Scene, truth: Truth) -> Case:
             torch.zeros_like(wp.to_torch(sums)), *limits,
         ),
         check=truth.check_penalties,
-        work=penalties_work(scene),
+        work=Work(bytes=_FLOAT * scene.num_envs * values, flops=scene.num_envs * (80 + 10 * geoms)),
         per_control_step=robot.decimation,
     )  # fmt: skip
 
@@ -296,6 +275,9 @@ def _geom_forces_case(scene: Scene, truth: Truth) -> Case:
     sim: Any = scene.rollout.sim
     names = ("count", "world", "geom", "frame", "efc_address", "efc_force")
     tensors = [wp.to_torch(getattr(sim.solver_contacts, name)) for name in names]
+    # The solver's contacts read, the forces written; 18 flops a contact: a vector turned, added.
+    count = min(int(sim.solver_contacts.count.numpy()[0]), sim.solver_contacts.capacity)
+    forces = 3 * _FLOAT * sim.geom_force.size
     return Case(
         name="contact_forces",
         launch=sim.read_geom_forces,
@@ -303,7 +285,7 @@ def _geom_forces_case(scene: Scene, truth: Truth) -> Case:
         counterpart=counterparts.geom_forces,
         arguments=(*tensors, wp.to_torch(sim.column_of_geom), len(sim.geom_names)),
         check=truth.check_geom_forces,
-        work=geom_forces_work(scene),
+        work=Work(bytes=count * _SOLVER_CONTACT + forces, flops=18 * count),
         per_control_step=scene.robot.decimation,
     )
 
