@@ -18,7 +18,6 @@ from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
 from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
 from sim.files.provenance import provenance
-from sim.files.settings import check
 from sim.mujoco_c.crossing import draw_starts, run_plain
 from sim.mujoco_c.model import crossing_model
 from sim.policy.spec import ControllerSpec
@@ -77,7 +76,6 @@ class Comparison:
         Raises:
             ValueError: If something asked for cannot be had.
         """
-        check(cfg)
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)
         crossing_model(self.robot, np.zeros((2, 2)))  # MuJoCo must read it too
