@@ -11,8 +11,6 @@ import warp as wp
 
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
 
-MAX_CONTACTS_PER_STRIP = 3
-
 
 @wp.struct
 class Probes:

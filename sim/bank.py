@@ -29,9 +29,7 @@ class TerrainBank:
             ValueError: If there is no terrain or a grid has no cell.
         """
         if num_terrains < 1 or nrow < 2 or ncol < 2:
-            raise ValueError(
-                f"a bank needs at least 1 terrain of 2 x 2 nodes, got {num_terrains} of {nrow} x {ncol}"
-            )
+            raise ValueError(f"a bank needs at least 1 terrain of 2 x 2 nodes, got {num_terrains} of {nrow} x {ncol}")
         self.terrain = Terrain()
         self.terrain.heights = wp.zeros((num_terrains, nrow, ncol), dtype=float, device=device)
         self.terrain.ceilings = wp.zeros(ceiling_shape(num_terrains, nrow, ncol), dtype=float, device=device)

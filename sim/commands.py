@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from sim.files.command import OfRobot, OnDevice, Who, publish
-from sim.files.settings import check, setting
+from sim.files.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,6 @@ class Stand(OfRobot, OnDevice):
 
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
-        check(self)
         from sim.robots.robot import get_robot
         from sim.robots.stand import describe_model, describe_standing, stand
         from sim.simulation import resolve_device
@@ -139,7 +138,6 @@ class Bench(OfRobot, OnDevice):
 
     def execute(self) -> None:
         """Measures, prints the table, writes the file."""
-        check(self)
         from sim.bench.report import file_of, measure, table
         from sim.files.provenance import provenance
         from sim.robots.robot import get_robot
@@ -179,7 +177,6 @@ class SolverOptions(Who, OnDevice):
 
     def execute(self) -> None:
         """Measures, prints the table, writes the file."""
-        check(self)
         from sim.bench.options import measure, print_rows
 
         publish(self.out, lambda: measure(self), print_rows)

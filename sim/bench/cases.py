@@ -58,17 +58,6 @@ def _share_within_reach(genes: NDArray) -> float:
     return float(np.mean(within))
 
 
-def rasterise_work(scene: Scene) -> Work:
-    """A node and bump: two rotated, scaled coordinates (7), two comparisons.
-
-    Within reach of the bump two powers, one exponential, and six more flops for signs, product and sum.
-    """
-    genes, nodes = scene.genes_on_device.numpy(), scene.cfg.num_terrains * NUM_ROWS * NUM_COLS
-    pairs = nodes * genes.shape[1] // len(LOWER)
-    near = _share_within_reach(genes) * pairs
-    return Work(bytes=_FLOAT * (genes.size + nodes), flops=9 * pairs + round(6 * near), specials=round(5 * near))
-
-
 def contact_work(scene: Scene, truth: Truth) -> Work:
     """Poses, probes, ground under the probes that could touch, and records; two triangles a cell under such a probe.
 
@@ -91,30 +80,8 @@ def contact_work(scene: Scene, truth: Truth) -> Work:
 
 def scan_work(scene: Scene) -> Work:
     """A point: three nodes read, one value written; rotation (8), cell and interpolation (10), clip (4)."""
-    envs, points = scene.cfg.num_envs, scene.robot.num_scan_points
+    envs, points = scene.num_envs, scene.robot.num_scan_points
     return Work(bytes=_FLOAT * envs * (points * (3 + 1) + 7 + 1), flops=22 * envs * points)
-
-
-def observation_work(scene: Scene) -> Work:
-    """The scan, the joint coordinates and velocities, command and action; three vectors turned into the base (100)."""
-    envs, scan, joints = scene.cfg.num_envs, scan_work(scene), scene.robot.num_joints
-    read, written = (2 * joints + 6) + 3 + joints, 12 + 3 * joints
-    flops = scan.flops + envs * (100 + 3 * joints)
-    return Work(bytes=scan.bytes + _FLOAT * envs * (read + written), flops=flops)
-
-
-def penalties_work(scene: Scene) -> Work:
-    """Base state, command, forces and flag read, six sums read and written; two vectors turned, ten flops a geom."""
-    envs, geoms = scene.cfg.num_envs, len(scene.robot.geom_names)
-    values = 4 + 6 + 3 + 3 * geoms + 1 + 2 * len(PENALTIES)
-    return Work(bytes=_FLOAT * envs * values, flops=envs * (80 + 10 * geoms))
-
-
-def geom_forces_work(scene: Scene) -> Work:
-    """The solver's contacts read, the forces written; 18 flops a contact: a vector turned, added."""
-    contacts = min(int(scene.rollout.sim.solver_contacts.count.numpy()[0]), scene.rollout.sim.solver_contacts.capacity)
-    forces = 3 * _FLOAT * scene.cfg.num_envs * len(scene.robot.geom_names)
-    return Work(bytes=contacts * _SOLVER_CONTACT + forces, flops=18 * contacts)
 
 
 CONTROL_STEPS_PER_ITERATION = 1000
@@ -128,58 +95,70 @@ class Case:
     name: str
     launch: Callable[[], None]
     """Launches it in its production form."""
+    output: Any
+    """Warp array that it writes; cleared before a check."""
     counterpart: Callable[..., Any]
     """The same work in torch."""
     arguments: tuple[Any, ...]
     """What the counterpart is called with."""
-    check_ours: Callable[[], None]
-    """Launches it and holds its output against the oracle."""
-    check_torch: Callable[[str, Any], None]
-    """Holds the counterpart's output against the oracle; first the name of the variant."""
+    check: Callable[[str, Any], None]
+    """Holds an output, as ``read`` or ``read_torch`` gives it, against the oracle; first the name of the variant."""
     work: Work
     per_control_step: float
     """Launches a control step."""
     part_of: str | None = None
     """Kernel that contains its work, so that the two are not to be added."""
+    read: Callable[[], Any] | None = None
+    """What it wrote; if left out, ``output`` as it is."""
+    read_torch: Callable[[Any], Any] = lambda tensor: tensor.cpu().numpy()
+    """The same of what the counterpart returned."""
+
+    def check_ours(self) -> None:
+        """Launches it and holds its output against the oracle."""
+        self.output.zero_()
+        self.launch()
+        self.check("kernel", self.read() if self.read else self.output.numpy())
+
+    def check_torch(self, who: str, outputs: Any) -> None:
+        """Holds what the counterpart returned against the oracle; ``who`` names the variant."""
+        self.check(who, self.read_torch(outputs))
 
 
 def _rasterise_case(scene: Scene, truth: Truth) -> Case:
-    genes = wp.to_torch(scene.genes_on_device)
-
-    def bounds(values: np.ndarray) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float32, device=genes.device)
-
-    x = torch.arange(NUM_COLS, device=genes.device) * SPACING
-    y = torch.arange(NUM_ROWS, device=genes.device) * SPACING
-
-    def launch() -> None:
-        rasterise(scene.genes_on_device, SPACING, scene.fresh.heights)
-
-    def check_ours() -> None:
-        scene.fresh.heights.zero_()
-        launch()
-        truth.check_rasterise("kernel", scene.fresh.heights.numpy())
-
+    genes = wp.array(scene.genes[: scene.num_terrains], dtype=float)
+    heights = wp.zeros((scene.num_terrains, NUM_ROWS, NUM_COLS), dtype=float)  # the ground under the robots stays
+    where = wp.to_torch(genes).device
+    lower, upper = (torch.tensor(bounds, dtype=torch.float32, device=where) for bounds in (LOWER, UPPER))
+    x, y = (torch.arange(count, device=where) * SPACING for count in (NUM_COLS, NUM_ROWS))
+    # A node and bump: two rotated, scaled coordinates (7), two comparisons; within reach of the bump two powers, one
+    # exponential, and six more flops for signs, product and sum.
+    pairs = heights.size * genes.shape[1] // len(LOWER)
+    near = _share_within_reach(scene.genes[: scene.num_terrains]) * pairs
+    work = Work(bytes=_FLOAT * (genes.size + heights.size), flops=9 * pairs + round(6 * near), specials=round(5 * near))
     return Case(
         name="rasterise",
-        launch=launch,
+        launch=lambda: rasterise(genes, SPACING, heights),
+        output=heights,
         counterpart=counterparts.rasterise,
-        arguments=(genes, bounds(LOWER), bounds(UPPER), x, y),
-        check_ours=check_ours,
-        check_torch=lambda who, heights: truth.check_rasterise(who, heights.cpu().numpy()),
-        work=rasterise_work(scene),
+        arguments=(wp.to_torch(genes), lower, upper, x, y),
+        check=truth.check_rasterise,
+        work=work,
         per_control_step=1.0 / CONTROL_STEPS_PER_ITERATION,
     )
 
 
-def kernel_contacts(scene: Scene) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """The records of the contact kernel: environment and probe of each, and what :meth:`Truth.check_contact` takes."""
+Contacts = tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]
+"""Contact records: environment and probe of each, and what :meth:`Truth.check_contact` takes."""
+_RECORDED = ("point0", "point1", "normal", "offset1")
+
+
+def kernel_contacts(scene: Scene) -> Contacts:
+    """The records of the contact kernel."""
     sim: Any = scene.rollout.sim
     count = int(sim.contact_count.numpy()[0])
     if count > sim.contact_capacity:
         raise ValueError(f"{count} contacts do not fit in {sim.contact_capacity}: raise the robot's nconmax")
-    names = ("point0", "point1", "normal", "offset1")
-    records = {name: getattr(sim.contact_records, name).numpy()[:count].copy() for name in names}
+    records = {name: getattr(sim.contact_records, name).numpy()[:count].copy() for name in _RECORDED}
     shape = sim.contact_records.shape1.numpy()[:count] - sim.layout.first_shape
     env, shape = np.divmod(shape, sim.layout.shapes_per_env)
     lengths = np.diff(sim.probes.strip_start.numpy())
@@ -190,13 +169,12 @@ def kernel_contacts(scene: Scene) -> tuple[np.ndarray, np.ndarray, dict[str, np.
     return env, probe, records
 
 
-def _check_dense_contacts(truth: Truth, who: str, outputs: tuple[torch.Tensor, ...]) -> None:
+def _torch_contacts(outputs: tuple[torch.Tensor, ...]) -> Contacts:
+    """The records of the counterpart, which has a slot for each that there may be."""
     probe, *values = (output.cpu().numpy() for output in outputs)
     exists = probe >= 0
-    records = {
-        name: value[exists] for name, value in zip(("point0", "point1", "normal", "offset1"), values, strict=True)
-    }
-    truth.check_contact(who, np.nonzero(exists)[0], probe[exists], records)
+    records = {name: value[exists] for name, value in zip(_RECORDED, values, strict=True)}
+    return np.nonzero(exists)[0], probe[exists], records
 
 
 def _contact_case(scene: Scene, truth: Truth) -> Case:
@@ -204,41 +182,31 @@ def _contact_case(scene: Scene, truth: Truth) -> Case:
     body_q = wp.to_torch(sim.body_q).view(sim.num_envs, -1, 7)
     probes = [getattr(sim.probes, name).numpy() for name in ("position", "strip_start", "strip_radius", "strip_body")]
     tables = make_tables(*probes, spacing=SPACING, device=body_q.device)
-
-    def check_ours() -> None:
-        sim.collide()
-        truth.check_contact("kernel", *kernel_contacts(scene))
-
     return Case(
         name="contact",
         launch=sim.collide,
+        output=sim.contact_count,
+        read=lambda: kernel_contacts(scene),
         counterpart=collide,
         arguments=(body_q, wp.to_torch(sim.terrain_of_env), wp.to_torch(sim.bank.heights), SPACING, tables),
-        check_ours=check_ours,
-        check_torch=lambda who, outputs: _check_dense_contacts(truth, who, outputs),
+        read_torch=_torch_contacts,
+        check=lambda who, contacts: truth.check_contact(who, *contacts),
         work=contact_work(scene, truth),
         per_control_step=scene.robot.decimation,
     )
 
 
 def _scan_case(scene: Scene, truth: Truth) -> Case:
-    sim, out = scene.rollout.sim, scene.buffers["scan"]
+    sim = scene.rollout.sim
+    out = wp.zeros((scene.num_envs, scene.robot.num_scan_points), dtype=float)
     arrays = (sim.joint_q, sim.terrain_of_env, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y)
-
-    def launch() -> None:
-        write_scan(sim.joint_q, sim.terrain_of_env, sim.bank.terrain, sim.sensors, out)
-
-    def check_ours() -> None:
-        launch()
-        truth.check_scan("kernel", out.numpy())
-
     return Case(
         name="scan",
-        launch=launch,
+        launch=lambda: write_scan(sim.joint_q, sim.terrain_of_env, sim.bank.terrain, sim.sensors, out),
+        output=out,
         counterpart=counterparts.scan,
         arguments=(*map(wp.to_torch, arrays), SPACING),
-        check_ours=check_ours,
-        check_torch=lambda who, scan: truth.check_scan(who, scan.cpu().numpy()),
+        check=truth.check_scan,
         work=scan_work(scene),
         per_control_step=1.0,
         part_of="observation",
@@ -246,92 +214,78 @@ def _scan_case(scene: Scene, truth: Truth) -> Case:
 
 
 def _observation_case(scene: Scene, truth: Truth) -> Case:
-    sim, out = scene.rollout.sim, scene.buffers["observation"]
-    seed = wp.zeros(1, dtype=int, device=sim.device)
-    arrays = (
-        sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env, sim.bank.heights,
-        sim.sensors.scan_x, sim.sensors.scan_y, sim.sensors.default_joint_pos,
-    )  # fmt: skip
+    sim = scene.rollout.sim
+    out = wp.zeros((scene.num_envs, scene.robot.observation_size), dtype=float)
+    seed = wp.zeros(1, dtype=int)
+    state = (sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env)
+    arrays = (*state, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y, sim.sensors.default_joint_pos)
     tensors = [wp.to_torch(array) for array in arrays]
 
     def constant(*values: float) -> torch.Tensor:
         return torch.tensor(values, dtype=torch.float32, device=tensors[0].device)
 
-    def launch() -> None:
-        write_observation(
-            sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env, sim.bank.terrain,
-            sim.sensors, Noise(), seed, out,
-        )  # fmt: skip
-
-    def check_ours() -> None:
-        launch()
-        truth.check_observation("kernel", out.numpy())
-
     scale = constant(LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE)
+    # The scan; joint coordinates and velocities, command and action read; three vectors turned into the base (100).
+    scan, joints = scan_work(scene), scene.robot.num_joints
+    values = (2 * joints + 6) + 3 + joints + (12 + 3 * joints)
+    flops = scan.flops + scene.num_envs * (100 + 3 * joints)
     return Case(
         name="observation",
-        launch=launch,
+        launch=lambda: write_observation(*state, sim.bank.terrain, sim.sensors, Noise(), seed, out),
+        output=out,
         counterpart=counterparts.observation,
         arguments=(*tensors, constant(*sim.sensors.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
-        check_ours=check_ours,
-        check_torch=lambda who, row: truth.check_observation(who, row.cpu().numpy()),
-        work=observation_work(scene),
+        check=truth.check_observation,
+        work=Work(bytes=scan.bytes + _FLOAT * scene.num_envs * values, flops=flops),
         per_control_step=1.0,
     )
 
 
 def _penalties_case(scene: Scene, truth: Truth) -> Case:
-    sim, robot, sums = scene.rollout.sim, scene.robot, scene.buffers["penalties"]
+    sim, robot = scene.rollout.sim, scene.robot
+    sums = wp.zeros((scene.num_envs, len(PENALTIES)), dtype=float)
+    counted = wp.ones(scene.num_envs, dtype=int)
     roles = sim.geom_role.numpy()
     joint_q, joint_qd, command, force = map(wp.to_torch, (sim.joint_q, sim.joint_qd, scene.command, sim.geom_force))
-    start = torch.zeros_like(wp.to_torch(sums))
     feet, others = (torch.tensor(np.flatnonzero(roles & role), device=force.device) for role in (FOOT, BASE | LIMB))
     base_com = torch.tensor(list(sim.sensors.base_com), dtype=torch.float32, device=force.device)
-
-    def launch() -> None:
-        add_penalties(
-            sim.joint_q, sim.joint_qd, sim.sensors.base_com, scene.command, sim.geom_force, sim.geom_role,
-            robot.contact_force_limit, robot.physics_dt, scene.counted, sums,
-        )  # fmt: skip
-
-    def check_ours() -> None:
-        sums.zero_()
-        launch()
-        truth.check_penalties("kernel", sums.numpy())
-
+    limits = (robot.contact_force_limit, robot.physics_dt)
+    # Base state, command, forces and flag read, six sums read and written; two vectors turned, ten flops a geom.
+    geoms = len(robot.geom_names)
+    values = 4 + 6 + 3 + 3 * geoms + 1 + 2 * len(PENALTIES)
     return Case(
         name="penalties",
-        launch=launch,
+        launch=lambda: add_penalties(
+            sim.joint_q, sim.joint_qd, sim.sensors.base_com, scene.command, sim.geom_force, sim.geom_role, *limits,
+            counted, sums,
+        ),
+        output=sums,
         counterpart=counterparts.penalties,
         arguments=(
-            joint_q, joint_qd, base_com, command, force, feet, others, wp.to_torch(scene.counted), start,
-            robot.contact_force_limit, robot.physics_dt,
+            joint_q, joint_qd, base_com, command, force, feet, others, wp.to_torch(counted),
+            torch.zeros_like(wp.to_torch(sums)), *limits,
         ),
-        check_ours=check_ours,
-        check_torch=lambda who, sums: truth.check_penalties(who, sums.cpu().numpy()),
-        work=penalties_work(scene),
+        check=truth.check_penalties,
+        work=Work(bytes=_FLOAT * scene.num_envs * values, flops=scene.num_envs * (80 + 10 * geoms)),
         per_control_step=robot.decimation,
     )  # fmt: skip
 
 
 def _geom_forces_case(scene: Scene, truth: Truth) -> Case:
     sim: Any = scene.rollout.sim
-    contacts = sim.solver_contacts
     names = ("count", "world", "geom", "frame", "efc_address", "efc_force")
-    tensors = [wp.to_torch(getattr(contacts, name)) for name in names]
-
-    def check_ours() -> None:
-        sim.read_geom_forces()
-        truth.check_geom_forces("kernel", sim.geom_force.numpy())
-
+    tensors = [wp.to_torch(getattr(sim.solver_contacts, name)) for name in names]
+    # The solver's contacts read, the forces written; 18 flops a contact: a vector turned, added.
+    count = min(int(sim.solver_contacts.count.numpy()[0]), sim.solver_contacts.capacity)
+    forces = 3 * _FLOAT * sim.geom_force.size
     return Case(
         name="contact_forces",
         launch=sim.read_geom_forces,
+        output=sim.geom_force,
         counterpart=counterparts.geom_forces,
         arguments=(*tensors, wp.to_torch(sim.column_of_geom), len(sim.geom_names)),
-        check_ours=check_ours,
-        check_torch=lambda who, forces: truth.check_geom_forces(who, forces.cpu().numpy()),
-        work=geom_forces_work(scene),
+        check=truth.check_geom_forces,
+        work=Work(bytes=count * _SOLVER_CONTACT + forces, flops=18 * count),
         per_control_step=scene.robot.decimation,
     )
 

@@ -129,11 +129,6 @@ class Ceiling:
         }
 
 
-def _copy_sizes(device: str) -> list[int]:
-    """Bytes moved: 1 MB to 4 GB on CUDA, 16 KB to 64 MB on the CPU, in powers of 2."""
-    return [1 << k for k in (range(20, 33) if device.startswith("cuda") else range(14, 27))]
-
-
 def launch(kernel: Any, out: Any, *inputs: float) -> None:
     """Launches one of the kernels above, one thread an entry of ``out``."""
     wp.launch(kernel, dim=out.shape[0], inputs=inputs, outputs=[out], device=out.device)
@@ -149,17 +144,18 @@ def measure_ceiling(device: str, timing: TimingCfg) -> Ceiling:
         "specials": partial(launch, exponentials, out, _STEPS),
     }
     variants = {
-        name: fit_launches(partial(repeat_warp, work, device=device), device, timing)
-        for name, work in launches.items()
+        name: fit_launches(partial(repeat_warp, work, device=device), device, timing) for name, work in launches.items()
     }
     where = wp.to_torch(out).device
-    for size in _copy_sizes(device):
+    # Bytes moved: 1 MB to 4 GB on CUDA, 16 KB to 64 MB on the CPU, in powers of 2.
+    sizes = [1 << k for k in (range(20, 33) if device.startswith("cuda") else range(14, 27))]
+    for size in sizes:
         source, target = (torch.zeros(size // 8, dtype=torch.float32, device=where) for _ in range(2))
         copy = partial(target.copy_, source)
         variants[str(size)] = fit_launches(partial(repeat_torch, copy, device=device), device, timing)
     seconds = time_in_turns(variants, device, timing)
     return Ceiling(
-        copies={size: size / seconds[str(size)] for size in _copy_sizes(device)},
+        copies={size: size / seconds[str(size)] for size in sizes},
         flops_per_s=threads * _STEPS * FLOPS_PER_STEP / seconds["flops"],
         specials_per_s=threads * _STEPS * SPECIALS_PER_STEP / seconds["specials"],
         launch_s=seconds["nothing"],

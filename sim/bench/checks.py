@@ -4,11 +4,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
-from kernels.penalties import BASE, FOOT, LIMB
+from kernels.penalties import FOOT
 from sim.bench import oracle
 from sim.bench.scene import Scene
+from sim.mujoco_c.model import observations, step_penalties, to_mujoco
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 # A sphere this close to touching, and two probes this close in depth, may go either way in float32 [m].
@@ -39,7 +41,8 @@ def require_close(what: str, got: NDArray, expected: NDArray, *, atol: float, rt
 
 
 def _exact(values: Any) -> NDArray:
-    return np.asarray(values, dtype=np.float64)
+    """A copy in double precision of an array, here or on a device."""
+    return np.array(values.numpy() if isinstance(values, wp.array) else values, dtype=np.float64)
 
 
 class Truth:
@@ -56,30 +59,26 @@ class Truth:
             num_checked: Environments checked where the oracle is slow.
         """
         sim: Any = scene.rollout.sim
-        rng = np.random.default_rng(scene.cfg.seed)
-        num_envs, robot = sim.num_envs, scene.robot
-        self._robot, self._genes = robot, scene.genes[: scene.cfg.num_terrains]
-        self.envs = np.sort(rng.permutation(num_envs)[:num_checked])
-        self._terrains = np.sort(rng.permutation(scene.cfg.num_terrains)[:6])
-        self._joint_q, self._joint_qd = sim.joint_q.numpy().copy(), sim.joint_qd.numpy().copy()
-        self._body_q = sim.body_q.numpy().reshape(num_envs, -1, 7).copy()
-        self._command, self._last_action = scene.command.numpy().copy(), scene.last_action.numpy().copy()
+        rng = np.random.default_rng(scene.seed)
+        self._robot, self._genes = scene.robot, scene.genes[: scene.num_terrains]
+        self.envs = np.sort(rng.permutation(sim.num_envs)[:num_checked])
+        self._terrains = np.sort(rng.permutation(scene.num_terrains)[:6])
+        self._state = to_mujoco(sim.joint_q.numpy(), sim.joint_qd.numpy(), _exact(list(sim.sensors.base_com)))
+        self._body_q = sim.body_q.numpy().reshape(sim.num_envs, -1, 7).copy()
+        self._command, self._last_action = _exact(scene.command), _exact(scene.last_action)
         self._terrain_of_env, self._heights = sim.terrain_of_env.numpy().copy(), sim.bank.heights.numpy().copy()
-        self._geom_force, self._roles = sim.geom_force.numpy().copy(), sim.geom_role.numpy()
-        self._base_com = _exact(list(sim.sensors.base_com))
+        self._geom_force, self._roles = _exact(sim.geom_force), sim.geom_role.numpy()
         self._position, self._strip_start = sim.probes.position.numpy(), sim.probes.strip_start.numpy().tolist()
         self._strip_body, self._strip_radius = (
-            sim.probes.strip_body.numpy().tolist(),
-            sim.probes.strip_radius.numpy().tolist(),
+            array.numpy().tolist() for array in (sim.probes.strip_body, sim.probes.strip_radius)
         )
         contacts = sim.solver_contacts
         count = min(int(contacts.count.numpy()[0]), contacts.capacity)
-        geom = contacts.geom.numpy()[:count, 1]
-        self._column = sim.column_of_geom.numpy()[geom]
         self._contacts = {
             name: getattr(contacts, name).numpy()[:count].copy() for name in ("world", "frame", "efc_address")
         }
-        self._efc_force = contacts.efc_force.numpy().copy()
+        self._contacts["column"] = sim.column_of_geom.numpy()[contacts.geom.numpy()[:count, 1]]
+        self._contacts["efc_force"] = contacts.efc_force.numpy().copy()
 
     @cached_property
     def _rasterised(self) -> NDArray:
@@ -92,17 +91,17 @@ class Truth:
 
     @cached_property
     def _rows(self) -> NDArray:
-        scan = np.stack(self._robot.scan_points(), axis=1)
+        state = (self._state.qpos, self._state.qvel, self._command, self._last_action)
         default = _exact(np.asarray(self._robot.default_joint_pos, dtype=np.float32))
-        return np.stack(
-            [
-                oracle.observation(
-                    self._joint_q[env], self._joint_qd[env], self._command[env], self._last_action[env],
-                    self._heights[self._terrain_of_env[env]], SPACING, default, scan, self._base_com,
-                )
-                for env in self.envs
-            ]
-        )  # fmt: skip
+        scan = np.stack(self._robot.scan_points(), axis=1)
+        rows = [
+            observations(
+                _exact(self._heights[self._terrain_of_env[env]]), *(array[env : env + 1] for array in state),
+                default_joint_pos=default, scan=scan,
+            )
+            for env in self.envs
+        ]  # fmt: skip
+        return np.concatenate(rows)
 
     def check_scan(self, who: str, scan: NDArray) -> None:
         """Scans (E, points); where cells are steep, a micrometre along is many up, times 5."""
@@ -116,17 +115,9 @@ class Truth:
 
     @cached_property
     def _penalties(self) -> NDArray:
-        feet = [g for g, role in enumerate(self._roles) if role & FOOT]
-        others = [g for g, role in enumerate(self._roles) if role & (BASE | LIMB)]
-        return self._robot.physics_dt * np.stack(
-            [
-                oracle.penalties(
-                    self._joint_q[env], self._joint_qd[env], self._base_com, _exact(self._command[env]),
-                    self._geom_force[env], feet, others, self._robot.contact_force_limit,
-                )
-                for env in range(len(self._joint_q))
-            ]
-        )  # fmt: skip
+        state = (self._state.qpos, self._state.qvel, self._command, self._geom_force)
+        feet, limit = (self._roles & FOOT) != 0, self._robot.contact_force_limit
+        return self._robot.physics_dt * step_penalties(*state, feet=feet, force_limit=limit)
 
     def check_penalties(self, who: str, sums: NDArray) -> None:
         """Sums (E, 6) after one step from zero; of 1,000 N float32 keeps a tenth of a millinewton."""
@@ -134,8 +125,7 @@ class Truth:
 
     @cached_property
     def _forces(self) -> NDArray:
-        shape = self._geom_force.shape[:2]
-        return oracle.geom_forces(column=self._column, efc_force=self._efc_force, shape=shape, **self._contacts)
+        return oracle.geom_forces(shape=self._geom_force.shape[:2], **self._contacts)
 
     def check_geom_forces(self, who: str, forces: NDArray) -> None:
         """Forces (E, G, 3) [N]."""

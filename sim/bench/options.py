@@ -1,5 +1,6 @@
 """What solver and capacity options cost and change: the same crossings under each choice."""
 
+import itertools
 import statistics
 from dataclasses import replace
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sim.commands import SolverOptions
+from sim.files.intervals import value_words
 from sim.files.provenance import provenance
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
@@ -25,13 +27,12 @@ def choices(cfg: SolverOptions, robot: RobotCfg) -> list[tuple[SolverCfg, RobotC
         raise ValueError("there must be a choice to try, got none: give --iterations or --njmax")
     if len(cfg.njmax) != len(cfg.nconmax):
         raise ValueError(f"--nconmax needs as many numbers as --njmax, got {cfg.nconmax} and {cfg.njmax}")
-    found = [
-        (SolverCfg(iterations=iterations, ls_iterations=line), robot)
-        for iterations in cfg.iterations
-        for line in cfg.ls_iterations
-    ]
+    caps = itertools.product(cfg.iterations, cfg.ls_iterations)
     capacities = zip(cfg.njmax, cfg.nconmax, strict=True)
-    return found + [(SolverCfg(), replace(robot, njmax=rows, nconmax=contacts)) for rows, contacts in capacities]
+    return [
+        *((SolverCfg(iterations=newton, ls_iterations=line), robot) for newton, line in caps),
+        *((SolverCfg(), replace(robot, njmax=rows, nconmax=contacts)) for rows, contacts in capacities),
+    ]
 
 
 def _means(result: RolloutResult) -> dict[str, Any]:
@@ -44,11 +45,6 @@ def _means(result: RolloutResult) -> dict[str, Any]:
         "invalid": int(result.invalid.sum()),
         "penalties": dict(zip(result.penalty_names, means, strict=True)),
     }
-
-
-def _cell(value: float | None, form: str) -> str:
-    width = form.partition(".")[0]
-    return format("-", f">{width}") if value is None else format(value, form)
 
 
 def measure(cfg: SolverOptions) -> dict[str, Any]:
@@ -99,6 +95,7 @@ def print_rows(report: dict[str, Any]) -> None:
         print(
             f"{row['iterations']:>10} {row['ls_iterations']:>6} {row['njmax']:>5} {row['nconmax']:>8} "
             f"{row['wall_s']:>7.2f} {row['world_steps_per_s'] / 1e6:>9.3f} "
-            f"{_cell(row['success_rate'], '7.4f')} {_cell(row['goal_rate'], '6.4f')} {row['invalid']:>7} "
-            + " ".join(_cell(row["penalties"][name], "13.4f") for name in names)
+            f"{value_words(row['success_rate'], None, '.4f'):>7} {value_words(row['goal_rate'], None, '.4f'):>6} "
+            f"{row['invalid']:>7} "
+            + " ".join(f"{value_words(row['penalties'][name], None, '.4f'):>13}" for name in names)
         )

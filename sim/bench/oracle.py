@@ -1,7 +1,7 @@
-"""What the kernels compute, written a second time: float64 NumPy, straight from the definitions, slow and plain.
+"""Terrain, contact and contact forces written a second time: float64 NumPy, from the definitions, slow and plain.
 
-The tests and :mod:`sim.bench` hold the kernels against it; nothing here is shared with the kernels or ported from them.
-Vectors are world-local unless a name ends in ``_b``.
+The tests and :mod:`sim.bench` hold the kernels against it, and against :mod:`sim.mujoco_c.model` for observation,
+command and penalties; nothing in either is shared with the kernels or ported from them. Vectors are world-local.
 """
 
 from typing import Any
@@ -112,13 +112,6 @@ def rotation_matrix(quaternion_xyzw: Array) -> Array:
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
-def base_velocities(q: Array, qd: Array, base_com: Array) -> tuple[Array, Array]:
-    """Base-frame velocity of the base link's origin, and base-frame angular velocity."""
-    to_base = rotation_matrix(q[3:7]).T
-    ang_vel_b = to_base @ np.float64(qd[3:6])
-    return to_base @ np.float64(qd[:3]) - np.cross(ang_vel_b, base_com), ang_vel_b
-
-
 def geom_forces(
     world: Array, column: Array, frame: Array, efc_address: Array, efc_force: Array,
     shape: tuple[int, int],
@@ -132,65 +125,3 @@ def geom_forces(
         force = efc_force[world[c], efc_address[c, :3]].astype(np.float64)
         total[world[c], column[c]] += force @ frame[c].astype(np.float64)
     return total
-
-
-def penalties(
-    q: Array, qd: Array, base_com: Array, command: Array, forces: Array, feet: list[int],
-    base_and_limbs: list[int], force_limit: float,
-) -> Array:  # fmt: skip
-    """The six raw penalties of one physics step, before times dt (definitions: raw penalties)."""
-    lin_vel_b, ang_vel_b = base_velocities(q, qd, base_com)
-    forces = np.float64(forces)
-    sizes = np.linalg.norm(forces, axis=1)
-    sideways = np.linalg.norm(forces[:, :2], axis=1)
-    return np.array(
-        [
-            abs(ang_vel_b[2] - command[2]),
-            abs(lin_vel_b[0] - command[0]),
-            abs(lin_vel_b[1] - command[1]),
-            np.maximum(0, sizes[feet] - force_limit).sum(),
-            float((sideways[feet] > 5 * np.abs(forces[feet, 2])).any()),
-            float((sizes[base_and_limbs] > 0.1).sum()),
-        ]
-    )
-
-
-def yaw_of(quaternion_xyzw: Array) -> float:
-    """Heading of the base's x axis."""
-    forward = rotation_matrix(quaternion_xyzw)[:, 0]
-    return np.arctan2(forward[1], forward[0])
-
-
-def observation(
-    q: Array, qd: Array, command: Array, last_action: Array, grid: Array, spacing: float,
-    default_joint_pos: Array, scan: Array, base_com: Array,
-) -> Array:  # fmt: skip
-    """One observation row; ``scan`` (num_scan_points, 2) in the yaw frame."""
-    num_joints = len(default_joint_pos)
-    q, qd = np.float64(q), np.float64(qd)
-    lin_vel_b, ang_vel_b = base_velocities(q, qd, base_com)
-    gravity_b = rotation_matrix(q[3:7]).T @ [0, 0, -1]
-    yaw = yaw_of(q[3:7])
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    ground = [surface_height(grid, spacing, *(q[:2] + turn @ point)) for point in scan]
-    return np.concatenate(
-        [
-            2 * lin_vel_b,
-            0.25 * ang_vel_b,
-            gravity_b,
-            np.asarray(command, np.float64) * [2, 2, 0.25],
-            q[7:] - default_joint_pos,
-            0.05 * qd[6 : 6 + num_joints],
-            np.float64(last_action),
-            5 * np.clip(q[2] - 0.5 - np.array(ground), -1, 1),
-        ]
-    )
-
-
-def goal_command(
-    position: Array, yaw: float, goal: Array, speed: float = 0.75, gain: float = 0.5, limit: float = 1.0
-) -> Array:
-    """Velocity toward the goal in the yaw frame, and the yaw rate that turns the robot to it."""
-    to_goal = np.float64(goal) - position
-    error = (np.arctan2(to_goal[1], to_goal[0]) - yaw + np.pi) % (2 * np.pi) - np.pi
-    return np.array([speed * np.cos(error), speed * np.sin(error), np.clip(gain * error, -limit, limit)])

@@ -49,36 +49,24 @@ class Segment:
 def measure_bare_physics(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray, *, steps: int = 1000) -> BareRates:
     """Bare physics rates on a rollout's own terrains, environments and solver.
 
-    The walking rate replays short segments, each from a recorded state: over 0.2 s a replayed robot still moves as the
-    recorded one did, which over a whole crossing without its controller it would not.
-
     Args:
         rollout: Built for the terrains.
         terrains: Genes or heights, as :meth:`Rollout.evaluate` takes them.
         seeds: One a terrain, uint32.
         steps: Physics steps timed at least.
     """
-    sim = rollout.sim
-    segments = record_segments(rollout, terrains, seeds)
-    graph = _capture_physics(sim)
-    _time(lambda: replay_segments(sim, graph, segments[:2]), sim.device)  # so that kernels are loaded
-    rounds = -(-steps // (len(segments) * _SEGMENT_STEPS * rollout.robot.decimation))
-    seconds = _time(lambda: [replay_segments(sim, graph, segments) for _ in range(rounds)], sim.device)
-    replayed = rounds * sum(len(segment.targets) for segment in segments) * rollout.robot.decimation
-    return BareRates(
-        walking=sim.num_envs * replayed / seconds, standing=_time_standing(rollout, graph, terrains, seeds, steps)
-    )
-
-
-def _capture_physics(sim: Simulation) -> Any:
-    """The graph of the physics steps of one control step."""
-
-    def control_step() -> None:
-        for _ in range(sim.robot.decimation):
-            sim.physics_step()
-
-    with wp.ScopedDevice(sim.device):
-        return sim.capture(control_step)
+    sim, robot = rollout.sim, rollout.robot
+    motion = Motion(sim, record_segments(rollout, terrains, seeds))
+    [walking] = replay_rates([motion], rounds=-(-steps // motion.physics_steps))
+    rollout.begin(terrains, seeds)
+    sim.joint_qd.zero_()
+    targets = np.zeros(sim.targets.shape, dtype=np.float32)
+    targets[:, 7:] = robot.default_joint_pos
+    sim.targets.assign(targets)
+    launches = -(-steps // robot.decimation)
+    motion.launch(100)  # 2 s, in which they settle
+    seconds = _time(lambda: motion.launch(launches), sim.device)
+    return BareRates(walking=walking, standing=sim.num_envs * launches * robot.decimation / seconds)
 
 
 def _time(work: Callable[[], object], device: str) -> float:
@@ -92,7 +80,11 @@ def _time(work: Callable[[], object], device: str) -> float:
 
 
 def record_segments(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -> list[Segment]:
-    """State and targets of the first 10 of every 20 control steps of the crossings."""
+    """State and targets of the first 10 of every 20 control steps of the crossings.
+
+    Segments are short: over 0.2 s a replayed robot still moves as the recorded one did, which over a whole crossing
+    without its controller it would not.
+    """
     sim, segments = rollout.sim, []
     most = round(rollout.cfg.max_duration_s / rollout.robot.control_dt)
     rollout.clear()
@@ -106,33 +98,50 @@ def record_segments(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray) -
     return segments
 
 
-def replay_segments(sim: Simulation, graph: Any, segments: list[Segment]) -> None:
-    """Play segments back: ``graph`` is launched once a control step."""
-    everyone = wp.ones(sim.num_envs, dtype=int, device=sim.device)
-    for segment in segments:
-        wp.copy(sim.joint_q, segment.joint_q)
-        wp.copy(sim.joint_qd, segment.joint_qd)
-        sim.clear_solver(everyone)
-        sim.refresh()
-        for targets in segment.targets:
-            wp.copy(sim.targets, targets)
-            wp.capture_launch(graph)
+class Motion:
+    """Recorded segments to be replayed in one simulation, by a captured graph of the physics of a control step."""
+
+    def __init__(self, sim: Simulation, segments: list[Segment]) -> None:
+        """Capture the graph and replay two segments, so that the kernels are loaded."""
+        self.sim, self.segments = sim, segments
+        self.physics_steps = sim.robot.decimation * sum(len(segment.targets) for segment in segments)
+        """Of one replay of all segments."""
+
+        def control_step() -> None:
+            for _ in range(sim.robot.decimation):
+                sim.physics_step()
+
+        with wp.ScopedDevice(sim.device):
+            self._graph: Any = sim.capture(control_step)
+        self.replay(slice(2))
+
+    def launch(self, times: int = 1) -> None:
+        """Simulates some control steps from the present state."""
+        with wp.ScopedDevice(self.sim.device):
+            for _ in range(times):
+                wp.capture_launch(self._graph)
+
+    def replay(self, part: slice = slice(None)) -> float:
+        """Plays segments back, each from its recorded state; returns the seconds it took."""
+        return _time(lambda: self._replay(self.segments[part]), self.sim.device)
+
+    def _replay(self, segments: list[Segment]) -> None:
+        sim = self.sim
+        everyone = wp.ones(sim.num_envs, dtype=int, device=sim.device)
+        for segment in segments:
+            wp.copy(sim.joint_q, segment.joint_q)
+            wp.copy(sim.joint_qd, segment.joint_qd)
+            sim.clear_solver(everyone)
+            sim.refresh()
+            for targets in segment.targets:
+                wp.copy(sim.targets, targets)
+                wp.capture_launch(self._graph)
 
 
-def _time_standing(rollout: Rollout, graph: Any, terrains: np.ndarray, seeds: np.ndarray, steps: int) -> float:
-    sim, robot = rollout.sim, rollout.robot
-    rollout.clear()
-    rollout.put(terrains, seeds)
-    sim.joint_qd.zero_()
-    targets = np.zeros(sim.targets.shape, dtype=np.float32)
-    targets[:, 7:] = robot.default_joint_pos
-    sim.targets.assign(targets)
-    launches = -(-steps // robot.decimation)
-    with wp.ScopedDevice(sim.device):
-        for _ in range(100):  # 2 s, in which they settle
-            wp.capture_launch(graph)
-    seconds = _time(lambda: [wp.capture_launch(graph) for _ in range(launches)], sim.device)
-    return sim.num_envs * launches * robot.decimation / seconds
+def replay_rates(motions: list[Motion], *, rounds: int) -> list[float]:
+    """Physics steps a second over all environments of each motion, replayed in turns; the median of ``rounds``."""
+    seconds = np.median([[motion.replay() for motion in motions] for _ in range(rounds)], axis=0)
+    return [m.sim.num_envs * m.physics_steps / float(s) for m, s in zip(motions, seconds, strict=True)]
 
 
 class HeightfieldSimulation(Simulation):
@@ -211,59 +220,50 @@ def measure_collision(
         thrown over a metre away), and ``solver_overflows`` of its buffers, which are as large as ours. What is not
         measured is None.
     """
-    sims: list[tuple[Simulation, Any, list[Segment]]] = [(sim, _capture_physics(sim), segments)]
+    motions = [Motion(sim, segments)]
     if other is not None:
-        sims.append((other, _capture_physics(other), [other.shift(segment) for segment in segments]))
-
-    def replay(which: tuple[Simulation, Any, list[Segment]], part: slice = slice(None)) -> float:
-        return _time(lambda: replay_segments(which[0], which[1], which[2][part]), sim.device)
-
-    for which in sims:
-        replay(which, slice(2))
-    seconds = np.median([[replay(which) for which in sims] for _ in range(rounds)], axis=0)
-    rates = sim.num_envs * sim.robot.decimation * sum(len(segment.targets) for segment in segments) / seconds
-    found: dict[str, Any] = {"physics_steps_per_s": float(rates[0])}
+        motions.append(Motion(other, [other.shift(segment) for segment in segments]))
+    rates = replay_rates(motions, rounds=rounds)
+    found: dict[str, Any] = {"physics_steps_per_s": rates[0]}
     names = ("speedup", "height_difference_m", "solver_invalid_envs", "solver_overflows")
     found |= dict.fromkeys(("physics_steps_per_s_solver_collision", *names))
     if other is None:
         return found
     middle = len(segments) // 2
-    for which in sims:
-        replay(which, slice(middle, middle + 1))
-    heights = [simulated.joint_q.numpy()[:, 2] for simulated in (sim, other)]
+    for motion in motions:
+        motion.replay(slice(middle, middle + 1))
     with np.errstate(invalid="ignore"):
-        apart = np.abs(heights[0] - heights[1])
+        apart = np.abs(sim.joint_q.numpy()[:, 2] - other.joint_q.numpy()[:, 2])
     apart = apart[segments[middle].joint_q.numpy()[:, 2] < 0.5 * PARKING_HEIGHT]  # parked robots tell nothing
     valid = apart < _LOST_M
     return found | {
-        "physics_steps_per_s_solver_collision": float(rates[1]),
-        "speedup": float(rates[0] / rates[1]),
+        "physics_steps_per_s_solver_collision": rates[1],
+        "speedup": rates[0] / rates[1],
         "height_difference_m": float(apart[valid].mean()) if valid.any() else None,
         "solver_invalid_envs": int((~valid).sum()),
         "solver_overflows": int(((other.overflow.numpy() & CAPACITY_OVERFLOWS) != 0).sum()),
     }
 
 
-def time_control_step(scene: Scene) -> float:
-    """Seconds a control step over whole crossings: policy, four physics steps, penalties, ends, observation."""
-    rollout = scene.rollout
-    steps = round(scene.cfg.duration_s / scene.robot.control_dt)
-    rollout.clear()
-    rollout.put(scene.genes, scene.seeds)
-    return _time(lambda: [rollout.control_step() for _ in range(steps)], rollout.sim.device) / steps
-
-
 def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of the whole step, and the physics rates with either collision.
+
+    The whole step is policy, four physics steps, penalties, ends and observation, over whole crossings.
 
     Args:
         scene: Robots and terrains; its state changes.
         rounds: Repetitions, of which the median counts.
         heightfield: Whether to measure the solver's own collision too.
     """
-    sim = scene.rollout.sim
-    seconds = sorted(time_control_step(scene) for _ in range(3))[1]
-    segments = record_segments(scene.rollout, scene.genes, scene.seeds)
+    rollout, sim = scene.rollout, scene.rollout.sim
+    steps = round(rollout.cfg.max_duration_s / scene.robot.control_dt)
+
+    def cross() -> float:
+        rollout.begin(scene.genes, scene.seeds)
+        return _time(lambda: [rollout.control_step() for _ in range(steps)], sim.device) / steps
+
+    seconds = sorted(cross() for _ in range(3))[1]
+    segments = record_segments(rollout, scene.genes, scene.seeds)
     other, failure = None, None if heightfield else "not asked for"
     if heightfield:
         try:

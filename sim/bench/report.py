@@ -14,7 +14,7 @@ from sim.bench.cases import Case, make_cases
 from sim.bench.ceiling import BOUND_BY_RULE, Ceiling, measure_ceiling
 from sim.bench.checks import Truth
 from sim.bench.physics import measure_step
-from sim.bench.scene import SceneCfg, build_scene
+from sim.bench.scene import build_scene
 from sim.bench.timing import TimingCfg, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns
 from sim.commands import Bench
 from sim.policy.loaders import prepare_torch, reason_of
@@ -25,21 +25,25 @@ _FLUSH_BYTES = 256 << 20
 _FLUSHED_LAUNCHES = 20
 
 
-def _torch_variant(call: Callable[..., Any], case: Case, device: str, timing: TimingCfg) -> Variant:
-    make = partial(repeat_torch, partial(call, *case.arguments), device=device)
-    return fit_launches(make, device, timing)
-
-
-def compile_variant(case: Case, device: str, timing: TimingCfg) -> tuple[Variant | None, str | None]:
-    """The counterpart through ``torch.compile``, or why there is none.
+def _torch_variants(
+    case: Case, device: str, timing: TimingCfg, *, compiled: bool
+) -> tuple[dict[str, Variant], str | None]:
+    """The counterpart as it is and through ``torch.compile``, or why that is missing.
 
     A compiler can fail with anything (on the CPU it needs one for C++): the column is then empty and says why.
     """
+
+    def variant(call: Callable[..., Any]) -> Variant:
+        return fit_launches(partial(repeat_torch, partial(call, *case.arguments), device=device), device, timing)
+
+    found = {"torch": variant(case.counterpart)}
+    if not compiled:
+        return found, "not asked for"
     try:
-        compiled = torch.compile(case.counterpart, dynamic=False, fullgraph=True)
-        return _torch_variant(compiled, case, device, timing), None
+        found["torch_compile"] = variant(torch.compile(case.counterpart, dynamic=False, fullgraph=True))
     except Exception as error:
-        return None, f"{type(error).__name__}: {reason_of(error)}"[:300]
+        return found, f"{type(error).__name__}: {reason_of(error)}"[:300]
+    return found, None
 
 
 def _time_cold(case: Case, device: str, timing: TimingCfg) -> float:
@@ -68,10 +72,7 @@ def measure_case(case: Case, ceiling: Ceiling, device: str, timing: TimingCfg, *
         OutputError: If an output of any variant is not what the oracle says.
     """
     case.check_ours()
-    variants = {"torch": _torch_variant(case.counterpart, case, device, timing)}
-    compiled_variant, failure = compile_variant(case, device, timing) if compiled else (None, "not asked for")
-    if compiled_variant is not None:
-        variants["torch_compile"] = compiled_variant
+    variants, failure = _torch_variants(case, device, timing, compiled=compiled)
     for name, variant in variants.items():
         variant.replay()
         case.check_torch(name, variant.outputs[0])
@@ -96,26 +97,21 @@ def measure_case(case: Case, ceiling: Ceiling, device: str, timing: TimingCfg, *
     }
 
 
-_RUNS = Path("runs") / "bench"  # a measurement made in passing does not replace the published one
-
-
-def sizes_of(cfg: Bench, device: str) -> tuple[SceneCfg, TimingCfg]:
-    """The sizes asked for; else those of the paper's iteration on CUDA, of one CPU process otherwise."""
+def sizes_of(cfg: Bench, device: str) -> tuple[int, int, TimingCfg]:
+    """Environments, terrains and timing asked for; else the paper's iteration on CUDA, one CPU process otherwise."""
     on_gpu = device.startswith("cuda")
-    scene = SceneCfg(
-        num_envs=cfg.num_envs or (4096 if on_gpu else 16),
-        num_terrains=cfg.num_terrains or (200 if on_gpu else 8),
-        walk_s=cfg.walk_s,
-        duration_s=cfg.duration_s,
-        seed=cfg.seed,
-    )
-    return scene, TimingCfg(rounds=cfg.rounds or (20 if on_gpu else 10), replay_s=2e-3 if on_gpu else 10e-3)
+    num_envs, num_terrains, rounds, replay_s = (4096, 200, 20, 2e-3) if on_gpu else (16, 8, 10, 10e-3)
+    timing = TimingCfg(rounds=cfg.rounds or rounds, replay_s=replay_s)
+    return cfg.num_envs or num_envs, cfg.num_terrains or num_terrains, timing
 
 
 def file_of(device_name: str) -> Path:
-    """Where numbers go by default: ``runs/bench/nvidia-h200.json`` for an NVIDIA H200, ``cpu.json`` for any CPU."""
+    """Where numbers go by default: ``runs/bench/nvidia-h200.json`` for an NVIDIA H200, ``cpu.json`` for any CPU.
+
+    A measurement made in passing does not replace the published one.
+    """
     name = "cpu" if device_name.startswith("CPU") else re.sub(r"[^a-z0-9]+", "-", device_name.lower()).strip("-")
-    return _RUNS / f"{name}.json"
+    return Path("runs") / "bench" / f"{name}.json"
 
 
 def add_shares(rows: list[dict[str, Any]], step_ms: float) -> float:
@@ -138,10 +134,13 @@ def measure(robot: RobotCfg, cfg: Bench, device: str) -> dict[str, Any]:
     Raises:
         OutputError: If a kernel or its counterpart disagrees with the oracle; nothing is reported then.
     """
-    sizes, timing = sizes_of(cfg, device)
+    num_envs, num_terrains, timing = sizes_of(cfg, device)
     prepare_torch(device)
-    print(f"walking {sizes.num_envs} robots on {sizes.num_terrains} terrains for {sizes.walk_s:g} s")
-    scene = build_scene(robot, sizes, device)
+    print(f"walking {num_envs} robots on {num_terrains} terrains for {cfg.walk_s:g} s")
+    scene = build_scene(
+        robot, device, num_envs=num_envs, num_terrains=num_terrains, walk_s=cfg.walk_s, duration_s=cfg.duration_s,
+        seed=cfg.seed,
+    )  # fmt: skip
     ceiling = measure_ceiling(device, timing)
     rows = []
     for case in make_cases(scene, Truth(scene)):
@@ -152,8 +151,8 @@ def measure(robot: RobotCfg, cfg: Bench, device: str) -> dict[str, Any]:
     share = add_shares(rows, step["ours_ms"])
     return {
         "robot": robot.name,
-        "num_envs": sizes.num_envs,
-        "num_terrains": sizes.num_terrains,
+        "num_envs": num_envs,
+        "num_terrains": num_terrains,
         "rows": [*rows, step],
         "share_of_step": share,
         "bound_by_rule": BOUND_BY_RULE,

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.settings import check
 
 _ALL = "all"
 _DEBUG = "FAULTLINE_DEBUG"
@@ -121,7 +122,7 @@ def told(error: BaseException, text: str) -> str:
 
 
 def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
-    """Parses the flags of a command and runs it.
+    """Parses the flags of a command, checks them against their ranges, and runs it.
 
     Args:
         cls: The command.
@@ -140,6 +141,7 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
         defaults: Any = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
         flags: Any = cls  # a protocol is no type that tyro's annotations take
         command: _Command = tyro.cli(flags, prog=f"faultline {name}", args=list(argv), **defaults)
+        check(command)
         status = command.execute()
         return status if isinstance(status, int) else 0
     except (ValueError, OSError, FloatingPointError, UserError) as error:

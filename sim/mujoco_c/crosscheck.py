@@ -13,17 +13,16 @@ from tqdm import tqdm
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.bank import TerrainBank
+from sim.bank import heights_of
 from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
 from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
 from sim.files.provenance import provenance
-from sim.files.settings import check
 from sim.mujoco_c.crossing import draw_starts, run_plain
 from sim.mujoco_c.model import crossing_model
 from sim.policy.spec import ControllerSpec
 from sim.robots.robot import RobotCfg, get_robot
-from sim.rollout import Rollout, RolloutResult
+from sim.rollout import Rollout
 from sim.simulation import SolverCfg, resolve_device
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 
@@ -54,12 +53,6 @@ def read_pool(path: Path) -> tuple[NDArray[np.float32], TerrainSpace]:
         raise ValueError(f"--genes {path}: 'genes': {error}") from None
 
 
-def success_rates(result: RolloutResult) -> NDArray[np.float64]:
-    """Share of each terrain's valid episodes without base collision, NaN without any; shape (num_terrains,)."""
-    valid = (~result.invalid).sum(axis=1)
-    return np.where(valid > 0, 1.0 - result.base_collision.sum(axis=1) / np.maximum(valid, 1), np.nan)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Choice:
     """Terrains of a pool that are neither too easy nor too hard to tell two simulators apart."""
@@ -83,7 +76,6 @@ class Comparison:
         Raises:
             ValueError: If something asked for cannot be had.
         """
-        check(cfg)
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)
         crossing_model(self.robot, np.zeros((2, 2)))  # MuJoCo must read it too
@@ -91,21 +83,11 @@ class Comparison:
         self.policy = cfg.policy or self.robot.policy_file
         self.rng = np.random.default_rng([_KEY, cfg.seed])
         self._pool, self.space = (None, SUPER_GAUSSIAN) if cfg.genes is None else read_pool(cfg.genes)
-        self._named = self._choice_named()
-
-    def _choice_named(self) -> Choice | None:
-        """The terrains that the command line names, if it does.
-
-        Raises:
-            ValueError: If there are none of these numbers.
-        """
-        cfg = self.cfg
-        if cfg.elite is None:
-            return None
-        if self._pool is None:
-            raise ValueError(f"--elite {cfg.elite!r} names terrains of a pool: give the pool too (--genes)")
-        index = chosen_elites(cfg.elite, len(self._pool), cfg.genes)
-        return Choice(genes=self._pool[index], index=index, first=[None] * len(index), looked_at=0)
+        self._named: list[int] | None = None
+        if cfg.elite is not None:
+            if self._pool is None:
+                raise ValueError(f"--elite {cfg.elite!r} names terrains of a pool: give the pool too (--genes)")
+            self._named = chosen_elites(cfg.elite, len(self._pool), cfg.genes)
 
     def choose(self) -> Choice:
         """Terrains of middling difficulty, or those that are named.
@@ -113,15 +95,12 @@ class Comparison:
         Raises:
             ValueError: If the pool has too few.
         """
-        if self._named is not None:
-            return self._named
-        cfg, at_once = self.cfg, 200 if self.device.startswith("cuda") else 32
+        cfg, at_once, named = self.cfg, 200 if self.device.startswith("cuda") else 32, self._named
         pool = self.space.hard_random(_MAX_POOL, self.rng) if self._pool is None else self._pool
+        if named is not None:
+            return Choice(genes=pool[named], index=named, first=[None] * len(named), looked_at=0)
         order = self.rng.permutation(len(pool))
-        rollout = Rollout(
-            self.robot, self.policy, num_terrains=at_once, num_replicas=cfg.episodes, device=self.device,
-            space=self.space,
-        )  # fmt: skip
+        rollout = self._rollout(self.robot, at_once)
         chosen: list[int] = []
         rates: list[float | None] = []
         looked_at = 0
@@ -129,7 +108,8 @@ class Comparison:
             while len(chosen) < cfg.terrains and looked_at < len(pool):
                 batch = order[np.arange(looked_at, looked_at + at_once) % len(pool)]
                 new = min(at_once, len(pool) - looked_at)
-                first = success_rates(rollout.evaluate(pool[batch], self._seeds(at_once)))[:new]
+                result = rollout.evaluate(pool[batch], self._seeds(at_once))
+                first = np.array([_rate(outcome, "success") for outcome in result.outcome[:new]])
                 hits = np.flatnonzero((first >= cfg.between[0]) & (first <= cfg.between[1]))
                 hits = hits[: cfg.terrains - len(chosen)]
                 chosen += batch[hits].tolist()
@@ -142,6 +122,17 @@ class Comparison:
                 f"{cfg.terrains}: give a larger --genes, fewer --terrains or a wider --between"
             )
         return Choice(genes=pool[chosen], index=chosen, first=rates, looked_at=looked_at)
+
+    def _rollout(self, robot: RobotCfg, num_terrains: int, time_constant_s: float | None = None) -> Rollout:
+        return Rollout(
+            robot,
+            self.policy,
+            num_terrains=num_terrains,
+            num_replicas=self.cfg.episodes,
+            device=self.device,
+            solver=SolverCfg(time_constant_s=time_constant_s),
+            space=self.space,
+        )
 
     def _seeds(self, count: int) -> NDArray[np.uint32]:
         return self.rng.integers(2**32, size=count, dtype=np.uint32)
@@ -159,19 +150,8 @@ class Comparison:
         choice = self.choose()
         genes, seeds = choice.genes, self._seeds(len(choice.index))
         robot, time_constant_s = self._resolved(cfg.fine == "both")
-        rollout = Rollout(
-            robot,
-            self.policy,
-            num_terrains=len(genes),
-            num_replicas=cfg.episodes,
-            device=self.device,
-            solver=SolverCfg(time_constant_s=time_constant_s),
-            space=self.space,
-        )
-        ours = rollout.evaluate(genes, seeds)
-        bank = TerrainBank(len(genes), device=self.device)
-        bank.set_genes(genes, self.space)
-        heights: Any = bank.heights.numpy()
+        ours = self._rollout(robot, len(genes), time_constant_s).evaluate(genes, seeds)
+        heights = heights_of(genes, self.space, device=self.device)
         starts = [
             draw_starts(self.robot, grid, int(seed), cfg.plain_episodes, self.device)
             for grid, seed in zip(heights, seeds, strict=True)
@@ -181,6 +161,7 @@ class Comparison:
         plain = run_plain(
             simulated, str(self.policy), heights, starts, processes=processes, time_constant_s=plain_time_constant_s
         )
+        plain_penalties = np.concatenate([crossings.penalties for crossings in plain])
         pairs = [
             Pair(index=choice.index[k], first=rate, ours=ours.outcome[k], plain=plain[k].outcome)
             for k, rate in enumerate(choice.first)
@@ -195,9 +176,11 @@ class Comparison:
             "mujoco_c": _settings(simulated, plain_time_constant_s),
             **summarise(pairs, cfg.seed),
             "penalties": {
-                name: {"ours": float(np.nanmean(ours.penalties[..., k])), "mujoco_c": float(np.nanmean(column))}
+                name: {
+                    "ours": float(np.nanmean(ours.penalties[..., k])),
+                    "mujoco_c": float(np.nanmean(plain_penalties[:, PENALTIES.index(name)])),
+                }
                 for k, name in enumerate(ours.penalty_names)
-                for column in [np.concatenate([crossings.penalties[:, PENALTIES.index(name)] for crossings in plain])]
             },
         }
 
@@ -223,16 +206,19 @@ def _hits(outcome: NDArray[np.uint8], kind: str) -> tuple[int, int]:
     return int(hit.sum()), len(valid)
 
 
+def _rate(outcome: NDArray[np.uint8], kind: str) -> float:
+    hits, count = _hits(outcome, kind)
+    return hits / count if count else float("nan")
+
+
 def _compare(pair: Pair, kind: str) -> dict[str, Any]:
-    hits, count = _hits(pair.ours, kind)
-    plain_hits, plain_count = _hits(pair.plain, kind)
-    low, high = wilson_interval(hits, count)
-    plain_rate = plain_hits / plain_count
+    low, high = wilson_interval(*_hits(pair.ours, kind))
+    plain_rate = _rate(pair.plain, kind)
     return {
-        "ours": hits / count,
+        "ours": _rate(pair.ours, kind),
         "interval": [low, high],
         "mujoco_c": plain_rate,
-        "mujoco_c_interval": list(wilson_interval(plain_hits, plain_count)),
+        "mujoco_c_interval": list(wilson_interval(*_hits(pair.plain, kind))),
         "inside": low <= plain_rate <= high,
     }
 

@@ -26,7 +26,15 @@ from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
-from sim.mujoco_c.model import Array, crossing_model, goal_commands, observations, step_penalties
+from sim.mujoco_c.model import (
+    Array,
+    Starts,
+    crossing_model,
+    goal_commands,
+    observations,
+    step_penalties,
+    to_mujoco,
+)
 from sim.policy.loaders import Policy, load_policy, prepare_torch
 from sim.policy.runner import forget_all
 from sim.robots.model import build_robot
@@ -41,17 +49,6 @@ _WARNINGS = [
     _mj.mjtWarning.mjWARN_BADQACC,
     _mj.mjtWarning.mjWARN_BADCTRL,
 ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Starts:
-    """Initial states in MuJoCo's convention, one row an episode."""
-
-    qpos: Array
-    """Base position [m], quaternion wxyz, joint angles [rad]; shape (num_episodes, 7 + num_joints)."""
-    qvel: Array
-    """Velocity of the base's origin, world frame [m/s]; its angular velocity, base frame [rad/s]; joint velocities
-    [rad/s]; shape (num_episodes, 6 + num_joints)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,25 +109,6 @@ def draw_starts(
         )  # fmt: skip
     order = np.argsort(queue.episode_of_env.numpy())  # on a GPU robots take them in any order
     return to_mujoco(joint_q.numpy()[order], joint_qd.numpy()[order], np.array(base_com))
-
-
-def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:
-    """Newton's joint state as MuJoCo's: quaternion wxyz, velocity of the origin, angular velocity in the base frame.
-
-    Args:
-        joint_q: Shape (num, 7 + num_joints), quaternion xyzw.
-        joint_qd: Shape (num, 6 + num_joints), velocity of the base's mass centre and angular velocity, world frame.
-        base_com: Mass centre of the base in its frame [m].
-    """
-    qpos, qvel = joint_q.astype(np.float64), joint_qd.astype(np.float64)
-    qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
-    for k, quaternion in enumerate(qpos[:, 3:7]):
-        matrix = np.zeros(9)
-        _mj.mju_quat2Mat(matrix, quaternion)
-        to_world = matrix.reshape(3, 3)
-        qvel[k, :3] -= np.cross(qvel[k, 3:6], to_world @ base_com)
-        qvel[k, 3:6] = to_world.T @ qvel[k, 3:6]
-    return Starts(qpos=qpos, qvel=qvel)
 
 
 class _Episodes:
@@ -198,6 +176,8 @@ def cross(
     cfg = cfg or CrossingCfg()
     episodes = _Episodes(robot, crossing_model(robot, heights, time_constant_s=time_constant_s), starts)
     count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
+    feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
+    default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
     outcome = np.full(count, Outcome.RUNNING)
     steps, sums = np.zeros(count, int), np.zeros((count, len(PENALTIES)))
     last_action = np.zeros((count, robot.num_joints))
@@ -212,21 +192,23 @@ def cross(
             qpos, qvel = episodes.qpos[running], episodes.qvel[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, cfg)
-            rows[running] = observations(robot, heights, qpos, qvel, command[running], last_action[running])
+            rows[running] = observations(
+                heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
+            )
             asked = rows if remembers else rows[running]
             action = policy(torch.as_tensor(asked, dtype=torch.float32)).numpy().astype(np.float64)
             action = action[running] if remembers else action
             action = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
             last_action[running] = action
-            episodes.hold(running, np.array(robot.default_joint_pos) + robot.action_scale * action)
+            episodes.hold(running, default + robot.action_scale * action)
         episodes.step(running)
         judged = _judge(robot, episodes, running, base, cfg)
         judged[(judged == Outcome.RUNNING) & (step + 1 >= most)] = Outcome.TIME_OUT
         outcome[running] = judged
         steps[running] += 1
-        sums[running] += robot.physics_dt * step_penalties(
-            robot, episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running]
-        )
+        state = (episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running])
+        penalties = step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
+        sums[running] += robot.physics_dt * penalties
     sums[outcome == Outcome.INVALID] = np.nan
     return PlainCrossings(outcome=outcome.astype(np.uint8), penalties=sums, duration_s=steps * robot.physics_dt)
 

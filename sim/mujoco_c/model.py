@@ -1,11 +1,13 @@
 """The crossing written a second time, from the definitions, for plain MuJoCo C with its own heightfield contact.
 
 Nothing of the parallel simulation is used, neither its kernels nor its contact: model, observation, command and
-penalties in float64 NumPy. States are MuJoCo's: the quaternion is wxyz, the base's linear velocity that of its origin
-in the world frame, its angular velocity in the base frame.
+penalties in float64 NumPy. The benchmark and the tests hold the kernels against them. States are MuJoCo's: the
+quaternion is wxyz, the base's linear velocity that of its origin in the world frame, its angular velocity in the base
+frame.
 """
 
 import xml.etree.ElementTree as ET
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -25,6 +27,36 @@ _OF_THE_FILE = ("stiffness", "damping", "effort_limit", "armature", "friction", 
 _mj: Any = mujoco  # its types are not written down
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Starts:
+    """Initial states in MuJoCo's convention, one row an episode."""
+
+    qpos: Array
+    """Base position [m], quaternion wxyz, joint angles [rad]; shape (num_episodes, 7 + num_joints)."""
+    qvel: Array
+    """Velocity of the base's origin, world frame [m/s]; its angular velocity, base frame [rad/s]; joint velocities
+    [rad/s]; shape (num_episodes, 6 + num_joints)."""
+
+
+def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:
+    """Newton's joint state as MuJoCo's: quaternion wxyz, velocity of the origin, angular velocity in the base frame.
+
+    Args:
+        joint_q: Shape (num, 7 + num_joints), quaternion xyzw.
+        joint_qd: Shape (num, 6 + num_joints), velocity of the base's mass centre and angular velocity, world frame.
+        base_com: Mass centre of the base in its frame [m].
+    """
+    qpos, qvel = joint_q.astype(np.float64), joint_qd.astype(np.float64)
+    qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
+    for k, quaternion in enumerate(qpos[:, 3:7]):
+        matrix = np.zeros(9)
+        _mj.mju_quat2Mat(matrix, quaternion)
+        to_world = matrix.reshape(3, 3)
+        qvel[k, :3] -= np.cross(qvel[k, 3:6], to_world @ base_com)
+        qvel[k, 3:6] = to_world.T @ qvel[k, 3:6]
+    return Starts(qpos=qpos, qvel=qvel)
 
 
 def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_constant_s: float | None = None) -> Any:
@@ -144,12 +176,23 @@ def goal_commands(qpos: Array, cfg: CrossingCfg) -> Array:
 
 
 def observations(
-    robot: RobotCfg, heights: NDArray[np.floating], qpos: Array, qvel: Array, command: Array, last_action: Array
-) -> Array:
-    """Observation rows, shape (num, observation_size); order and scales as the controllers of the field expect them."""
+    heights: NDArray[np.floating], qpos: Array, qvel: Array, command: Array, last_action: Array, *,
+    default_joint_pos: Array, scan: NDArray[np.floating],
+) -> Array:  # fmt: skip
+    """Observation rows, shape (num, observation_size); order and scales as the controllers of the field expect them.
+
+    Args:
+        heights: Height grid [m], shape (nrow, ncol).
+        qpos: Shape (num, 7 + num_joints).
+        qvel: Shape (num, 6 + num_joints).
+        command: Shape (num, 3).
+        last_action: Shape (num, num_joints).
+        default_joint_pos: Default pose [rad], shape (num_joints,).
+        scan: Scan points ahead and left of the base, yaw frame [m], shape (num_scan_points, 2).
+    """
     rotations = _rotations(qpos)
     heading = _heading(qpos)[:, None]
-    scan_x, scan_y = (points.astype(np.float64) for points in robot.scan_points())
+    scan_x, scan_y = scan.T.astype(np.float64)
     x = qpos[:, 0:1] + np.cos(heading) * scan_x - np.sin(heading) * scan_y
     y = qpos[:, 1:2] + np.sin(heading) * scan_x + np.cos(heading) * scan_y
     return np.concatenate(
@@ -158,7 +201,7 @@ def observations(
             0.25 * qvel[:, 3:6],
             -rotations[:, 2, :],  # gravity's direction in the base frame
             command * [2.0, 2.0, 0.25],
-            qpos[:, 7:] - np.array(robot.default_joint_pos),
+            qpos[:, 7:] - default_joint_pos,
             0.05 * qvel[:, 6:],
             last_action,
             5.0 * np.clip(qpos[:, 2:3] - 0.5 - surface_heights(heights, x, y), -1.0, 1.0),
@@ -167,26 +210,28 @@ def observations(
     )
 
 
-def step_penalties(robot: RobotCfg, qpos: Array, qvel: Array, command: Array, forces: Array) -> Array:
+def step_penalties(
+    qpos: Array, qvel: Array, command: Array, forces: Array, *, feet: NDArray[np.bool_], force_limit: float
+) -> Array:
     """Raw penalties of one physics step, before times dt, in the order of :data:`PENALTIES`; shape (num, 6).
 
     Args:
-        robot: Robot settings.
         qpos: Shape (num, 7 + num_joints).
         qvel: Shape (num, 6 + num_joints).
         command: Shape (num, 3).
-        forces: Contact force on each of ``robot.geom_names``, world frame [N], shape (num, num_geoms, 3).
+        forces: Contact force on each geom with a role, world frame [N], shape (num, num_geoms, 3).
+        feet: Which of them are feet, shape (num_geoms,).
+        force_limit: Highest foot contact force that costs nothing [N].
     """
     velocity = _base_velocity(qpos, qvel)
     size = np.linalg.norm(forces, axis=2)
     sideways = np.linalg.norm(forces[:, :, :2], axis=2)
-    foot = np.array([name in robot.foot_geoms for name in robot.geom_names])
     by_name = {
         "yaw_rate": np.abs(qvel[:, 5] - command[:, 2]),
         "vel_x": np.abs(velocity[:, 0] - command[:, 0]),
         "vel_y": np.abs(velocity[:, 1] - command[:, 1]),
-        "contact_force": np.maximum(0.0, size[:, foot] - robot.contact_force_limit).sum(axis=1),
-        "stumble": (sideways[:, foot] > 5.0 * np.abs(forces[:, foot, 2])).any(axis=1).astype(float),
-        "collision": (size[:, ~foot] > 0.1).sum(axis=1).astype(float),
+        "contact_force": np.maximum(0.0, size[:, feet] - force_limit).sum(axis=1),
+        "stumble": (sideways[:, feet] > 5.0 * np.abs(forces[:, feet, 2])).any(axis=1).astype(float),
+        "collision": (size[:, ~feet] > 0.1).sum(axis=1).astype(float),
     }
     return np.stack([by_name[name] for name in PENALTIES], axis=1)

@@ -152,11 +152,6 @@ class Renderer:
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         return self._image[::-1].copy()  # OpenGL's lowest row is first
 
-    def foot_positions(self, qpos: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Centres of the foot geoms in a pose, world-local [m], shape (num_feet, 3); NaN of what no file names."""
-        centres = self._posed(0, qpos).geom_xpos
-        return np.array([centres[index] if index >= 0 else np.full(3, np.nan) for index in self._feet])
-
     def _posed(self, number: int, qpos: NDArray[np.floating]) -> Any:
         while len(self._data) <= number:
             self._data.append(_mj.MjData(self.model))

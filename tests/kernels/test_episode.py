@@ -15,8 +15,8 @@ from kernels.episode import (
     park_ended,
 )
 from kernels.penalties import BASE, FOOT, LIMB
-from sim.bench import oracle
 from sim.crossing import CrossingCfg, make_task
+from sim.mujoco_c.model import goal_commands, to_mujoco
 from tests.kernels.states import random_states, upright
 
 ROLES = [LIMB, BASE, FOOT, BASE]
@@ -240,7 +240,7 @@ def command(states, device, anymal, outcome=0):
 
 def test_command_parity_with_the_oracle(device, anymal):
     q, qd = random_states(300, 3)
-    expected = [oracle.goal_command(row[:2], oracle.yaw_of(row[3:7]), GOAL) for row in np.float64(q)]
+    expected = goal_commands(to_mujoco(q, qd, np.zeros(3)).qpos, CrossingCfg(goal=GOAL))
     np.testing.assert_allclose(command((q, qd), device, anymal), expected, atol=2e-5)
 
 

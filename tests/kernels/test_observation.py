@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 
 from kernels.observation import Noise, Sensors, apply_action, write_observation, write_scan
-from sim.bench import oracle
-from tests.builders import SPACING, make_terrain, rough
+from sim.mujoco_c.model import observations, to_mujoco
+from tests.builders import make_terrain, rough
 from tests.kernels.states import random_states, upright
 
 BASE_COM = (-0.02, 0.01, 0.03)
@@ -59,18 +59,15 @@ def test_parity_with_the_oracle(device, num_envs, num_joints, num_scan):
     states, command, action, terrain_of_env, grids, scan = random_case(num_envs, num_joints, num_scan)
     got = observe(states, command, action, terrain_of_env, grids, scan, device)
     default = np.float64(np.float32(np.linspace(-0.5, 0.5, num_joints)))
+    plain = to_mujoco(*states, np.array(BASE_COM))
     for env in range(num_envs):
-        grid = grids[terrain_of_env[env]]
-        expected = oracle.observation(
-            states[0][env], states[1][env], command[env], action[env], grid, SPACING, default, scan, BASE_COM
-        )
-        np.testing.assert_allclose(
-            got[env, : len(expected) - num_scan], expected[: len(expected) - num_scan], atol=1e-5
-        )
+        one = (array[env : env + 1] for array in (plain.qpos, plain.qvel, command, action))
+        grid = np.float64(grids[terrain_of_env[env]])
+        [expected] = observations(grid, *one, default_joint_pos=default, scan=scan)
+        split = len(expected) - num_scan
+        np.testing.assert_allclose(got[env, :split], expected[:split], atol=1e-5)
         # A scan point is off by 1e-6 m in float32 where cells are as steep as 12 to 1, times 5.
-        np.testing.assert_allclose(
-            got[env, len(expected) - num_scan :], expected[len(expected) - num_scan :], atol=3e-4
-        )
+        np.testing.assert_allclose(got[env, split:], expected[split:], atol=3e-4)
 
 
 def test_the_scan_alone_is_that_of_the_row(device):

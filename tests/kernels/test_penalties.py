@@ -5,11 +5,10 @@ import pytest
 import warp as wp
 
 from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, SolverContacts, add_penalties, sum_geom_forces
-from sim.bench import oracle
+from sim.mujoco_c.model import step_penalties, to_mujoco
 from tests.kernels.states import random_states, upright
 
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
-FEET, BASE_AND_LIMBS = [3, 4], [0, 1, 2]
 BASE_COM = (0.05, -0.02, 0.1)
 LIMIT = 500.0
 DT = 0.005
@@ -48,13 +47,10 @@ def test_parity_with_the_oracle(device, num_envs):
     states = random_states(num_envs, 3)
     command = np.float32(np.random.default_rng(1).uniform(-1, 1, (num_envs, 3)))
     forces = random_forces(num_envs, 5)
-    expected = [
-        oracle.penalties(q, qd, BASE_COM, c, f, FEET, BASE_AND_LIMBS, LIMIT)
-        for q, qd, c, f in zip(*states, np.float64(command), forces, strict=True)
-    ]
-    np.testing.assert_allclose(
-        sums_after(states, command, forces, device), DT * np.array(expected), rtol=1e-5, atol=1e-7
-    )
+    plain, feet = to_mujoco(*states, np.array(BASE_COM)), np.array(ROLES) == FOOT
+    exact = (np.float64(command), np.float64(forces))
+    expected = step_penalties(plain.qpos, plain.qvel, *exact, feet=feet, force_limit=LIMIT)
+    np.testing.assert_allclose(sums_after(states, command, forces, device), DT * expected, rtol=1e-5, atol=1e-7)
 
 
 def test_permuting_environments(device):

@@ -74,7 +74,7 @@ def test_starts_fill_their_ranges(device, anymal):
     columns = {  # drawn quantity, middle, half width (definitions: a crossing)
         "x": (q[:, :1], 2, 0.1),
         "y": (q[:, 1:2], 4, 0.1),
-        "yaw": (np.array([[oracle.yaw_of(row[3:7])] for row in q]), 0, 0.2),
+        "yaw": (np.array([np.arctan2(*oracle.rotation_matrix(row[3:7])[[1, 0], :1]) for row in q]), 0, 0.2),
         "joints": (q[:, 7:][:, moving] / default[moving], 1, 0.2),
         "velocity": (origin_velocity, 0, 0.2),
         "angular velocity": (qd[:, 3:6], 0, 0.2),

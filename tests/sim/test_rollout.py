@@ -9,8 +9,8 @@ import warp as wp
 
 from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
-from sim.bench import oracle
 from sim.crossing import CrossingCfg
+from sim.mujoco_c.model import step_penalties, to_mujoco
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout, evaluate
 from sim.space import SUPER_GAUSSIAN
@@ -187,8 +187,7 @@ def test_penalties_equal_a_replay_on_the_host(robot, device):
     sim = recorder.sim
     result = recorder.evaluate(np.stack([FLAT, spike()]), np.array([3, 4]))
     put(sim, *starts[0])
-    feet = [sim.geom_names.index(name) for name in robot.foot_geoms]
-    touchy = [k for k, name in enumerate(sim.geom_names) if name not in robot.foot_geoms]
+    feet = np.array([name in robot.foot_geoms for name in sim.geom_names])
     bases = [sim.geom_names.index(name) for name in robot.base_geoms]
     sums, ended, limit = np.zeros((4, 6)), np.zeros(4, bool), robot.contact_force_limit
     with wp.ScopedDevice(device):
@@ -202,10 +201,9 @@ def test_penalties_equal_a_replay_on_the_host(robot, device):
                 sim.read_geom_forces()
                 q, qd = positions(sim), velocities(sim)
                 force = np.array(sim.geom_force.numpy(), dtype=np.float64)
-                for env in np.flatnonzero(~ended):
-                    sums[env] += robot.physics_dt * oracle.penalties(
-                        q[env], qd[env], list(sim.sensors.base_com), command[env], force[env], feet, touchy, limit
-                    )
+                plain = to_mujoco(q, qd, np.array(sim.sensors.base_com))
+                step = step_penalties(plain.qpos, plain.qvel, command, force, feet=feet, force_limit=limit)
+                sums[~ended] += robot.physics_dt * step[~ended]
                 ended |= np.linalg.norm(force[:, bases], axis=2).max(axis=1) > 1
     assert ended.tolist() == [False, False, True, True]
     np.testing.assert_array_equal(result.base_collision.ravel(), ended)

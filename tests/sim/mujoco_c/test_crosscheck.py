@@ -72,19 +72,17 @@ def test_a_pool_that_is_no_file_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("flags", "reason"),
     [
-        {"terrains": 0},
-        {"episodes": 0},
-        {"between": (0.9, 0.3)},
-        {"between": (0.0, 1.5)},
-        {"workers": -1},
-        {"seed": -1},
+        (["--terrains", "0", "--episodes", "0"], "terrains must be at least 1, got 0; episodes must"),
+        (["--between", "0.9", "0.3"], "between must rise"),
+        (["--between", "0", "1.5"], "between must be at least 0 and at most 1"),
+        (["--workers", "-1", "--seed", "-1"], "workers must be at least 1, got -1; seed must"),
     ],
 )
-def test_numbers_without_sense_are_refused(settings):
-    with pytest.raises(ValueError, match=r"must (be|rise)"):
-        Comparison(Crosscheck(device="cpu", **settings))
+def test_numbers_without_sense_are_refused(flags, reason, capsys):
+    assert run_command(Crosscheck, ["--device", "cpu", *flags], name="crosscheck") == 2
+    assert reason in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -119,6 +119,11 @@ def test_ghosts_are_paler_and_forces_are_arrows(opengl, anymal, ground):
     assert red(pushed) > red(alone) + 20
 
 
+def foot_positions(renderer, qpos):
+    """Centres of the foot geoms in the pose that is drawn, shape (num_feet, 3)."""
+    return renderer._posed(0, qpos).geom_xpos[renderer._feet].copy()
+
+
 def test_bones_join_a_robot_of_bare_shapes(opengl, robot):
     """From hip to foot there is something to see, where the file has shapes to collide with alone."""
     model = scene_model(robot, np.zeros((NUM_ROWS, NUM_COLS)), width=64, height=64)
@@ -126,7 +131,7 @@ def test_bones_join_a_robot_of_bare_shapes(opengl, robot):
     assert model.ngeom > plain.ngeom + robot.num_joints // 2
     assert model.nq == plain.nq == 7 + robot.num_joints
     with Renderer(robot, np.zeros((NUM_ROWS, NUM_COLS)), width=64, height=64) as renderer:
-        feet = renderer.foot_positions(standing(robot, 5.0, 4.0, 0.0))
+        feet = foot_positions(renderer, standing(robot, 5.0, 4.0, 0.0))
     data = mujoco.MjData(plain)
     data.qpos[:] = standing(robot, 5.0, 4.0, 0.0)
     mujoco.mj_kinematics(plain, data)
@@ -140,7 +145,7 @@ def test_a_robot_of_ones_own_is_shown_as_the_simulation_has_it(opengl, tmp_path,
                       cfg=CrossingCfg(max_duration_s=0.4))  # fmt: skip
     _, recording = record(rollout, np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([1]), policy="trot")
     with Renderer(dog, recording.heights[0], width=64, height=64) as renderer:
-        feet = np.array([renderer.foot_positions(pose) for pose in recording.qpos(0, 0)])
+        feet = np.array([foot_positions(renderer, pose) for pose in recording.qpos(0, 0)])
         renderer.render(
             recording.qpos(0, 0)[0], Camera(target=(2, 4, 0), distance=2), foot_force=recording.foot_force[0, 0, 9]
         )
