@@ -190,7 +190,7 @@ def test_rates_of_ones_own_terrain_with_their_intervals(capsys):
     assert report["rates"]["success"] == {"rate": 1.0, "hits": 4, "interval": [pytest.approx(0.5101, abs=1e-4), 1.0]}
     assert report["rates"]["goal"] == {"rate": 0.0, "hits": 0, "interval": [0.0, pytest.approx(0.4899, abs=1e-4)]}
     assert report["outcomes"] == {"goal": 0, "base_collision": 0, "time_out": 4, "out": 0, "invalid": 0}
-    assert report["heights_m"] == [0.0, 2.0] and report["map"] == "161 x 81 nodes over 16 x 8 m"
+    assert report["heights_m"] == [0.0, 2.0] and report["map"] == "161 x 81 nodes over 16 x 8 m, heights 0.00 to 2.00 m"
     assert report["duration_s"] == 20.0
     # 20 s at rest against 0.75 m/s
     assert report["penalties"]["vel_x"]["mean"] == pytest.approx(15.0, rel=0.1)
@@ -205,7 +205,7 @@ def test_rates_of_ones_own_terrain_with_their_intervals(capsys):
         "terrain_sha256",
     } <= report.keys()
     text = capsys.readouterr().out
-    assert "wall.png: 161 x 81 nodes over 16 x 8 m" in text
+    assert "wall.png: 161 x 81 nodes over 16 x 8 m, heights 0.00 to 2.00 m" in text
     assert "anymal with tests.sim.policies:stand on wall.png, 4 episodes" in text
     assert " ".join(text.split()).count("goal reached 0 of 4 (0%, 0 to 49%)") == 1
     assert Image.open("numbers-paths.png").size[0] > 1000
