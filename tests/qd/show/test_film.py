@@ -226,15 +226,16 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     result = SimpleNamespace(
         invalid=np.array([[False, False, True]]), base_collision=np.array([[True, False, False]]),
         reached_goal=np.array([[False, True, False]]), fallen=np.array([[False, False, True]]), penalties=penalties,
-        penalty_names=("vel_x",), outcome=np.array([[2, 1, 5]]), duration_s=np.array([[4.0, 16.0, 1.0]]),
+        penalty_names=("vel_x",), outcome=np.array([[2, 1, 5]]), invalidity=np.array([[0, 0, 3]]),
+        duration_s=np.array([[4.0, 16.0, 1.0]]),
     )  # fmt: skip
     numbers = numbers_of(result)
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["duration_s"] == 10.0 and numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "m"}
     assert numbers["invalid_episodes"] == 1 and numbers["outcomes"]["invalid"] == 1
     text = describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
-    assert "1 of 2 (50%, 9 to 91%)" in text and "1 invalid episodes are left out" in text
-    result.invalid[:] = True
+    assert "1 of 2 (50%, 9 to 91%)" in text and "1 invalid episodes are left out: 1 too fast" in text
+    result.invalid[:], result.invalidity[:] = True, 3
     numbers = numbers_of(result)
     assert numbers["rates"]["goal"] == {"rate": None, "hits": 0, "interval": None} and numbers["duration_s"] is None
     assert "no valid episode" in describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
