@@ -1,7 +1,9 @@
 """Parallel robots on height grids: one world each, terrain contact of our own, Newton's MuJoCo solver."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import newton
@@ -47,9 +49,8 @@ def resolve_device(name: str | None) -> str:
     Raises:
         ValueError: If the device is unknown or absent.
     """
-    wp.init()
     if name is None:
-        return "cuda:0" if wp.is_cuda_available() else "cpu"
+        return "cuda:0" if wp.is_cuda_available() else _cpu_instead()
     if name.startswith("cuda") and not wp.is_cuda_available():
         raise ValueError(f"device '{name}' asked for, but no CUDA device was found here: use --device cpu")
     try:
@@ -57,6 +58,13 @@ def resolve_device(name: str | None) -> str:
     except (RuntimeError, ValueError) as error:
         present = ", ".join(str(device) for device in wp.get_devices())
         raise ValueError(f"unknown device '{name}': expected one of {present}") from error
+
+
+@cache
+def _cpu_instead() -> str:
+    """The CPU, where no device was asked for; says so, once."""
+    print("No CUDA device was found here: this machine works on its CPU.", file=sys.stderr, flush=True)
+    return "cpu"
 
 
 class Simulation:

@@ -58,7 +58,8 @@ def measure_bare_physics(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarr
     sim, robot = rollout.sim, rollout.robot
     motion = Motion(sim, record_segments(rollout, terrains, seeds))
     [walking] = replay_rates([motion], rounds=-(-steps // motion.physics_steps))
-    rollout.begin(terrains, seeds)
+    rollout.clear()
+    rollout.put(terrains, seeds)
     sim.joint_qd.zero_()
     targets = np.zeros(sim.targets.shape, dtype=np.float32)
     targets[:, 7:] = robot.default_joint_pos
@@ -259,7 +260,8 @@ def measure_step(scene: Scene, *, rounds: int, heightfield: bool) -> tuple[dict[
     steps = round(rollout.cfg.max_duration_s / scene.robot.control_dt)
 
     def cross() -> float:
-        rollout.begin(scene.genes, scene.seeds)
+        rollout.clear()
+        rollout.put(scene.genes, scene.seeds)
         return _time(lambda: [rollout.control_step() for _ in range(steps)], sim.device) / steps
 
     seconds = sorted(cross() for _ in range(3))[1]

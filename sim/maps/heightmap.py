@@ -193,6 +193,7 @@ def fitted(heightmap: Heightmap) -> str:
     """What becomes of a map on the terrain, in words."""
     rows, columns = heightmap.heights.shape
     said = f"{columns} x {rows} nodes over {heightmap.size_m[0]:g} x {heightmap.size_m[1]:g} m"
+    said += f", heights {heightmap.heights.min():.2f} to {heightmap.heights.max():.2f} m"
     sides = zip("xy", heightmap.size_m, (SPACING * (NUM_COLS - 1), SPACING * (NUM_ROWS - 1)), strict=True)
     for axis, side, whole in sides:
         if side > whole + 1e-6:

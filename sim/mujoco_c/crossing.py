@@ -198,7 +198,8 @@ def cross(
             asked = rows if remembers else rows[running]
             action = policy(torch.as_tensor(asked, dtype=torch.float32)).numpy().astype(np.float64)
             action = action[running] if remembers else action
-            action = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
+            limited = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
+            action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
             last_action[running] = action
             episodes.hold(running, default + robot.action_scale * action)
         episodes.step(running)

@@ -17,6 +17,7 @@ from qd.archive import read_archive
 from qd.search import run_search
 from qd.show import figures
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError
+from qd.workers.invalid import AllInvalidError
 from sim.files import atomic as files
 from sim.files.command import Interrupted
 from sim.files.provenance import provenance
@@ -259,3 +260,42 @@ def test_ctrl_c_ends_without_a_traceback_and_says_how_to_go_on(tmp_path):
     assert code == 130
     assert "Traceback" not in errors
     assert f"Go on with:  faultline archive --resume {path}" in errors
+
+
+def invalid_from(iteration, share, crossed):
+    """Opens a stand-in whose episodes are invalid from an iteration on: so large a share of each terrain's."""
+
+    @contextmanager
+    def opened(cfg):
+        def evaluate(genes, seeds, progress=None):
+            crossed.append(len(genes))
+            result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
+            if len(crossed) < iteration:
+                return result
+            invalid = np.zeros(result.invalid.shape, bool)
+            invalid[:, : round(share * cfg.num_replicas)] = True
+            return stand_in.make_result(result.penalties, invalid=invalid)
+
+        yield evaluate
+
+    return opened
+
+
+def test_an_iteration_of_invalid_episodes_alone_stops_the_search_with_those_before_saved(tmp_path, plain_figures):
+    path = tmp_path / "run"
+    with pytest.raises(AllInvalidError, match=r"all 48 episodes .*48 non-finite state.*--resume") as error:
+        run_search(make_job(path, iterations=4), open_evaluator=invalid_from(3, 1.0, []))
+    assert error.value.status == 1
+    assert [row["iteration"] for row in rows_of(path)] == [1, 2]
+    run(path, iterations=4, resumes=True)  # with what it was mended by
+    run(tmp_path / "whole", iterations=4)
+    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
+
+
+def test_many_invalid_episodes_are_told_in_the_progress_line_and_at_the_end(tmp_path, plain_figures, capsys):
+    # One of four episodes of each of 12 terrains, in the second iteration of two.
+    run_search(make_job(tmp_path / "run"), open_evaluator=invalid_from(2, 0.25, []))
+    said = capsys.readouterr()
+    assert "25% invalid (12 non-finite state)" in said.err
+    assert "Warning: In 1 of 2 iterations" in said.out and "12 of 48 episodes" in said.out
+    assert [row["invalid_reasons"] for row in rows_of(tmp_path / "run")] == [{}, {"state": 12}]

@@ -1,6 +1,8 @@
 """The simulation as a machine: torques, forces, randomisation, capture, reset, limits and errors."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import warp as wp
 
 from sim.bank import TerrainBank
 from sim.mujoco_c.model import to_mujoco
-from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, resolve_device
+from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, _cpu_instead, resolve_device
 from sim.space import SUPER_GAUSSIAN
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, Stepper, lying, positions, put, velocities
 
@@ -205,3 +207,18 @@ def test_devices():
         assert resolve_device(None) == "cpu"
         with pytest.raises(ValueError, match="no CUDA device was found here: use --device cpu"):
             resolve_device("cuda")
+
+
+def test_that_there_is_no_gpu_is_said_once(capsys):
+    if wp.is_cuda_available():
+        pytest.skip("there is a GPU")
+    _cpu_instead.cache_clear()  # tests before may have heard it
+    assert resolve_device(None) == resolve_device(None) == "cpu"
+    resolve_device("cpu")
+    assert capsys.readouterr().err == "No CUDA device was found here: this machine works on its CPU.\n"
+
+
+def test_warp_itself_says_nothing_of_a_gpu_that_is_not_there():
+    # Its C++ has a warning of its own, which every worker would repeat.
+    done = subprocess.run([sys.executable, "-c", "import kernels"], capture_output=True, text=True, check=True)
+    assert "CUDA" not in done.stderr

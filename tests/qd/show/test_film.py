@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kernels.episode import Outcome
+from kernels.episode import Invalidity, Outcome
 from qd.archive import write_archive
 from qd.show.cross import Cross, cross, describe, numbers_of
 from qd.show.crossed import crossed_of
@@ -194,7 +194,7 @@ def test_rates_of_ones_own_terrain_with_their_intervals(capsys):
     assert report["rates"]["success"] == {"rate": 1.0, "hits": 4, "interval": [pytest.approx(0.5101, abs=1e-4), 1.0]}
     assert report["rates"]["goal"] == {"rate": 0.0, "hits": 0, "interval": [0.0, pytest.approx(0.4899, abs=1e-4)]}
     assert report["outcomes"] == {"goal": 0, "base_collision": 0, "time_out": 4, "out": 0, "invalid": 0}
-    assert report["heights_m"] == [0.0, 2.0] and report["map"] == "161 x 81 nodes over 16 x 8 m"
+    assert report["heights_m"] == [0.0, 2.0] and report["map"] == "161 x 81 nodes over 16 x 8 m, heights 0.00 to 2.00 m"
     assert report["duration_s"] == 20.0
     # 20 s at rest against 0.75 m/s
     assert report["penalties"]["vel_x"]["mean"] == pytest.approx(15.0, rel=0.1)
@@ -209,7 +209,7 @@ def test_rates_of_ones_own_terrain_with_their_intervals(capsys):
         "terrain_sha256",
     } <= report.keys()
     text = capsys.readouterr().out
-    assert "wall.png: 161 x 81 nodes over 16 x 8 m" in text
+    assert "wall.png: 161 x 81 nodes over 16 x 8 m, heights 0.00 to 2.00 m" in text
     assert "anymal with tests.sim.policies:stand on wall.png, 4 episodes" in text
     assert " ".join(text.split()).count("goal reached 0 of 4 (0%, 0 to 49%)") == 1
     assert Image.open("numbers-paths.png").size[0] > 1000
@@ -227,14 +227,18 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     ends = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.INVALID]
     sums = np.repeat([[1.0], [3.0], [np.nan]], 6, axis=1)
     made = recording_of(ends, [4.0, 14.0, 3.0], penalties=sums, fallen=[False, False, True])
-    made = dataclasses.replace(made, duration_s=np.array([[4.0, 16.0, 1.0]]))
+    made = dataclasses.replace(
+        made, duration_s=np.array([[4.0, 16.0, 1.0]]), invalidity=np.array([[0, 0, Invalidity.SPEED]], np.uint8)
+    )
     numbers = numbers_of(crossed_of(made, NAMES, (1.0,) * 6))
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["duration_s"] == 10.0 and numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "m"}
     assert numbers["invalid_episodes"] == 1 and numbers["outcomes"]["invalid"] == 1
     text = describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
-    assert "1 of 2 (50%, 9 to 91%)" in text and "1 invalid episodes are left out" in text
-    broken = dataclasses.replace(made, outcome=np.full((1, 3), Outcome.INVALID, np.uint8))
+    assert "1 of 2 (50%, 9 to 91%)" in text and "1 invalid episodes are left out: 1 too fast" in text
+    broken = dataclasses.replace(
+        made, outcome=np.full((1, 3), Outcome.INVALID, np.uint8), invalidity=np.full((1, 3), Invalidity.SPEED, np.uint8)
+    )
     numbers = numbers_of(crossed_of(broken, NAMES, (1.0,) * 6))
     assert numbers["rates"]["goal"] == {"rate": None, "hits": 0, "interval": None} and numbers["duration_s"] is None
     assert "no valid episode" in describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})

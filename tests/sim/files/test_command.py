@@ -22,6 +22,7 @@ from sim.files.command import (
 
 ERRORS = {"value": ValueError("two\nlines"), "user": UserError("a worker is lost"), "bug": ZeroDivisionError()}
 ERRORS |= {"file": OSError("a/b cannot be written"), "number": FloatingPointError("not finite")}
+ERRORS |= {"own status": type("NothingError", (UserError,), {"status": 1})("nothing is valid")}
 ERRORS |= {"stop": KeyboardInterrupt(), "resumable": Interrupted("Stopped; 3 saved. Resume with x")}
 
 
@@ -49,6 +50,7 @@ def run(*argv):
     [
         ("value", 2, "error: two lines\n"),
         ("user", 2, "error: a worker is lost\n"),
+        ("own status", 1, "error: nothing is valid\n"),
         ("file", 2, "error: a/b cannot be written\n"),
         ("number", 2, "error: not finite\n"),
         ("stop", 130, "\nStopped.\n"),

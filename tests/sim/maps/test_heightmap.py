@@ -47,13 +47,16 @@ def test_a_small_map_is_continued_by_the_height_of_its_edge():
     ramp = sampled(lambda x, y: x - 8.0, (4.0, 8.0), (81, 161))
     terrain = as_terrain(ramp)
     np.testing.assert_allclose(terrain, np.broadcast_to(np.clip(X - 8.0, -2.0, 2.0), terrain.shape), atol=1e-6)
-    assert fitted(ramp) == "81 x 161 nodes over 4 x 8 m, continued by the height of its edge to 16 m along x"
+    said = "81 x 161 nodes over 4 x 8 m, heights -2.00 to 2.00 m, continued by the height of its edge to 16 m along x"
+    assert fitted(ramp) == said
 
 
 def test_of_a_large_map_the_middle_is_crossed():
     wide = sampled(lambda x, y: 0.1 * (x - 8.0) + 0.2 * (y - 4.0), (40.0, 10.0), (401, 101))
     np.testing.assert_allclose(as_terrain(wide), 0.1 * (X[None, :] - 8) + 0.2 * (Y[:, None] - 4), atol=1e-6)
-    assert fitted(wide).endswith("over 40 x 10 m, cut to its middle 16 m along x, cut to its middle 8 m along y")
+    # 0.1 * (+-20) + 0.2 * (+-5) m, of which the crossing takes the middle
+    assert "over 40 x 10 m, heights -3.00 to 3.00 m, cut to its middle 16 m along x" in fitted(wide)
+    assert fitted(wide).endswith(", cut to its middle 8 m along y")
 
 
 def test_a_finer_map_is_averaged_not_picked_from():
