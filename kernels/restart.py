@@ -9,6 +9,7 @@ from kernels.heightfield import Terrain, node_height
 from kernels.observation import Sensors
 from kernels.rewards import Rewards
 
+
 @wp.struct
 class StartRanges:
     """Randomised start of an episode: half widths round the nominal start, uniform."""

@@ -328,9 +328,7 @@ class Rollout:
         self._write_terrains(terrains, seeds, slots)
         num_episodes = count * self.num_replicas
         most_steps = self._most * -(-num_episodes // self.num_envs)
-        self._batches.append(
-            _Batch(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._steps)
-        )
+        self._batches.append(_Batch(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._steps))
         self._first_free = (first + count) % self.num_terrains
         self._waiting += num_episodes
         if idle:
@@ -387,9 +385,7 @@ class Rollout:
         for _ in range(stop - since):
             self.control_step(watcher)
 
-    def take(
-        self, progress: Callable[[float], None] | None = None, *, watcher: Watcher | None = None
-    ) -> RolloutResult:
+    def take(self, progress: Callable[[float], None] | None = None, *, watcher: Watcher | None = None) -> RolloutResult:
         """Wait for the terrains that were put in first.
 
         Args:

@@ -102,7 +102,8 @@ class EvaluatorCfg:
 
 def best_num_envs(device: str) -> int:
     """Robots at once with which a device crosses the most episodes a second: a GPU is full with them, and on a core
-    more would wait longer for the last ones to arrive (results/anymal/speed.json)."""
+    more would wait longer for the last ones to arrive (results/anymal/speed.json).
+    """
     return 32_768 if device.startswith("cuda") else 32
 
 

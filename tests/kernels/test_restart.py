@@ -19,7 +19,10 @@ BASE_COM = (-0.02, 0.01, 0.03)
 def starts_of(seeds, replicas, device):
     """What each start is drawn from, as a queue hands it out: replica by replica, terrain by terrain."""
     num_envs = len(seeds) * replicas
-    queue, waiting = make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=device), make_episodes(num_envs, device)
+    queue, waiting = (
+        make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=device),
+        make_episodes(num_envs, device),
+    )
     queue.seed.assign(np.uint32(seeds))
     make_ready(num_envs, queue)
     sums, terrain_of_env = wp.zeros((num_envs, 1), device=device), wp.zeros(num_envs, dtype=int, device=device)

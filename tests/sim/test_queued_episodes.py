@@ -27,7 +27,9 @@ def pit():
     return heights
 
 
-GRIDS = np.stack([FLAT, np.roll(spike(), 210, axis=1), crossing_terrain("boxes", 9, 1), pit(), crossing_terrain("noise", 9, 2)])
+GRIDS = np.stack(
+    [FLAT, np.roll(spike(), 210, axis=1), crossing_terrain("boxes", 9, 1), pit(), crossing_terrain("noise", 9, 2)]
+)
 # Begun 1 m before the edge of the goal, a walk of two seconds has every end there is.
 NEAR = CrossingCfg(start=(12.5, 4.0), max_duration_s=2.4, poll_every_s=0.2)
 
@@ -43,7 +45,7 @@ class FearsDepth:
         return torch.where((deep > 0.0) & (deep < 0.5), torch.nan, self.walker(row))
 
 
-def rollout_of(robot, num_envs, policy=None, cfg=NEAR, device="cpu", num_terrains=len(GRIDS)):
+def rollout_of(robot, num_envs, policy=None, cfg=NEAR, device="cpu", num_terrains=5):
     return Rollout(
         robot, policy or FearsDepth(robot, device), num_terrains=num_terrains, num_replicas=REPLICAS, device=device,
         num_envs=num_envs, cfg=cfg,
@@ -100,8 +102,7 @@ def test_lots_run_into_each_other(anymal):
     assert 0.5 * robot_steps < used <= robot_steps
     with pytest.raises(RuntimeError, match="nothing under way"):
         rollout.take()
-    again = rollout.evaluate(GRIDS[3:], SEEDS[3:])
-    same(dataclasses.replace(expected, **{k: getattr(expected, k)[3:] for k in ARRAYS if getattr(expected, k) is not None}), again)
+    same(expected, rollout.evaluate(GRIDS[3:], SEEDS[3:]), slice(3, 5))
 
 
 def test_more_may_be_put_in_while_one_waits(anymal):

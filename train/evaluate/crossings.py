@@ -76,7 +76,9 @@ class KeptCrossings:
             with np.load(file, allow_pickle=False) as content:
                 found: dict[str, Any] = {name: content[name] for name in _FIELDS}
             found["penalty_names"] = tuple(found["penalty_names"].tolist())
-            numbers = {name: value.item() for name, value in found.items() if isinstance(value, np.ndarray) and not value.ndim}
+            numbers = {
+                name: value.item() for name, value in found.items() if isinstance(value, np.ndarray) and not value.ndim
+            }
             result = RolloutResult(**found | numbers)
             # Bits that flipped before they were written have no checksum.
             if flaw := flaw_of(result, len(terrains), self._episodes):

@@ -203,7 +203,10 @@ URDFS = [
     (urdf().replace('xyz="0.2 0.12 0"', 'xyz="0.2 left 0"'), 'line 23: <origin xyz="0.2 left 0"> must be numbers'),
     (urdf().replace(FIRST_MASS, '<mass value="${m}"/>'), r"line 8: a xacro file \(\$\{m\}\).*`xacro dog\.urdf > "),
     (urdf().replace('<parent link="trunk"/>', "", 1), "line 22: joint FL_hip has no <parent link"),
-    (urdf().replace('<child link="FL_thigh"/>', '<child link="leg"/>'), "joint FL_hip: no link named leg, the file has"),
+    (
+        urdf().replace('<child link="FL_thigh"/>', '<child link="leg"/>'),
+        "joint FL_hip: no link named leg, the file has",
+    ),
     (urdf().replace('"revolute"', '"hinge"', 1), "joint FL_hip must be of type revolute.*got 'hinge'"),
     (urdf().replace('"trunk">', '"">', 1), "line 2: a link without a name"),
 ]

@@ -163,7 +163,9 @@ IN_CM = re.sub(
     ),
     urdf(),
 )
-IN_DEGREES = urdf().replace('"-1.5" upper="2.5"', '"-86" upper="143"').replace('"-2.6" upper="-0.1"', '"-149" upper="-6"')
+IN_DEGREES = (
+    urdf().replace('"-1.5" upper="2.5"', '"-86" upper="143"').replace('"-2.6" upper="-0.1"', '"-149" upper="-6"')
+)
 
 
 @pytest.mark.parametrize(
