@@ -46,7 +46,7 @@ class Train(TrainingFlags):
             return cls(robot=name, task=TaskCfg.of(robot), ppo=PpoCfg.of(robot))
         from train.ppo.run import read_saved, settings_of
 
-        return cls(robot=name, resume=run, **settings_of(run, read_saved(run, robot.name, finetuning=False), _KINDS))
+        return cls(robot=name, resume=run, **settings_of(run, read_saved(run, robot, finetuning=False), _KINDS))
 
     def execute(self) -> int:
         """Trains; returns the exit status: 0, or 130 after Ctrl-C.
@@ -95,7 +95,7 @@ def _job_of(flags: Train, began: float) -> "Job":
         "ppo": asdict(flags.ppo),
         **own_hash(robot),
     }
-    saved = read_saved(flags.resume, robot.name, finetuning=False) if flags.resume else None
+    saved = read_saved(flags.resume, robot, finetuning=False) if flags.resume else None
     for change in check_resumed(flags, saved, settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     run_dir = prepare_run_dir(flags, f"{robot.name}-base")

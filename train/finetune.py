@@ -30,7 +30,8 @@ class Finetune(TrainingFlags):
     """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G) or hard-random ones (C-HR), or
     nothing else (C-HC)."""
     archive: Path | None = None
-    """Run of a search, or its archive.npz, for mix generated; results/<robot>/archive."""
+    """Run of a search, or its archive.npz, for mix generated; results/<robot>/archive, or of a robot without one
+    its newest run under runs/."""
     split_seed: int = setting(0, least=0)
     """Which elites are held out for the evaluation."""
     draw: Literal["uniform", "failing"] = "uniform"
@@ -65,7 +66,7 @@ class Finetune(TrainingFlags):
         from train.ppo.run import read_saved, settings_of
         from train.task.mix import MixCfg
 
-        saved = read_saved(run, robot.name, finetuning=True)
+        saved = read_saved(run, robot, finetuning=True)
         sizes = dict.fromkeys(("seed", "num_envs", "iterations", "critic_iterations", "split_seed"), int)
         begun = settings_of(run, saved, {**sizes, "policy": str, "mix": MixCfg, "task": TaskCfg, "ppo": PpoCfg})
         archive = saved["extra"]["settings"].get("archive")

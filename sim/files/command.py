@@ -52,8 +52,8 @@ class Where(OnDevice):
     """Options that say where a command works."""
 
     workers: str | None = None
-    """Who works: a number of processes on the CPU (one a core if left out), ray for every device of a Ray cluster, or
-    ray:N for N of them. RAY_ADDRESS names a running cluster."""
+    """Worker processes: a number of them on the CPU (one a core if left out), ray for one on every device of a Ray
+    cluster, or ray:N for N of them. RAY_ADDRESS names a running cluster."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -84,6 +84,8 @@ class TrainingFlags(OnDevice):
     """Where to write; a new directory under runs/, or the resumed run."""
     resume: Path | None = None
     """Run directory to go on from."""
+    overwrite: bool = False
+    """Replace the file that --export names if it is there and of another training."""
     export: Path | None = None
     """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
     <name>.pt beside the settings file of another robot makes it that robot's own."""

@@ -99,12 +99,12 @@ def gather(cfg: "Report") -> Material:
         ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
     """
     _refuse_unbegun(cfg.run)
-    found = find_archive(cfg.robot, cfg.run)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy)
     archive, robot, run = found.archive, found.robot, found.run
     if not len(archive):
         raise ValueError(
             f"{run} must have elites to report on, got an archive of none after {archive.iterations} iterations: "
-            f"let it go on with `{command_line('archive', resume=run, iterations='N')}`"
+            f"{found.go_on}"
         )
     searched, _ = found.as_searched()
     folder = RunDirectory(found.folder)

@@ -41,7 +41,7 @@ def read_tables(file: Path, robot: str) -> dict[str, Any]:
         FileNotFoundError: If there is no such file.
         ValueError: If it is damaged, another file, or of another robot.
     """
-    writer = f"`{command_line('evaluate', robot=robot, policies='...')}`"
+    writer = f"`{command_line('evaluate', robot=robot, policies='base=shipped')}`"
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: {writer} writes them")
     tables = read_json(file)
