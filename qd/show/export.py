@@ -123,10 +123,8 @@ def _refuse_to_replace(folder: Path, elites: list[int]) -> None:
 def _check_room(folder: Path, count: int, formats: list[str]) -> None:
     from sim.maps.terrain_files import TYPICAL_BYTES
 
-    needed, free = (
-        count * sum(TYPICAL_BYTES[ending] for ending in formats),
-        shutil.disk_usage(_that_exists(folder)).free,
-    )
+    needed = count * sum(TYPICAL_BYTES[ending] for ending in formats)
+    free = shutil.disk_usage(_that_exists(folder)).free
     print(f"Writing about {needed / 1e6:,.0f} MB to {folder}.", flush=True)
     if needed > free:
         raise ValueError(

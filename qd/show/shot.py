@@ -26,7 +26,6 @@ _HOLD_S = 1.0  # of the last frame
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
 _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 _DPI = 100
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # apart for every kind of colour blindness
 _FUTURE = 0.25  # how much is left to see of what has not happened yet
 _OUTCOMES = {Outcome.INVALID: "invalid", **{outcome: ending.words for outcome, ending in ENDINGS.items()}}
 
@@ -254,7 +253,7 @@ def _draw_map(axes: Any, shot: Shot) -> None:
 
 def _draw_curves(axes: Any, shot: Shot) -> None:
     times = shot.recording.times_s[: shot.num_frames]
-    for (name, values), color in zip(shot.penalties.items(), _COLORS, strict=False):
+    for (name, values), color in zip(shot.penalties.items(), COLORS, strict=False):
         label = f"{label_of(name)} {values[-1]:.1f}"
         axes.plot(times, values, color=color, linewidth=1.8, label=label)
     axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))

@@ -63,7 +63,7 @@ class Which:
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
-    """Number of the elite, 0 the worst; where a command takes several: numbers separated by spaces, or all."""
+    """Numbers of the elites, 0 the worst: one, several as in --elite "0 3", or all. replay and view take one."""
 
 
 class UserError(Exception):

@@ -12,8 +12,6 @@ from qd.show.elites import Elites, elites_of
 from qd.show.figures import label_of
 from sim.files.intervals import rate_words
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#666666")
-"""Of curves, one a penalty; readable by most colour-blind people."""
 _SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites by fitness, the worst darkest
 _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
 _WIDTH, _HEIGHT = 460, 350

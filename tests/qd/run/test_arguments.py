@@ -36,7 +36,7 @@ def nan_policy(observation: torch.Tensor) -> torch.Tensor:
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figures, "write_figures", lambda *_: [])  # they take longer than the searches
-    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self: stand_in.SCALES)
+    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
     before = signal.getsignal(signal.SIGTERM)
     yield
     signal.signal(signal.SIGTERM, before)
