@@ -40,7 +40,7 @@ MISTAKES = [
     (["replay", *RUN, "--robot", "kicked/dog.py"], rf"again \({FLAG}\)"),  # searched with code
     (["archive", "--robot", "bare/dog.py"], COMMAND),  # no scales, nor a controller to measure them with
     (["train", *TRAIN, "--export", "bare/dog.pt"], r"give (--overwrite)"),
-    (["train", *TRAIN], rf"(--resume runs/base)"),  # a training is there
+    (["train", *TRAIN], r"(--resume runs/base)"),  # a training is there
     (["finetune", "--robot", "bare/dog.py", "--resume", "runs/base"], COMMAND),  # it is no fine-tuning
     (["finetune", *KICKED], COMMAND),  # from code
     (["evaluate", "--robot", "lone/dog.py"], COMMAND),  # no controller
@@ -88,7 +88,9 @@ def test_a_remedy_works(home, monkeypatch, capsys):
             place = words.index("--policy")
             again = [*words[:place], *words[place + 2 :], *remedy]
         else:
-            again = [word for word in words if remedy[0] != "--resume" or word not in ("--run-dir", "runs/base")] + remedy
+            again = [
+                word for word in words if remedy[0] != "--resume" or word not in ("--run-dir", "runs/base")
+            ] + remedy
         status, said = run(again, capsys)
         assert status == 0, (words, again, said)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from qd.show.crossed import ENDINGS
-from qd.show.figures import label_of
+from qd.show.figures import label_of, look_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
 from sim.policy.spec import ControllerSpec
@@ -253,9 +253,9 @@ def _draw_map(axes: Any, shot: Shot) -> None:
 
 def _draw_curves(axes: Any, shot: Shot) -> None:
     times = shot.recording.times_s[: shot.num_frames]
-    for (name, values), color in zip(shot.penalties.items(), COLORS, strict=False):
+    for name, values in shot.penalties.items():
         label = f"{label_of(name)} {values[-1]:.1f}"
-        axes.plot(times, values, color=color, linewidth=1.8, label=label)
+        axes.plot(times, values, color=look_of(name)[0], linewidth=1.8, label=label)
     axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")

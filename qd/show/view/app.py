@@ -259,7 +259,7 @@ class App:
             self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
         else:
             self._clock.load(crossing.duration_s)
-            self._curves = Curves(crossing.times_s, crossing.penalties, self._axes.labels)
+            self._curves = Curves(crossing.times_s, crossing.penalties, archive.penalties)
             ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
             self._panel.show_status(f"{ended} {all_of_them}")
             self._show_frame()

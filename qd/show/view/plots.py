@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.show.elites import Elites, elites_of
-from qd.show.figures import label_of
+from qd.show.figures import label_of, look_of
 from sim.files.intervals import rate_words
 
 _SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites by fitness, the worst darkest
@@ -181,13 +181,13 @@ def _svg(height: int, parts: Iterable[str]) -> str:
 class Curves:
     """Running penalties of one crossing, drawn once; only the mark of the shown time moves."""
 
-    def __init__(self, times_s: NDArray[np.floating], sums: NDArray[np.floating], labels: Sequence[str]) -> None:
+    def __init__(self, times_s: NDArray[np.floating], sums: NDArray[np.floating], penalties: Sequence[str]) -> None:
         """Draw the curves.
 
         Args:
             times_s: Time of each frame [s], shape (num_frames,).
             sums: Scaled penalty sums so far, shape (num_frames, num_penalties).
-            labels: Each penalty in words.
+            penalties: Name of each.
         """
         self._end = max(float(times_s[-1]), 1e-9)
         most = max(float(np.max(sums)), 1e-9)
@@ -202,11 +202,11 @@ class Curves:
             _text(_MARGIN + 8, bottom + 13, "penalties so far, in multiples of their scales", "start"),
             _text(_WIDTH - 8, bottom + 13, f"{self._end:.1f} s", "end"),
         ]
-        for column, label in enumerate(labels):
-            color = COLORS[column % len(COLORS)]
+        for column, name in enumerate(penalties):
+            color = look_of(name)[0]
             y = bottom - np.asarray(sums[chosen, column], dtype=np.float64) / most * (bottom - top)
             parts.append(_lines(x, y[None], color, 1.6, 1.0))
-            parts.append(_text(_MARGIN + 16, top + 12 * column + 4, label, "start", f'style="fill:{color}"'))
+            parts.append(_text(_MARGIN + 16, top + 12 * column + 4, label_of(name), "start", f'style="fill:{color}"'))
         self._drawn = "".join(parts)
 
     def _x(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -166,7 +166,7 @@ def test_code_runs_only_if_it_is_named_again(capsys):
     told = capsys.readouterr().out
     assert f"replay --robot anymal --run a --elite 0 --policy {fine}" in told
     before = everything_in("a")
-    refused = f"a was searched with the controller {fine}, which is code: name it again (--policy)"
+    refused = f"a was searched with the controller {fine}, which is code: name it again (--policy {fine})"
     assert refused in fails(capsys, "--resume", "a", "--iterations", "2")
     assert f"archive --robot anymal --resume a --policy {fine} --device cpu" in fails(
         capsys, *TINY, "--policy", fine, "--run-dir", "a"

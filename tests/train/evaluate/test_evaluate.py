@@ -200,7 +200,10 @@ def test_sizes(capsys):
     ("flags", "message"),
     [
         (["--sets", "easy"], "sets must be some of hand_crafted, hard_random, generated, generated_far, got easy"),
-        (["--sets", "generated"], "no archive of anymal under runs/"),
+        (
+            ["--sets", "generated"],
+            "generated is made of elites: give the run that found them (--archive results/anymal/archive)",
+        ),
         (["--sets", "hard_random hard_random"], "each set may be named once"),
         (["--archive", "{folder}/none"], "no archive at {folder}/none"),
         (["--archive", "{folder}/cassie"], "must be of robot 'anymal', got one of 'cassie'"),
