@@ -286,7 +286,7 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
     ("flags", "message"),
     [
         (["--robot", "spot"], "unknown robot 'spot'"),
-        (["--archive", "{dir}/nowhere"], "archive --robot anymal) and name it with --archive"),
+        (["--archive", "{dir}/nowhere"], "archive --robot anymal` and name it with --archive"),
         (["--archive", "{dir}/cassie.npz"], "the archive must be of robot 'anymal', got one of 'cassie'"),
         (["--archive", "{dir}/empty.npz"], "needs at least 5 elites, got 0"),
         (["--mix", "hand-crafted", "--archive", "{dir}/archive"], "takes no terrains from an archive"),
