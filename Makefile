@@ -13,6 +13,17 @@ ON_TWO_CORES := -n 2 --dist loadfile
 FAULTLINE_DEVICE ?= cuda:0
 
 quoted = '$(subst ','\'',$(1))'
+
+# A variable that make was given and nobody reads is a misspelt one.
+KNOWN := ROBOT ARGS PYTHON TORCH FAULTLINE_DEVICE
+UNKNOWN := $(foreach name,$(filter-out $(KNOWN),$(.VARIABLES)),$(if $(filter command,$(origin $(name))),$(name)))
+NEAREST = import difflib, sys; print("".join(difflib.get_close_matches(sys.argv[1].upper(), sys.argv[2:], 1)))
+ifneq ($(strip $(UNKNOWN)),)
+near := $(shell $(PYTHON) -c '$(NEAREST)' $(call quoted,$(firstword $(UNKNOWN))) $(KNOWN))
+$(error unknown variable $(strip $(UNKNOWN))$(if $(near),; did you mean $(near)?): expected $(KNOWN). \
+Flags of a command go through ARGS, for example make archive ARGS="--policy FILE --seed 3")
+endif
+
 faultline = $(BIN)/faultline $(1) $(if $(ROBOT),--robot $(call quoted,$(ROBOT))) $(ARGS)
 
 help: ## This list

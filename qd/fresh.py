@@ -222,7 +222,7 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
     """
     from sim.robots.robot import get_robot, robot_of
 
-    path = args.run or newest_run(get_robot(args.robot or "anymal"))
+    path = args.run or newest_run(get_robot(args.robot or "anymal"), args.policy)
     run = RunDirectory(path)
     config, cfg = run.read_config(), run.read_cfg()
     robot = robot_of(cfg.robot, args.robot, path)
@@ -237,7 +237,8 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
     with claimed(path):
         loaded = run.load(cfg)
         if loaded is None:
-            raise ValueError(f"{path} has no finished iteration, expected at least one: go on with it (--resume)")
+            go_on = command_line("archive", robot=robot.spec, resume=path, policy=args.policy, device=args.device)
+            raise ValueError(f"{path} has no finished iteration, expected at least one: go on with it with `{go_on}`")
         search, metrics = loaded
         with naming_what_is_next(f"{path} is as it was", lambda: again):
             found = archive_of(cfg, search, len(metrics))

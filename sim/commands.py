@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sim.files.command import OfRobot, OnDevice, Who, publish
+from sim.files.command import OfRobot, OnDevice, Who, command_line, publish
 from sim.files.settings import setting
 
 
@@ -62,7 +62,8 @@ class ExportPolicy(Who):
         apart = export_onnx(policy, self.out)
         sizes = f"{INPUT} (batch, {policy.sizes[0]}) -> {OUTPUT} (batch, {policy.sizes[1]})"
         print(f"Written to {self.out}: {sizes}, {self.out.stat().st_size / 1e6:.2f} MB.")
-        print(f"Loaded back, its actions are within {apart:.1g} of the original's. Try it: --policy {self.out}")
+        print(f"Loaded back, its actions are within {apart:.1g} of the original's. Next:")
+        print(f"  {command_line('evaluate', robot=self.robot, policy=self.out)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,7 +67,7 @@ def _job_of(flags: Train, began: float) -> "Job":
     on_gpu = {"num_envs": robot.learning.num_envs, "iterations": robot.learning.iterations}
     size = sizes_of(flags, on_gpu, _SMALL, device=device)
     settings = settings_of(flags, robot, size, flags.task, flags.ppo) | {"processes": Ranks.of_environment().size}
-    saved = read_saved(flags.resume, robot.name, flags.command) if flags.resume else None
+    saved = read_saved(flags.resume, robot, flags.command) if flags.resume else None
     for change in check_resumed(flags, saved, settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     run_dir = prepare_run_dir(flags, f"{robot.name}-base")

@@ -32,7 +32,8 @@ class Finetune(TrainingFlags):
     """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G) or hard-random ones (C-HR), or
     nothing else (C-HC)."""
     archive: Path | None = None
-    """Run of a search, or its archive.npz, for mix generated; results/<robot>/archive."""
+    """Run of a search, or its archive.npz, for mix generated; results/<robot>/archive, or of a robot without one
+    its newest run under runs/."""
     split_seed: int = setting(0, least=0)
     """Which elites are held out for the evaluation."""
     draw: Literal["uniform", "failing"] = "uniform"

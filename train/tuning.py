@@ -1,12 +1,12 @@
 """A fine-tuning: what it begins with, checked, and how it exchanges terrains under the learner."""
 
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qd.archive import read_archive
+from qd.run.directory import published_or_newest
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
@@ -102,7 +102,7 @@ class FineTuning(Training):
         return command_line(
             "evaluate",
             robot=self.job.robot.spec,
-            policies=["base=shipped", f"tuned={self.job.run_dir / POLICY}"],
+            policies=[f"base={self.job.settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
             archive=archive and archive["path"],
             split_seed=(self.job.settings["split_seed"] or None) if archive else None,
         )
@@ -115,7 +115,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
     """
     robot, device = get_robot(flags.robot), device_of(flags)
-    saved = read_saved(flags.resume, robot.name, flags.command) if flags.resume else None
+    saved = read_saved(flags.resume, robot, flags.command) if flags.resume else None
     size = sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
     alone = flags.critic_iterations
     alone = min(_CRITIC_ITERATIONS, size["iterations"] // 2) if alone is None else alone
@@ -173,13 +173,14 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace,
         if flags.archive is not None:
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
         return np.zeros((0, SUPER_GAUSSIAN.num_genes), np.float32), SUPER_GAUSSIAN, None
-    path = flags.archive or Path("results") / robot.name / "archive"
+    named = None if flags.policy is None else str(flags.policy)
+    path = flags.archive or published_or_newest(robot, named, flag="archive")
     try:
         archive = read_archive(path)
     except FileNotFoundError as error:
-        make = command_line("archive", robot=robot.spec)
-        raise ValueError(f"{error}; make one ({make}) and name it with --archive") from error
-    rows = split_elites(archive, robot.name, flags.split_seed).train
+        make = command_line("archive", robot=robot.spec, policy=named)
+        raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error
+    rows = split_elites(archive, robot.name, flags.split_seed, spec=robot.spec, run=path).train
     return archive.genes[rows], get_space(archive.space), {
         "path": str(path), "archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows),
         "elites_sha256": elites_sha256(archive),

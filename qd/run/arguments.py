@@ -151,7 +151,7 @@ def job_of(args: Archive) -> Job:
         refuse_changes(path, "run", as_settings(there), as_settings(cfg))
     else:
         name = args.preset or ("wide" if device.startswith("cuda") else "small")
-        cfg = measured_now(changed(preset(name, robot), changes), robot)
+        cfg = measured_now(changed(preset(name, robot, args.policy), changes), robot)
         path = _free_path(args, cfg, robot)
     get_space(cfg.space)
     now = origin_of(device, cfg.seed, args.workers)

@@ -38,8 +38,13 @@ Metrics = list[dict[str, Any]]
 """One row an iteration."""
 
 
-def newest_run(robot: "RobotCfg") -> Path:
+def newest_run(robot: "RobotCfg", policy: str | None = None, *, flag: str = "run") -> Path:
     """The run of a robot under runs/ whose archive changed last.
+
+    Args:
+        robot: The robot.
+        policy: Controller that the command line names, for the command that makes a run.
+        flag: The flag that names a run.
 
     Raises:
         FileNotFoundError: If there is none.
@@ -49,17 +54,26 @@ def newest_run(robot: "RobotCfg") -> Path:
         return run
     published = _published(robot.name)
     such = f", such as the published {published}" if published else ""
-    make = f"`{command_line('archive', robot=robot.spec)}`"
-    raise FileNotFoundError(f"no archive of {robot.name} under {RUNS}/: make one with {make}, or give --run{such}")
+    make = f"`{command_line('archive', robot=robot.spec, policy=policy)}`"
+    raise FileNotFoundError(f"no archive of {robot.name} under {RUNS}/: make one with {make}, or give --{flag}{such}")
 
 
-def newest_or_published(robot: "RobotCfg") -> Path:
-    """The newest run of a robot under runs/, or its published archive where there is none.
+def newest_or_published(robot: "RobotCfg", policy: str | None = None) -> Path:
+    """The newest run of a robot under runs/, or its published archive where there is none; as :func:`newest_run`.
 
     Raises:
         FileNotFoundError: If there is neither.
     """
-    return _newest(robot.name) or _published(robot.name) or newest_run(robot)
+    return _newest(robot.name) or _published(robot.name) or newest_run(robot, policy)
+
+
+def published_or_newest(robot: "RobotCfg", policy: str | None = None, *, flag: str = "run") -> Path:
+    """The published archive of a robot, or its newest run under runs/ where there is none; as :func:`newest_run`.
+
+    Raises:
+        FileNotFoundError: If there is neither.
+    """
+    return _published(robot.name) or newest_run(robot, policy, flag=flag)
 
 
 def _newest(name: str) -> Path | None:

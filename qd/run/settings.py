@@ -4,6 +4,7 @@ Nothing here imports pyribs, which takes seconds: `--help` and the worker proces
 """
 
 import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -129,12 +130,17 @@ class SearchCfg:
         return self.scheduler.num_terrains * self.replicas
 
 
-def preset(name: str, robot: "RobotCfg") -> SearchCfg:
+def preset(name: str, robot: "RobotCfg", policy: str | None = None) -> SearchCfg:
     """Settings by the name of a preset.
 
     ``paper`` is the paper's search: 10 emitters x 20 terrains x 20 episodes, 1,000 iterations. ``wide`` has as many
     episodes, and eight times as many emitters and an eighth of the iterations, which fills a GPU. ``small`` is one that
     a laptop finishes while one waits: 4 emitters x 8 terrains x 4 episodes, 20 iterations.
+
+    Args:
+        name: Of the preset.
+        robot: Robot to search.
+        policy: Controller to search, other than the robot's own.
 
     Raises:
         ValueError: If there is no such preset, or the robot's penalty scales were never measured.
@@ -144,12 +150,12 @@ def preset(name: str, robot: "RobotCfg") -> SearchCfg:
     return SearchCfg(
         robot=robot.name,
         preset=name,
-        policy=SHIPPED,
+        policy=policy or SHIPPED,
         policy_sha256=None,
         seed=0,
         intervals=10,
         collision_bit=robot.collision_bit,
-        fitness=FitnessCfg(penalties=robot.penalties, scales=robot.read_penalty_scales()),
+        fitness=FitnessCfg(penalties=robot.penalties, scales=robot.read_penalty_scales(policy)),
         **_PRESETS[name],
     )
 
@@ -270,7 +276,8 @@ def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
 
     penalties = cfg.fitness.penalties
     _check_known(penalties, robot)
-    scales = dict(zip(robot.penalties, robot.read_penalty_scales(), strict=True))
+    named = None if cfg.policy == SHIPPED else cfg.policy
+    scales = dict(zip(robot.penalties, robot.read_penalty_scales(named), strict=True))
     return replace(
         cfg,
         robot=robot.name,
@@ -299,8 +306,8 @@ def refuse_unnamed_code(policy: str, given: str | None, path: Path) -> None:
     """
     if given is None and ControllerSpec.parse(policy).runs_code:
         raise ValueError(
-            f"{path} was searched with the controller {policy}, which is code: name it again (--policy), since no code "
-            "runs that the command line does not name"
+            f"{path} was searched with the controller {policy}, which is code: name it again "
+            f"(--policy {shlex.quote(policy)}), since no code runs that the command line does not name"
         )
 
 

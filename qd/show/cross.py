@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from qd.show.crossed import Crossed
 
 OWN_FOLDER = RUNS / "terrains"
+_LONGEST_NAME = 120  # characters of a path; with robot, controller and ending a file may have 255
 """Where what is made of a user's own terrains goes."""
 
 
@@ -59,8 +60,8 @@ class Cross(Who, OnDevice, Mapped):
     seed: int = 0
     """Draws their starts."""
     out: Path | None = None
-    """Where to write the numbers, runs/terrains/<map>-<robot>[-<controller>].json; beside it the figure,
-    ...-paths.png."""
+    """Where to write the numbers, runs/terrains/<map>-<robot>[-<controller>].json, where <map> is the path of the map
+    with - between its folders; beside it the figure, ...-paths.png. Older ones are replaced."""
 
     def execute(self) -> None:
         """Crosses the map, prints rates and costs, writes numbers and figure."""
@@ -131,15 +132,23 @@ def cross(cfg: Cross) -> dict[str, Any]:
     crossed = crossed_of(recording, recording.penalty_names, (1.0,) * len(recording.penalty_names))
     report = {**origin, **about, **numbers_of(crossed)}
     print(describe(report))
+    replaced = " (replaced)" if out.exists() else ""
     write_atomically(out, to_json(report))
     save_figure(figure, draw_paths(crossed, f"{who} on {terrain.label}: {_headline(report)}"))
-    print(f"Numbers: {out}\nFigure: {figure}")
+    print(f"Numbers: {out}{replaced}\nFigure: {figure}")
     return report
+
+
+def name_of_map(path: Path) -> str:
+    """What files about a map are called: its path from here, so that two maps of one name have files of their own."""
+    path, here = path.resolve(), Path.cwd()
+    path = path.relative_to(here) if path.is_relative_to(here) else path.relative_to(path.anchor)
+    return "-".join(path.parts)[-_LONGEST_NAME:]
 
 
 def _outputs(cfg: Cross, who: str) -> tuple[Path, Path]:
     """Files of the numbers and of the figure; neither may be the map or the file that says its scale."""
-    out = cfg.out or OWN_FOLDER / f"{cfg.terrain.stem}-{who}.json"
+    out = cfg.out or OWN_FOLDER / f"{name_of_map(cfg.terrain)}-{who}.json"
     figure = out.with_name(f"{out.stem}-paths.png")
     given = {cfg.terrain.resolve(), cfg.terrain.with_suffix(".json").resolve()}
     if given & {out.resolve(), figure.resolve()}:

@@ -11,8 +11,8 @@ from qd.archive import Archive, read_archive
 from qd.fitness import FAILING_GOAL_RATE, FitnessCfg
 from qd.run.directory import CONFIG_FILE, RunDirectory, directory_of, newest_or_published
 from qd.run.settings import refuse_unnamed_code
-from sim.files.command import chosen_elites
-from sim.policy.spec import SHIPPED, spec_of
+from sim.files.command import chosen_elites, command_line
+from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -33,6 +33,14 @@ class Found:
     def folder(self) -> Path:
         """The directory."""
         return directory_of(self.run)
+
+    @property
+    def go_on(self) -> str:
+        """How to let the search go on, for errors."""
+        searched, _ = self.as_searched()
+        code = searched if ControllerSpec.parse(searched).runs_code else None
+        more = {"resume": self.folder, "policy": code, "iterations": 2 * max(self.archive.iterations, 1)}
+        return f"let its search go on with `{command_line('archive', robot=self.robot.spec, **more)}`"
 
     def as_searched(self) -> tuple[str, FitnessCfg]:
         """Controller and fitness of the search; defaults where the archive lies without its config.
@@ -87,12 +95,13 @@ def robot_named(name: str | None) -> "RobotCfg":
     return get_robot(name or _USUAL_ROBOT)
 
 
-def find_archive(named: str | None, run: Path | None) -> Found:
+def find_archive(named: str | None, run: Path | None, policy: str | None = None) -> Found:
     """The archive of a run; without one the robot's newest under runs/, else its published one.
 
     Args:
         named: The robot, as the command line names it; left out, that of the run.
         run: Run directory or archive file.
+        policy: Controller that the command line names, for the command that makes an archive.
 
     Raises:
         FileNotFoundError: If there is none.
@@ -102,7 +111,7 @@ def find_archive(named: str | None, run: Path | None) -> Found:
 
     if run is None or named is not None:
         robot_named(named)  # an unknown name is said first
-    run = run or newest_or_published(robot_named(named))
+    run = run or newest_or_published(robot_named(named), policy)
     archive = read_archive(run)
     robot = robot_of(archive.robot, named, run)
     unknown = [name for name in archive.penalties if name not in robot.penalties]

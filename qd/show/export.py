@@ -14,7 +14,7 @@ from qd.archive import Archive
 from qd.run.directory import folder_for
 from qd.show.elites import find_archive
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.command import Which, chosen_elites, split_words
+from sim.files.command import OfRobot, Which, chosen_elites, split_words
 from sim.files.provenance import provenance
 
 INDEX_FILE = "index.json"
@@ -24,7 +24,7 @@ _AT_ONCE = 32  # terrains rasterised
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Which):
+class Export(OfRobot, Which):
     """Write elites of an archive as files that other programs read.
 
     Of each elite: `elite-N.npz` (heights in m, rows along y; genes), `elite-N.png` (16-bit grayscale seen from above;
@@ -33,12 +33,12 @@ class Export(Which):
     with the .png, crosses it again.
     """
 
-    robot: str | None = None
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); that of the run if left out."""
     out: Path | None = None
     """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published."""
     formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
     """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
+    overwrite: bool = False
+    """Replace files of an earlier export; without it the command refuses to."""
 
     def execute(self) -> None:
         """Writes the files."""
@@ -65,8 +65,10 @@ def export(cfg: Export) -> list[Path]:
     formats = list(dict.fromkeys(split_words(cfg.formats)))
     check_formats(formats)
     folder = cfg.out or folder_for(found.run, found.robot.name) / _FOLDER
-    prepare_output(folder / INDEX_FILE)
+    if not cfg.overwrite:
+        _refuse_to_replace(folder, elites)
     _check_room(folder, len(elites), formats)
+    prepare_output(folder / INDEX_FILE)
     origin = {"run": str(found.run), **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
     archive, files, index = found.archive, [], []
@@ -109,13 +111,28 @@ def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
     }
 
 
+def _refuse_to_replace(folder: Path, elites: list[int]) -> None:
+    there = [file for file in (folder / INDEX_FILE, *folder.glob("elite-*")) if file.exists()]
+    wanted = {INDEX_FILE, *(f"elite-{elite}" for elite in elites)}
+    found = sorted({file.name for file in there if file.name == INDEX_FILE or file.stem in wanted})
+    if found:
+        names = ", ".join(found[:3]) + ", ..." * (len(found) > 3)
+        raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")
+
+
 def _check_room(folder: Path, count: int, formats: list[str]) -> None:
     from sim.maps.terrain_files import TYPICAL_BYTES
 
-    needed, free = count * sum(TYPICAL_BYTES[ending] for ending in formats), shutil.disk_usage(folder).free
+    needed = count * sum(TYPICAL_BYTES[ending] for ending in formats)
+    free = shutil.disk_usage(_that_exists(folder)).free
     print(f"Writing about {needed / 1e6:,.0f} MB to {folder}.", flush=True)
     if needed > free:
         raise ValueError(
             f"{folder} has room for {free / 1e6:,.0f} MB, but {count} elites as {', '.join(formats)} take about "
             f"{needed / 1e6:,.0f} MB: leave stl out (--formats), or give another --out"
         )
+
+
+def _that_exists(folder: Path) -> Path:
+    """The folder, or the nearest above it that is there."""
+    return next(path for path in (folder, *folder.absolute().parents) if path.exists())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.run.directory import elite_name, folder_for
-from qd.show.cross import OWN_FOLDER, Mapped, read_own_terrain
+from qd.show.cross import OWN_FOLDER, Mapped, name_of_map, read_own_terrain
 from qd.show.elites import find_archive, robot_named
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import prepare_output, write_atomically
@@ -107,7 +107,7 @@ def _elite_orders(cfg: Film) -> Iterator[Order]:
     """Films of elites, whose recordings are written before the first is made."""
     from qd.show.recordings import Recordings, on_elite
 
-    found = find_archive(cfg.robot, cfg.run)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy)
     archive, robot = found.archive, found.robot
     elites = chosen_elites(cfg.elite, len(archive), found.run)
     policy, searched = found.policy(cfg.policy), spec_of(found.as_searched()[0], robot)
@@ -116,9 +116,9 @@ def _elite_orders(cfg: Film) -> Iterator[Order]:
     else:
         folder = cfg.out or folder_for(found.run, robot.name)
         outs = [folder / f"{elite_name(elite, policy, searched)}.mp4" for elite in elites]
-    prepare_output(outs[0])
     device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
+    prepare_output(outs[0])
     wanted = [
         on_elite(
             archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed,
@@ -143,11 +143,11 @@ def _own_order(cfg: Film, path: Path) -> Order:
     print(f"{path}: {terrain.fitted}", flush=True)
     device, policy = resolve_device(cfg.device), cfg.policy or str(robot.policy_file)
     check_policy(policy, robot, device)
-    out = cfg.out or OWN_FOLDER / f"{path.stem}-{who_crossed(robot, policy)}.mp4"
+    out = cfg.out or OWN_FOLDER / f"{name_of_map(path)}-{who_crossed(robot, policy)}.mp4"
     prepare_output(out)
     wanted = on_heights(terrain.heights, label=terrain.label, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
     (recording,) = Recordings(robot, device=device).all_of([wanted])
-    order = Order(recording, out, _scales_of(robot))
+    order = Order(recording, out, _scales_of(robot, cfg.policy))
     _keep(order)
     return order
 
@@ -166,7 +166,7 @@ def _kept_orders(cfg: Film, path: Path) -> Iterator[Order]:
         name = f"{stem}.mp4" if single else f"{stem}-{k}.mp4"
         out = cfg.out if cfg.out and single and not cfg.out.is_dir() else (cfg.out or path.parent) / name
         prepare_output(out)
-        yield Order(recording.of_terrain(k), out, _scales_of(robot))
+        yield Order(recording.of_terrain(k), out, _scales_of(robot, cfg.policy))
 
 
 def _keep(order: Order) -> None:
@@ -175,10 +175,10 @@ def _keep(order: Order) -> None:
     write_recording(order.out.with_name(order.out.stem + _RECORDING), order.recording)
 
 
-def _scales_of(robot: "RobotCfg") -> dict[str, float]:
+def _scales_of(robot: "RobotCfg", policy: str | None) -> dict[str, float]:
     """The robot's penalty scales; 1 each, and so raw sums, where they were never measured."""
     try:
-        scales = robot.read_penalty_scales()
+        scales = robot.read_penalty_scales(policy)
     except ValueError as error:
         print(f"{error}; penalties are drawn as they are, unscaled", flush=True)
         scales = (1.0,) * len(robot.penalties)

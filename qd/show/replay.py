@@ -68,7 +68,7 @@ def replay(cfg: ReplayElite) -> Replay:
     """
     from qd.show.recordings import Recordings, on_elite
 
-    found = find_archive(cfg.robot, cfg.run)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy)
     archive, robot = found.archive, found.robot
     elite = found.one(cfg.elite)
     policy, (searched, fitness) = found.policy(cfg.policy), found.as_searched()
@@ -77,9 +77,9 @@ def replay(cfg: ReplayElite) -> Replay:
     out = cfg.out or folder_for(found.run, robot.name) / f"{elite_name(elite, policy, searched)}.png"
     if out.suffix != ".png":
         raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
-    prepare_output(out)
     device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
+    prepare_output(out)
     (recording,) = Recordings(robot, device=device).all_of([wanted])
     return Replay(
         found=found,

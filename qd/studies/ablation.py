@@ -92,7 +92,7 @@ class Ablation(StudyFlags):
     def _begun(self, robot: "RobotCfg", device: str) -> SearchCfg:
         """Settings of searches from the start."""
         size = self.preset or ("paper" if device.startswith("cuda") else "small")
-        cfg = preset(size, robot)
+        cfg = preset(size, robot, self.policy)
         iterations, every = _DEFAULTS[size]
         asked = {"iterations": self.iterations or iterations, "seed": self.seed, "policy": self.policy}
         return measured_now(changed(cfg, {**asked, "reevaluate_every": every}), robot)

@@ -99,7 +99,7 @@ class Compare(StudyFlags):
         robot, device = get_robot(self.robot or "anymal"), resolve_device(self.device, self.workers)
         size = self.preset or ("paper" if device.startswith("cuda") else "small")
         asked = {name: getattr(self, name) for name in ("seed", "iterations", "reevaluate_every", "policy")}
-        shared = measured_now(changed(preset(size, robot), asked), robot)
+        shared = measured_now(changed(preset(size, robot, self.policy), asked), robot)
         methods = self._methods(shared)
         seeds = range(self.seed, self.seed + self.seeds)
         runs = {f"{name}-{seed}": replace(cfg, seed=seed) for name, cfg in methods.items() for seed in seeds}

@@ -101,8 +101,9 @@ class EvaluatorCfg:
 
 
 def best_num_envs(device: str) -> int:
-    """Robots at once with which a device crosses the most episodes a second: a GPU is full with them, and on a core
-    more would wait longer for the last ones to arrive (results/anymal/speed.json).
+    """Robots at once with which a device crosses the most episodes a second (results/anymal/speed.json).
+
+    A GPU is full with so many; on a core, more would wait longer for the last ones to arrive.
     """
     return 32_768 if device.startswith("cuda") else 32
 

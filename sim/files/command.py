@@ -54,8 +54,8 @@ class Where(OnDevice):
     """Options that say where a command works."""
 
     workers: str | None = None
-    """Who works: a number of processes on the CPU (one a core if left out), ray for every device of a Ray cluster, or
-    ray:N for N of them. RAY_ADDRESS names a running cluster."""
+    """Worker processes: a number of them on the CPU (one a core if left out), ray for one on every device of a Ray
+    cluster, or ray:N for N of them. RAY_ADDRESS names a running cluster."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ class Which:
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
-    """Number of the elite, 0 the worst; where a command takes several: numbers separated by spaces, or all."""
+    """Numbers of the elites, 0 the worst: one, several as in --elite "0 3", or all. replay and view take one."""
 
 
 class UserError(Exception):

@@ -13,7 +13,6 @@ import torch
 import warp as wp
 
 from sim.files.atomic import check_zip
-from sim.files.command import command_line
 from sim.policy.onnx_file import load_onnx
 from sim.policy.runner import action_problem
 from sim.policy.spec import ControllerSpec, find_named, in_one_line, place_of_code
@@ -194,7 +193,7 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
     if path == robot.policy_file and not path.exists():
         raise ValueError(
             f"robot '{robot.name}' has no shipped controller yet, expected at {path}: train one with "
-            f"`{command_line('train', robot=robot.spec)}` and give its policy.pt as the policy"
+            f"`{robot.train_command}`, or name another with --policy"
         )
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")

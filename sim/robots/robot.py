@@ -140,13 +140,24 @@ class RobotCfg:
         x, y = np.meshgrid(self.scan_x, self.scan_y, indexing="ij")
         return x.ravel().astype(np.float32), y.ravel().astype(np.float32)
 
-    def read_penalty_scales(self) -> tuple[float, ...]:
+    @property
+    def train_command(self) -> str:
+        """The command that trains the controller that comes with the robot."""
+        return command_line("train", robot=self.spec, export=self.policy_file)
+
+    def read_penalty_scales(self, policy: str | None = None) -> tuple[float, ...]:
         """Scales of the penalties, in the order of ``penalties``.
+
+        Args:
+            policy: Controller that the command line names, for the command that measures them.
 
         Raises:
             ValueError: If they were never measured, or not for these penalties.
         """
-        remedy = f"run `{command_line('calibrate', robot=self.spec)}`"
+        given = policy if self.settings_file is not None else None  # a shipped robot's are of its own controller
+        remedy = f"run `{command_line('calibrate', robot=self.spec, policy=given)}`"
+        if given is None and not self.policy_file.exists():
+            remedy = f"train its controller first with `{self.train_command}`, or name one with --policy; then {remedy}"
         if not self.scales_file.exists():
             raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
         scales = read_json(self.scales_file).get("scales")

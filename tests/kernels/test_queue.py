@@ -1,4 +1,4 @@
-"""The queue of episodes: each is run once, what came of it stands in its own row, and robots find no more than is ready."""
+"""The queue of episodes: each is run once, and what came of it stands in a row of its own."""
 
 import numpy as np
 import pytest

@@ -253,7 +253,7 @@ def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
     with pytest.raises(ValueError, match=r"training of a base controller.*go on with .*train --robot anymal --resume"):
         finetune(resumed(run, iterations=4))
     with pytest.raises(ValueError, match=r"is a fine-tuning: go on with .*finetune --robot anymal --resume"):
-        read_saved(finished, "anymal", "train")
+        read_saved(finished, get_robot("anymal"), "train")
 
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):
@@ -286,7 +286,7 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
     ("flags", "message"),
     [
         (["--robot", "spot"], "unknown robot 'spot'"),
-        (["--archive", "{dir}/nowhere"], "archive --robot anymal) and name it with --archive"),
+        (["--archive", "{dir}/nowhere"], "archive --robot anymal` and name it with --archive"),
         (["--archive", "{dir}/cassie.npz"], "the archive must be of robot 'anymal', got one of 'cassie'"),
         (["--archive", "{dir}/empty.npz"], "needs at least 5 elites, got 0"),
         (["--mix", "hand-crafted", "--archive", "{dir}/archive"], "takes no terrains from an archive"),

@@ -42,15 +42,17 @@ def distances(flags: Distances) -> dict[str, Any]:
     import numpy as np
 
     from qd.archive import read_archive
+    from qd.run.directory import published_or_newest
     from sim.files.provenance import provenance
     from sim.robots.robot import get_robot
     from sim.space import get_space
     from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, split_elites
 
     check(flags)
-    robot = get_robot(flags.robot).name
-    archive = read_archive(flags.archive or Path("results") / robot / "archive")
-    split = split_elites(archive, robot, flags.split_seed)
+    found = get_robot(flags.robot)
+    robot, path = found.name, flags.archive or published_or_newest(found, flag="archive")
+    archive = read_archive(path)
+    split = split_elites(archive, robot, flags.split_seed, spec=found.spec, run=path)
     count = flags.terrains or paper_terrains(robot)
     sets = make_sets(("hard_random", "generated"), count, flags.seed, archive=archive, split=split)
     space = get_space(archive.space)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
 from qd.fresh import Open
+from qd.run.directory import newest_or_published
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import Where, Who, naming_what_is_next, publish, split_words
@@ -111,9 +112,9 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     policy = str(flags.policy or robot.policy_file)
     evaluator = replace(evaluator_of(flags, robot), policy=policy, penalties_from_s=VELOCITY_FROM_S)
     out = flags.out or Path("runs") / f"{who_crossed(robot, policy)}-rates.json"
+    check_policy(policy, robot, evaluator.device)
 
     def measure() -> dict[str, Any]:
-        check_policy(policy, robot, evaluator.device)
         with open_evaluator(evaluator) as evaluate:
             rates = base_rates(evaluate, evaluator.num_terrains, flags.seed)
         about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
@@ -147,19 +148,27 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
     evaluator = replace(evaluator_of(flags, robot), reward=True)
     controllers = controllers_of(flags.policies, robot)
     archive = None if flags.archive is None else read_archive(flags.archive)
-    split = None if archive is None else split_elites(archive, robot.name, flags.split_seed)
+    split = (
+        None
+        if archive is None
+        else split_elites(archive, robot.name, flags.split_seed, spec=robot.spec, run=flags.archive)
+    )
     names = split_words(flags.sets) or [name for name in SETS if archive is not None or name not in FROM_ARCHIVE]
     run_dir = flags.run_dir or Path("runs") / f"{robot.name}-tables"
-    kept = run_dir / "crossings"
-    prepare_output(kept / "any")
-    scales = robot.read_penalty_scales()
+    if archive is None and any(name in FROM_ARCHIVE for name in names):
+        found = newest_or_published(robot)
+        raise ValueError(f"set {', '.join(names)} is made of elites: give the run that found them (--archive {found})")
     for policy in controllers.values():
         check_policy(policy, robot, evaluator.device)
+    own = next((policy for policy in controllers.values() if policy != str(robot.policy_file)), None)
+    scales = robot.read_penalty_scales(own)
     check_seeds(controllers)
     sets = make_sets(names, evaluator.num_terrains, flags.seed, archive=archive, split=split)
     for name in FROM_ARCHIVE:
         if name in sets:
             check_held_out(controllers, sets[name].terrains, flags.split_seed)
+    kept = run_dir / "crossings"
+    prepare_output(kept / "any")  # last: what is refused leaves no folder
     about = _about(flags, archive, split)  # before the long work: the file may be another afterwards
 
     def tables() -> dict[str, Any]:

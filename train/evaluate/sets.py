@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
+from qd.run.directory import directory_of
 from sim.bank import heights_of
 from sim.files.atomic import read_json
+from sim.files.command import command_line
 from sim.policy.spec import ControllerSpec
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings
@@ -84,7 +86,9 @@ def paper_terrains(robot: str) -> int:
     return PAPER_TERRAINS.get(robot, _OTHER_TERRAINS)
 
 
-def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
+def split_elites(
+    archive: Archive, robot: str, seed: int = 0, *, spec: str | None = None, run: Path | None = None
+) -> EliteSplit:
     """Draw at random which elites are trained on and which are held out.
 
     The paper's numbers where the archive has so many: 750 to train on, 300 (ANYmal) or 180 (Cassie) held out; else
@@ -95,6 +99,8 @@ def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
         archive: The elites.
         robot: Name of the robot that is trained and evaluated.
         seed: Of the draw, from 0 on; training and evaluation must name the same one.
+        spec: What the command line calls the robot, for errors; ``robot`` if left out.
+        run: Where the archive lies, for errors.
 
     Raises:
         ValueError: If the archive is of another robot, or has fewer than 5 elites.
@@ -102,12 +108,13 @@ def split_elites(archive: Archive, robot: str, seed: int = 0) -> EliteSplit:
     if archive.robot != robot:
         raise ValueError(
             f"the archive must be of robot '{robot}', got one of '{archive.robot}': its terrains were found to break "
-            f"another body; give an archive of '{robot}' (faultline archive --robot {robot})"
+            f"another body; give an archive of '{robot}', which `{command_line('archive', robot=spec or robot)}` makes"
         )
     if len(archive) < _MIN_ELITES:
+        more = {"resume": directory_of(run) if run else "RUN", "iterations": 2 * archive.iterations}
         raise ValueError(
             f"an archive to be split into training and test terrains needs at least {_MIN_ELITES} elites, got "
-            f"{len(archive)}: let its search go on (faultline archive --resume RUN --iterations N)"
+            f"{len(archive)}: let its search go on with `{command_line('archive', robot=spec or robot, **more)}`"
         )
     num_train, num_test = PAPER_TRAINING_ELITES, paper_terrains(robot)
     if len(archive) < num_train + num_test:

@@ -86,6 +86,8 @@ class TrainingFlags(OnDevice):
     """Where to write; a new directory under runs/, or the resumed run."""
     resume: Path | None = None
     """Run directory to go on from."""
+    overwrite: bool = False
+    """Replace the file that --export names if it is there and of another training."""
     export: Path | None = None
     """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
     <name>.pt beside the settings file of another robot makes it that robot's own."""
@@ -115,7 +117,7 @@ class TrainingFlags(OnDevice):
             return cls(robot=named.robot, **cls.begun(robot, None))
         from train.ppo.run import CHECKPOINT, read_saved
 
-        saved = read_saved(named.resume, robot.name, cls.command)
+        saved = read_saved(named.resume, robot, cls.command)
         try:
             values = cls.begun(robot, saved["extra"]["settings"])
             flags = built(cls, {**values, "robot": named.robot, "resume": named.resume}, "a training")

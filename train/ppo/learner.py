@@ -288,7 +288,7 @@ def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
     """
     remedy = "give the run directory of a training run to --resume"
     if not os.path.isfile(path):
-        raise ValueError(f"no checkpoint at {path}: {remedy}")
+        raise ValueError(f"no checkpoint at {path}: {remedy}, or leave --resume out to begin one")
     try:
         content = read_weights(path)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
@@ -339,7 +339,8 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
     policy = load_policy(path, robot, "cpu")
     if not isinstance(policy, MlpPolicy):
         raise ValueError(
-            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: {path}"
+            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: "
+            f"{path}; train one with `{robot.train_command}`, and leave --policy out"
         )
     content = read_weights(path)
     actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}

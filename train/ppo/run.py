@@ -15,6 +15,7 @@ from sim.files.atomic import locked, prepare_output, read_json, to_json, write_a
 from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import problems
+from sim.policy.spec import is_same
 from sim.robots.own import own_hash
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
@@ -144,34 +145,40 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
     config = run_dir / CONFIG
     if config.exists() and "settings" in read_json(config):
         raise ValueError(f"{run_dir} holds the run of a search, not of a training: name another --run-dir")
-    for file in (config, *([export] if export else [])):
-        prepare_output(file)
+    if export is not None:
+        if export.exists() and not flags.overwrite and not is_same(str(export), str(run_dir / POLICY)):
+            raise ValueError(f"{export} is there already: give --overwrite to replace it, or another --export")
+        prepare_output(export)
+    prepare_output(config)  # last: what is refused leaves no run directory
     return run_dir
 
 
 # Going on with a run ---------------------------------------------------------------------------------------------
 
 
-def read_saved(run: Path, robot: str, command: str) -> dict[str, Any]:
+def read_saved(run: Path, robot: RobotCfg, command: str) -> dict[str, Any]:
     """The checkpoint of a run of this robot, with the progress it had made.
 
     Args:
         run: Its directory.
-        robot: Name of the robot.
+        robot: The robot.
         command: What goes on with it: train or finetune.
 
     Raises:
         ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is the run of the other command.
     """
     path = run / CHECKPOINT
-    saved = read_checkpoint(path, robot)
+    saved = read_checkpoint(path, robot.name)
     extra = saved["extra"]
     check_entries(extra, STATE, path)
     made_by = "finetune" if "mix" in extra or "mix" in extra["settings"] else "train"
     if made_by != command:
         kind = "a fine-tuning" if made_by == "finetune" else "the training of a base controller, not a fine-tuning"
-        other = f", or fine-tune what it made with --policy {path}" if command == "finetune" else ""
-        raise ValueError(f"{run} is {kind}: go on with {command_line(made_by, robot=robot, resume=run)}{other}")
+        other = f", or fine-tune what it made with `{command_line(command, robot=robot.spec, policy=path)}`"
+        raise ValueError(
+            f"{run} is {kind}: go on with `{command_line(made_by, robot=robot.spec, resume=run)}`"
+            f"{other if command == 'finetune' else ''}"
+        )
     if command == "finetune":
         check_entries(extra, {"mix": (dict,)}, path)
     return saved
@@ -226,9 +233,9 @@ class Training:
     def before_iteration(self) -> None:
         """What a kind of training does before each iteration: nothing."""
 
-    def next_command(self) -> str | None:
-        """The command to look at the controller with, if there is one."""
-        return None
+    def next_command(self) -> str:
+        """The command to look at the controller with."""
+        return command_line("evaluate", robot=self.job.robot.spec, policy=self.job.run_dir / POLICY)
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the learner."""
@@ -290,7 +297,8 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
         OSError: If a file cannot be written.
     """
     run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
-    go_on = f"Go on with: {command_line(job.flags.command, robot=job.robot.spec, resume=run_dir)}"
+    again = {"resume": run_dir, "export": job.flags.export, "overwrite": job.flags.overwrite}
+    go_on = f"Go on with: {command_line(job.flags.command, robot=job.robot.spec, **again)}"
     busy = f"another training works in {run_dir}: let it end, or name another --run-dir"
     with StopRequest() as stop, locked(run_dir, busy):
         training = begin()
@@ -307,7 +315,7 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
     done, following = training.learner.iteration, training.next_command()
     if done < job.iterations:
         print(f"Stopped after {done} of {job.iterations} iterations. {go_on}")
-    elif following is not None:
+    else:
         print(f"Next, see what it did:  {following}")
     return 130 if stop.requested else 0
 

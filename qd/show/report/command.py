@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import write_atomically
-from sim.files.command import OnDevice, Who, command_line, naming_what_is_next
+from sim.files.command import OnDevice, Who, naming_what_is_next
 from sim.files.settings import check, setting
 from sim.policy.spec import controller_hash, spec_of
 
@@ -58,7 +58,7 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
         ValueError: If something is not as it must be; raised before any long work.
         Interrupted: On Ctrl-C; what was crossed is kept.
     """
-    from qd.show.elites import elites_of
+    from qd.show.elites import Found, elites_of
     from qd.show.report.material import Shown, gather
     from qd.show.report.modes import find_modes
 
@@ -68,7 +68,7 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
     if not len(elites):
         raise ValueError(
             f"{material.run} must have elites to report on, got {len(material.archive)} whose fresh episodes are all "
-            f"invalid: let its search go on with `{command_line('archive', resume=material.run, iterations='N')}`"
+            f"invalid: {Found(run=material.run, archive=material.archive, robot=material.robot).go_on}"
         )
     shown = Shown(
         material=material,

@@ -100,13 +100,13 @@ def gather(cfg: "Report") -> Material:
         FileNotFoundError: If there is no run or no such tables.
         ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
     """
-    _refuse_unbegun(cfg.run)
-    found = find_archive(cfg.robot, cfg.run)
+    _refuse_unbegun(cfg.run, cfg)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy)
     archive, robot, run = found.archive, found.robot, found.run
     if not len(archive):
         raise ValueError(
             f"{run} must have elites to report on, got an archive of none after {archive.iterations} iterations: "
-            f"let it go on with `{command_line('archive', resume=run, iterations='N')}`"
+            f"{found.go_on}"
         )
     searched, _ = found.as_searched()
     folder = RunDirectory(found.folder)
@@ -122,35 +122,35 @@ def gather(cfg: "Report") -> Material:
         run=run,
         out=cfg.out or folder_for(run, robot.name) / "report.html",
         archive=archive,
-        metrics=_metrics_of(folder, archive),
+        metrics=_metrics_of(folder, archive, cfg),
         searched=searched,
         search=search,
         origin={key: config[key] for key in _ORIGIN if key in config},
         reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
-        tables=read_tables(tables_file, robot.name) if has_tables else None,
+        tables=read_tables(tables_file, robot.name, robot.spec) if has_tables else None,
         tables_file=tables_file,
     )
     _check_out(material.out)
     return material
 
 
-def _refuse_unbegun(run: Path | None) -> None:
+def _refuse_unbegun(run: Path | None, cfg: "Report") -> None:
     if run is not None and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
         raise ValueError(
             f"{run} must hold a search that has ended an iteration, got one without {ARCHIVE_FILE}: "
-            f"let it go on with `{command_line('archive', resume=run)}`"
+            f"let it go on with `{command_line('archive', robot=cfg.robot, resume=run, policy=cfg.policy)}`"
         )
 
 
-def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
+def _metrics_of(folder: RunDirectory, archive: Archive, cfg: "Report") -> Metrics | None:
     """The rows up to the archive's iteration; a run that goes on meanwhile may have some more."""
     file = folder.path / METRICS_FILE
     if not file.exists():
         return None
     rows = folder.read_metrics()
     if len(rows) < archive.iterations:
-        again = command_line("archive", resume=folder.path)
+        again = command_line("archive", robot=cfg.robot, resume=folder.path, policy=cfg.policy)
         raise ValueError(
             f"{file} must have a row for each of the archive's {archive.iterations} iterations, got {len(rows)}: the "
             f"run is half-written; `{again}` writes both again"

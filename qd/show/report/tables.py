@@ -30,18 +30,19 @@ _CONTROLLERS = ("*.pt", "*.onnx")  # files beside the tables that may be one
 _NUMBER = int | float | None
 
 
-def read_tables(file: Path, robot: str) -> dict[str, Any]:
+def read_tables(file: Path, robot: str, spec: str | None = None) -> dict[str, Any]:
     """The evaluation's tables.
 
     Args:
         file: What ``faultline evaluate`` wrote.
         robot: Robot it must be of.
+        spec: What the command line calls it, for errors; ``robot`` if left out.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is damaged, another file, or of another robot.
     """
-    writer = f"`{command_line('evaluate', robot=robot, policies='...')}`"
+    writer = f"`{command_line('evaluate', robot=spec or robot, policies='base=shipped', out=file)}`"
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: {writer} writes them")
     tables = read_json(file)

@@ -11,7 +11,7 @@ from qd.run.directory import RESULTS, RUNS
 from qd.show.elites import Found, find_archive
 from qd.workers.evaluator import check_policy
 from sim.files.atomic import prepare_output
-from sim.files.command import Which
+from sim.files.command import OfRobot, Which
 from sim.files.settings import check, setting
 from sim.policy.spec import ControllerSpec
 
@@ -23,7 +23,7 @@ SEARCHED = "as searched"
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Which):
+class View(OfRobot, Which):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
     Left, the archive on parallel axes. Under "Ranges" drag the ends of an axis: elites outside turn grey and leave the
@@ -36,8 +36,6 @@ class View(Which):
     open the page at home.
     """
 
-    robot: str | None = None
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); that of the run if left out."""
     policies: tuple[str, ...] = ()
     """Controllers to choose from, each NAME=FILE, NAME=module:callable or NAME=shipped, such as base=shipped
     C-G=runs/tuned/policy.pt; the one the archive was made with if none is given."""
@@ -46,8 +44,8 @@ class View(Which):
     port: int = 8080
     """Where the page is served."""
     host: str = "127.0.0.1"
-    """Whom to serve it to: this machine alone, as whoever reaches the page may use it, without a password. 0.0.0.0
-    serves it to the network."""
+    """Address to serve it at. 127.0.0.1 is reached from this machine alone, 0.0.0.0 from the network: there is no
+    password."""
     cache: Path = RUNS / "recordings"
     """Where recordings are kept."""
 
@@ -115,10 +113,10 @@ def show_of(cfg: View) -> Show:
     check(cfg)
     found = find_archive(cfg.robot, cfg.run)
     if not len(found.archive):
-        raise ValueError(f"{found.run} has no elites yet: let its search go on, or give another --run")
+        raise ValueError(f"{found.run} has no elites yet: {found.go_on}, or give another --run")
     elite = found.one(cfg.elite)
-    prepare_output(cfg.cache / "recording.npz")
     controllers, note = _controllers_of(cfg, found)
+    prepare_output(cfg.cache / "recording.npz")
     return Show(cfg=cfg, found=found, elite=elite, controllers=controllers, note=note)
 
 

@@ -36,7 +36,7 @@ def nan_policy(observation: torch.Tensor) -> torch.Tensor:
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figures, "write_figures", lambda *_: [])  # they take longer than the searches
-    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self: stand_in.SCALES)
+    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
     before = signal.getsignal(signal.SIGTERM)
     yield
     signal.signal(signal.SIGTERM, before)
@@ -166,7 +166,7 @@ def test_code_runs_only_if_it_is_named_again(capsys):
     told = capsys.readouterr().out
     assert f"replay --robot anymal --run a --elite 0 --policy {fine}" in told
     before = everything_in("a")
-    refused = f"a was searched with the controller {fine}, which is code: name it again (--policy)"
+    refused = f"a was searched with the controller {fine}, which is code: name it again (--policy {fine})"
     assert refused in fails(capsys, "--resume", "a", "--iterations", "2")
     assert f"archive --robot anymal --resume a --policy {fine} --device cpu" in fails(
         capsys, *TINY, "--policy", fine, "--run-dir", "a"

@@ -27,7 +27,7 @@ def robot(policy_file: Path = Path("missing.pt"), scales=stand_in.SCALES):
         policy_file=policy_file,
         collision_bit=False,
         penalties=stand_in.PENALTIES,
-        read_penalty_scales=lambda: scales,
+        read_penalty_scales=lambda policy=None: scales,
     )
 
 

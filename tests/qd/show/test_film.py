@@ -111,8 +111,8 @@ def test_a_film_of_ones_own_terrain(opengl):
             terrain=Path("hill.npz"), policy="tests.sim.policies:stand", device="cpu", replicas=4, fps=1, shadows=False
         )
     )
-    assert films == [Path("runs/terrains/hill-anymal-tests.sim.policies-stand.mp4")]
-    recording = read_recording("runs/terrains/hill-anymal-tests.sim.policies-stand.recording.npz")
+    assert films == [Path("runs/terrains/hill.npz-anymal-tests.sim.policies-stand.mp4")]
+    recording = read_recording("runs/terrains/hill.npz-anymal-tests.sim.policies-stand.recording.npz")
     assert recording.labels == ("hill.npz",) and (recording.heights == 0).all()
 
 
@@ -219,7 +219,7 @@ def test_files_of_another_controller_are_named_after_it():
     np.savez("hill.npz", heights=np.zeros((3, 5)), size_m=[16.0, 8.0])
     cross(Cross(terrain=Path("hill.npz"), policy="tests.sim.policies:stand", device="cpu", episodes=4))
     assert sorted(path.name for path in Path("runs/terrains").iterdir()) == [
-        "hill-anymal-tests.sim.policies-stand-paths.png", "hill-anymal-tests.sim.policies-stand.json"
+        "hill.npz-anymal-tests.sim.policies-stand-paths.png", "hill.npz-anymal-tests.sim.policies-stand.json"
     ]  # fmt: skip
 
 

@@ -81,15 +81,6 @@ def test_what_comes_next_keeps_the_error_before_it():
     with pytest.raises(UserError) as raised, naming_what_is_next("", lambda: "x"):
         raise lost
     assert raised.value.__cause__ is lost
-    monkeypatch.setenv("FAULTLINE_DEBUG", "0")
-    assert run("--how", "value") == 2
-
-
-def test_what_comes_next_keeps_the_error_before_it():
-    lost = UserError("lost")
-    with pytest.raises(UserError) as raised, naming_what_is_next("", lambda: "x"):
-        raise lost
-    assert raised.value.__cause__ is lost
 
 
 def test_the_option_groups_are_flags(capsys):

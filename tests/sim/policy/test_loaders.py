@@ -224,7 +224,9 @@ def test_a_file_that_is_not_there_is_named(tmp_path, anymal):
 def test_a_robot_without_a_controller_yet_says_how_to_train_one(tmp_path, anymal, monkeypatch):
     monkeypatch.setattr(type(anymal), "policy_file", tmp_path / "anymal.pt")
     for spec in (anymal.policy_file, str(anymal.policy_file)):
-        with pytest.raises(ValueError, match=r"no shipped controller.*anymal\.pt: .*faultline train --robot anymal`"):
+        with pytest.raises(
+            ValueError, match=r"no shipped controller.*anymal\.pt: .*faultline train --robot anymal --export "
+        ):
             load_policy(spec, anymal, "cpu")
 
 

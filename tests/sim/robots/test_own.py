@@ -190,53 +190,6 @@ def test_a_decimal_comma_in_the_settings_is_asked_for(tmp_path):
         get_robot(str(file))
 
 
-LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
-FIRST_MASS = '<mass value="0.8"/>'
-URDFS = [
-    # The hip's <joint> is the 22nd line, the thigh's <mass> the eighth.
-    (urdf().replace(LIMIT, "", 1), r"dog\.urdf, line 22: joint FL_hip has no <limit>.*without effort .*: FL_hip"),
-    (urdf().replace('lower="-1.5" ', "", 1), "line 22: joint FL_hip has no lower: give it <limit lower"),
-    (urdf().replace('effort="30"', 'effort="0"', 2), "joints without effort .*: FL_hip, FL_knee: .*effort_limit"),
-    (urdf().replace(' effort="30"', "", 1), r"joints without effort \(<limit effort>\): FL_hip: "),
-    (urdf().replace(FIRST_MASS, "", 1), "mass above 0, unlike FL_thigh: give it an <inertial>"),
-    (urdf().replace(FIRST_MASS, '<mass value="0,8"/>', 1), r'line 8: <mass value="0,8"> must be numbers.* point'),
-    (urdf().replace('xyz="0.2 0.12 0"', 'xyz="0.2 left 0"'), 'line 23: <origin xyz="0.2 left 0"> must be numbers'),
-    (urdf().replace(FIRST_MASS, '<mass value="${m}"/>'), r"line 8: a xacro file \(\$\{m\}\).*`xacro dog\.urdf > "),
-    (urdf().replace('<parent link="trunk"/>', "", 1), "line 22: joint FL_hip has no <parent link"),
-    (
-        urdf().replace('<child link="FL_thigh"/>', '<child link="leg"/>'),
-        "joint FL_hip: no link named leg, the file has",
-    ),
-    (urdf().replace('"revolute"', '"hinge"', 1), "joint FL_hip must be of type revolute.*got 'hinge'"),
-    (urdf().replace('"trunk">', '"">', 1), "line 2: a link without a name"),
-]
-
-
-@pytest.mark.parametrize(("model", "message"), URDFS, ids=[message for _, message in URDFS])
-def test_what_a_urdf_lacks_is_named_by_file_and_line(tmp_path, model, message):
-    more = GAINS.replace("\n    effort_limit=(30.0,) * 8,", "")
-    with pytest.raises(ValueError, match=message):
-        get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=more)))
-
-
-def test_effort_may_stand_in_the_settings_and_a_link_without_inertial_weighs_nothing(tmp_path):
-    foot = '<inertial><origin xyz="0 0 0.0"/><mass value="0.1"/>'
-    model = urdf().replace(' effort="30"', "")
-    start = model.index(foot)
-    model = model[:start] + model[model.index("</inertial>", start) + len("</inertial>") :]
-    builder = build_robot(get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=GAINS))))
-    assert builder.joint_effort_limit[6:] == [30.0] * 8
-    assert sum(builder.body_mass) == pytest.approx(MASS - 0.1)
-
-
-def test_a_decimal_comma_in_the_settings_is_asked_for(tmp_path):
-    file = write_dog(tmp_path)
-    file.write_text(file.read_text().replace("height=0.29", "height=0,29"))
-    line = next(number for number, text in enumerate(file.read_text().splitlines(), 1) if "0,29" in text)
-    with pytest.raises(ValueError, match=rf"fails: SyntaxError: .*the comma in line {line} a decimal point"):
-        get_robot(str(file))
-
-
 @pytest.mark.parametrize(("model", "message"), MODELS, ids=[message for _, message in MODELS])
 def test_what_is_wrong_with_the_model_is_named(tmp_path, model, message):
     with pytest.raises(ValueError, match=message):

@@ -80,25 +80,6 @@ def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
     assert "A biped may fall" in text and "pelvis" in found.carried
 
 
-def test_the_height_is_computed_where_the_settings_have_none(tmp_path):
-    file = write_dog(tmp_path)
-    file.write_text(file.read_text().replace("    default_base_height=0.29,\n", ""))
-    # Legs are longest with hips of 0.8 * 0.6 rad and knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
-    assert get_robot(str(file)).default_base_height == pytest.approx(0.2911, abs=3e-3)
-
-
-def test_feet_that_bounce_are_told_and_armature_or_softer_contact_mend_it(tmp_path, device):
-    dog = get_robot(str(write_dog(tmp_path, **KINDS["urdf"])))
-    bare = dataclasses.replace(dog, armature=(0.0,) * 8)
-    found = stand(bare, device=device, drops=1)
-    assert found.stands and found.bounce[0] < 0.8 < 1.2 < found.bounce[1]
-    assert sum(found.carried.values()) == pytest.approx(1.0, abs=0.1)
-    text, fine = describe_standing(bare, found)
-    assert re.search(r"To mend: its feet bounce at rest: .* armature .* contact_time_constant_s", text) and not fine
-    for mended in (dog, dataclasses.replace(bare, contact_time_constant_s=0.03)):
-        assert describe_standing(mended, stand(mended, device=device, drops=1))[1]
-
-
 IN_CM = re.sub(
     r'(xyz|size|radius|length)="([^"]*)"',
     lambda found: (
@@ -113,32 +94,10 @@ IN_DEGREES = (
 )
 
 
-@pytest.mark.parametrize(
-    ("model", "says"),
-    [
-        (IN_CM, r"it reaches [6-9]\.\d* m from its base: are lengths in the model in metres"),  # 20 times 0.41 m
-        (urdf().replace('mass value="', 'mass value="100'), r"it weighs 1\.\d*e\+04 kg.*in kilograms"),
-        (urdf().replace('ixx="0.03"', 'ixx="300"'), r"gyration of trunk \(6\.12 m\)"),  # sqrt(300 / 8)
-        (IN_DEGREES, r"default_joint_pos is beyond a full turn for FL_hip \(34\), FL_knee \(-69\).*radians"),
-        (IN_DEGREES, r"joints turn by more than two full turns: FL_hip \(-86 to 143\).*radians"),
-    ],
-    ids=["cm", "g", "inertia", "pose", "limits"],
-)
-def test_other_units_are_warned_of_with_the_numbers(tmp_path, model, says):
-    file = write_dog(tmp_path, model=model, suffix="urdf", more=GAINS)
-    if model == IN_DEGREES:
-        file.write_text(file.read_text().replace("(0.6, -1.2)", "(34.0, -69.0)"))
-    assert re.search(f"Warning: .*{says}", describe_model(get_robot(str(file))))
-
-
-def test_shipped_robots_are_in_the_right_units(anymal, cassie):
-    assert "Warning" not in describe_model(anymal) + describe_model(cassie)
-
-
 def test_the_height_is_computed_where_the_settings_have_none(tmp_path):
     file = write_dog(tmp_path)
     file.write_text(file.read_text().replace("    default_base_height=0.29,\n", ""))
-    # The legs are longest with hips of 0.8 * 0.6 rad and knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
+    # Legs are longest with hips of 0.8 * 0.6 rad, knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
     assert get_robot(str(file)).default_base_height == pytest.approx(0.2911, abs=3e-3)
 
 
@@ -152,20 +111,6 @@ def test_feet_that_bounce_are_told_and_armature_or_softer_contact_mend_it(tmp_pa
     assert re.search(r"To mend: its feet bounce at rest: .* armature .* contact_time_constant_s", text) and not fine
     for mended in (dog, dataclasses.replace(bare, contact_time_constant_s=0.03)):
         assert describe_standing(mended, stand(mended, device=device, drops=1))[1]
-
-
-IN_CM = re.sub(
-    r'(xyz|size|radius|length)="([^"]*)"',
-    lambda found: (
-        found[0]
-        if found[2] == "0 1 0"  # an axis
-        else f'{found[1]}="{" ".join(str(20 * float(word)) for word in found[2].split())}"'
-    ),
-    urdf(),
-)
-IN_DEGREES = (
-    urdf().replace('"-1.5" upper="2.5"', '"-86" upper="143"').replace('"-2.6" upper="-0.1"', '"-149" upper="-6"')
-)
 
 
 @pytest.mark.parametrize(

@@ -200,7 +200,10 @@ def test_sizes(capsys):
     ("flags", "message"),
     [
         (["--sets", "easy"], "sets must be some of hand_crafted, hard_random, generated, generated_far, got easy"),
-        (["--sets", "generated"], "generated is made of elites: give the run that found them (--archive RUN)"),
+        (
+            ["--sets", "generated"],
+            "generated is made of elites: give the run that found them (--archive results/anymal/archive)",
+        ),
         (["--sets", "hard_random hard_random"], "each set may be named once"),
         (["--archive", "{folder}/none"], "no archive at {folder}/none"),
         (["--archive", "{folder}/cassie"], "must be of robot 'anymal', got one of 'cassie'"),
@@ -218,7 +221,7 @@ def test_sizes(capsys):
             ["--policies", "base=shipped", "C-G={folder}/small.pt"],
             "maps 48 observations to 12 actions, but robot 'anymal'",
         ),
-        (["--policy", "x.pt", "--sets", "hard_random"], "give --policies NAME=x.pt instead of --policy"),
+        (["--policy", "x.pt", "--sets", "hard_random"], "give --policies own=x.pt instead of --policy"),
         (["--sets", "hard_random", "--robot", "spot"], "unknown robot 'spot'"),
         (["--sets", "hard_random", "--terrains", "0"], "terrains must be at least 1, got 0"),
         (["--sets", "hard_random", "--episodes", "-2"], "episodes must be at least 1, got -2"),
