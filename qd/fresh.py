@@ -231,7 +231,7 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         raise ValueError(f"seed must be at least 0, got {seed}")
     device = resolve_device(args.device, args.workers)
     policy = args.policy or _own_policy(path, cfg, robot)
-    evaluator = evaluator_of(cfg, robot, policy, device, args.workers)
+    evaluator = evaluator_of(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
     given = {"run": path, "policy": args.policy, "seed": args.seed, "device": args.device, "workers": args.workers}
     again = f"Start again with:  {command_line('reevaluate', robot=robot.spec, **given)}"
     with claimed(path):

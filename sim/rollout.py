@@ -1,8 +1,10 @@
 """The crossing task: robots cross terrains toward a goal, and what it cost them comes back."""
 
+import re
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +20,7 @@ from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges, make_task
-from sim.policy.loaders import PolicySpec, load_policy, prepare_torch
+from sim.policy.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.policy.runner import Memory, PolicyRunner
 from sim.reward import Reward
 from sim.robots.robot import RobotCfg
@@ -162,7 +164,7 @@ class Rollout:
             space: What the genes of terrains mean.
 
         Raises:
-            ValueError: If the policy does not fit the robot, or a number is not positive.
+            ValueError: If the policy does not fit the robot, a number is not positive, or memory is too small.
         """
         if num_terrains < 1 or num_replicas < 1 or (num_envs is not None and num_envs < 1):
             raise ValueError(
@@ -177,16 +179,20 @@ class Rollout:
         self.space = space
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
-        bank = TerrainBank(num_terrains, device=device)
-        self.sim = Simulation(robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
+        with _saying_what_does_not_fit(self.num_envs, num_terrains, device):
+            self._build(loaded, solver, device)
+
+    def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
+        bank = TerrainBank(self.num_terrains, device=device)
+        self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
         self._batches: deque[_Batch] = deque()
         self._first_free = self._waiting = 0  # the ring's next slot, and episodes that no robot may take yet
-        self._most = round(self.cfg.max_duration_s / robot.control_dt)
+        self._most = round(self.cfg.max_duration_s / self.robot.control_dt)
         self._steps = self._began = self._taken_at = 0  # control steps: now, when all waited, at the last result
         self._taken_s = time.perf_counter()
         with wp.ScopedDevice(device):
             self._allocate()
-            self._policy = PolicyRunner(loaded, self._observation, self._action, self._queue.begins)
+            self._policy = PolicyRunner(policy, self._observation, self._action, self._queue.begins)
             self._step_graph = self.sim.capture(self._launch_control_step)
             self._turn_graph = self.sim.capture(self._launch_turn_over)
 
@@ -456,6 +462,24 @@ class Rollout:
             wall_s=wall_s,
             reward=reward,
         )
+
+
+@contextmanager
+def _saying_what_does_not_fit(num_envs: int, num_terrains: int, device: str) -> Iterator[None]:
+    """Says of an allocation that failed what it was for.
+
+    Raises:
+        ValueError: If memory ran out.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not re.search("out of memory|failed to allocate", str(error).lower()):
+            raise
+        raise ValueError(
+            f"{num_envs:,} robots and {num_terrains:,} terrains at once need more memory than {device} has free: "
+            "give fewer robots (--num-envs), or fewer terrains"
+        ) from error
 
 
 def _ring_slices(first: int, count: int, size: int) -> tuple[slice, ...]:

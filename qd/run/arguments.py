@@ -160,7 +160,9 @@ def job_of(args: Archive) -> Job:
         cfg=cfg,
         path=path,
         resumes=there is not None,
-        evaluator=evaluator_of(cfg, robot, moved or policy_spec(cfg, robot), device, args.workers),
+        evaluator=evaluator_of(
+            cfg, robot, moved or policy_spec(cfg, robot), device, args.workers, num_envs=args.num_envs
+        ),
         reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset != "small"),
         origin=origin_in(RunDirectory(path).read_config()) if there else {**now, **own_file(robot), "sessions": []},
         session={name: now[name] for name in _SESSION},
@@ -180,12 +182,19 @@ def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | 
     reproduce = None if args.reproduce == "auto" else args.reproduce
     return command_line(
         "archive", robot=robot.spec, resume=path, policy=policy, device=args.device, workers=args.workers,
-        reproduce=reproduce,
+        num_envs=args.num_envs, reproduce=reproduce,
     )  # fmt: skip
 
 
 def evaluator_of(
-    cfg: SearchCfg, robot: "RobotCfg", policy: str, device: str, workers: str | None, *, runs: int = 1
+    cfg: SearchCfg,
+    robot: "RobotCfg",
+    policy: str,
+    device: str,
+    workers: str | None,
+    *,
+    num_envs: int | None = None,
+    runs: int = 1,
 ) -> EvaluatorCfg:
     """What evaluates an iteration's terrains all at once, with a controller that was tried.
 
@@ -195,6 +204,7 @@ def evaluator_of(
         policy: Controller.
         device: Warp device name.
         workers: Who crosses them, as on a command line.
+        num_envs: Robots at once; as many as the device is good for if None.
         runs: Searches whose terrains are crossed together.
 
     Raises:
@@ -208,6 +218,7 @@ def evaluator_of(
         num_replicas=cfg.replicas,
         device=device,
         workers=workers,
+        num_envs=num_envs,
         space=cfg.space,
     )
 

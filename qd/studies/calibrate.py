@@ -86,6 +86,7 @@ class Calibrate(Who, Where):
             num_replicas=self.replicas,
             device=device,
             workers=self.workers,
+            num_envs=self.num_envs,
             space=self.space,
         )
         genes = get_space(self.space).hard_random(self.terrains, self.seed)

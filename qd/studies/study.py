@@ -92,7 +92,7 @@ def study_of(
         path=path,
         out=flags.out or path / f"{name}.json",
         runs=runs,
-        evaluator=evaluator_of(cfg, robot, controller, device, flags.workers, runs=len(runs)),
+        evaluator=evaluator_of(cfg, robot, controller, device, flags.workers, num_envs=flags.num_envs, runs=len(runs)),
         origin={**origin_of(device, cfg.seed, flags.workers), **own_file(robot)},
         sampled=sampled,
     )

@@ -56,6 +56,9 @@ class Where(OnDevice):
     workers: str | None = None
     """Worker processes: a number of them on the CPU (one a core if left out), ray for one on every device of a Ray
     cluster, or ray:N for N of them. RAY_ADDRESS names a running cluster."""
+    num_envs: int | None = setting(None, least=1)
+    """Robots at once over all workers, which take episode after episode; as many as the device is good for if left out.
+    It changes how long the work takes, and no result."""
 
 
 @dataclass(frozen=True, kw_only=True)

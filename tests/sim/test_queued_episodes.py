@@ -194,3 +194,29 @@ def test_a_gpus_robots_run_the_same_episodes(anymal, device):
     )
     np.testing.assert_array_equal(alone.outcome, queued.outcome)
     np.testing.assert_allclose(alone.final_position, queued.final_position, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        RuntimeError("Failed to allocate 6000000000 bytes on device 'cuda:0'"),
+        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"),
+        MemoryError(),
+    ],
+)
+def test_what_does_not_fit_the_device_is_said(anymal, monkeypatch, failure):
+    def fail(*args, **kwargs):
+        raise failure
+
+    monkeypatch.setattr("sim.rollout.TerrainBank", fail)
+    with pytest.raises(ValueError, match=r"20 robots and 5 terrains at once need more memory than cpu has.*--num-envs"):
+        rollout_of(anymal, None, stretch)
+
+
+def test_another_failure_to_build_is_left_as_it_is(anymal, monkeypatch):
+    def fail(*args, **kwargs):
+        raise RuntimeError("no such kernel")
+
+    monkeypatch.setattr("sim.rollout.TerrainBank", fail)
+    with pytest.raises(RuntimeError, match="no such kernel"):
+        rollout_of(anymal, None, stretch)

@@ -95,6 +95,7 @@ def evaluator_of(flags: Evaluate, robot: "RobotCfg") -> EvaluatorCfg:
         num_replicas=flags.episodes or episodes,
         device=device,
         workers=flags.workers,
+        num_envs=flags.num_envs,
     )
 
 
