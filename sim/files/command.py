@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.settings import check
+from sim.files.settings import check, setting
 
 _ALL = "all"
 _DEBUG = "FAULTLINE_DEBUG"
