@@ -4,12 +4,14 @@ The iterations timed are those of a real search, ask to saved checkpoint, in a d
 rates are measured right after, on the terrains of the last of them, with as many environments and the same solver.
 """
 
+import re
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from qd.run.arguments import evaluator_of
@@ -23,8 +25,15 @@ from sim.files.command import OfRobot, OnDevice, publish, show_json
 from sim.files.provenance import provenance
 from sim.files.settings import check, setting
 
+if TYPE_CHECKING:
+    from qd.scheduler import Scheduler
+
 _WARM_UP = 2
-_CURVE_REPLICAS = 16
+_CURVE_REPLICAS = 20
+_EPISODES_A_ROBOT = 20
+_PAPER_EPISODES = 4_000_000  # of the paper's search
+_PROFILED_STEPS = 50  # control steps
+_NAMED_KERNELS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,32 +53,44 @@ class Speed(OfRobot, OnDevice):
     steps: int = setting(1000, least=1)
     """Physics steps of the bare measurement."""
     curve: tuple[int, ...] = (1024, 2048, 4096, 8192, 16384, 32768)
-    """Numbers of environments of the curve, multiples of 16; none to leave it out."""
+    """Numbers of robots of the curve, each of which runs 20 episodes; none to leave it out."""
+    kernels: int = setting(0, least=0)
+    """Robots with which every kernel of a control step is timed, on a GPU; 0: none is."""
+    wide: Path | None = None
+    """Run of preset wide, made on this GPU, whose iterations are told of."""
+    before: Path | None = None
+    """speed.json of another commit, made on this GPU, whose curve is kept beside this one's."""
     train_speed: Path | None = None
     """Output of `faultline train-speed`, whose rates are taken over."""
+    timeline: Path | None = None
+    """Draw which robot ran which episode when, with and without the queue, into this file; nothing is timed."""
     out: Path | None = None
     """Where to write; printed alone if left out."""
 
     def execute(self) -> None:
         """Times and publishes."""
+        if self.timeline is not None:
+            from qd.show.timeline import draw_timeline
+
+            draw_timeline(self.timeline, self.robot or "anymal", resolve_device(self.device))
+            return
         publish(self.out, lambda: measure(self), show_json)
 
 
 def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, NDArray[Any]]:
-    """Runs a search from the start; its metrics rows, and the terrains of its last iteration."""
-    search, metrics, crossed = begin(cfg), list[dict[str, Any]](), list[NDArray[Any]]()
+    """Runs a search from the start; its metrics rows, and the terrains it would ask for next."""
+    search, metrics = begin(cfg), list[dict[str, Any]]()
     with (
         tempfile.TemporaryDirectory() as folder,
         open_evaluator(evaluator) as evaluate,
         ProgressBar(cfg.iterations, 0) as bar,
     ):
+        search_terrains(cfg, RunDirectory(Path(folder)), search, metrics, evaluate, bar)
+    return metrics, _asked(cfg, search)
 
-        def remembering(terrains: NDArray, seeds: NDArray, progress: Any = None) -> Any:
-            crossed[:] = [terrains]
-            return evaluate(terrains, seeds, progress)
 
-        search_terrains(cfg, RunDirectory(Path(folder)), search, metrics, remembering, bar)
-    return metrics, crossed[0]
+def _asked(cfg: SearchCfg, search: "Scheduler") -> NDArray[Any]:
+    return np.concatenate([search.ask(group) for group in range(cfg.scheduler.groups)])
 
 
 def read_iterations(folder: Path, count: int, device_name: str) -> tuple[SearchCfg, Metrics, NDArray[Any]]:
@@ -90,27 +111,81 @@ def read_iterations(folder: Path, count: int, device_name: str) -> tuple[SearchC
     search, metrics = run.load(cfg) or (None, [])
     if search is None or len(metrics) < count + _WARM_UP:
         raise ValueError(f"--run {folder} must have at least {count + _WARM_UP} iterations, got {len(metrics)}")
-    return cfg, metrics[-count:], search.ask()
+    return cfg, metrics[-count:], _asked(cfg, search)
+
+
+def wide_numbers(folder: Path, device_name: str) -> dict[str, float]:
+    """What a search of preset wide takes, over all its iterations but the first two.
+
+    Raises:
+        ValueError: If the run is of another preset or device, damaged, or too short.
+    """
+    cfg = RunDirectory(folder).read_cfg()
+    if cfg.preset != "wide":
+        raise ValueError(f"--wide {folder} must be a run of preset wide, got one of {cfg.preset}")
+    done = RunDirectory(folder).iterations_done()
+    cfg, metrics, _ = read_iterations(folder, max(1, done - _WARM_UP), device_name)
+    wall_s = sum(row["wall_s"] for row in metrics)
+    waited = sum(row["idle_share"] * row["robot_steps"] for row in metrics)
+    return {
+        "iterations": len(metrics),
+        "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
+        "idle_share": waited / sum(row["robot_steps"] for row in metrics),
+        "minutes_per_4m_episodes": _PAPER_EPISODES / (len(metrics) * cfg.episodes_per_iteration) * wall_s / 60,
+    }
 
 
 def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[int, ...]) -> list[dict[str, float]]:
-    """Episodes a second of one evaluation over numbers of environments, terrains repeated as needed."""
+    """Episodes a second over numbers of robots, each of which runs 20 episodes; terrains repeated as needed."""
     rows = []
     for count in counts:
-        num_terrains = count // _CURVE_REPLICAS
+        num_terrains = max(1, count * _EPISODES_A_ROBOT // _CURVE_REPLICAS)
+        at_once = -(-num_terrains // 5)  # four episodes a robot under way, by halves
         genes = terrains[np.arange(num_terrains) % len(terrains)]
         seeds = np.arange(num_terrains, dtype=np.uint32)
-        with open_evaluator(replace(evaluator, num_terrains=num_terrains, num_replicas=_CURVE_REPLICAS)) as evaluate:
+        sizes = {"num_envs": count, "num_terrains": at_once, "num_replicas": _CURVE_REPLICAS}
+        with open_evaluator(replace(evaluator, **sizes)) as evaluate:
             result = evaluate(genes, seeds)
         rows.append(
             {
                 "num_envs": count,
-                "episodes_per_s": count / result.wall_s,
-                "world_steps_per_s": count * result.physics_steps / result.wall_s,
+                "episodes_per_s": result.outcome.size / result.wall_s,
+                "world_steps_per_s": result.robot_steps / result.wall_s,
+                "idle_share": result.idle_share,
             }
         )
-        print(f"  {count:>6} environments: {rows[-1]['episodes_per_s']:,.0f} episodes/s", flush=True)
+        rate, idle = rows[-1]["episodes_per_s"], rows[-1]["idle_share"]
+        print(f"  {count:>6} robots: {rate:,.0f} episodes/s, {idle:.1%} idle", flush=True)
     return rows
+
+
+def kernel_shares(evaluator: EvaluatorCfg, terrains: NDArray[Any], num_envs: int) -> list[dict[str, Any]]:
+    """Shares of the GPU's time by kernel, over a second of crossings a second after their start, the most first.
+
+    Args:
+        evaluator: What is crossed with what.
+        terrains: Genes.
+        num_envs: Robots.
+    """
+    from torch.profiler import ProfilerActivity, profile
+
+    num_terrains = -(-num_envs // _CURVE_REPLICAS)
+    sizes = {"num_envs": num_envs, "num_terrains": num_terrains, "num_replicas": _CURVE_REPLICAS}
+    rollout: Any = build_rollout(replace(evaluator, **sizes), num_terrains)
+    rollout.put(terrains[np.arange(num_terrains) % len(terrains)], np.arange(num_terrains, dtype=np.uint32))
+    for _ in range(_PROFILED_STEPS):
+        rollout.control_step()
+    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+        for _ in range(_PROFILED_STEPS):
+            rollout.control_step()
+        wp.synchronize_device(rollout.sim.device)
+    times: dict[str, float] = {}
+    for event in profiled.key_averages():
+        name = re.sub(r"_[0-9a-f]{8}(_cuda_kernel_forward)?$|_cuda_kernel_forward$", "", event.key)
+        times[name] = times.get(name, 0.0) + event.self_device_time_total
+    total = sum(times.values())
+    ranked = sorted(times.items(), key=lambda one: -one[1])[:_NAMED_KERNELS]
+    return [{"name": name, "share": time / total} for name, time in ranked]
 
 
 def training_rates(file: Path | None) -> dict[str, float | None]:
@@ -133,14 +208,15 @@ def measure(args: Speed) -> dict[str, Any]:
     from sim.robots.robot import get_robot, robot_of
 
     check(args)
-    if any(count < 1 or count % _CURVE_REPLICAS for count in args.curve):
-        raise ValueError(f"curve must be multiples of {_CURVE_REPLICAS}, got {args.curve}")
     robot, device = get_robot(args.robot or "anymal"), resolve_device(args.device)
+    name = provenance(device, 0)["device"]
     training = training_rates(args.train_speed)
+    before = None if args.before is None else _curve_of(args.before, name)
+    wide = None if args.wide is None else wide_numbers(args.wide, name)
+    if (args.run or args.kernels) and not device.startswith("cuda"):
+        raise ValueError(f"--run and --kernels need a CUDA device, got {device}")
     if args.run is not None:
-        if not device.startswith("cuda"):
-            raise ValueError(f"--run needs a CUDA device, got {device}: a run on the CPU has several workers")
-        cfg, metrics, terrains = read_iterations(args.run, args.iterations, provenance(device, 0)["device"])
+        cfg, metrics, terrains = read_iterations(args.run, args.iterations, name)
         robot = robot_of(cfg.robot, args.robot, args.run)
         refuse_unnamed_code(cfg.policy, None, args.run)
     else:
@@ -152,12 +228,12 @@ def measure(args: Speed) -> dict[str, Any]:
         metrics, terrains = time_iterations(cfg, evaluator)
         metrics = metrics[_WARM_UP:]
     num_envs = cfg.episodes_per_iteration
-    rollout: Any = build_rollout(evaluator, evaluator.num_terrains)
+    rollout: Any = build_rollout(replace(evaluator, num_envs=num_envs), evaluator.num_terrains)
     seeds = episode_seeds(cfg.seed, cfg.iterations, len(terrains))
     bare = measure_bare_physics(rollout, terrains, seeds, steps=args.steps)
     del rollout
-    rates = [num_envs * row["physics_steps"] / row["wall_s"] for row in metrics]
-    running = [num_envs * row["mean_duration_s"] / robot.physics_dt / row["wall_s"] for row in metrics]
+    rates = [row["robot_steps"] / row["wall_s"] for row in metrics]
+    running = [(1.0 - row["idle_share"]) * rate for row, rate in zip(metrics, rates, strict=True)]
     return {
         **provenance(device, cfg.seed),
         "robot": robot.name,
@@ -165,6 +241,7 @@ def measure(args: Speed) -> dict[str, Any]:
         "run": None if args.run is None else str(args.run),
         "num_envs": num_envs,
         "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
+        "idle_share": float(np.median([row["idle_share"] for row in metrics])),
         "bare_physics_ratio": float(np.median(rates)) / bare.walking,
         "bare_physics_ratio_standing": float(np.median(rates)) / bare.standing,
         "world_steps_per_s": float(np.median(rates)),
@@ -173,4 +250,21 @@ def measure(args: Speed) -> dict[str, Any]:
         "bare_world_steps_per_s_standing": bare.standing,
         **training,
         "envs_curve": time_curve(evaluator, terrains, args.curve) or None,
+        "before": before,
+        "wide": wide,
+        "kernels": kernel_shares(evaluator, terrains, args.kernels) if args.kernels else None,
     }
+
+
+def _curve_of(file: Path, device_name: str) -> dict[str, Any]:
+    """Commit and curve of a speed.json.
+
+    Raises:
+        ValueError: If it is none, or of another device.
+    """
+    found = read_json(file)
+    if not isinstance(found.get("envs_curve"), list) or found.get("device") != device_name:
+        raise ValueError(
+            f"--before {file} must be a speed.json with a curve of {device_name}, got one of {found.get('device')}"
+        )
+    return {"commit": found["commit"], "envs_curve": found["envs_curve"]}
