@@ -46,7 +46,7 @@ class Train(TrainingFlags):
             return cls(robot=name, task=TaskCfg.of(robot), ppo=PpoCfg.of(robot))
         from train.ppo.run import read_saved, settings_of
 
-        return cls(robot=name, resume=run, **settings_of(run, read_saved(run, robot.name, finetuning=False), _KINDS))
+        return cls(robot=name, resume=run, **settings_of(run, read_saved(run, robot, finetuning=False), _KINDS))
 
     def execute(self) -> int:
         """Trains; returns the exit status: 0, or 130 after Ctrl-C.
@@ -69,7 +69,7 @@ class Train(TrainingFlags):
 
 def _job_of(flags: Train, began: float) -> "Job":
     """What the flags ask for, checked."""
-    from sim.robots.own import own_hash
+    from sim.robots.identity import robot_digest
     from sim.robots.robot import get_robot
     from train.ppo.learner import Ranks
     from train.ppo.run import Job, check_resumed, check_training, device_of, prepare_run_dir, read_saved
@@ -93,9 +93,9 @@ def _job_of(flags: Train, began: float) -> "Job":
         "processes": Ranks.of_environment().size,
         "task": asdict(flags.task),
         "ppo": asdict(flags.ppo),
-        **own_hash(robot),
+        "robot_sha256": robot_digest(robot),
     }
-    saved = read_saved(flags.resume, robot.name, finetuning=False) if flags.resume else None
+    saved = read_saved(flags.resume, robot, finetuning=False) if flags.resume else None
     for change in check_resumed(flags, saved, settings) if saved else []:
         print(f"Changed since the checkpoint: {change}")
     run_dir = prepare_run_dir(flags, f"{robot.name}-base")

@@ -65,7 +65,7 @@ class Finetune(TrainingFlags):
         from train.ppo.run import read_saved, settings_of
         from train.task.mix import MixCfg
 
-        saved = read_saved(run, robot.name, finetuning=True)
+        saved = read_saved(run, robot, finetuning=True)
         sizes = dict.fromkeys(("seed", "num_envs", "iterations", "critic_iterations", "split_seed"), int)
         begun = settings_of(run, saved, {**sizes, "policy": str, "mix": MixCfg, "task": TaskCfg, "ppo": PpoCfg})
         archive = saved["extra"]["settings"].get("archive")

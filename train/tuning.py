@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from qd.archive import read_archive
+from qd.run.directory import read_archive_of
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
-from sim.robots.own import own_hash
+from sim.robots.identity import robot_digest
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
@@ -115,7 +115,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         ValueError: If controller, archive, mix, a size or the directory is not as it must be.
     """
     robot, device = get_robot(flags.robot), device_of(flags)
-    saved = read_saved(flags.resume, robot.name, finetuning=True) if flags.resume else None
+    saved = read_saved(flags.resume, robot, finetuning=True) if flags.resume else None
     size = sizes_of(flags, robot.name, on_gpu=device.startswith("cuda"))
     if saved is None:
         path = flags.policy or robot.policy_file
@@ -143,7 +143,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         "critic_iterations": size["critic_iterations"],
         "task": asdict(task),
         "ppo": asdict(ppo),
-        **own_hash(robot),
+        "robot_sha256": robot_digest(robot),
         **({"trained_before": before} if before else {}),
     }
     if saved is not None:
@@ -187,7 +187,7 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace,
         return np.zeros((0, SUPER_GAUSSIAN.num_genes), np.float32), SUPER_GAUSSIAN, None
     path = flags.archive or Path("results") / robot.name / "archive"
     try:
-        archive = read_archive(path)
+        archive = read_archive_of(robot, path)
     except FileNotFoundError as error:
         make = command_line("archive", robot=robot.spec)
         raise ValueError(f"{error}; make one ({make}) and name it with --archive") from error
@@ -199,8 +199,11 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace,
 
 
 def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, Any]) -> None:
-    """Nothing but the iterations may change, and where the archive lies: its hash says whether it is the same."""
-    free = ("iterations ", "archive.path ")
+    """Nothing but the iterations may change, and where the archive lies: its hash says whether it is the same.
+
+    The robot was compared when the checkpoint was read; an older one names no hash of it.
+    """
+    free = ("iterations ", "archive.path ", "robot_sha256 ")
     different = [line for line in check_resumed(flags, saved, settings) if not line.startswith(free)]
     if different:
         raise ValueError(

@@ -150,6 +150,8 @@ def job_of(args: Archive) -> Job:
         name = args.preset or ("paper" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot), changes), robot)
         path = _free_path(args, cfg, robot)
+        if told := robot.scaled_by_another(policy_spec(cfg, robot)):
+            print(told)
     get_space(cfg.space)
     now = origin_of(device, cfg.seed, args.workers)
     named = moved or code_of(cfg)
@@ -177,7 +179,7 @@ def _robot_of(args: Archive, there: SearchCfg | None) -> "RobotCfg":
     from sim.robots.robot import get_robot, robot_of
 
     if args.resume and there:
-        return robot_of(there.robot, args.robot, args.resume)
+        return robot_of(as_settings(there), args.robot, args.resume)
     return get_robot(args.robot or "anymal")
 
 

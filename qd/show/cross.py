@@ -16,9 +16,11 @@ from qd.workers.evaluator import check_policy, origin_of, resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OnDevice, Who, split_words
 from sim.files.intervals import rate_words, wilson_interval
-from sim.policy.spec import ControllerSpec, who_crossed
+from sim.policy.spec import who_crossed
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
+    from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
 
 OWN_FOLDER = RUNS / "terrains"
@@ -124,7 +126,7 @@ def cross(cfg: Cross) -> dict[str, Any]:
     prepare_output(out)
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)
     (recording,) = Recordings(robot, device=device).all_of([wanted])
-    origin, about = origin_of(device, cfg.seed, None), _about(cfg, robot.name, terrain, policy)
+    origin, about = origin_of(device, cfg.seed, None), _about(cfg, robot, terrain, policy)
     report = {**origin, **about, **numbers_of(recording.result())}
     print(describe(report))
     write_atomically(out, to_json(report))
@@ -146,13 +148,9 @@ def _outputs(cfg: Cross, who: str) -> tuple[Path, Path]:
     return out, figure
 
 
-def _about(cfg: Cross, robot: str, terrain: OwnTerrain, policy: str) -> dict[str, Any]:
-    from sim.policy.spec import controller_hash
-
+def _about(cfg: Cross, robot: "RobotCfg", terrain: OwnTerrain, policy: str) -> dict[str, Any]:
     return {
-        "robot": robot,
-        "policy": ControllerSpec.parse(policy).label,
-        "policy_sha256": controller_hash(policy),
+        **identity(robot, policy),
         "terrain": str(cfg.terrain),
         "terrain_sha256": hashlib.sha256(cfg.terrain.read_bytes()).hexdigest(),
         "map": terrain.fitted,

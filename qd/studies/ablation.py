@@ -19,6 +19,7 @@ from qd.run.settings import (
     resumed,
 )
 from sim.files.command import Where, Who
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +74,7 @@ class Ablation(Who, Where):
         if self.run is None:
             robot = get_robot(self.robot or "anymal")
         else:
-            robot = robot_of(RunDirectory(self.run).read_cfg().robot, self.robot, self.run)
+            robot = robot_of(as_settings(RunDirectory(self.run).read_cfg()), self.robot, self.run)
         path = self.run_dir or RUNS / f"{robot.name}-ablation"
         base = self._begun(robot, device) if self.run is None else self._of_run(self.run, robot)
         if base.iterations < base.reevaluate_every:
@@ -91,7 +92,7 @@ class Ablation(Who, Where):
             if self.run is not None:
                 metrics["alpha_1"] = RunDirectory(self.run).read_metrics()
             numbers = numbers_of(metrics, base.iterations)
-            return {**study.origin, "robot": robot.name, "preset": base.preset, **numbers}
+            return {**study.origin, **identity(robot, study.evaluator.policy), "preset": base.preset, **numbers}
 
         return publish_with_figure(self.out or path / "ablation.json", measure, _show, draw_ablation)
 

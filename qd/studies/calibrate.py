@@ -4,7 +4,7 @@ The scale of a penalty is its mean over all valid episodes or, where it is 0 in 
 Scales are measured once with the shipped controller, before any search, and never tuned on an archive.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim.files.command import Where, Who, publish
 from sim.files.settings import check, setting
-from sim.policy.spec import ControllerSpec
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.fresh import Open
@@ -52,6 +52,7 @@ class Calibrate(Who, Where):
         """
         from qd.run.progress import share_bar
         from qd.workers import evaluator as workers
+        from sim.crossing import CrossingCfg
         from sim.robots.robot import get_robot
         from sim.space import get_space
 
@@ -83,8 +84,9 @@ class Calibrate(Who, Where):
                 result = evaluate(genes, seeds, progress)
             return {
                 **workers.origin_of(device, self.seed, self.workers),
-                "robot": robot.name,
-                "policy": ControllerSpec.parse(policy).label,
+                **identity(robot, policy),
+                "space": self.space,
+                "crossing": asdict(CrossingCfg()),
                 **_measured(result),
             }
 

@@ -14,6 +14,7 @@ from qd.run.directory import RUNS, Metrics
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
 from sim.files.command import Where, Who
 from sim.files.intervals import MAX_T_VALUES, t_interval
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -117,7 +118,7 @@ class Compare(Who, Where):
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds] for name in methods}
             return {
                 **study.origin,
-                "robot": robot.name,
+                **identity(robot, study.evaluator.policy),
                 "preset": size,
                 "seeds": list(seeds),
                 "reachable_cells": shared.cells.num_cells,

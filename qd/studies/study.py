@@ -78,6 +78,8 @@ class Study:
         """
         cfg = next(iter(runs.values()))
         controller = moved or policy_spec(cfg, robot)
+        if told := robot.scaled_by_another(controller):
+            print(told)
         return cls(
             path=path,
             runs=runs,

@@ -21,7 +21,7 @@ from sim.files.provenance import provenance
 from sim.files.settings import check
 from sim.mujoco_c.crossing import draw_starts, run_plain
 from sim.mujoco_c.model import crossing_model
-from sim.policy.spec import ControllerSpec
+from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device
@@ -187,8 +187,7 @@ class Comparison:
         ]
         return {
             **provenance(self.device, cfg.seed),
-            "robot": self.robot.name,
-            "policy": ControllerSpec.parse(self.policy).label,
+            **identity(self.robot, self.policy),
             "pool": "hard_random" if cfg.genes is None else str(cfg.genes),
             "looked_at": choice.looked_at,
             "ours": _settings(robot, time_constant_s),

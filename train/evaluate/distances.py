@@ -41,15 +41,17 @@ def distances(flags: Distances) -> dict[str, Any]:
     """
     import numpy as np
 
-    from qd.archive import read_archive
+    from qd.run.directory import read_archive_of
     from sim.files.provenance import provenance
+    from sim.robots.identity import robot_identity
     from sim.robots.robot import get_robot
     from sim.space import get_space
     from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, split_elites
 
     check(flags)
-    robot = get_robot(flags.robot).name
-    archive = read_archive(flags.archive or Path("results") / robot / "archive")
+    found = get_robot(flags.robot)
+    robot = found.name
+    archive = read_archive_of(found, flags.archive or Path("results") / robot / "archive")
     split = split_elites(archive, robot, flags.split_seed)
     count = flags.terrains or paper_terrains(robot)
     sets = make_sets(("hard_random", "generated"), count, flags.seed, archive=archive, split=split)
@@ -60,6 +62,7 @@ def distances(flags: Distances) -> dict[str, Any]:
     return {
         **provenance("cpu", flags.seed),
         "robot": robot,
+        **robot_identity(found),
         "iterations": archive.iterations,
         "trained_on": len(split.train),
         "nearest_m": {

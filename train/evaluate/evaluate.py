@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qd.archive import ARCHIVE_FILE, Archive, read_archive
+from qd.archive import ARCHIVE_FILE, Archive
+from qd.run.directory import read_archive_of
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import Where, Who, naming_what_is_next, publish, split_words
 from sim.files.settings import check, setting
-from sim.policy.spec import ControllerSpec, controller_hash, controllers_of, who_crossed
+from sim.policy.spec import controller_hash, controllers_of, who_crossed
+from sim.robots.identity import identity, robot_identity
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -116,8 +118,7 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
         check_policy(policy, robot, evaluator.device)
         with open_evaluator(evaluator) as evaluate:
             rates = base_rates(evaluate, evaluator.num_terrains, flags.seed)
-        about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
-        return {**origin_of(evaluator.device, flags.seed, flags.workers), **about, **rates}
+        return {**origin_of(evaluator.device, flags.seed, flags.workers), **identity(robot, policy), **rates}
 
     return publish(out, measure, print_rates)
 
@@ -150,7 +151,7 @@ def _plan_of(flags: Evaluate) -> _Plan:
     robot = get_robot(flags.robot)
     evaluator = replace(evaluator_of(flags, robot), reward=True)
     controllers = controllers_of(flags.policies, robot)
-    archive = None if flags.archive is None else read_archive(flags.archive)
+    archive = None if flags.archive is None else read_archive_of(robot, flags.archive)
     split = None if archive is None else split_elites(archive, robot.name, flags.split_seed)
     names = split_words(flags.sets) or [name for name in SETS if archive is not None or name not in FROM_ARCHIVE]
     run_dir = flags.run_dir or Path("runs") / f"{robot.name}-tables"
@@ -209,6 +210,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: "Open" = open_evaluator)
         return {
             **origin_of(plan.evaluator.device, flags.seed, flags.workers),
             "robot": plan.robot.name,
+            **robot_identity(plan.robot),
             "episodes": plan.evaluator.num_replicas,
             "controllers": about,
             **plan.archive,

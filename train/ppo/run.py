@@ -15,6 +15,7 @@ from sim.files.atomic import locked, prepare_output, read_json, to_json, write_a
 from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import built, problems
+from sim.robots.identity import check_robot
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
 from train.evaluate.sets import TRAINED_ON
@@ -130,23 +131,25 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
 # Going on with a run ---------------------------------------------------------------------------------------------
 
 
-def read_saved(run: Path, robot: str, *, finetuning: bool) -> dict[str, Any]:
+def read_saved(run: Path, robot: RobotCfg, *, finetuning: bool) -> dict[str, Any]:
     """The checkpoint of a run of this robot, with the progress it had made: a fine-tuning, or the training of a base.
 
     Raises:
-        ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is of the other kind.
+        ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is of the other kind, or of the robot before
+            it changed.
     """
     path = run / CHECKPOINT
-    saved = read_checkpoint(path, robot)
+    saved = read_checkpoint(path, robot.name)
     extra = saved["extra"]
     check_entries(extra, STATE, path)
+    check_robot(extra["settings"], robot, path, "put back what was there then, or begin a new run")
     found = "mix" in extra or "mix" in extra["settings"]
     if found and not finetuning:
-        raise ValueError(f"{run} is a fine-tuning: go on with {command_line('finetune', robot=robot, resume=run)}")
+        raise ValueError(f"{run} is a fine-tuning: go on with {command_line('finetune', robot=robot.spec, resume=run)}")
     if finetuning and not found:
         raise ValueError(
             f"{run} is the training of a base controller, not a fine-tuning: go on with "
-            f"{command_line('train', robot=robot, resume=run)}, or fine-tune what it made with --policy {path}"
+            f"{command_line('train', robot=robot.spec, resume=run)}, or fine-tune what it made with --policy {path}"
         )
     if finetuning:
         check_entries(extra, {"mix": (dict,)}, path)

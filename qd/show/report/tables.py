@@ -9,6 +9,7 @@ from qd.archive import Archive, read_archive
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
+from sim.robots.identity import check_identity
 from sim.robots.robot import RobotCfg
 
 MEASURES = {"success": "success (no base collision)", "goal": "goal reached", "reward": "training reward"}
@@ -30,7 +31,7 @@ _CONTROLLERS = ("*.pt", "*.onnx")  # files beside the tables that may be one
 _KEYS = ("robot", "episodes", "controllers", "terrains", "intervals", "differences", *MEASURES)
 
 
-def read_tables(file: Path, robot: str) -> dict[str, Any]:
+def read_tables(file: Path, robot: RobotCfg) -> dict[str, Any]:
     """The evaluation's tables.
 
     Args:
@@ -39,16 +40,19 @@ def read_tables(file: Path, robot: str) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is damaged, another file, or of another robot.
+        ValueError: If it is damaged, another file, of another robot, or of one that has changed since.
     """
-    writer = f"`{command_line('evaluate', robot=robot, policies='...')}`"
+    writer = f"`{command_line('evaluate', robot=robot.spec, policies='...')}`"
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: {writer} writes them")
     tables = read_json(file)
     if problem := _problem_of(tables):
         raise ValueError(f"{file} must hold the tables of {writer}, but {problem}: give that file")
-    if tables["robot"] != robot:
-        raise ValueError(f"{file} is of robot {tables['robot']}, got --robot {robot}: give that robot or other tables")
+    if tables["robot"] != robot.name:
+        raise ValueError(
+            f"{file} is of robot {tables['robot']}, got --robot {robot.name}: give that robot or other tables"
+        )
+    check_identity(tables, robot, file, f"make them anew with {writer}")
     return tables
 
 
