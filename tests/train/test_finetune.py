@@ -253,7 +253,7 @@ def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
     with pytest.raises(ValueError, match=r"training of a base controller.*go on with .*train --robot anymal --resume"):
         finetune(resumed(run, iterations=4))
     with pytest.raises(ValueError, match=r"is a fine-tuning: go on with .*finetune --robot anymal --resume"):
-        read_saved(finished, "anymal", finetuning=False)
+        read_saved(finished, ROBOT, finetuning=False)
 
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):

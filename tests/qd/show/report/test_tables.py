@@ -100,6 +100,12 @@ def test_tables_of_another_archive_are_not_told_of_in_the_first_chapter(reported
     assert "Of 4 elites held out of training C-G mends 1 of 2" in text
 
 
+def test_tables_of_the_robot_before_it_changed_are_refused(tables):
+    changed(tables, robot_sha256="0" * 64)
+    with pytest.raises(ValueError, match=r"of robot 'anymal' as it was: .*expected SHA-256 000000000000.*evaluate"):
+        read_tables(tables, get_robot("anymal"))
+
+
 def test_controllers_and_archive_are_found_beside_the_tables_by_what_they_are(tables, run):
     robot = get_robot("anymal")
     shipped = hashlib.sha256(robot.policy_file.read_bytes()).hexdigest()
@@ -108,13 +114,13 @@ def test_controllers_and_archive_are_found_beside_the_tables_by_what_they_are(ta
     about = {"path": "/another/machine/archive", "elites": 20, "iterations": 4}
     controllers = {"base": {"policy": far, "sha256": shipped}, "C-G": {"policy": far, "sha256": tuned}}
     changed(tables, controllers=controllers, archive=about)
-    assert "The archive of the tables cannot" in changes_of(read_tables(tables, "anymal"), tables, robot).reason
+    assert "The archive of the tables cannot" in changes_of(read_tables(tables, robot), tables, robot).reason
     run.rename(tables.parent / "archive")
-    found = changes_of(read_tables(tables, "anymal"), tables, robot)
+    found = changes_of(read_tables(tables, robot), tables, robot)
     assert found.policies == {"base": "shipped", "C-G": str(tables.parent / "C-G.pt")}
     assert found.run == tables.parent / "archive" and found.archive is not None and found.reason == ""
     (tables.parent / "C-G.pt").write_text("another one")
-    reason = changes_of(read_tables(tables, "anymal"), tables, robot).reason
+    reason = changes_of(read_tables(tables, robot), tables, robot).reason
     assert reason.startswith("Controller C-G of the tables is not at /another/machine/policy.pt")
 
 
