@@ -254,9 +254,9 @@ def test_kept_crossings_are_those_of_the_robot_and_the_controller_as_they_are(do
     terrains = plain_set("hard_random", 2, 0)
 
     def file():
-        return KeptCrossings(Path("kept"), EvaluatorCfg(robot=str(dog), policy="", num_terrains=2)).file(
-            trot(dog), terrains
-        )
+        return KeptCrossings(
+            Path("kept"), EvaluatorCfg(robot=str(dog), policy="", num_terrains=2, num_replicas=1)
+        ).file(trot(dog), terrains)
 
     found, code = {file()}, dog.parent / "dog_trot.py"
     change_robot(dog)
