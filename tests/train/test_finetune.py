@@ -335,5 +335,6 @@ def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeyp
     if "--archive" not in flags and not {"hand-crafted", "hard-random"} & set(flags) and "--resume" not in flags:
         given += ["--archive", str(places / "archive" / "archive.npz")]
     assert run_command(Finetune, given, name="finetune") == 2
-    error = capsys.readouterr().err
-    assert message in error and error.startswith("error: ") and error.count("\n") == 1
+    lines = capsys.readouterr().err.splitlines()
+    (error,) = [line for line in lines if "names no hash" not in line]  # a warning of archives made by hand
+    assert message in error and error.startswith("error: ")
