@@ -9,6 +9,9 @@ from kernels.state import base_ang_vel_b, base_lin_vel_b
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 """Columns of the penalty sums."""
 
+PENALTY_DEFINITION = "absolute"
+"""How yaw_rate, vel_x and vel_y measure an error; runs, scales and recordings name it, and none of another is read."""
+
 BASE = 1
 FOOT = 2
 LIMB = 4

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
+from sim.robots.identity import FIRST_DEFINITION
 
 ARCHIVE_FILE = "archive.npz"
 """Name of the archive in a run directory."""
@@ -79,8 +80,18 @@ class Archive(Evaluation):
     """Clipped genes, shape (N, num_genes)."""
     iteration: NDArray[np.int64]
     """Iteration that found the elite, from 1, shape (N,)."""
+    robot_sha256: str | None = None
+    """Hash of the robot that was searched; None in a file of a version before there was one."""
+    policy_sha256: str | None = None
+    """Hash of its controller; None where it has no file."""
+    penalty_definition: str = FIRST_DEFINITION
+    """How its penalties are defined (:data:`kernels.penalties.PENALTY_DEFINITION`)."""
     fresh: FreshValues | None = None
     """What fresh episodes say of the elites; None if there were none."""
+
+    def named(self) -> dict[str, Any]:
+        """Robot, controller and definition of the penalties, as :func:`sim.robots.identity.identity` names them."""
+        return {name: getattr(self, name) for name in ("robot", *_HASHES)}
 
     def __len__(self) -> int:
         """Number of elites."""
@@ -133,11 +144,14 @@ class Archive(Evaluation):
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
 
-_SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations")
+_HASHES = ("robot_sha256", "policy_sha256", "penalty_definition")  # which a file may lack
+_SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations", *_HASHES)
 _PREFIX = "fresh_"
-_KINDS = {"robot": "U", "space": "U", "penalties": "U", "collision_bit": "b", "reproduced": "b"} | dict.fromkeys(
-    ("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"
-)
+_KINDS = {
+    **dict.fromkeys(("robot", "space", "penalties", *_HASHES), "U"),
+    **dict.fromkeys(("collision_bit", "reproduced"), "b"),
+    **dict.fromkeys(("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"),
+}
 _MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
 PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, "fresh"))
 """Names of the arrays that have one row an elite."""
@@ -151,7 +165,9 @@ def write_archive(path: Path, archive: Archive) -> None:
         archive: What to write.
     """
     buffer = io.BytesIO()
-    content: dict[str, Any] = {name: np.asarray(getattr(archive, name)) for name in _SETTINGS} | _arrays(archive)
+    settings = {name: getattr(archive, name) for name in _SETTINGS}
+    content: dict[str, Any] = {name: np.asarray(value) for name, value in settings.items() if value is not None}
+    content |= _arrays(archive)
     np.savez_compressed(buffer, **content)
     write_atomically(path, buffer.getvalue())
 
@@ -183,8 +199,9 @@ def read_archive(path: str | Path) -> Archive:
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
         with zipfile.ZipFile(file) as members:  # np.load would leave some checksums unread
-            names = [*_SETTINGS, *PER_ELITE]
-            if any(name.startswith(_PREFIX) for name in members.namelist()):  # then all of them, or it is damage
+            there = members.namelist()
+            names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _HASHES or f"{name}.npy" in there]
+            if any(name.startswith(_PREFIX) for name in there):  # then all of them, or it is damage
                 names += [_PREFIX + name for name in FRESH]
             content = {name: _read_array(members.read(f"{name}.npy")) for name in names}
         _check_kinds(content)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +20,14 @@ from qd.fitness import FITNESS_FLOOR, FitnessCfg, evaluation_of
 from qd.run.arguments import evaluator_of
 from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, origin_in, write_results
 from qd.run.progress import share_bar
-from qd.run.settings import SearchCfg, file_hash, policy_spec, refuse_unnamed_code
+from qd.run.settings import SearchCfg, as_settings, own_policy, suffix_of
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, open_evaluator, origin_of, resolve_device
 from qd.workers.invalid import tell_invalid
 from qd.workers.shards import taken
 from sim.files.command import Where, Who, command_line, naming_what_is_next
 from sim.files.intervals import bootstrap_interval, wilson_interval
-
-if TYPE_CHECKING:
-    from sim.robots.robot import RobotCfg
+from sim.policy.spec import spec_of
+from sim.robots.identity import identity
 
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""
@@ -191,7 +190,8 @@ class Reevaluate(Who, Where):
     """Evaluate every elite of a run again with 40 fresh episodes.
 
     An elite is the best of many noisy evaluations; its fresh episodes say what it is worth. The run's archive, numbers
-    and figures are written again with them, elites by descending corrected fitness.
+    and figures are written again with them, elites by descending corrected fitness. With another controller than was
+    searched (--policy), archive-<its name>.npz and archive-<its name>.json are written instead.
     """
 
     run: Path | None = None
@@ -216,7 +216,8 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
 
     Raises:
         FileNotFoundError: If there is no run.
-        ValueError: If the run is damaged or empty, its controller is another now, or an argument is not as it must be.
+        ValueError: If the run is damaged or empty, its robot or controller is another now, or an argument is not as it
+            must be.
         Interrupted: On Ctrl-C; the run is as it was.
         EvaluatorError: If a worker is lost; likewise.
     """
@@ -225,12 +226,13 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
     path = args.run or newest_run(get_robot(args.robot or "anymal"), args.policy)
     run = RunDirectory(path)
     config, cfg = run.read_config(), run.read_cfg()
-    robot = robot_of(cfg.robot, args.robot, path)
+    robot = robot_of(as_settings(cfg), args.robot, path)
     seed = cfg.seed if args.seed is None else args.seed
     if seed < 0:
         raise ValueError(f"seed must be at least 0, got {seed}")
     device = resolve_device(args.device, args.workers)
-    policy = args.policy or _own_policy(path, cfg, robot)
+    policy = own_policy(path, cfg, robot) if args.policy is None else spec_of(args.policy, robot)
+    suffix = suffix_of(cfg, policy, robot)
     evaluator = evaluator_of(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
     given = {"run": path, "policy": args.policy, "seed": args.seed, "device": args.device, "workers": args.workers}
     again = f"Start again with:  {command_line('reevaluate', robot=robot.spec, **given)}"
@@ -243,23 +245,9 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         with naming_what_is_next(f"{path} is as it was", lambda: again):
             found = archive_of(cfg, search, len(metrics))
             archive = corrected(found, cfg, evaluator, open_evaluator, seed)
-        by = origin_of(device, seed, args.workers)
-        if args.policy is not None:
-            by |= {"policy": args.policy, "policy_sha256": file_hash(args.policy)}
+        by = {**origin_of(device, seed, args.workers), **identity(robot, policy)}
         with naming_what_is_next("some files may not be written", lambda: again):
-            write_results(run, archive, metrics, origin_in(config), reproduced_by=by)
+            if suffix:
+                print(f"With another controller than was searched, {policy}: the run's own files stay as they are.")
+            write_results(run, archive, metrics, origin_in(config), reproduced_by=by, suffix=suffix)
     return archive
-
-
-def _own_policy(path: Path, cfg: SearchCfg, robot: "RobotCfg") -> str:
-    """The run's own controller, which must be what it was."""
-    refuse_unnamed_code(cfg.policy, None, path)
-    policy = policy_spec(cfg, robot)
-    digest = file_hash(policy)
-    if digest != cfg.policy_sha256:
-        state = "lost" if digest is None else "another one now"
-        raise ValueError(
-            f"{path} was searched with the controller in {policy}, which is {state} (expected SHA-256 "
-            f"{cfg.policy_sha256}, got {digest}): put it back, or say with --policy which one to evaluate with"
-        )
-    return policy

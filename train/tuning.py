@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from qd.archive import read_archive
-from qd.run.directory import published_or_newest
+from qd.run.directory import published_or_newest, read_archive_of
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
@@ -176,7 +175,7 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace,
     named = None if flags.policy is None else str(flags.policy)
     path = flags.archive or published_or_newest(robot, named, flag="archive")
     try:
-        archive = read_archive(path)
+        archive = read_archive_of(robot, path)
     except FileNotFoundError as error:
         make = command_line("archive", robot=robot.spec, policy=named)
         raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error
@@ -188,8 +187,11 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace,
 
 
 def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, Any]) -> None:
-    """Nothing but the iterations may change, and where the archive lies: its hash says whether it is the same."""
-    free = ("iterations ", "archive.path ")
+    """Nothing but the iterations may change, and where the archive lies: its hash says whether it is the same.
+
+    The robot was compared when the checkpoint was read; an older one names no hash of it.
+    """
+    free = ("iterations ", "archive.path ", "robot_sha256 ")
     different = [line for line in check_resumed(flags, saved, settings) if not line.startswith(free)]
     if different:
         raise ValueError(

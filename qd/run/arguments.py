@@ -137,7 +137,9 @@ def job_of(args: Archive) -> Job:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
     there = RunDirectory(args.resume).read_cfg() if args.resume else None
     robot = (
-        robot_of(there.robot, args.robot, args.resume) if there and args.resume else get_robot(args.robot or "anymal")
+        robot_of(as_settings(there), args.robot, args.resume)
+        if there and args.resume
+        else get_robot(args.robot or "anymal")
     )
     device = resolve_device(args.device, args.workers)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
@@ -153,6 +155,8 @@ def job_of(args: Archive) -> Job:
         name = args.preset or ("wide" if device.startswith("cuda") else "small")
         cfg = measured_now(changed(preset(name, robot, args.policy), changes), robot)
         path = _free_path(args, cfg, robot)
+        if told := robot.scaled_by_another(policy_spec(cfg, robot)):
+            print(told)
     get_space(cfg.space)
     now = origin_of(device, cfg.seed, args.workers)
     named = moved or code_of(cfg)

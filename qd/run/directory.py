@@ -19,7 +19,7 @@ from qd.run.progress import clock
 from qd.run.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
 from sim.files.command import command_line
-from sim.policy.spec import controller_suffix
+from sim.robots.identity import FIRST_DEFINITION, check_robot
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
@@ -91,6 +91,33 @@ def directory_of(run: Path) -> Path:
     return run if run.is_dir() else run.parent
 
 
+def named_by(run: Path, archive: Archive) -> dict[str, Any]:
+    """What an archive is of (:func:`sim.robots.identity.identity`), or the config beside it where the file names none.
+
+    Args:
+        run: Run directory or archive file.
+        archive: What it holds.
+    """
+    folder = RunDirectory(directory_of(run))
+    if archive.robot_sha256 is not None or not (folder.path / CONFIG_FILE).exists():
+        return archive.named()
+    settings = folder.read_config()["settings"]
+    return archive.named() | {name: settings[name] for name in ("robot_sha256", "policy_sha256") if name in settings}
+
+
+def read_archive_of(robot: "RobotCfg", run: Path) -> Archive:
+    """An archive whose terrains alone are taken; of another robot's name it is for the caller to refuse.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        ValueError: If it is damaged, or of the robot as it was before it changed.
+    """
+    archive = read_archive(run)
+    if archive.robot == robot.name:
+        check_robot(named_by(run, archive), robot, run, "put back what was there then, or give another archive")
+    return archive
+
+
 def folder_for(run: Path, robot: str) -> Path:
     """Where what is made from a run goes: into its directory, or of a published one to runs/<robot>-published.
 
@@ -101,17 +128,6 @@ def folder_for(run: Path, robot: str) -> Path:
     folder = directory_of(run)
     published = RESULTS.resolve() in folder.resolve().parents
     return RUNS / f"{robot}-published" if published else folder
-
-
-def elite_name(elite: int, policy: str, searched: str) -> str:
-    """What a file about an elite is called: elite-3; of another controller than the search's elite-3-C-G.
-
-    Args:
-        elite: Its number.
-        policy: The controller that crosses it.
-        searched: That of the search.
-    """
-    return f"elite-{elite}{controller_suffix(policy, searched)}"
 
 
 def numbered(root: Path, name: str) -> Iterator[Path]:
@@ -295,7 +311,7 @@ class RunDirectory:
         there, metrics = state.get("settings"), state.get("metrics")
         if not isinstance(there, dict) or not isinstance(metrics, list):
             raise ValueError(f"{file} is no checkpoint of a search: it lacks settings or metrics; {_REMEDY}")
-        different = differences(there, as_settings(cfg))
+        different = differences({"penalty_definition": FIRST_DEFINITION, **there}, as_settings(cfg))
         if different:
             raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}; {_REMEDY}")
         try:
@@ -315,6 +331,9 @@ def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
         intervals=cfg.intervals,
         collision_bit=cfg.collision_bit,
         iterations=iterations,
+        robot_sha256=cfg.robot_sha256,
+        policy_sha256=cfg.policy_sha256,
+        penalty_definition=cfg.penalty_definition,
         **elites,
     )
 
@@ -326,6 +345,7 @@ def write_results(
     origin: dict[str, Any],
     *,
     reproduced_by: dict[str, Any] | None = None,
+    suffix: str = "",
 ) -> None:
     """Writes what a search leaves to look at, and says what it is.
 
@@ -335,18 +355,26 @@ def write_results(
         metrics: One row an iteration.
         origin: Provenance, with the sessions of the run.
         reproduced_by: Provenance of the fresh values; left out, what the run's summary says stays.
+        suffix: Ending of the names of archive and summary, where the fresh values are of another controller than the
+            search's; all other files stay as they are.
     """
     from qd.show.figures import summary, write_figures
 
-    run.write_derived(metrics, archive)
+    archive_file, summary_file = (
+        file.with_stem(file.stem + suffix) for file in (run.path / ARCHIVE_FILE, run.path / SUMMARY_FILE)
+    )
+    if suffix:
+        write_archive(archive_file, archive)
+    else:
+        run.write_derived(metrics, archive)
     if reproduced_by is None and archive.fresh is not None:
         reproduced_by = run.read_summary().get("reproduced_by")
     sessions = reached(origin["sessions"], len(metrics))
     origin = {**origin, "sessions": sessions, "reproduced_by": reproduced_by}
-    figures = write_figures(run.path, archive, metrics)
+    figures = [] if suffix else write_figures(run.path, archive, metrics)
     gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
     numbers = summary(archive, metrics, gpus=gpus, origin=origin)
-    write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
+    write_atomically(summary_file, to_json(numbers))
     if archive.fresh is None:
         print(
             f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
@@ -358,5 +386,5 @@ def write_results(
     print(
         f"Corrected by fresh episodes: {numbers['elites_reproduced']:,} of {len(archive):,} elites reproduced, "
         f"{numbers['corrected_coverage']:.1%} of the reachable cells, QD score {numbers['corrected_qd_score']:.0f}; "
-        f"in {run.path / SUMMARY_FILE} and the figures"
+        f"in {summary_file} and {archive_file if suffix else 'the figures'}"
     )

@@ -14,7 +14,8 @@ from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from sim.files.command import split_words
 from sim.files.settings import built, check, setting
-from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
+from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, label_suffix, spec_of
+from sim.robots.identity import FIRST_DEFINITION, robot_identity
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -96,7 +97,7 @@ class SearchCfg:
     policy: str
     """Controller: ``shipped``, or as :func:`sim.policy.loaders.load_policy` takes it."""
     policy_sha256: str | None
-    """Hash of the controller's files, None for the code of a module."""
+    """Hash of the controller's files, None where there are none."""
     seed: int = setting(least=0)
     iterations: int = setting(least=1)
     """Iterations to reach; may be raised later."""
@@ -111,7 +112,9 @@ class SearchCfg:
     space: str = "super_gaussian"
     """Terrain space (:data:`sim.space.SPACES`)."""
     robot_sha256: str | None = None
-    """Hash of the settings, model and meshes of a robot that is not shipped."""
+    """Hash of the robot's settings, model and meshes; None in a run of a version before there was one."""
+    penalty_definition: str = FIRST_DEFINITION
+    """How the penalties are defined (:data:`kernels.penalties.PENALTY_DEFINITION`)."""
     reevaluate_every: int = setting(50, least=0)
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
 
@@ -234,11 +237,6 @@ def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
     return spec_of(cfg.policy, robot)
 
 
-def file_hash(policy: str | Path) -> str | None:
-    """SHA-256 of a controller's file or files; None where there are none, as of ``module:callable``."""
-    return ControllerSpec.parse(policy).digest()
-
-
 def kept_penalties(robot: "RobotCfg", without: Sequence[str]) -> tuple[str, ...]:
     """The robot's penalties but for some.
 
@@ -272,8 +270,6 @@ def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
     Raises:
         ValueError: If the robot lacks one of the penalties, or their scales were never measured.
     """
-    from sim.robots.own import robot_digest
-
     penalties = cfg.fitness.penalties
     _check_known(penalties, robot)
     named = None if cfg.policy == SHIPPED else cfg.policy
@@ -281,8 +277,8 @@ def measured_now(cfg: SearchCfg, robot: "RobotCfg") -> SearchCfg:
     return replace(
         cfg,
         robot=robot.name,
-        robot_sha256=None if robot.settings_file is None else robot_digest(robot),
-        policy_sha256=file_hash(policy_spec(cfg, robot)),
+        **robot_identity(robot),
+        policy_sha256=controller_hash(policy_spec(cfg, robot)),
         fitness=replace(cfg.fitness, scales=tuple(scales[name] for name in penalties)),
         collision_bit=robot.collision_bit,
     )
@@ -313,8 +309,38 @@ def refuse_unnamed_code(policy: str, given: str | None, path: Path) -> None:
 
 def moved_policy(there: SearchCfg, given: str | None) -> str | None:
     """The file given for a run's controller, if it is the run's own in another place."""
-    same = given is not None and there.policy_sha256 is not None and file_hash(given) == there.policy_sha256
+    same = given is not None and there.policy_sha256 is not None and controller_hash(given) == there.policy_sha256
     return given if same else None
+
+
+def is_searched(cfg: SearchCfg, policy: str, robot: "RobotCfg") -> bool:
+    """Whether a controller is that of a search: by its hash, or by its name where it has none."""
+    if cfg.policy_sha256 is None:
+        return policy == policy_spec(cfg, robot)
+    return controller_hash(policy) == cfg.policy_sha256
+
+
+def suffix_of(cfg: SearchCfg, policy: str, robot: "RobotCfg") -> str:
+    """The ending of the names of what is made of a run with a controller: empty for the search's, else ``-C-G``."""
+    return "" if is_searched(cfg, policy, robot) else label_suffix(policy)
+
+
+def own_policy(path: Path, cfg: SearchCfg, robot: "RobotCfg") -> str:
+    """The controller that a run was searched with, which must be what it was.
+
+    Raises:
+        ValueError: If it is lost, another one now, or code, which only the command line may name.
+    """
+    refuse_unnamed_code(cfg.policy, None, path)
+    policy = policy_spec(cfg, robot)
+    if not is_searched(cfg, policy, robot):
+        digest = controller_hash(policy)
+        state = "lost" if digest is None else "another one now"
+        raise ValueError(
+            f"{path} was searched with the controller in {policy}, which is {state} (expected SHA-256 "
+            f"{cfg.policy_sha256}, got {digest}): put it back, or say with --policy which one to cross with"
+        )
+    return policy
 
 
 def resumed(path: Path, there: SearchCfg, robot: "RobotCfg", changes: Settings, moved: str | None) -> SearchCfg:
@@ -323,23 +349,19 @@ def resumed(path: Path, there: SearchCfg, robot: "RobotCfg", changes: Settings, 
     Args:
         path: Its directory.
         there: Its settings.
-        robot: Its robot as it is now.
+        robot: Its robot as it is now, by :func:`sim.robots.robot.robot_of`.
         changes: What the command line gives, as :func:`changed` takes it.
         moved: Where the run's controller is now, if elsewhere.
 
     Raises:
-        ValueError: If its robot is another now, its controller is lost, or a setting is out of range.
+        ValueError: If its controller is lost, or a setting is out of range.
     """
     if moved is not None:
-        changes = {**changes, "policy": None}
+        changes = {**changes, "policy": moved}
     wanted = measured_now(changed(there, changes), robot)
-    if wanted.robot_sha256 != there.robot_sha256:
-        raise ValueError(
-            f"{path} was searched with robot '{there.robot}' as it was: its settings, model or meshes have changed "
-            f"since ({robot.spec}): put them back, or start a new run"
-        )
+    wanted = replace(wanted, robot_sha256=there.robot_sha256)  # was compared; a run that names none goes on so
     if moved is not None:
-        return replace(wanted, policy_sha256=there.policy_sha256)
+        return replace(wanted, policy=there.policy)
     if wanted.policy == there.policy and there.policy_sha256 is not None and wanted.policy_sha256 is None:
         raise ValueError(
             f"{path} was searched with the controller in {policy_spec(there, robot)}, got no such file now: put it "

@@ -17,14 +17,16 @@ from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OnDevice, Who, split_words
 from sim.files.intervals import rate_words, wilson_interval
-from sim.policy.spec import ControllerSpec, who_crossed
+from sim.policy.spec import who_crossed
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.show.crossed import Crossed
+    from sim.robots.robot import RobotCfg
 
 OWN_FOLDER = RUNS / "terrains"
-_LONGEST_NAME = 120  # characters of a path; with robot, controller and ending a file may have 255
 """Where what is made of a user's own terrains goes."""
+_LONGEST_NAME = 120  # characters of a path; with robot, controller and ending a file may have 255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +129,7 @@ def cross(cfg: Cross) -> dict[str, Any]:
     prepare_output(out)
     print(f"{cfg.terrain}: {terrain.fitted}", flush=True)
     (recording,) = Recordings(robot, device=device).all_of([wanted])
-    origin, about = origin_of(device, cfg.seed, None), _about(cfg, robot.name, terrain, policy)
+    origin, about = origin_of(device, cfg.seed, None), _about(cfg, robot, terrain, policy)
     refuse_all_invalid(recording.result())
     crossed = crossed_of(recording, recording.penalty_names, (1.0,) * len(recording.penalty_names))
     report = {**origin, **about, **numbers_of(crossed)}
@@ -158,13 +160,9 @@ def _outputs(cfg: Cross, who: str) -> tuple[Path, Path]:
     return out, figure
 
 
-def _about(cfg: Cross, robot: str, terrain: OwnTerrain, policy: str) -> dict[str, Any]:
-    from sim.policy.spec import controller_hash
-
+def _about(cfg: Cross, robot: "RobotCfg", terrain: OwnTerrain, policy: str) -> dict[str, Any]:
     return {
-        "robot": robot,
-        "policy": ControllerSpec.parse(policy).label,
-        "policy_sha256": controller_hash(policy),
+        **identity(robot, policy),
         "terrain": str(cfg.terrain),
         "terrain_sha256": hashlib.sha256(cfg.terrain.read_bytes()).hexdigest(),
         "map": terrain.fitted,

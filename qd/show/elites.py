@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.fitness import FAILING_GOAL_RATE, FitnessCfg
-from qd.run.directory import CONFIG_FILE, RunDirectory, directory_of, newest_or_published
-from qd.run.settings import refuse_unnamed_code
+from qd.run.directory import CONFIG_FILE, RunDirectory, directory_of, named_by, newest_or_published
+from qd.run.settings import SearchCfg, own_policy, suffix_of
 from sim.files.command import chosen_elites, command_line
-from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
+from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, label_suffix, spec_of
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -48,9 +48,15 @@ class Found:
         Raises:
             ValueError: If the config is not that of the archive, or damaged.
         """
+        archive, cfg = self.archive, self._search()
+        if cfg is None:
+            return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)
+        return cfg.policy, cfg.fitness
+
+    def _search(self) -> SearchCfg | None:
         archive, file = self.archive, self.folder / CONFIG_FILE
         if not file.exists():
-            return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)
+            return None
         cfg = RunDirectory(self.folder).read_cfg()
         there = (cfg.fitness.penalties, cfg.fitness.scales)
         if there != (archive.penalties, archive.scales):
@@ -58,17 +64,38 @@ class Found:
                 f"{file} must have the penalties and scales of its archive, {', '.join(archive.penalties)}: "
                 f"{archive.scales}, got {', '.join(there[0])}: {there[1]}: put back the one that is not this run's"
             )
-        return cfg.policy, cfg.fitness
+        return cfg
 
     def policy(self, given: str | None) -> str:
         """The controller to cross with: the one given, or that of the search.
 
         Raises:
-            ValueError: If that of the search is code, or the config is not that of the archive.
+            ValueError: If that of the search is code, lost or another one now, or the config is not that of the
+                archive.
         """
-        searched, _ = self.as_searched()
-        refuse_unnamed_code(searched, given, self.run)
-        return spec_of(given or searched, self.robot)
+        cfg = self._search()
+        if given is None and cfg is not None:
+            return own_policy(self.run, cfg, self.robot)
+        policy, searched = spec_of(given or SHIPPED, self.robot), self.archive.policy_sha256
+        if given is None and searched not in (None, found := controller_hash(policy)):
+            raise ValueError(
+                f"{self.run} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
+                f"{found}): say with --policy which one to cross with"
+            )
+        return policy
+
+    def suffix(self, policy: str) -> str:
+        """The ending of the names of what is made with a controller: empty for the search's, else such as ``-C-G``.
+
+        Raises:
+            ValueError: If the config is not that of the archive.
+        """
+        cfg = self._search()
+        if cfg is None:
+            searched, own = self.archive.policy_sha256, str(self.robot.policy_file)
+            same = is_same(policy, own) if searched is None else controller_hash(policy) == searched
+            return "" if same else label_suffix(policy)
+        return suffix_of(cfg, policy, self.robot)
 
     def one(self, text: str) -> int:
         """The elite that a command line names, where only one makes sense.
@@ -113,7 +140,7 @@ def find_archive(named: str | None, run: Path | None, policy: str | None = None)
         robot_named(named)  # an unknown name is said first
     run = run or newest_or_published(robot_named(named), policy)
     archive = read_archive(run)
-    robot = robot_of(archive.robot, named, run)
+    robot = robot_of(named_by(run, archive), named, run)
     unknown = [name for name in archive.penalties if name not in robot.penalties]
     if unknown:
         raise ValueError(

@@ -84,7 +84,7 @@ def export(cfg: Export) -> list[Path]:
                 index.append({**about, "files": stem.name})
                 bar.update()
     files.append(folder / INDEX_FILE)
-    write_atomically(files[-1], to_json({"robot": archive.robot, "formats": formats, "elites": index, **origin}))
+    write_atomically(files[-1], to_json({**archive.named(), "formats": formats, "elites": index, **origin}))
     print(f"{len(elites)} elite{'s' * (len(elites) != 1)} as {', '.join(formats)}: {folder}")
     return files
 

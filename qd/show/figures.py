@@ -264,7 +264,7 @@ def summary(
     with_collision = int(archive.collided.sum())
     return {
         **origin,
-        "robot": archive.robot,
+        **archive.named(),
         "space": archive.space,
         "iterations": archive.iterations,
         "terrains_evaluated": sum(row["terrains"] for row in metrics),

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from qd.run.directory import elite_name, folder_for
+from qd.run.directory import folder_for
 from qd.show.cross import OWN_FOLDER, Mapped, name_of_map, read_own_terrain
 from qd.show.elites import find_archive, robot_named
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import prepare_output, write_atomically
 from sim.files.command import OnDevice, Which, Who, chosen_elites
 from sim.files.settings import check, setting
-from sim.policy.spec import spec_of, who_crossed
+from sim.policy.spec import who_crossed
 
 if TYPE_CHECKING:
     from sim.recording.recorder import Recording
@@ -68,6 +68,7 @@ class Order(NamedTuple):
 
     recording: "Recording"
     """Of that terrain alone."""
+    robot: "RobotCfg"
     out: Path
     scales: dict[str, float]
 
@@ -110,12 +111,13 @@ def _elite_orders(cfg: Film) -> Iterator[Order]:
     found = find_archive(cfg.robot, cfg.run, cfg.policy)
     archive, robot = found.archive, found.robot
     elites = chosen_elites(cfg.elite, len(archive), found.run)
-    policy, searched = found.policy(cfg.policy), spec_of(found.as_searched()[0], robot)
+    policy = found.policy(cfg.policy)
+    suffix = found.suffix(policy)
     if cfg.out is not None and len(elites) == 1 and not cfg.out.is_dir():
         outs = [cfg.out]
     else:
         folder = cfg.out or folder_for(found.run, robot.name)
-        outs = [folder / f"{elite_name(elite, policy, searched)}.mp4" for elite in elites]
+        outs = [folder / f"elite-{elite}{suffix}.mp4" for elite in elites]
     device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
     prepare_output(outs[0])
@@ -128,7 +130,7 @@ def _elite_orders(cfg: Film) -> Iterator[Order]:
     ]  # fmt: skip
     scales = dict(zip(archive.penalties, archive.scales, strict=True))
     orders = [
-        Order(recording, out, scales)
+        Order(recording, robot, out, scales)
         for recording, out in zip(Recordings(robot, device=device).all_of(wanted), outs, strict=True)
     ]
     for order in orders:
@@ -147,7 +149,7 @@ def _own_order(cfg: Film, path: Path) -> Order:
     prepare_output(out)
     wanted = on_heights(terrain.heights, label=terrain.label, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
     (recording,) = Recordings(robot, device=device).all_of([wanted])
-    order = Order(recording, out, _scales_of(robot, cfg.policy))
+    order = Order(recording, robot, out, _scales_of(robot, cfg.policy))
     _keep(order)
     return order
 
@@ -157,7 +159,7 @@ def _kept_orders(cfg: Film, path: Path) -> Iterator[Order]:
     from sim.robots.robot import robot_of
 
     recording = read_recording(path)
-    robot = robot_of(recording.robot, cfg.robot, path)
+    robot = robot_of({**recording.origin, "robot": recording.robot}, cfg.robot, path)
     if recording.joint_names != robot.joint_names:
         raise ValueError(f"{path} is of other joints than {robot.name} has: give the --robot that was recorded")
     stem = path.name.removesuffix(_RECORDING).removesuffix(".npz")
@@ -166,7 +168,7 @@ def _kept_orders(cfg: Film, path: Path) -> Iterator[Order]:
         name = f"{stem}.mp4" if single else f"{stem}-{k}.mp4"
         out = cfg.out if cfg.out and single and not cfg.out.is_dir() else (cfg.out or path.parent) / name
         prepare_output(out)
-        yield Order(recording.of_terrain(k), out, _scales_of(robot, cfg.policy))
+        yield Order(recording.of_terrain(k), robot, out, _scales_of(robot, cfg.policy))
 
 
 def _keep(order: Order) -> None:
@@ -188,10 +190,8 @@ def _scales_of(robot: "RobotCfg", policy: str | None) -> dict[str, float]:
 def _film(order: Order, cfg: Film) -> None:
     from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, num_pictures, typical_episode
     from sim.recording.renderer import Renderer
-    from sim.robots.robot import robot_of
 
-    recording = order.recording
-    robot = robot_of(recording.robot, cfg.robot, order.out)
+    recording, robot = order.recording, order.robot
     replicas = recording.replicas.tolist()
     if cfg.replica is not None and cfg.replica not in replicas:
         raise ValueError(f"episode {cfg.replica} was not recorded, expected one of {', '.join(map(str, replicas))}")

@@ -20,6 +20,7 @@ from qd.run.progress import share_bar
 from qd.workers.evaluator import episode_seeds
 from sim.files.provenance import code_fingerprint
 from sim.policy.spec import controller_hash
+from sim.robots.identity import robot_identity
 
 if TYPE_CHECKING:
     from sim.recording.recorder import Recording
@@ -155,11 +156,10 @@ class Recordings:
         published: Path | None = None,
         cross: Cross | None = None,
     ) -> None:
-        from sim.robots.own import robot_digest
-
         on_gpu = device.startswith("cuda")  # its last bits differ from a CPU's
         self._robot, self._folder, self._published = robot, folder, published
-        self._code = f"{code_fingerprint(_ROOMS)} {robot_digest(robot)}{' cuda' * on_gpu}"
+        self._about = robot_identity(robot)
+        self._code = f"{code_fingerprint(_ROOMS)}{' cuda' * on_gpu}"
         self._at_once = _AT_ONCE if on_gpu else 1
         self._cross = cross or Simulation(robot, device)
         self._last: tuple[Wanted, Recording] | None = None
@@ -242,8 +242,7 @@ class Recordings:
         return None if self._published is None else self._published / f"{self._key(wanted, '')}.npz"
 
     def _key(self, wanted: Wanted, code: str) -> str:
-        model = hashlib.sha256(self._robot.model_file.read_bytes()).hexdigest()
-        identity: list[Any] = [self._robot.name, model, controller_hash(wanted.policy), [wanted.terrain_seed]]
+        identity: list[Any] = [self._about, controller_hash(wanted.policy), [wanted.terrain_seed]]
         identity += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), code]
         return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:_KEY_LENGTH]
 
@@ -254,6 +253,7 @@ class Recordings:
         terrain = recording.heights if recording.genes is None else recording.genes
         return (
             recording.robot == self._robot.name
+            and self._about.items() <= recording.origin.items()
             and recording.joint_names == self._robot.joint_names
             and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
             and space_in(recording.origin) == wanted.space

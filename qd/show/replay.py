@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 from qd.archive import Archive
 from qd.fitness import Evaluation, evaluation_of
-from qd.run.directory import elite_name, folder_for
+from qd.run.directory import folder_for
 from qd.show.elites import Found, find_archive
 from qd.show.figures import look_of, save_figure
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import OnDevice, Which, Who
 from sim.files.intervals import rate_words
-from sim.policy.spec import ControllerSpec, is_same, spec_of
+from sim.policy.spec import ControllerSpec
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,10 +71,10 @@ def replay(cfg: ReplayElite) -> Replay:
     found = find_archive(cfg.robot, cfg.run, cfg.policy)
     archive, robot = found.archive, found.robot
     elite = found.one(cfg.elite)
-    policy, (searched, fitness) = found.policy(cfg.policy), found.as_searched()
-    searched = spec_of(searched, robot)
+    policy, (_, fitness) = found.policy(cfg.policy), found.as_searched()
+    suffix = found.suffix(policy)
     wanted = on_elite(archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
-    out = cfg.out or folder_for(found.run, robot.name) / f"{elite_name(elite, policy, searched)}.png"
+    out = cfg.out or folder_for(found.run, robot.name) / f"elite-{elite}{suffix}.png"
     if out.suffix != ".png":
         raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
     device = resolve_device(cfg.device)
@@ -87,7 +87,7 @@ def replay(cfg: ReplayElite) -> Replay:
         elite=elite,
         recording=recording,
         fresh=evaluation_of(recording.result(), archive.cells, fitness),
-        controller="" if is_same(policy, searched) else policy,
+        controller=policy if suffix else "",
     )
 
 

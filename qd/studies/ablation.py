@@ -22,6 +22,7 @@ from qd.run.settings import (
 from qd.studies.study import LOOKS, StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, resolve_device
 from sim.files.command import publish
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +70,7 @@ class Ablation(StudyFlags):
             base = self._begun(robot, device)
         else:
             there = RunDirectory(self.run).read_cfg()
-            robot = robot_of(there.robot, self.robot, self.run)
+            robot = robot_of(as_settings(there), self.robot, self.run)
             moved = moved_policy(there, self.policy)
             base, names = self._of_run(self.run, there, robot, moved), ["alpha_0"]
         if base.iterations < base.reevaluate_every:
@@ -85,7 +86,7 @@ class Ablation(StudyFlags):
             if self.run is not None:
                 metrics["alpha_1"] = RunDirectory(self.run).read_metrics()
             numbers = numbers_of(metrics, base.iterations)
-            return {**study.origin, "robot": robot.name, "preset": base.preset, **numbers}
+            return {**study.origin, **identity(robot, study.evaluator.policy), "preset": base.preset, **numbers}
 
         return publish(study.out, measure, _show, draw=lambda report: as_png(draw_ablation(report)))
 

@@ -50,7 +50,7 @@ class Beside:
         sides = sides_of(self.runs)
         report = {
             **provenance("cpu", 0),
-            "robot": sides[0].archive.robot,
+            **{key: sides[0].settings[key] for key in ("robot", "robot_sha256", "penalty_definition")},
             "iterations": sides[0].archive.iterations,
             "runs": {side.name: numbers_of(side) for side in sides},
         }

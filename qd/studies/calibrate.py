@@ -9,7 +9,7 @@ import io
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,8 @@ from sim.files.atomic import write_atomically
 from sim.files.command import Where, Who, naming_what_is_next, publish
 from sim.files.provenance import code_fingerprint
 from sim.files.settings import check, setting
-from sim.policy.spec import ControllerSpec, controller_hash
+from sim.policy.spec import controller_hash
+from sim.robots.identity import identity, robot_identity
 
 if TYPE_CHECKING:
     from qd.fresh import Open
@@ -67,6 +68,7 @@ class Calibrate(Who, Where):
             EvaluatorError: If a worker is lost; what was crossed is kept.
         """
         from qd.workers import evaluator as workers
+        from sim.crossing import CrossingCfg
         from sim.robots.robot import get_robot
         from sim.space import get_space
 
@@ -110,8 +112,9 @@ class Calibrate(Who, Where):
             tell_invalid(crossed, "hard-random terrains")
             return {
                 **workers.origin_of(device, self.seed, self.workers),
-                "robot": robot.name,
-                "policy": ControllerSpec.parse(policy).label,
+                **identity(robot, policy),
+                "space": self.space,
+                "crossing": asdict(CrossingCfg()),
                 **_measured(crossed),
             }
 
@@ -155,8 +158,6 @@ class _Kept:
     """
 
     def __init__(self, file: Path, robot: "RobotCfg", evaluator: "EvaluatorCfg", drawn: list[int]) -> None:
-        from sim.robots.own import robot_digest
-
         self.file, self._names = file, robot.penalties
         self._empty = Crossed(
             penalties=np.zeros((0, evaluator.num_replicas, len(self._names))),
@@ -164,8 +165,7 @@ class _Kept:
             penalty_names=self._names,
         )
         controller = controller_hash(evaluator.policy)
-        model = hashlib.sha256(robot.model_file.read_bytes()).hexdigest()
-        way = [robot.name, robot_digest(robot), model, controller, evaluator.space, evaluator.num_replicas, *drawn]
+        way = [robot_identity(robot), controller, evaluator.space, evaluator.num_replicas, *drawn]
         way += [evaluator.device.startswith("cuda"), code_fingerprint(("kernels", "sim")), *self._names]
         self._key = None if controller is None else hashlib.sha256(json.dumps(way).encode()).hexdigest()
 

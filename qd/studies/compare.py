@@ -17,6 +17,7 @@ from qd.workers.evaluator import open_evaluator, resolve_device
 from sim.files.command import publish
 from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
 from sim.files.settings import check, setting
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -110,7 +111,7 @@ class Compare(StudyFlags):
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds] for name in methods}
             return {
                 **study.origin,
-                "robot": robot.name,
+                **identity(robot, study.evaluator.policy),
                 "preset": size,
                 "seeds": list(seeds),
                 "reachable_cells": shared.cells.num_cells,

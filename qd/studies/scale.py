@@ -17,6 +17,7 @@ from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, r
 from sim.files.command import OfRobot, OnDevice, publish, show_json
 from sim.files.provenance import provenance
 from sim.files.settings import check, setting
+from sim.robots.identity import identity
 
 _PAPER_ITERATIONS = 1000
 
@@ -109,7 +110,7 @@ def measure(args: Scale) -> dict[str, Any]:
     last = rows[-1]
     return {
         **provenance(device, args.seed),
-        "robot": robot.name,
+        **identity(robot, robot.policy_file),
         "gpus": last["workers"] if on_gpu else 0,
         "workers": last["workers"],
         "envs_per_worker": terrains * replicas,

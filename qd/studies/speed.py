@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from qd.run.arguments import evaluator_of
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.progress import ProgressBar
-from qd.run.settings import SearchCfg, changed, policy_spec, preset, refuse_unnamed_code
+from qd.run.settings import SearchCfg, as_settings, changed, own_policy, policy_spec, preset
 from qd.search import begin, search_terrains
 from qd.workers.evaluator import EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
 from sim.files.atomic import read_json
 from sim.files.command import OfRobot, OnDevice, publish, show_json
 from sim.files.provenance import provenance
 from sim.files.settings import check, setting
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
@@ -217,13 +218,13 @@ def measure(args: Speed) -> dict[str, Any]:
         raise ValueError(f"--run and --kernels need a CUDA device, got {device}")
     if args.run is not None:
         cfg, metrics, terrains = read_iterations(args.run, args.iterations, name)
-        robot = robot_of(cfg.robot, args.robot, args.run)
-        refuse_unnamed_code(cfg.policy, None, args.run)
+        robot = robot_of(as_settings(cfg), args.robot, args.run)
+        policy = own_policy(args.run, cfg, robot)
     else:
         cfg = changed(preset(args.preset, robot), {"iterations": args.iterations + _WARM_UP})
-        metrics, terrains = [], None
+        policy, metrics, terrains = policy_spec(cfg, robot), [], None
     # In one process, as bare physics is measured.
-    evaluator = evaluator_of(cfg, robot, policy_spec(cfg, robot), device, "1")
+    evaluator = evaluator_of(cfg, robot, policy, device, "1")
     if terrains is None:
         metrics, terrains = time_iterations(cfg, evaluator)
         metrics = metrics[_WARM_UP:]
@@ -236,7 +237,7 @@ def measure(args: Speed) -> dict[str, Any]:
     running = [(1.0 - row["idle_share"]) * rate for row, rate in zip(metrics, rates, strict=True)]
     return {
         **provenance(device, cfg.seed),
-        "robot": robot.name,
+        **identity(robot, policy),
         "preset": args.preset if args.run is None else None,
         "run": None if args.run is None else str(args.run),
         "num_envs": num_envs,

@@ -88,6 +88,8 @@ def study_of(
     cfg = next(iter(runs.values()))
     path = flags.run_dir or RUNS / f"{robot.name}-{name}"
     controller = moved or policy_spec(cfg, robot)
+    if told := robot.scaled_by_another(controller):
+        print(told)
     return Study(
         path=path,
         out=flags.out or path / f"{name}.json",

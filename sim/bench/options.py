@@ -11,6 +11,7 @@ from tqdm import tqdm
 from sim.commands import SolverOptions
 from sim.files.intervals import value_words
 from sim.files.provenance import provenance
+from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device
@@ -54,6 +55,7 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
         ValueError: If something asked for cannot be had.
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
+    policy = cfg.policy or robot.policy_file
     rng = np.random.default_rng(cfg.seed)
     genes = SUPER_GAUSSIAN.hard_random(cfg.terrains, rng)
     seeds = rng.integers(2**32, size=cfg.terrains, dtype=np.uint32)
@@ -62,7 +64,7 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
     for solver, sized in tqdm(tried, desc="choices", disable=None):
         rollout = Rollout(
             sized,
-            cfg.policy or robot.policy_file,
+            policy,
             num_terrains=cfg.terrains,
             num_replicas=cfg.episodes,
             device=device,
@@ -83,7 +85,12 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
             }
         )
         del rollout
-    return {**provenance(device, cfg.seed), "robot": robot.name, "episodes": cfg.terrains * cfg.episodes, "rows": rows}
+    return {
+        **provenance(device, cfg.seed),
+        **identity(robot, policy),
+        "episodes": cfg.terrains * cfg.episodes,
+        "rows": rows,
+    }
 
 
 def print_rows(report: dict[str, Any]) -> None:

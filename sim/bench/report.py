@@ -18,6 +18,7 @@ from sim.bench.scene import build_scene
 from sim.bench.timing import TimingCfg, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns
 from sim.commands import Bench
 from sim.policy.loaders import prepare_torch, reason_of
+from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg
 
 _FLUSH_BYTES = 256 << 20
@@ -150,7 +151,7 @@ def measure(robot: RobotCfg, cfg: Bench, device: str) -> dict[str, Any]:
     step, collision = measure_step(scene, rounds=replays, heightfield=cfg.heightfield)
     share = add_shares(rows, step["ours_ms"])
     return {
-        "robot": robot.name,
+        **identity(robot, robot.policy_file),
         "num_envs": num_envs,
         "num_terrains": num_terrains,
         "rows": [*rows, step],

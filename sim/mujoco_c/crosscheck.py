@@ -20,7 +20,7 @@ from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
 from sim.files.provenance import provenance
 from sim.mujoco_c.crossing import draw_starts, run_plain
 from sim.mujoco_c.model import crossing_model
-from sim.policy.spec import ControllerSpec
+from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
 from sim.simulation import SolverCfg, resolve_device
@@ -168,8 +168,7 @@ class Comparison:
         ]
         return {
             **provenance(self.device, cfg.seed),
-            "robot": self.robot.name,
-            "policy": ControllerSpec.parse(self.policy).label,
+            **identity(self.robot, self.policy),
             "pool": "hard_random" if cfg.genes is None else str(cfg.genes),
             "looked_at": choice.looked_at,
             "ours": _settings(robot, time_constant_s),

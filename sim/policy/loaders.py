@@ -16,6 +16,7 @@ from sim.files.atomic import check_zip
 from sim.policy.onnx_file import load_onnx
 from sim.policy.runner import action_problem
 from sim.policy.spec import ControllerSpec, find_named, in_one_line, place_of_code
+from sim.robots.identity import warn_if_trained_otherwise
 from sim.robots.robot import RobotCfg
 
 _CALLED_WITH = {"factory": "robot, device", "adapter": "controller, robot"}
@@ -109,7 +110,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
 
     Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
     checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
-    file made to harm can crash.
+    file made to harm can crash. A training record beside a file that names another robot is told.
 
     Args:
         spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or ``module:adapter@file``;
@@ -130,6 +131,8 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     named = ControllerSpec.parse(spec)
     policy = _load_file(Path(spec), robot, where) if named.place is None else _load_code(named, robot, where)
     _try_policy(policy, robot, where, str(spec))
+    if named.file is not None:
+        warn_if_trained_otherwise(Path(named.file), robot)
     return policy
 
 

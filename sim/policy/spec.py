@@ -4,7 +4,6 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
-import os
 import re
 import sys
 import sysconfig
@@ -70,40 +69,39 @@ class ControllerSpec:
             place = str(folder / Path(place).name)
         return ControllerSpec(place=place, name=self.name, file=file and str(folder / Path(file).name))
 
-    def digest(self) -> str | None:
-        """SHA-256 of the file, or of all files and the callable's name; None without files, or if one is missing.
-
-        The code of an importable module is not in it.
-        """
-        if not self.files or not all(file.is_file() for file in self.files):
-            return None
-        hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in self.files]
-        if self.place is None:
-            return hashes[0]
-        return hashlib.sha256(" ".join([str(self.name), *hashes]).encode()).hexdigest()
-
 
 def spec_of(policy: str, robot: "RobotCfg") -> str:
     """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
     return str(robot.policy_file) if policy == SHIPPED else policy
 
 
-def controller_hash(policy: str) -> str | None:
-    """SHA-256 of a controller's files, among them the module that a ``module:callable`` stands in; None without any.
+def controller_hash(policy: str | Path) -> str | None:
+    """SHA-256 of a controller: of its file, or of the code's file, the controller's and the callable's name.
 
     What code reads beside its own file is not in it.
+
+    Returns:
+        None if a file is missing, or the code of a module has none.
     """
     spec = ControllerSpec.parse(policy)
-    if spec.place is None or spec.place.endswith(".py"):
-        return spec.digest()
-    try:
-        module = importlib.util.find_spec(spec.place)
-    except (ImportError, ValueError):  # no package of that name
-        module = None
-    if module is None or module.origin is None or not os.path.isfile(module.origin):
+    files = list(spec.files)
+    if spec.place is not None and not spec.place.endswith(".py"):
+        files.insert(0, Path(_origin_of(spec.place)))
+    if not all(file.is_file() for file in files):
         return None
-    digest = hashlib.sha256(Path(module.origin).read_bytes()).hexdigest()
-    return digest if spec.file is None else f"{digest} {spec.digest()}"
+    hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    if spec.place is None:
+        return hashes[0]
+    return hashlib.sha256(" ".join([str(spec.name), *hashes]).encode()).hexdigest()
+
+
+def _origin_of(module: str) -> str:
+    """File of a module; empty if there is no such module."""
+    try:
+        found = importlib.util.find_spec(module)
+    except (ImportError, ValueError):  # no package of that name
+        found = None
+    return "" if found is None or found.origin is None else found.origin
 
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -249,17 +247,15 @@ def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]
     return found
 
 
-def controller_suffix(policy: str, usual: str) -> str:
-    """The ending of the names of files about a controller: empty for the usual one, else for example ``-C-G``."""
-    if is_same(policy, usual):
-        return ""
+def label_suffix(policy: str) -> str:
+    """The ending of the names of files about a controller that is not the usual one, for example ``-C-G``."""
     label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
 def who_crossed(robot: "RobotCfg", policy: str) -> str:
     """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
-    return robot.name + controller_suffix(policy, str(robot.policy_file))
+    return robot.name + ("" if is_same(policy, str(robot.policy_file)) else label_suffix(policy))
 
 
 def is_same(policy: str, other: str) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.files.provenance import provenance
-from sim.policy.spec import controller_hash
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:  # who reads a recording has no simulation to wait for
     from sim.rollout import Rollout, RolloutResult
@@ -80,7 +80,7 @@ class Recording:
     command: NDArray[np.float32]
     """Command of the coming control step: v_x, v_y [m/s], yaw rate [rad/s], yaw frame; 0 once ended; (T, K, F, 3)."""
     origin: dict[str, Any]
-    """Where it comes from: policy, policy_sha256, command, commit, device, versions, seed, date."""
+    """Where it comes from: :func:`sim.robots.identity.identity`, command, commit, device, versions, seed, date."""
 
     @property
     def num_terrains(self) -> int:
@@ -261,8 +261,8 @@ def record(
         seeds=seeds.astype(np.uint32),
         replicas=np.arange(rollout.num_replicas, dtype=np.int32),
         origin={
+            **identity(robot, str(policy)),
             "policy": str(policy),
-            "policy_sha256": controller_hash(str(policy)),
             "space": rollout.space.name,
             **provenance(device, seed),
         },

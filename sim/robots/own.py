@@ -1,11 +1,9 @@
-"""Robots of a user: load and check their settings file, hash them, pack them for another machine."""
+"""Robots of a user: load and check their settings file, pack them for another machine."""
 
-import hashlib
 import itertools
-import json
 import os
 import re
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,6 @@ from sim.robots.model_files import read_model_files
 from sim.robots.robot import ROBOTS, RobotCfg
 
 _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
-_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning")
 
 
 def load_robot(path: Path) -> RobotCfg:
@@ -97,27 +94,6 @@ def _name_problems(robot: RobotCfg) -> list[str]:
     if strange:
         found.append(f"training.steady_joints: no joint named {', '.join(strange)} in joint_names")
     return found
-
-
-def robot_digest(robot: RobotCfg) -> str | None:
-    """SHA-256 of a user's robot: settings without training, model and meshes; None for a shipped robot.
-
-    Raises:
-        ValueError: If a file is missing.
-    """
-    if robot.settings_file is None:
-        return None
-    settings = {name: value for name, value in asdict(robot).items() if name not in _NOT_IN_DIGEST}
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-    for file in read_model_files(robot.model_file).files:
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
-
-
-def own_hash(robot: RobotCfg) -> dict[str, str]:
-    """The key ``robot_sha256`` for the settings of a training; empty for a shipped robot."""
-    digest = robot_digest(robot)
-    return {} if digest is None else {"robot_sha256": digest}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,14 +1,18 @@
 """Settings of robots: the shipped ones, and how a user's own are found."""
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.settings import setting
+from sim.policy.spec import controller_hash
+from sim.robots.identity import check_identity
 from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg
 
 _ROBOTS_DIR = Path(__file__).parent
@@ -152,7 +156,7 @@ class RobotCfg:
             policy: Controller that the command line names, for the command that measures them.
 
         Raises:
-            ValueError: If they were never measured, or not for these penalties.
+            ValueError: If they were never measured, not for these penalties, or with a robot that has changed since.
         """
         given = policy if self.settings_file is not None else None  # a shipped robot's are of its own controller
         remedy = f"run `{command_line('calibrate', robot=self.spec, policy=given)}`"
@@ -160,12 +164,27 @@ class RobotCfg:
             remedy = f"train its controller first with `{self.train_command}`, or name one with --policy; then {remedy}"
         if not self.scales_file.exists():
             raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
-        scales = read_json(self.scales_file).get("scales")
+        content = read_json(self.scales_file)
+        check_identity(content, self, self.scales_file, remedy)
+        scales = content.get("scales")
         scales = scales if isinstance(scales, dict) else {}
         missing = [name for name in self.penalties if not _is_positive(scales.get(name))]
         if missing:
             raise ValueError(f"{self.scales_file} holds no positive scale for {', '.join(missing)}: {remedy}")
         return tuple(float(scales[name]) for name in self.penalties)
+
+    def scaled_by_another(self, policy: str) -> str | None:
+        """What to tell of a search whose controller is not the one that the scales were measured with; None if it is.
+
+        Scales of the robot's own controller make searches against others comparable: this is no mistake.
+
+        Args:
+            policy: The search's controller.
+        """
+        there = read_json(self.scales_file) if self.scales_file.exists() else {}
+        if there.get("policy_sha256") in (None, controller_hash(policy)):
+            return None
+        return f"Penalties are scaled by those of {there.get('policy')}, with which {self.scales_file} was measured."
 
 
 def _is_positive(value: object) -> bool:
@@ -272,21 +291,22 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     )
 
 
-def robot_of(name: str, given: "str | RobotCfg | None", file: Path) -> RobotCfg:
-    """The robot that a file names, for example a run's.
+def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Path) -> RobotCfg:
+    """The robot that a file names, for example a run's, if it is still what it was.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
     file names.
 
     Args:
-        name: What the file says.
+        there: What the file says: ``robot``, its name, and the rest of :func:`sim.robots.identity.identity`.
         given: What the command line names, if anything.
         file: The file, for errors.
 
     Raises:
-        ValueError: If the two are not the same, or the command line must name it.
+        ValueError: If the two are not the same, the robot or the definition of its penalties has changed since, or the
+            command line must name it.
     """
-    robot = None if given is None else get_robot(given)
+    name, robot = there["robot"], None if given is None else get_robot(given)
     if robot is not None and robot.name != name:
         raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --run")
     if robot is None and name not in ROBOTS:
@@ -294,4 +314,6 @@ def robot_of(name: str, given: "str | RobotCfg | None", file: Path) -> RobotCfg:
             f"{file} is of robot '{name}', which is not shipped: name its settings file too (--robot .../{name}.py), "
             "since no code runs that the command line does not name"
         )
-    return robot or ROBOTS[name]
+    robot = robot or ROBOTS[name]
+    check_identity(there, robot, file, "put back what was there then, or make it anew")
+    return robot

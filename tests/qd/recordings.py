@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from kernels.episode import Outcome
-from sim.policy.spec import controller_hash
 from sim.recording.recorder import Recording
+from sim.robots.identity import identity
 from sim.robots.robot import get_robot
 
 NAMES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
@@ -57,7 +57,7 @@ def stand_in_cross(crossed: list):
             ends = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT)
             outcomes = [ends[(number + k) % 4] for k in range(one.replicas)]
             recording = recording_of(outcomes, np.linspace(6.0, 14.0, one.replicas), seed=one.terrain_seed)
-            origin = {"policy": one.policy, "policy_sha256": controller_hash(one.policy)}
+            origin = identity(get_robot("anymal"), one.policy)
             made.append(replace(recording, genes=one.terrain[None], labels=(one.label,), origin=origin))
         progress(1.0)
         return made

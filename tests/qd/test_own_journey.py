@@ -110,7 +110,7 @@ def test_it_goes_on_only_if_robot_and_controller_are_named_and_are_what_they_wer
     model, code = home / "dog.xml", home / "dog_trot.py"
     whole, gait = model.read_text(), code.read_text()
     model.write_text(whole.replace('mass="8"', 'mass="9"'))
-    refused("searched with robot 'dog' as it was: its settings, model or meshes have changed", robot=dog, policy=policy)
+    refused("is of robot 'dog' as it was: its settings, model or meshes have changed", robot=dog, policy=policy)
     model.write_text(whole)
     code.write_text(gait.replace("0.35", "0.3"))
     refused("other settings: policy_sha256", robot=dog, policy=policy)

@@ -10,18 +10,18 @@ import pytest
 
 from qd.archive import read_archive
 from qd.fresh import Reevaluate, reevaluate_run
-from qd.run.settings import file_hash
 from qd.search import run_search
 from qd.show import figures
 from qd.workers.evaluator import EvaluatorError
 from sim.files.command import Interrupted
+from sim.policy.spec import controller_hash
 from sim.robots.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.searches import make_job, rows_of, run
 from tests.qd.stand_in import open_stand_in
 
 POLICY = "tests.sim.policies:stand"
-SHIPPED = {"policy": "shipped", "policy_sha256": file_hash(get_robot("anymal").policy_file)}
+SHIPPED = {"policy": "shipped", "policy_sha256": controller_hash(get_robot("anymal").policy_file)}
 
 
 @pytest.fixture(autouse=True)
@@ -203,7 +203,7 @@ def test_the_newest_run_of_the_robot_is_taken_and_another_robots_is_refused(tmp_
         reevaluate_run(Reevaluate(robot="cassie", device="cpu"))
 
 
-def test_a_controller_that_is_another_now_is_refused_unless_it_is_given(tmp_path):
+def test_a_controller_that_is_another_now_is_refused_unless_it_is_given(tmp_path, capsys):
     path, policy = tmp_path / "run", tmp_path / "policy.pt"
     run(path, policy=str(policy), policy_sha256="0" * 64)
     with pytest.raises(ValueError, match=rf"the controller in {policy}, which is lost .* with --policy"):
@@ -212,9 +212,15 @@ def test_a_controller_that_is_another_now_is_refused_unless_it_is_given(tmp_path
     with pytest.raises(ValueError, match=rf"the controller in {policy}, which is another one now"):
         again(path)
     assert numbers_in(path)["reproduced_by"] is None
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
     again(path, policy=POLICY)
-    by = numbers_in(path)["reproduced_by"]
-    assert (by["policy"], by["policy_sha256"]) == (POLICY, None)  # code has no hash
+    assert f"With another controller than was searched, {POLICY}: the run's own files stay" in capsys.readouterr().out
+    after = {file.name: file.read_bytes() for file in path.iterdir()}
+    own = "archive-tests.sim.policies-stand"
+    assert {name: after.pop(name) for name in before} == before and set(after) == {f"{own}.npz", f"{own}.json"}
+    by = json.loads(after[f"{own}.json"])["reproduced_by"]
+    assert (by["policy"], by["policy_sha256"]) == (POLICY, controller_hash(POLICY))
+    assert read_archive(path / f"{own}.npz").fresh is not None and read_archive(path).fresh is None
 
 
 def test_what_is_no_run_is_refused(tmp_path):

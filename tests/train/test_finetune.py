@@ -253,7 +253,7 @@ def test_the_training_of_a_base_is_left_to_its_own_command(finished, places):
     with pytest.raises(ValueError, match=r"training of a base controller.*go on with .*train --robot anymal --resume"):
         finetune(resumed(run, iterations=4))
     with pytest.raises(ValueError, match=r"is a fine-tuning: go on with .*finetune --robot anymal --resume"):
-        read_saved(finished, get_robot("anymal"), "train")
+        read_saved(finished, ROBOT, "train")
 
 
 def test_a_run_directory_takes_one_training_at_a_time(finished):
@@ -335,5 +335,6 @@ def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeyp
     if "--archive" not in flags and not {"hand-crafted", "hard-random"} & set(flags) and "--resume" not in flags:
         given += ["--archive", str(places / "archive" / "archive.npz")]
     assert run_command(Finetune, given, name="finetune") == 2
-    error = capsys.readouterr().err
-    assert message in error and error.startswith("error: ") and error.count("\n") == 1
+    lines = capsys.readouterr().err.splitlines()
+    (error,) = [line for line in lines if "names no hash" not in line]  # a warning of archives made by hand
+    assert message in error and error.startswith("error: ")

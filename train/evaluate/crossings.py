@@ -8,7 +8,6 @@ date, whichever command asks for it.
 import hashlib
 import io
 import json
-import os
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
@@ -25,7 +24,7 @@ from qd.workers.shards import flaw_of
 from sim.files.atomic import check_zip, write_atomically
 from sim.files.provenance import code_fingerprint
 from sim.policy.spec import controller_hash
-from sim.robots.own import robot_digest
+from sim.robots.identity import robot_identity
 from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
 from train.evaluate.measures import terrain_rates
@@ -56,13 +55,13 @@ class KeptCrossings:
         self.folder, self._episodes = folder, evaluator.num_replicas
         robot = get_robot(evaluator.robot)
         kind = "cuda" if evaluator.device.startswith("cuda") else "cpu"
-        self._common = [robot_digest(robot) or robot.name, self._episodes, kind, code_fingerprint(_ROOMS)]
+        self._common = [robot_identity(robot), self._episodes, kind, code_fingerprint(_ROOMS)]
 
     def file(self, policy: str, terrains: TerrainSet) -> Path:
         """Where the crossings of one controller on one set are kept."""
         parts = [hashlib.sha256(part.tobytes()).hexdigest() for part in (terrains.terrains, terrains.seeds)]
-        callable_name = None if os.path.isfile(policy) else policy
-        identity = [*self._common, callable_name, controller_hash(policy), *parts]
+        unhashed = policy if controller_hash(policy) is None else None
+        identity = [*self._common, unhashed, controller_hash(policy), *parts]
         digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
         return self.folder / f"{terrains.name}-{digest[:24]}.npz"
 

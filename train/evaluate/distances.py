@@ -41,9 +41,9 @@ def distances(flags: Distances) -> dict[str, Any]:
     """
     import numpy as np
 
-    from qd.archive import read_archive
-    from qd.run.directory import published_or_newest
+    from qd.run.directory import published_or_newest, read_archive_of
     from sim.files.provenance import provenance
+    from sim.robots.identity import robot_identity
     from sim.robots.robot import get_robot
     from sim.space import get_space
     from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, split_elites
@@ -51,7 +51,7 @@ def distances(flags: Distances) -> dict[str, Any]:
     check(flags)
     found = get_robot(flags.robot)
     robot, path = found.name, flags.archive or published_or_newest(found, flag="archive")
-    archive = read_archive(path)
+    archive = read_archive_of(found, path)
     split = split_elites(archive, robot, flags.split_seed, spec=found.spec, run=path)
     count = flags.terrains or paper_terrains(robot)
     sets = make_sets(("hard_random", "generated"), count, flags.seed, archive=archive, split=split)
@@ -62,6 +62,7 @@ def distances(flags: Distances) -> dict[str, Any]:
     return {
         **provenance("cpu", flags.seed),
         "robot": robot,
+        **robot_identity(found),
         "iterations": archive.iterations,
         "trained_on": len(split.train),
         "nearest_m": {

@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qd.archive import ARCHIVE_FILE, Archive, read_archive
+from qd.archive import ARCHIVE_FILE, Archive
 from qd.fresh import Open
-from qd.run.directory import newest_or_published
+from qd.run.directory import newest_or_published, read_archive_of
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import Where, Who, naming_what_is_next, publish, split_words
 from sim.files.settings import check, setting
-from sim.policy.spec import ControllerSpec, controller_hash, controllers_of, who_crossed
+from sim.policy.spec import controller_hash, controllers_of, who_crossed
+from sim.robots.identity import identity, robot_identity
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -118,8 +119,7 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     def measure() -> dict[str, Any]:
         with open_evaluator(evaluator) as evaluate:
             rates = base_rates(evaluate, evaluator.num_terrains, flags.seed)
-        about = {"robot": robot.name, "policy": ControllerSpec.parse(policy).label}
-        return {**origin_of(evaluator.device, flags.seed, flags.workers), **about, **rates}
+        return {**origin_of(evaluator.device, flags.seed, flags.workers), **identity(robot, policy), **rates}
 
     return publish(out, measure, print_rates)
 
@@ -148,7 +148,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
     robot = get_robot(flags.robot)
     evaluator = replace(evaluator_of(flags, robot), reward=True)
     controllers = controllers_of(flags.policies, robot)
-    archive = None if flags.archive is None else read_archive(flags.archive)
+    archive = None if flags.archive is None else read_archive_of(robot, flags.archive)
     split = (
         None
         if archive is None
@@ -178,6 +178,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
         return {
             **origin_of(evaluator.device, flags.seed, flags.workers),
             "robot": robot.name,
+            **robot_identity(robot),
             "episodes": evaluator.num_replicas,
             "controllers": {
                 who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()

@@ -16,7 +16,7 @@ from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import problems
 from sim.policy.spec import is_same
-from sim.robots.own import own_hash
+from sim.robots.identity import check_robot, robot_digest
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
 from train.evaluate.sets import TRAINED_ON
@@ -122,7 +122,7 @@ def settings_of(
         "iterations": size["iterations"],
         "task": asdict(task),
         "ppo": asdict(ppo),
-        **own_hash(robot),
+        "robot_sha256": robot_digest(robot),
     }
 
 
@@ -165,7 +165,8 @@ def read_saved(run: Path, robot: RobotCfg, command: str) -> dict[str, Any]:
         command: What goes on with it: train or finetune.
 
     Raises:
-        ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is the run of the other command.
+        ValueError: As :func:`train.ppo.learner.read_checkpoint`, or if it is the run of the other command, or of
+            the robot before it changed.
     """
     path = run / CHECKPOINT
     saved = read_checkpoint(path, robot.name)
@@ -181,6 +182,7 @@ def read_saved(run: Path, robot: RobotCfg, command: str) -> dict[str, Any]:
         )
     if command == "finetune":
         check_entries(extra, {"mix": (dict,)}, path)
+    check_robot(extra["settings"], robot, path, "put back what was there then, or begin a new run")
     return saved
 
 

@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from qd.run.settings import own_policy
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import write_atomically
 from sim.files.command import OnDevice, Who, naming_what_is_next
 from sim.files.settings import check, setting
-from sim.policy.spec import controller_hash, spec_of
+from sim.policy.spec import spec_of
 
 if TYPE_CHECKING:
     from qd.archive import Archive
@@ -35,7 +36,8 @@ class Report(Who, OnDevice):
     tables: Path | None = None
     """File of the evaluation tables; results/<robot>/tables.json if it is there."""
     out: Path | None = None
-    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published."""
+    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published; with another
+    controller report-<its name>.html."""
     elites: int = setting(5, least=1, most=10)
     """How many of the worst and of the most reproducible elites to show, beside one of each failure mode."""
     episodes: int = setting(20, least=1, most=100)
@@ -113,6 +115,8 @@ def _uncrossable(material: "Material", device: str) -> str:
             f"that the command line does not name: name it with --policy {material.searched}"
         )
     try:
+        if material.cfg.policy is None and material.search is not None:
+            own_policy(material.run, material.search, material.robot)
         check_policy(material.policy, material.robot, device)
     except ValueError as error:
         if material.cfg.policy is not None:
@@ -150,13 +154,10 @@ def _pairs(
 
 
 def _lead(material: "Material") -> str:
-    """What stands under the title; a controller that is no longer the one searched is named here."""
+    """What stands under the title; another controller than was searched is named here."""
     lead = f"Made from {material.run} by faultline, which searches terrains that break a legged robot's controller."
-    search = material.search
     if material.cfg.policy is not None:
         return f"{lead} The crossings shown are of another controller than was searched: {material.policy}."
-    if search is not None and search.policy_sha256 not in (None, controller_hash(material.policy)):
-        return f"{lead} The controller's file has changed since the search: the crossings shown are of the present one."
     return lead
 
 

@@ -115,12 +115,13 @@ def gather(cfg: "Report") -> Material:
     again = numbers.get("reproduced_by")
     config = {} if search is None else folder.read_config()
     tables_file = cfg.tables or RESULTS / robot.name / "tables.json"
+    suffix = "" if cfg.policy is None else found.suffix(spec_of(cfg.policy, robot))
     has_tables = cfg.tables is not None or tables_file.exists()
     material = Material(
         cfg=cfg,
         robot=robot,
         run=run,
-        out=cfg.out or folder_for(run, robot.name) / "report.html",
+        out=cfg.out or folder_for(run, robot.name) / f"report{suffix}.html",
         archive=archive,
         metrics=_metrics_of(folder, archive, cfg),
         searched=searched,
@@ -128,7 +129,7 @@ def gather(cfg: "Report") -> Material:
         origin={key: config[key] for key in _ORIGIN if key in config},
         reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
-        tables=read_tables(tables_file, robot.name, robot.spec) if has_tables else None,
+        tables=read_tables(tables_file, robot) if has_tables else None,
         tables_file=tables_file,
     )
     _check_out(material.out)

@@ -9,6 +9,7 @@ from qd.archive import Archive, read_archive
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
+from sim.robots.identity import check_identity
 from sim.robots.robot import RobotCfg
 
 MEASURES = {"success": "success (no base collision)", "goal": "goal reached", "reward": "training reward"}
@@ -30,7 +31,7 @@ _CONTROLLERS = ("*.pt", "*.onnx")  # files beside the tables that may be one
 _NUMBER = int | float | None
 
 
-def read_tables(file: Path, robot: str, spec: str | None = None) -> dict[str, Any]:
+def read_tables(file: Path, robot: RobotCfg) -> dict[str, Any]:
     """The evaluation's tables.
 
     Args:
@@ -40,17 +41,20 @@ def read_tables(file: Path, robot: str, spec: str | None = None) -> dict[str, An
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is damaged, another file, or of another robot.
+        ValueError: If it is damaged, another file, of another robot, or of one that has changed since.
     """
-    writer = f"`{command_line('evaluate', robot=spec or robot, policies='base=shipped', out=file)}`"
+    writer = f"`{command_line('evaluate', robot=robot.spec, policies='base=shipped', out=file)}`"
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: {writer} writes them")
     tables = read_json(file)
     for key, shape in _shapes(tables):
         if not _fits(shape, tables.get(key)):
             raise ValueError(f"{file} must hold the tables of {writer}, but its {key} cannot be read: give that file")
-    if tables["robot"] != robot:
-        raise ValueError(f"{file} is of robot {tables['robot']}, got --robot {robot}: give that robot or other tables")
+    if tables["robot"] != robot.name:
+        raise ValueError(
+            f"{file} is of robot {tables['robot']}, got --robot {robot.name}: give that robot or other tables"
+        )
+    check_identity(tables, robot, file, f"make them anew with {writer}")
     return tables
 
 

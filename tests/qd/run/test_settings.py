@@ -1,7 +1,6 @@
 import dataclasses
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -16,19 +15,15 @@ from qd.run.settings import (
     policy_spec,
     preset,
 )
+from sim.robots.robot import ROBOTS, RobotCfg
 from tests.qd import stand_in
 
 
 def robot(policy_file: Path = Path("missing.pt"), scales=stand_in.SCALES):
-    """What settings read of a robot."""
-    return SimpleNamespace(
-        name="anymal",
-        settings_file=None,
-        policy_file=policy_file,
-        collision_bit=False,
-        penalties=stand_in.PENALTIES,
-        read_penalty_scales=lambda policy=None: scales,
-    )
+    """ANYmal with another controller and other scales."""
+    changed = {"policy_file": policy_file, "read_penalty_scales": lambda self, policy=None: scales}
+    kind = type("Robot", (RobotCfg,), changed)
+    return kind(**{field.name: getattr(ROBOTS["anymal"], field.name) for field in dataclasses.fields(RobotCfg)})
 
 
 def test_paper_has_the_papers_numbers():

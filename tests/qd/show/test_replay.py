@@ -8,10 +8,12 @@ from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.run.directory import RunDirectory, elite_name, folder_for, newest_or_published, newest_run
+from qd.run.directory import RunDirectory, folder_for, newest_or_published, newest_run
+from qd.run.settings import suffix_of
 from qd.show.elites import Found, find_archive
 from qd.show.replay import Replay, ReplayElite, describe, draw, replay
 from sim.files.command import run_command
+from sim.policy.spec import controller_hash
 from sim.robots.robot import get_robot
 from tests.builders import fresh_values, small_archive
 from tests.qd import stand_in
@@ -85,10 +87,15 @@ def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
     for name, content in (("a.pt", b"1"), ("b.pt", b"1"), ("C-G.pt", b"2")):
         (tmp_path / name).write_bytes(content)
     a, b, tuned = (str(tmp_path / name) for name in ("a.pt", "b.pt", "C-G.pt"))
-    assert elite_name(3, a, b) == elite_name(3, "no.such:code", "no.such:code") == "elite-3"
-    assert elite_name(3, tuned, a) == "elite-3-C-G"
-    assert elite_name(3, "no.such:code", "no.other:code") == "elite-3-no.such-code"
-    assert elite_name(3, "mine/row.py:adapt@my model.onnx", a) == "elite-3-row.py-adapt-my-model"
+    robot, cfg = get_robot("anymal"), dataclasses.replace(CFG, policy=a, policy_sha256=controller_hash(a))
+    assert suffix_of(cfg, a, robot) == suffix_of(cfg, b, robot) == ""
+    assert suffix_of(cfg, tuned, robot) == "-C-G"
+    assert suffix_of(cfg, "mine/row.py:adapt@my model.onnx", robot) == "-row.py-adapt-my-model"
+    Path(a).write_bytes(b"3")
+    assert suffix_of(cfg, a, robot) == "-a"  # another controller now, whatever its name
+    code = dataclasses.replace(CFG, policy="no.such:code")
+    assert suffix_of(code, "no.such:code", robot) == ""
+    assert suffix_of(code, "no.other:code", robot) == "-no.other-code"
 
 
 def test_of_an_invalid_terrain_no_rate_is_known(done):

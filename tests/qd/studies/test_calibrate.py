@@ -9,6 +9,7 @@ import pytest
 from qd.studies.calibrate import Calibrate, penalty_scales
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
+from sim.robots.identity import identity
 from tests.qd import stand_in
 from tests.qd.stand_in import make_result
 
@@ -44,6 +45,9 @@ def test_the_file_is_what_the_robot_reads(tmp_path, any_policy, monkeypatch):
     assert get_robot("anymal").read_penalty_scales() == tuple(content["scales"].values())
     assert (content["terrains"], content["episodes"], content["invalid_episodes"], content["seed"]) == (12, 48, 0, 0)
     assert set(content) >= {"command", "commit", "device", "versions", "seed", "date", "share_of_episodes_with"}
+    robot = get_robot("anymal")
+    assert identity(robot, robot.policy_file).items() <= content.items()
+    assert (content["space"], content["crossing"]["speed"]) == ("super_gaussian", 0.75)
 
 
 def opener(change, calls):

@@ -9,9 +9,10 @@ import shutil
 import numpy as np
 import pytest
 
+from sim.robots.identity import robot_digest
 from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
-from sim.robots.own import PackedRobot, pack_robot, robot_digest
+from sim.robots.own import PackedRobot, pack_robot
 from sim.robots.robot import get_robot
 from tests.sim.dogs import GAINS, KINDS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
 
@@ -266,7 +267,7 @@ def test_a_variant_of_a_shipped_robot_is_a_robot(tmp_path, anymal):
 def test_the_hash_tells_robots_apart(tmp_path, anymal):
     file = with_mesh(tmp_path, "mjcf")
     text, model, mesh = file.read_text(), file.with_name("dog.xml"), tmp_path / "dog" / "meshes" / "trunk.stl"
-    assert robot_digest(anymal) is None
+    assert robot_digest(anymal) != robot_digest(dataclasses.replace(anymal, action_scale=0.25))
 
     def digest(path=file):
         return robot_digest(get_robot(str(path)))
@@ -298,14 +299,14 @@ def test_the_hash_tells_robots_apart(tmp_path, anymal):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_robot_travels_with_its_files(tmp_path, kind):
     robot = get_robot(str(with_mesh(tmp_path / "here", kind)))
-    packed = pickle.loads(pickle.dumps(pack_robot(robot)))
+    packed, digest = pickle.loads(pickle.dumps(pack_robot(robot))), robot_digest(robot)
     assert isinstance(packed, PackedRobot) and len(packed.files) == 2
     shutil.rmtree(tmp_path / "here")
     there = packed.unpacked(tmp_path / "there")
     assert there == dataclasses.replace(robot, model_file=there.model_file)
     assert tmp_path / "there" in there.model_file.parents
     assert sum(build_robot(there).body_mass) == pytest.approx(MASS)
-    assert robot_digest(there) is not None
+    assert robot_digest(there) == digest
 
 
 def test_what_an_mjcf_includes_belongs_to_it(tmp_path):

@@ -254,7 +254,8 @@ def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monke
     home = [] if "--run-dir" in flags else ["--run-dir", str(tmp_path / "tables")]
     device = [] if "--device" in flags else ["--device", "cpu"]
     assert run_command(Evaluate, [*flags, *home, *device], name="evaluate") == 2
-    error = [line for line in capsys.readouterr().err.splitlines() if "Warp" not in line]
+    lines = capsys.readouterr().err.splitlines()  # with a warning of archives made by hand
+    error = [line for line in lines if "Warp" not in line and "names no hash" not in line]
     assert len(error) == 1 and error[0].startswith("error: ")
     for part in message.format(folder=tmp_path).split(".*"):
         assert part.strip() in error[0]

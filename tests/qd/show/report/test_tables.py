@@ -100,6 +100,12 @@ def test_tables_of_another_archive_are_not_told_of_in_the_first_chapter(reported
     assert "Of 4 elites held out of training C-G mends 1 of 2" in text
 
 
+def test_tables_of_the_robot_before_it_changed_are_refused(tables):
+    changed(tables, robot_sha256="0" * 64)
+    with pytest.raises(ValueError, match=r"of robot 'anymal' as it was: .*expected SHA-256 000000000000.*evaluate"):
+        read_tables(tables, get_robot("anymal"))
+
+
 def test_controllers_and_archive_are_found_beside_the_tables_by_what_they_are(tables, run):
     robot = get_robot("anymal")
     shipped = hashlib.sha256(robot.policy_file.read_bytes()).hexdigest()
@@ -109,14 +115,14 @@ def test_controllers_and_archive_are_found_beside_the_tables_by_what_they_are(ta
     controllers = {"base": {"policy": far, "sha256": shipped}, "C-G": {"policy": far, "sha256": tuned}}
     changed(tables, controllers=controllers, archive=about)
     with pytest.raises(ValueError, match="The archive of the tables cannot"):
-        changes_of(read_tables(tables, "anymal"), tables, robot)
+        changes_of(read_tables(tables, robot), tables, robot)
     run.rename(tables.parent / "archive")
-    found = changes_of(read_tables(tables, "anymal"), tables, robot)
+    found = changes_of(read_tables(tables, robot), tables, robot)
     assert found.policies == {"base": "shipped", "C-G": str(tables.parent / "C-G.pt")}
     assert found.run == tables.parent / "archive" and len(found.archive) == 20
     (tables.parent / "C-G.pt").write_text("another one")
     with pytest.raises(ValueError, match="Controller C-G of the tables is not at /another/machine/policy"):
-        changes_of(read_tables(tables, "anymal"), tables, robot)
+        changes_of(read_tables(tables, robot), tables, robot)
 
 
 def fate(**terrains):

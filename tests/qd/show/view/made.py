@@ -4,6 +4,7 @@ import numpy as np
 
 from kernels.episode import Outcome
 from sim.recording.recorder import Recording
+from sim.robots.identity import robot_identity
 
 FRAMES = 6
 OUTCOMES = (Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.INVALID)
@@ -46,5 +47,10 @@ def make_recording(robot, genes, *, seeds, policy_sha256, replicas=3) -> Recordi
         foot_force=frames(force),
         penalties=frames(k * np.arange(1.0, len(robot.penalties) + 1)),
         command=frames(np.tile([0.75, 0.25, 0.5], (FRAMES, 1))),
-        origin={"policy_sha256": policy_sha256, "date": "2026-01-02T03:04:05", "commit": "abcdef123456"},
+        origin={
+            **robot_identity(robot),
+            "policy_sha256": policy_sha256,
+            "date": "2026-01-02T03:04:05",
+            "commit": "abcdef123456",
+        },
     )

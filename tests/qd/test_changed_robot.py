@@ -1,0 +1,311 @@
+"""A robot, controller or definition of the penalties that is another now: every reader says so and changes nothing."""
+
+import dataclasses
+import hashlib
+import json
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from kernels import penalties
+from qd.archive import read_archive, write_archive
+from qd.fresh import Reevaluate, reevaluate_run
+from qd.run.arguments import Archive, job_of
+from qd.search import run_search
+from qd.show import figures
+from qd.show.elites import find_archive
+from qd.show.export import Export
+from qd.show.film import Film
+from qd.show.recordings import Recordings, on_elite
+from qd.show.replay import ReplayElite
+from qd.show.report.command import Report
+from qd.show.view.command import View
+from qd.studies.ablation import Ablation
+from qd.workers.evaluator import EvaluatorCfg
+from sim.files.command import run_command
+from sim.recording.file import write_recording
+from sim.robots.identity import identity, robot_digest
+from sim.robots.robot import ROBOTS, get_robot
+from tests.builders import rsl_rl_actor, save_checkpoint
+from tests.qd import stand_in
+from tests.qd.show.view.made import make_recording
+from tests.sim.dogs import KINDS, write_dog
+from train.base import Train
+from train.evaluate.crossings import KeptCrossings
+from train.evaluate.distances import Distances
+from train.evaluate.evaluate import Evaluate
+from train.evaluate.sets import plain_set
+from train.finetune import Finetune
+from train.ppo.learner import CHECKPOINT_FORMAT
+from train.ppo.run import read_saved
+
+SIZE = {"emitters": 1, "batch_size": 4, "replicas": 2, "iterations": 1, "device": "cpu"}
+NAMES = ("yaw_rate", "vel_x", "vel_y", "collision")
+
+
+@contextmanager
+def open_dog(cfg):
+    """The stand-in with the dog's four penalties."""
+
+    def evaluate(genes, seeds, progress=None):
+        result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
+        return dataclasses.replace(result, penalties=result.penalties[..., :4], penalty_names=NAMES)
+
+    yield evaluate
+
+
+@pytest.fixture
+def dog(tmp_path, monkeypatch):
+    """The dog's settings, beside them its controller's scales, and a run of it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(figures, "write_figures", lambda *_: [])
+    file = write_dog(tmp_path / "mine", **KINDS["urdf"])
+    (tmp_path / "mine" / "bad.py").write_text(
+        "from dog_trot import Trot as First\n\n\nclass Trot(First):\n    faultline_factory = True\n"
+    )
+    robot, policy = get_robot(str(file)), trot(file)
+    content = {**identity(robot, policy), "scales": dict.fromkeys(NAMES, 1.0)}
+    robot.scales_file.write_text(json.dumps(content))
+    run_search(
+        job_of(Archive(robot=str(file), policy=policy, run_dir=Path("runs/dog"), **SIZE)), open_evaluator=open_dog
+    )
+    return file
+
+
+def trot(file: Path) -> str:
+    return f"{file.parent}/dog_trot.py:Trot"
+
+
+def change_robot(file: Path) -> None:
+    """Softer joints and a lower limit of the feet's forces, under the same name."""
+    text = file.read_text()
+    assert "stiffness=(60.0,)" in text and "contact_force_limit=150.0" in text
+    text = text.replace("stiffness=(60.0,)", "stiffness=(24.0,)").replace("limit=150.0", "limit=15.0")
+    file.write_text(text)
+
+
+def hashes(folder: Path = Path()) -> dict[str, str]:
+    """SHA-256 of all files below a folder, but for what Python compiles."""
+    files = [file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+    return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def refused(capsys, command, *argv: str) -> str:
+    """The line that a command ends with, which must change no file."""
+    before = hashes()
+    capsys.readouterr()
+    assert run_command(command, argv, name="it") == 2
+    assert hashes() == before
+    (line,) = capsys.readouterr().err.splitlines()
+    return line.removeprefix("error: ")
+
+
+READERS = {
+    "archive --resume": (Archive, ("--resume", "runs/dog", "--device", "cpu", "--policy")),
+    "reevaluate": (Reevaluate, ("--run", "runs/dog", "--device", "cpu", "--policy")),
+    "replay": (ReplayElite, ("--run", "runs/dog", "--device", "cpu", "--policy")),
+    "film": (Film, ("--run", "runs/dog", "--device", "cpu", "--policy")),
+    "report": (Report, ("--run", "runs/dog", "--device", "cpu", "--policy")),
+    "ablation": (Ablation, ("--run", "runs/dog", "--device", "cpu", "--policy")),
+    "view": (View, ("--run", "runs/dog")),
+    "export": (Export, ("--run", "runs/dog")),
+    "an archive alone": (Export, ("--run", "alone.npz")),
+    "finetune": (Finetune, ("--archive", "runs/dog", "--device", "cpu", "--policy")),
+    "evaluate": (Evaluate, ("--archive", "runs/dog", "--device", "cpu")),
+    "distances": (Distances, ("--archive", "runs/dog")),
+}
+
+
+@pytest.fixture
+def without_gl(monkeypatch):
+    """No film is drawn here, so no OpenGL is needed."""
+    monkeypatch.setattr("sim.recording.renderer.open_context", lambda *_: SimpleNamespace(free=lambda: None))
+
+
+@pytest.mark.usefixtures("without_gl")
+def test_no_command_takes_a_run_of_the_robot_before_it_changed(dog, capsys):
+    Path("alone.npz").write_bytes(Path("runs/dog/archive.npz").read_bytes())
+    actor = rsl_rl_actor(12 + 24 + 15, 8).state_dict()
+    controller = save_checkpoint(dog.parent / "dog.pt", actor, critic_state_dict=None)
+    was = robot_digest(get_robot(str(dog)))
+    change_robot(dog)
+    now = robot_digest(get_robot(str(dog)))
+    for name, (command, argv) in READERS.items():
+        given = controller if name == "finetune" else trot(dog)
+        words = [*argv, str(given)] if argv[-1] == "--policy" else argv
+        line = refused(capsys, command, "--robot", str(dog), *words)
+        assert line.startswith(argv[1]), (name, line)
+        for part in ("is of robot 'dog' as it was", was[:12], now[:12], str(dog), "put back"):
+            assert part in line, (name, line)
+
+
+def test_no_command_compares_numbers_of_another_definition(dog, capsys, monkeypatch):
+    assert read_archive("runs/dog").penalty_definition == "absolute"
+    monkeypatch.setattr(penalties, "PENALTY_DEFINITION", "squared")
+    for name in ("archive --resume", "reevaluate", "replay", "report", "export", "ablation"):
+        command, argv = READERS[name]
+        words = [*argv, trot(dog)] if argv[-1] == "--policy" else argv
+        line = refused(capsys, command, "--robot", str(dog), *words)
+        assert line.startswith("runs/dog has penalties of another definition"), (name, line)
+        assert "expected 'absolute', got 'squared'" in line
+    with pytest.raises(ValueError, match=r"dog\.scales\.json has penalties of another.*calibrate --robot"):
+        get_robot(str(dog)).read_penalty_scales()
+
+
+def test_scales_of_another_robot_are_refused_and_those_of_another_controller_told(dog, capsys):
+    other = f"{dog.parent}/bad.py:Trot"
+    job_of(Archive(robot=str(dog), policy=other, run_dir=Path("runs/other"), **SIZE))
+    said = capsys.readouterr()
+    assert f"scaled by those of dog_trot.py:Trot, with which {dog.parent}/dog.scales.json was measured" in said.out
+    job_of(Archive(robot=str(dog), policy=trot(dog), run_dir=Path("runs/other"), **SIZE))
+    assert "scaled by" not in capsys.readouterr().out
+    change_robot(dog)
+    argv = ("--robot", str(dog), "--policy", trot(dog), "--run-dir", "runs/new", "--device", "cpu")
+    line = refused(capsys, Archive, *argv)
+    assert line.startswith(f"{dog.parent}/dog.scales.json is of robot 'dog' as it was")
+    assert f"calibrate --robot {dog}`" in line
+
+
+def test_a_controller_that_changed_is_another_and_writes_other_files(dog, capsys):
+    code = dog.parent / "dog_trot.py"
+    code.write_text(code.read_text().replace("0.35", "0.3"))
+    line = refused(
+        capsys, Archive, "--resume", "runs/dog", "--robot", str(dog), "--policy", trot(dog), "--device", "cpu"
+    )
+    assert "policy_sha256" in line
+    # Named, it is another controller than was searched, whatever its name.
+    found = find_archive(str(dog), Path("runs/dog"))
+    assert found.suffix(found.policy(trot(dog))) == "-dog_trot.py-Trot"
+    before = hashes(Path("runs/dog"))
+    args = Reevaluate(robot=str(dog), run=Path("runs/dog"), policy=trot(dog), device="cpu")
+    reevaluate_run(args, open_evaluator=open_dog)
+    assert "With another controller than was searched" in capsys.readouterr().out
+    after = hashes(Path("runs/dog"))
+    assert before.items() <= after.items()
+    assert set(after) - set(before) == {f"runs/dog/archive-dog_trot.py-Trot.{kind}" for kind in ("npz", "json")}
+    code.write_text(code.read_text().replace("0.3", "0.35"))
+    assert found.suffix(trot(dog)) == ""
+
+
+def test_a_lost_or_changed_file_of_the_search_is_refused_unless_named(dog, capsys):
+    policy = save_checkpoint(dog.parent / "mine.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())
+    run_search(
+        job_of(Archive(robot=str(dog), policy=str(policy), run_dir=Path("runs/file"), **SIZE)), open_evaluator=open_dog
+    )
+    found = find_archive(str(dog), Path("runs/file"))
+    assert found.policy(None) == str(policy)
+    save_checkpoint(policy, rsl_rl_actor(12 + 24 + 15, 8, normalised=True).state_dict())
+    for command in (ReplayElite, Reevaluate):
+        line = refused(capsys, command, "--robot", str(dog), "--run", "runs/file", "--device", "cpu")
+        assert f"the controller in {policy}, which is another one now" in line and "--policy" in line
+    assert found.suffix(found.policy(str(policy))) == "-mine"
+
+
+def test_an_archive_alone_names_what_it_is_of(dog):
+    archive, robot = read_archive("runs/dog"), get_robot(str(dog))
+    expected = identity(robot, trot(dog))
+    del expected["policy"]
+    assert archive.named() == expected
+    config = json.loads(Path("runs/dog/config.json").read_text())["settings"]
+    summary = json.loads(Path("runs/dog/archive.json").read_text())
+    for name, value in expected.items():
+        assert config[name] == value and summary[name] == value
+    older = dataclasses.replace(archive, robot_sha256=None, policy_sha256=None)
+    write_archive(Path("old.npz"), older)
+    assert read_archive("old.npz").robot_sha256 is None
+
+
+def test_a_run_that_names_no_hash_is_looked_at_and_that_is_said(dog, capsys):
+    write_archive(Path("old.npz"), dataclasses.replace(read_archive("runs/dog"), robot_sha256=None))
+    find_archive(str(dog), Path("old.npz"))
+    assert "warning: old.npz names no hash of robot 'dog'" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("without_gl")
+def test_recordings_of_the_robot_before_are_made_anew_or_refused(dog, capsys):
+    robot, archive = get_robot(str(dog)), read_archive("runs/dog")
+    wanted = on_elite(archive, 0, policy=trot(dog), replicas=2)
+
+    def made_of(robot):
+        policy_sha256 = identity(robot, trot(dog))["policy_sha256"]
+        seeds = np.array([wanted.terrain_seed], np.uint32)
+        return make_recording(robot, wanted.terrain[None], seeds=seeds, policy_sha256=policy_sha256, replicas=2)
+
+    kept = Recordings(robot, folder=Path("kept"))
+    kept.keep(wanted, made_of(robot))
+    assert Recordings(robot, folder=Path("kept")).read(wanted) is not None
+    write_recording(Path("named.recording.npz"), made_of(robot))
+    change_robot(dog)
+    changed = get_robot(str(dog))
+    now = Recordings(changed, folder=Path("kept"))
+    assert now.file_of(wanted) != kept.file_of(wanted) and now.read(wanted) is None
+    now.file_of(wanted).write_bytes(kept.file_of(wanted).read_bytes())  # whatever it is called
+    assert now.read(wanted) is None
+    argv = ["--robot", str(dog), "--recording", "named.recording.npz"]
+    line = refused(capsys, Film, *argv)
+    assert line.startswith("named.recording.npz is of robot 'dog' as it was")
+
+
+def test_kept_crossings_are_those_of_the_robot_and_the_controller_as_they_are(dog):
+    terrains = plain_set("hard_random", 2, 0)
+
+    def file():
+        return KeptCrossings(
+            Path("kept"), EvaluatorCfg(robot=str(dog), policy="", num_terrains=2, num_replicas=1)
+        ).file(trot(dog), terrains)
+
+    found, code = {file()}, dog.parent / "dog_trot.py"
+    change_robot(dog)
+    found.add(file())
+    code.write_text(code.read_text().replace("0.35", "0.3"))
+    found.add(file())
+    assert len(found) == 3
+
+
+@pytest.mark.parametrize("kind", ["train", "finetune"])
+def test_a_training_does_not_go_on_with_the_robot_after_it_changed(dog, capsys, kind):
+    settings = {"robot_sha256": robot_digest(get_robot(str(dog)))}
+    progress = {"settings": settings, "curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
+    content = {
+        "format": CHECKPOINT_FORMAT, "robot": "dog", "iter": 1, "levels": torch.zeros(1), "counter": 0,
+        "rng_cpu": torch.get_rng_state(), "rng_cuda": None,
+        "extra": progress if kind == "train" else {**progress, "mix": {}},
+    }  # fmt: skip
+    Path("training").mkdir()
+    torch.save(content, "training/checkpoint.pt")
+    command = {"train": Train, "finetune": Finetune}[kind]
+    assert read_saved(Path("training"), get_robot(str(dog)), kind)["iter"] == 1
+    change_robot(dog)
+    line = refused(capsys, command, "--robot", str(dog), "--resume", "training")
+    assert line.startswith("training/checkpoint.pt is of robot 'dog' as it was") and "begin a new run" in line
+
+
+def test_a_controller_trained_with_the_robot_before_is_told_so(dog, capsys):
+    from sim.policy.loaders import load_policy
+
+    robot = get_robot(str(dog))
+    policy = save_checkpoint(dog.parent / "a1.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())
+    record = {"settings": {"robot_sha256": robot_digest(robot)}}
+    policy.with_suffix(".train.json").write_text(json.dumps(record))
+    load_policy(policy, robot, "cpu")
+    load_policy(policy, dataclasses.replace(robot, physics_dt=0.001, decimation=20), "cpu")  # finer, not another
+    assert "warning" not in capsys.readouterr().err
+    change_robot(dog)
+    changed = get_robot(str(dog))
+    load_policy(policy, changed, "cpu")
+    load_policy(policy, changed, "cpu")
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("warning"))
+    assert f"{policy} was trained with a robot of other settings" in line
+    assert robot_digest(robot)[:12] in line and robot_digest(changed)[:12] in line
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_shipped_scales_are_of_the_shipped_robot_and_controller(name):
+    """If this fails, a shipped file has changed: `faultline calibrate` measures its scales again."""
+    robot = ROBOTS[name]
+    content = json.loads(robot.scales_file.read_text())
+    assert identity(robot, robot.policy_file).items() <= content.items()
