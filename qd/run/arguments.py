@@ -58,6 +58,8 @@ class Archive(Who, Where):
     """Emitters."""
     batch_size: int | None = None
     """Terrains an emitter asks for in an iteration."""
+    groups: int | None = None
+    """Groups of emitters that ask and are told in turn, so that robots do not wait for the last of an iteration."""
     learning_rate: float | None = None
     """Step of a cell's acceptance threshold."""
     sigma0: float | None = None
@@ -86,7 +88,7 @@ class Archive(Who, Where):
         run_search(job_of(self))
 
 
-_NOT_SETTINGS = ("device", "workers", "robot", "resume", "run_dir", "without", "reproduce")
+_NOT_SETTINGS = ("device", "workers", "num_envs", "robot", "resume", "run_dir", "without", "reproduce")
 _SESSION = ("command", "commit", "device")
 
 
