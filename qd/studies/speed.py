@@ -53,7 +53,7 @@ class Speed(OfRobot, OnDevice):
     """Iterations timed, after two that are not."""
     steps: int = setting(1000, least=1)
     """Physics steps of the bare measurement."""
-    curve: tuple[int, ...] = (1024, 2048, 4096, 8192, 16384, 32768)
+    curve: tuple[int, ...] = setting((1024, 2048, 4096, 8192, 16384, 32768), least=1)
     """Numbers of robots of the curve, each of which runs 20 episodes; none to leave it out."""
     kernels: int = setting(0, least=0)
     """Robots with which every kernel of a control step is timed, on a GPU; 0: none is."""
