@@ -39,12 +39,15 @@ class _Recording:
     """What a recording process has: the simulation of a controller."""
 
     def __init__(self, robot: "RobotCfg", first: Wanted) -> None:
-        self._simulation, self._first = Simulation(robot, "cpu"), first
+        self._simulation, self._first, self._next = Simulation(robot, "cpu"), first, first
 
-    def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None]) -> "Recording":
-        """The recording of one terrain, crossed as the first one was."""
-        wanted = replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0]))
-        return self._simulation([wanted], progress)[0]
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """One terrain to cross as the first one was."""
+        self._next = replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0]))
+
+    def take(self, progress: Callable[[float], None]) -> "Recording":
+        """Its recording."""
+        return self._simulation([self._next], progress)[0]
 
 
 def build_recording(cfg: "tuple[RobotCfg, Wanted]", num_terrains: int) -> Any:
