@@ -245,7 +245,7 @@ def test_the_runner_writes_actions_into_its_buffer(anymal, device):
     observation = wp.full((5, OBSERVATIONS), 0.5, dtype=float, device=device)
     action = wp.zeros((5, ACTIONS), dtype=float, device=device)
     policy = load_policy(anymal.policy_file, anymal, device)
-    runner = PolicyRunner(policy, observation, action)
+    runner = PolicyRunner(policy, observation, action, wp.zeros(5, dtype=int, device=observation.device))
     runner()
     with torch.inference_mode():
         expected = policy(wp.to_torch(observation))
@@ -265,7 +265,7 @@ def test_a_controller_may_keep_and_change_its_row(anymal):
 
     observation = wp.full((5, OBSERVATIONS), 0.5, dtype=float, device="cpu")
     action = wp.zeros((5, ACTIONS), dtype=float, device="cpu")
-    runner = PolicyRunner(policy, observation, action)
+    runner = PolicyRunner(policy, observation, action, wp.zeros(5, dtype=int, device=observation.device))
     runner()
     np.testing.assert_array_equal(observation.numpy(), 0.5)
     observation.fill_(-1.0)
@@ -293,4 +293,4 @@ def fails(_):
 def test_what_goes_wrong_in_a_crossing_is_named(policy, message):
     observation, action = (wp.zeros((5, size), dtype=float, device="cpu") for size in (OBSERVATIONS, ACTIONS))
     with pytest.raises(ValueError, match=message):
-        PolicyRunner(policy, observation, action)()
+        PolicyRunner(policy, observation, action, wp.zeros(5, dtype=int, device="cpu"))()
