@@ -157,7 +157,7 @@ def test_what_is_sensed_is_the_state_in_physical_units(anymal, device):
         heading = rotation[:2, 0] / np.linalg.norm(rotation[:2, 0])
         # The point 0.8 m ahead and 0.3 m to the left is [16, 8].
         x, y = q[env, :2] + 0.8 * heading + 0.3 * np.array([-heading[1], heading[0]])
-        ground = surface_heights(heights[env // 2], np.array([x]), np.array([y]))[0]
+        ground = surface_heights(heights[rollout.sim.terrain_of_env.numpy()[env]], np.array([x]), np.array([y]))[0]
         assert float(sensed.scan[env, 16, 8]) == pytest.approx(np.clip(q[env, 2] - ground, -0.5, 1.5), abs=1e-3)
     assert float(sensed.lin_vel.abs().max()) > 0.1
 
