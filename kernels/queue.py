@@ -78,6 +78,13 @@ def make_queue(
     return queue
 
 
+def ring_slices(first: int, count: int, size: int) -> tuple[slice, ...]:
+    """``count`` slots from ``first`` on, of a ring of ``size``."""
+    whole = slice(first, min(first + count, size))
+    rest = first + count - size
+    return (whole, slice(0, rest)) if rest > 0 else (whole,)
+
+
 @wp.func
 def _write_down(
     row: int, env: int, episodes: Episodes, penalty_sums: wp.array2d[float], rewards: Rewards, queue_out: EpisodeQueue

@@ -195,6 +195,7 @@ class Scheduler:
         Raises:
             ValueError: If the state is none of a search.
         """
+        state = {"asked": [None], **state}  # one of before there were groups was saved when all were told
         archive, result, emitters, asked = (state.get(name) for name in ("archive", "result", "emitters", "asked"))
         if not (
             isinstance(archive, GridArchive)

@@ -83,13 +83,18 @@ class TerrainBank:
         max_blocks(replaced, self.terrain.ceilings[slots])
 
 
-def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str = "cpu") -> np.ndarray:
+def host_device() -> str:
+    """Warp device of small work for the host: the CPU, or the default device where Warp has no compiler for the CPU."""
+    return "cpu" if wp.is_cpu_available() else str(wp.get_device())
+
+
+def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str | None = None) -> np.ndarray:
     """Height grids [m] of genes as a simulation has them, on the host.
 
     Args:
         genes: Shape (num_terrains, num_genes), at least one terrain.
         space: What the genes mean.
-        device: Warp device name.
+        device: Warp device name; :func:`host_device` if None.
 
     Returns:
         Float32, shape (num_terrains, NUM_ROWS, NUM_COLS).
@@ -97,6 +102,7 @@ def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, devic
     Raises:
         ValueError: If the shape differs or a gene is not finite.
     """
+    device = device or host_device()
     bank = TerrainBank(len(genes), device=device)
     with wp.ScopedDevice(device):
         bank.set_genes(genes, space)

@@ -15,7 +15,7 @@ import warp as wp
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
-from kernels.queue import make_queue, make_ready, turn_over
+from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.bank import TerrainBank
@@ -330,7 +330,7 @@ class Rollout:
         if not 1 <= count <= self.num_free:
             raise ValueError(f"terrains must be 1 to {self.num_free} at once here, got {count}")
         first = 0 if idle else self._first_free
-        slots = _ring_slices(first, count, self.num_terrains)
+        slots = ring_slices(first, count, self.num_terrains)
         self._write_terrains(terrains, seeds, slots)
         num_episodes = count * self.num_replicas
         most_steps = self._most * -(-num_episodes // self.num_envs)
@@ -480,13 +480,6 @@ def _saying_what_does_not_fit(num_envs: int, num_terrains: int, device: str) -> 
             f"{num_envs:,} robots and {num_terrains:,} terrains at once need more memory than {device} has free: "
             "give fewer robots (--num-envs), or fewer terrains"
         ) from error
-
-
-def _ring_slices(first: int, count: int, size: int) -> tuple[slice, ...]:
-    """``count`` slots from ``first`` on, of a ring of ``size``."""
-    whole = slice(first, min(first + count, size))
-    rest = first + count - size
-    return (whole, slice(0, rest)) if rest > 0 else (whole,)
 
 
 def evaluate(

@@ -19,7 +19,7 @@ from qd.run.progress import clock
 from qd.run.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
 from sim.files.command import command_line
-from sim.robots.identity import FIRST_DEFINITION, check_robot
+from sim.robots.identity import check_robot
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
@@ -311,7 +311,11 @@ class RunDirectory:
         there, metrics = state.get("settings"), state.get("metrics")
         if not isinstance(there, dict) or not isinstance(metrics, list):
             raise ValueError(f"{file} is no checkpoint of a search: it lacks settings or metrics; {_REMEDY}")
-        different = differences({"penalty_definition": FIRST_DEFINITION, **there}, as_settings(cfg))
+        try:
+            there = as_settings(from_settings(there, cfg.iterations))  # with what an older one does not name yet
+        except ValueError as error:
+            raise ValueError(f"{file} is no checkpoint of a search: {error}; {_REMEDY}") from None
+        different = differences(there, as_settings(cfg))
         if different:
             raise ValueError(f"{file} belongs to a run of other settings: {', '.join(different)}; {_REMEDY}")
         try:

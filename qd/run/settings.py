@@ -181,6 +181,8 @@ def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:
         ValueError: If a value is out of range.
     """
     given = {name: value for name, value in changes.items() if value is not None}
+    if "emitters" in given:  # a preset's groups are of its own emitters
+        given.setdefault("groups", min(cfg.scheduler.groups, max(given["emitters"], 1)))
     for part in ("fitness", "scheduler"):
         current = getattr(cfg, part)
         names = {field.name for field in fields(current)} & given.keys()

@@ -4,14 +4,12 @@ The iterations timed are those of a real search, ask to saved checkpoint, in a d
 rates are measured right after, on the terrains of the last of them, with as many environments and the same solver.
 """
 
-import re
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from qd.run.arguments import evaluator_of
@@ -33,8 +31,6 @@ _WARM_UP = 2
 _CURVE_REPLICAS = 20
 _EPISODES_A_ROBOT = 20
 _PAPER_EPISODES = 4_000_000  # of the paper's search
-_PROFILED_STEPS = 50  # control steps
-_NAMED_KERNELS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +49,7 @@ class Speed(OfRobot, OnDevice):
     """Iterations timed, after two that are not."""
     steps: int = setting(1000, least=1)
     """Physics steps of the bare measurement."""
-    curve: tuple[int, ...] = (1024, 2048, 4096, 8192, 16384, 32768)
+    curve: tuple[int, ...] = setting((1024, 2048, 4096, 8192, 16384, 32768), least=1)
     """Numbers of robots of the curve, each of which runs 20 episodes; none to leave it out."""
     kernels: int = setting(0, least=0)
     """Robots with which every kernel of a control step is timed, on a GPU; 0: none is."""
@@ -161,32 +157,14 @@ def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[in
 
 
 def kernel_shares(evaluator: EvaluatorCfg, terrains: NDArray[Any], num_envs: int) -> list[dict[str, Any]]:
-    """Shares of the GPU's time by kernel, over a second of crossings a second after their start, the most first.
-
-    Args:
-        evaluator: What is crossed with what.
-        terrains: Genes.
-        num_envs: Robots.
-    """
-    from torch.profiler import ProfilerActivity, profile
+    """:func:`sim.bench.physics.profile_kernels` of so many robots' crossings; terrains repeated as needed."""
+    from sim.bench.physics import profile_kernels
 
     num_terrains = -(-num_envs // _CURVE_REPLICAS)
     sizes = {"num_envs": num_envs, "num_terrains": num_terrains, "num_replicas": _CURVE_REPLICAS}
     rollout: Any = build_rollout(replace(evaluator, **sizes), num_terrains)
     rollout.put(terrains[np.arange(num_terrains) % len(terrains)], np.arange(num_terrains, dtype=np.uint32))
-    for _ in range(_PROFILED_STEPS):
-        rollout.control_step()
-    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
-        for _ in range(_PROFILED_STEPS):
-            rollout.control_step()
-        wp.synchronize_device(rollout.sim.device)
-    times: dict[str, float] = {}
-    for event in profiled.key_averages():
-        name = re.sub(r"_[0-9a-f]{8}(_cuda_kernel_forward)?$|_cuda_kernel_forward$", "", event.key)
-        times[name] = times.get(name, 0.0) + event.self_device_time_total
-    total = sum(times.values())
-    ranked = sorted(times.items(), key=lambda one: -one[1])[:_NAMED_KERNELS]
-    return [{"name": name, "share": time / total} for name, time in ranked]
+    return profile_kernels(rollout)
 
 
 def training_rates(file: Path | None) -> dict[str, float | None]:

@@ -3,6 +3,7 @@
 Bare physics is terrain contact and solver alone, on the motion of recorded crossings: the yardstick of everything else.
 """
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from sim.terrain import SPACING
 _SEGMENT_STEPS = 10
 _SEGMENT_EVERY = 20
 _LOST_M = 1.0
+_PROFILED_STEPS = 50  # control steps
+_NAMED_KERNELS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +71,28 @@ def measure_bare_physics(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarr
     motion.launch(100)  # 2 s, in which they settle
     seconds = _time(lambda: motion.launch(launches), sim.device)
     return BareRates(walking=walking, standing=sim.num_envs * launches * robot.decimation / seconds)
+
+
+def profile_kernels(rollout: Rollout) -> list[dict[str, Any]]:
+    """Name and share of the GPU's time of each kernel, the most first, over a second of crossings that are under way.
+
+    It begins a second on.
+    """
+    from torch.profiler import ProfilerActivity, profile
+
+    for _ in range(_PROFILED_STEPS):
+        rollout.control_step()
+    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+        for _ in range(_PROFILED_STEPS):
+            rollout.control_step()
+        wp.synchronize_device(rollout.sim.device)
+    times: dict[str, float] = {}
+    for event in profiled.key_averages():
+        name = re.sub(r"_[0-9a-f]{8}(_cuda_kernel_forward)?$|_cuda_kernel_forward$", "", event.key)
+        times[name] = times.get(name, 0.0) + event.self_device_time_total
+    total = sum(times.values())
+    ranked = sorted(times.items(), key=lambda one: -one[1])[:_NAMED_KERNELS]
+    return [{"name": name, "share": time / total} for name, time in ranked]
 
 
 def _time(work: Callable[[], object], device: str) -> float:

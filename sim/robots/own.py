@@ -24,6 +24,7 @@ def load_robot(path: Path) -> RobotCfg:
     """
     import warp as wp
 
+    from sim.bank import host_device
     from sim.robots.model import read_robot
     from sim.robots.probes import make_probes
     from sim.robots.stand import start_height
@@ -39,7 +40,7 @@ def load_robot(path: Path) -> RobotCfg:
     file = path.resolve()  # of a link, the model lies beside what it points to
     if "model_file" not in wrong:
         robot = replace(robot, model_file=file.parent / robot.model_file, settings_file=file)
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(host_device()):
             builder, of_model = read_robot(robot, wrong)
             try:
                 make_probes(builder)

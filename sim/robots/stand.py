@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.bank import TerrainBank
+from sim.bank import TerrainBank, host_device
 from sim.crossing import CrossingCfg
 from sim.robots.model import build_robot, effort_limits, geom_names, leaf_name
 from sim.robots.probes import make_probes
@@ -122,7 +122,7 @@ def _extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[st
 
     The lowest points are by the names of their geoms.
     """
-    with wp.ScopedDevice("cpu"):
+    with wp.ScopedDevice(host_device()):
         model, probes = builder.finalize(), make_probes(builder)
         state: Any = model.state()
         counts = np.diff(np.append(probes.strip_start.numpy(), len(probes.position))).astype(int)

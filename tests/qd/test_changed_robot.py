@@ -167,7 +167,7 @@ def test_scales_of_another_robot_are_refused_and_those_of_another_controller_tol
     argv = ("--robot", str(dog), "--policy", trot(dog), "--run-dir", "runs/new", "--device", "cpu")
     line = refused(capsys, Archive, *argv)
     assert line.startswith(f"{dog.parent}/dog.scales.json is of robot 'dog' as it was")
-    assert f"calibrate --robot {dog}`" in line
+    assert f"calibrate --robot {dog} --policy {trot(dog)}`" in line
 
 
 def test_a_controller_that_changed_is_another_and_writes_other_files(dog, capsys):

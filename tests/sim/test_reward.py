@@ -115,12 +115,12 @@ def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker,
 
     def break_one(share):
         step = round(30 * share)  # of 0.6 s
-        q = np.array(rollout.sim.joint_q.numpy())
+        q, episode = np.array(rollout.sim.joint_q.numpy()), rollout.state.episode.numpy()
         if step == 10:
-            q[0, 8] = np.nan  # still on its way
-            q[2, :2] = 14.0, 4.0  # at the goal from now on
+            q[episode == 0, 8] = np.nan  # still on its way
+            q[episode == 2, :2] = 14.0, 4.0  # at the goal from now on
         if step == 20:
-            q[2, 8] = np.nan
+            q[episode == 2, 8] = np.nan
         put(rollout.sim, q)
 
     result = rollout.evaluate(np.stack([FLAT, FLAT]), np.arange(2), progress=break_one)

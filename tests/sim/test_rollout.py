@@ -106,9 +106,9 @@ def test_a_robot_has_fallen_that_tilts_by_more_than_60_degrees(anymal, device):
     tilt = np.deg2rad([0.0, 58.0, 62.0, 180.0])
 
     def turn(share):
-        q = positions(flyer.sim)
+        q, own = positions(flyer.sim), tilt[flyer.state.episode.numpy()]  # of each robot's episode
         q[:, 2], q[:, 3:7] = 5.0, 0.0
-        q[:, 3], q[:, 6] = np.sin(tilt / 2), np.cos(tilt / 2)
+        q[:, 3], q[:, 6] = np.sin(own / 2), np.cos(own / 2)
         put(flyer.sim, q)
 
     result = flyer.evaluate(FLAT[None], np.array([1]), progress=turn)
@@ -120,15 +120,15 @@ def test_robots_that_are_done_wait_above_the_ground(anymal, device):
     # One starts at the goal, the other walks on: the first is over at once and touches nothing from then on.
     rollout = crossing(anymal, device, replicas=2, num_terrains=2, start=(2.0, 4.0), goal_radius=0.5)
     rollout.put(np.stack([FLAT, FLAT]), np.arange(2))
-    q = positions(rollout.sim)
-    q[0, :2] = 14.0, 4.0
+    q, first = positions(rollout.sim), rollout.state.episode.numpy() == 0
+    q[first, :2] = 14.0, 4.0
     put(rollout.sim, q)
     for _ in range(25):
         rollout.control_step()
     height = positions(rollout.sim)[:, 2]
-    assert height[0] > 49.9 and (height[1:] < 1.0).all()
+    assert first.sum() == 1 and height[first] > 49.9 and (height[~first] < 1.0).all()
     forces = np.linalg.norm(rollout.sim.geom_force.numpy(), axis=(1, 2))
-    assert forces[0] == 0.0 and (forces[1:] > 100.0).all()
+    assert forces[first] == 0.0 and (forces[~first] > 100.0).all()
 
 
 @pytest.mark.parametrize("what", ["not a number", "too fast"])
@@ -139,7 +139,8 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout, grids, what):
     def break_one(share):
         array = rollout.sim.joint_q if what == "not a number" else rollout.sim.joint_qd
         values = np.array(array.numpy())
-        values[6, 8] = np.nan if what == "not a number" else 3000.0  # terrain 1, replica 2
+        robot = rollout.state.episode.numpy() == 6  # terrain 1, replica 2
+        values[robot, 8] = np.nan if what == "not a number" else 3000.0
         array.assign(values)
 
     result = rollout.evaluate(grids, seeds, progress=break_one)
@@ -172,11 +173,12 @@ def test_actions_that_are_not_finite_make_their_episodes_invalid_in_the_step_the
 
 def test_penalties_equal_a_replay_on_the_host(robot, device):
     """The captured rollout against single eager steps of the same actions, summed by the float64 oracle."""
-    rows, actions, starts = [], [], []
+    rows, actions, starts, robots = [], [], [], []
 
     def record(observation):
         if not starts:
             starts.append((positions(sim), velocities(sim)))
+            robots.extend(np.argsort(recorder.state.episode.numpy()))  # on a GPU they take episodes in any order
         action = stretch(observation)
         rows.append(np.array(observation.cpu().numpy(), dtype=np.float64))
         actions.append(np.array(action.cpu().numpy(), dtype=np.float32))
@@ -205,12 +207,13 @@ def test_penalties_equal_a_replay_on_the_host(robot, device):
                 step = step_penalties(plain.qpos, plain.qvel, command, force, feet=feet, force_limit=limit)
                 sums[~ended] += robot.physics_dt * step[~ended]
                 ended |= np.linalg.norm(force[:, bases], axis=2).max(axis=1) > 1
+    sums, ended = sums[robots], ended[robots]
     assert ended.tolist() == [False, False, True, True]
     np.testing.assert_array_equal(result.base_collision.ravel(), ended)
     columns = [PENALTIES.index(name) for name in robot.penalties]
     tolerance = {"rtol": 1e-3, "atol": 1e-4} if device.startswith("cuda") else {"rtol": 1e-4, "atol": 1e-6}
     np.testing.assert_allclose(result.penalties.reshape(4, -1), sums[:, columns], **tolerance)
-    assert (sums[:, :3] > 0.01).all()
+    assert (sums[:, :3] > 0.003).all()  # far above the tolerance
     assert sums[2:, 5].min() > 0  # the base's touch itself is counted
 
 

@@ -117,7 +117,7 @@ def test_it_ends_with_the_command_that_compares(places, capsys):
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Next, see what it did:"))
     words = shlex.split(line.partition("  ")[2])
     assert words[1:] == [
-        "evaluate", "--robot", "anymal", "--policies", "base=shipped", f"tuned={run / 'policy.pt'}",
+        "evaluate", "--robot", "anymal", "--policies", f"base={places / 'start.pt'}", f"tuned={run / 'policy.pt'}",
         "--archive", str(places / "archive" / "archive.npz"), "--split-seed", "3",
     ]  # fmt: skip
 

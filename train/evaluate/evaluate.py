@@ -144,7 +144,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
     from train.evaluate.tables import check_seeds, make_tables
 
     if flags.policy is not None:
-        raise ValueError(f"tables are of named controllers: give --policies NAME={flags.policy} instead of --policy")
+        raise ValueError(f"tables are of named controllers: give --policies own={flags.policy} instead of --policy")
     robot = get_robot(flags.robot)
     evaluator = replace(evaluator_of(flags, robot), reward=True)
     controllers = controllers_of(flags.policies, robot)

@@ -1,6 +1,7 @@
 """Records crossings on the CPU in a process of their own, while the page goes on answering."""
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -40,11 +41,15 @@ class _Recording:
 
     def __init__(self, robot: "RobotCfg", first: Wanted) -> None:
         self._simulation, self._first = Simulation(robot, "cpu"), first
+        self._wanted: deque[Wanted] = deque()
 
-    def evaluate(self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None]) -> "Recording":
-        """The recording of one terrain, crossed as the first one was."""
-        wanted = replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0]))
-        return self._simulation([wanted], progress)[0]
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """Keeps one terrain, to be crossed as the first one was."""
+        self._wanted.append(replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0])))
+
+    def take(self, progress: Callable[[float], None]) -> "Recording":
+        """The recording of the terrain that was put in first, crossed now."""
+        return self._simulation([self._wanted.popleft()], progress)[0]
 
 
 def build_recording(cfg: "tuple[RobotCfg, Wanted]", num_terrains: int) -> Any:

@@ -85,6 +85,9 @@ def test_summary_by_hand():
     assert numbers == {
         "seed": 9,
         "robot": "anymal",
+        "robot_sha256": None,
+        "policy_sha256": None,
+        "penalty_definition": "absolute",
         "space": "super_gaussian",
         "iterations": 7,
         "terrains_evaluated": 40,

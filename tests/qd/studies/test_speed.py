@@ -32,8 +32,7 @@ def test_where_to_write_is_tried_before_the_timing(tmp_path, monkeypatch, module
     [
         (Speed(iterations=0), "iterations must be at least 1, got 0"),
         (Speed(steps=0), "steps must be at least 1, got 0"),
-        (Speed(curve=(1000,)), "curve must be multiples of 16, got"),
-        (Speed(curve=(0,)), "curve must be multiples of 16, got"),
+        (Speed(curve=(1024, 0)), r"curve must be at least 1, got \(1024, 0\)"),
         (Scale(counts=(2, 1)), "counts must be numbers of workers that rise"),
         (Scale(counts=(0, 1)), "counts must be at least 1"),
         (Scale(rounds=0), "rounds must be at least 1, got 0"),

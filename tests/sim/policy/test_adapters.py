@@ -131,7 +131,7 @@ def test_a_crossing_through_an_adapter_is_the_same_crossing(tmp_path, write, any
     for spec in specs:
         rollout = Rollout(anymal, spec, num_terrains=2, num_replicas=2, device=device, cfg=SHORT)
         result = rollout.evaluate(SUPER_GAUSSIAN.hard_random(2, 5), np.arange(2, dtype=np.uint32))
-        ends.append((result.penalties, positions(rollout.sim)))
+        ends.append((result.penalties, result.final_position))
     np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=1e-2, atol=1e-3)
     np.testing.assert_allclose(ends[0][1], ends[1][1], atol=2e-3)
     assert np.abs(velocities(rollout.sim)).max() > 0.1
@@ -157,7 +157,7 @@ def test_what_is_sensed_is_the_state_in_physical_units(anymal, device):
         heading = rotation[:2, 0] / np.linalg.norm(rotation[:2, 0])
         # The point 0.8 m ahead and 0.3 m to the left is [16, 8].
         x, y = q[env, :2] + 0.8 * heading + 0.3 * np.array([-heading[1], heading[0]])
-        ground = surface_heights(heights[env // 2], np.array([x]), np.array([y]))[0]
+        ground = surface_heights(heights[rollout.sim.terrain_of_env.numpy()[env]], np.array([x]), np.array([y]))[0]
         assert float(sensed.scan[env, 16, 8]) == pytest.approx(np.clip(q[env, 2] - ground, -0.5, 1.5), abs=1e-3)
     assert float(sensed.lin_vel.abs().max()) > 0.1
 
@@ -213,7 +213,7 @@ def test_code_in_a_file_is_a_controller(write, anymal):
         ("1 / 0", "act", r"cannot be imported: .*mine\.py fails: ZeroDivisionError"),
         ("act = 3", "act", "must be callable, got int"),
         ("x = 3", "act", "cannot be imported: AttributeError.*'act'"),
-        ("def adapt(actor, robot): raise KeyError('gone')", "adapt@{}", "an adapter that failed: KeyError: 'gone'"),
+        ("def adapt(actor, robot): raise KeyError('gone')", "adapt@{}", "an adapter that failed, .*: KeyError: 'gone'"),
         ("def adapt(actor, robot): return 3", "adapt@{}", "an adapter that must return a callable, got int"),
         ("def adapt(actor, robot): return actor", "adapt@{}", r"failed on observations of shape \(4, 235\)"),
         ("def adapt(actor, robot): return actor", "adapt@gone.pt", "'gone.pt': no such file"),

@@ -115,7 +115,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     code, out, _ = tell(capsys, "--robot", "anymal", "--out", path)
     assert code == 0
     assert "observation (batch, 235) -> action (batch, 12)" in out
-    assert f"Try it: --policy {path}" in out
+    assert f"evaluate --robot anymal --policy {path}" in out
     assert isinstance(load_policy(path, ANYMAL, "cpu"), OnnxPolicy)
     # The file is a controller, but not one that can be written again.
     code, _, error = tell(capsys, "--policy", path, "--out", tmp_path / "again.onnx")

@@ -241,11 +241,16 @@ def test_the_size_comes_from_the_robot(tmp_path, anymal):
     assert load_policy(path, small, "cpu").sizes == (49, 12)
 
 
+def runner_of(policy, observation, action):
+    """A runner in the middle of episodes: none begins."""
+    return PolicyRunner(policy, observation, action, wp.zeros(len(action), dtype=int, device=action.device))
+
+
 def test_the_runner_writes_actions_into_its_buffer(anymal, device):
     observation = wp.full((5, OBSERVATIONS), 0.5, dtype=float, device=device)
     action = wp.zeros((5, ACTIONS), dtype=float, device=device)
     policy = load_policy(anymal.policy_file, anymal, device)
-    runner = PolicyRunner(policy, observation, action)
+    runner = runner_of(policy, observation, action)
     runner()
     with torch.inference_mode():
         expected = policy(wp.to_torch(observation))
@@ -265,7 +270,7 @@ def test_a_controller_may_keep_and_change_its_row(anymal):
 
     observation = wp.full((5, OBSERVATIONS), 0.5, dtype=float, device="cpu")
     action = wp.zeros((5, ACTIONS), dtype=float, device="cpu")
-    runner = PolicyRunner(policy, observation, action)
+    runner = runner_of(policy, observation, action)
     runner()
     np.testing.assert_array_equal(observation.numpy(), 0.5)
     observation.fill_(-1.0)
@@ -293,4 +298,4 @@ def fails(_):
 def test_what_goes_wrong_in_a_crossing_is_named(policy, message):
     observation, action = (wp.zeros((5, size), dtype=float, device="cpu") for size in (OBSERVATIONS, ACTIONS))
     with pytest.raises(ValueError, match=message):
-        PolicyRunner(policy, observation, action)()
+        runner_of(policy, observation, action)()

@@ -147,13 +147,14 @@ def test_one_controller_more_crosses_alone(tmp_path):
     assert list(report["differences"]["hard_random"]) == ["base -> C-G"]
 
 
-def test_sets_of_other_sizes_have_simulations_of_their_own(tmp_path):
+def test_sets_of_one_space_share_a_simulation_that_has_room_for_the_largest(tmp_path):
     found = make_archive(5)  # one elite is held out
     sets = make_sets(["hard_random", "generated"], 3, 0, archive=found, split=split_elites(found, "anymal"))
     crossings = Crossings()
     evaluator = EvaluatorCfg(robot="anymal", policy="", num_terrains=9, num_replicas=2, reward=True)
     results = cross_all({"base": STANDER}, sets, evaluator, tmp_path, open_evaluator=crossings.open)
-    assert [cfg.num_terrains for cfg in crossings.opened] == [3, 1]
+    assert [cfg.num_terrains for cfg in crossings.opened] == [3]
+    assert results["hard_random"]["base"].outcome.shape == (3, 2)
     assert results["generated"]["base"].outcome.shape == (1, 2)
 
 

@@ -5,9 +5,11 @@ import time
 import numpy as np
 import pytest
 
+from kernels.episode import Outcome
 from qd.show.recordings import Wanted
 from qd.show.view.recorder import Recorder
 from tests.qd.show.view.instant import build
+from tests.sim.scenes import spike
 
 
 def wish(number, policy="fast"):
@@ -42,6 +44,21 @@ def test_progress_comes_before_the_recording(recorder, reports):
     assert "building" in found[0].text and found[-1].recording == "fast on 2"
     recorder.record(wish(3))
     assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
+
+
+def test_a_simulation_is_recorded(anymal, reports):
+    recorder = Recorder(anymal, reports.put)
+    try:
+        found = []
+        for seed in (1, 2):  # it falls on the spike at once, every time from another start
+            stands = {"terrain": spike(), "policy": "tests.sim.policies:stand"}
+            recorder.record(Wanted(label="", **stands, replicas=4, terrain_seed=seed))
+            found.append(last_of(reports)[-1].recording)
+    finally:
+        recorder.stop()
+    assert [recording.seeds.tolist() for recording in found] == [[1], [2]]
+    assert all((recording.outcome == Outcome.BASE_COLLISION).all() for recording in found)
+    assert (found[0].base_position[:, :, 0] != found[1].base_position[:, :, 0]).any()
 
 
 def test_of_several_wishes_the_last_one_counts(recorder, reports):
