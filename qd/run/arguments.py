@@ -224,6 +224,7 @@ def evaluator_of(
         num_replicas=cfg.replicas,
         device=device,
         workers=workers,
+        lots=cfg.scheduler.groups,
         num_envs=num_envs,
         space=cfg.space,
     )

@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.archive import read_archive
 from qd.show.figures import save_figure
 from sim.files.atomic import prepare_output
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
 from sim.space import SUPER_GAUSSIAN
 
-_ROBOTS, _TERRAINS, _REPLICAS = 8, 8, 2
+_ROBOTS, _TERRAINS, _REPLICAS = 8, 20, 2
 _SEED = 3
 
 
@@ -31,14 +32,21 @@ class _Timeline:
         """Adds nothing."""
 
 
-def _run(robot: RobotCfg, device: str, *, queued: bool) -> NDArray[np.int32]:
+def _terrains(run: Path | None) -> NDArray[np.float32]:
+    """Genes of elites from all ranks of a run, or of hard-random terrains."""
+    if run is None:
+        return SUPER_GAUSSIAN.hard_random(_TERRAINS, _SEED)
+    genes = read_archive(run).genes
+    return genes[np.linspace(0, len(genes) - 1, _TERRAINS).astype(int)]
+
+
+def _run(robot: RobotCfg, genes: NDArray[np.float32], device: str, *, queued: bool) -> NDArray[np.int32]:
     """Episode of each robot at each control step, -1 where it waits, shape (steps, robots)."""
     num_terrains = _TERRAINS if queued else _ROBOTS // _REPLICAS
     rollout = Rollout(
         robot, robot.policy_file, num_terrains=num_terrains, num_replicas=_REPLICAS, num_envs=_ROBOTS, device=device
     )
-    genes, seeds = SUPER_GAUSSIAN.hard_random(_TERRAINS, _SEED), np.arange(_TERRAINS, dtype=np.uint32)
-    timeline, rows = _Timeline(rollout), []
+    seeds, timeline, rows = np.arange(_TERRAINS, dtype=np.uint32), _Timeline(rollout), []
     for first in range(0, _TERRAINS, num_terrains):
         own = slice(first, first + num_terrains)
         rollout.evaluate(genes[own], seeds[own], watcher=timeline)
@@ -49,29 +57,30 @@ def _run(robot: RobotCfg, device: str, *, queued: bool) -> NDArray[np.int32]:
     return np.concatenate(rows)
 
 
-def draw_timeline(file: Path, robot: str, device: str) -> None:
+def draw_timeline(file: Path, robot: str, run: Path | None, device: str) -> None:
     """Cross some terrains without and with the queue, and draw both.
 
     Args:
         file: Picture to write.
         robot: Name of the robot.
+        run: Whose elites are crossed; hard-random terrains if None.
         device: Warp device name.
     """
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     prepare_output(file)
-    cfg = get_robot(robot)
+    cfg, genes = get_robot(robot), _terrains(run)
     figure = Figure(figsize=(8.0, 4.4), layout="constrained")
     both = figure.subplots(2, 1, sharex=True)
     titles = (False, "one lot after the other"), (True, "a queue")
     for axes, (queued, title) in zip(both, titles, strict=True):
-        rows = _run(cfg, device, queued=queued)
+        rows = _run(cfg, genes, device, queued=queued)
         for env, episodes in enumerate(rows.T):
             cuts = np.flatnonzero(np.diff(episodes, prepend=-2, append=-2))
             for begin, end in pairwise(cuts.tolist()):
                 if episodes[begin] >= 0:
-                    color = colormaps["tab10"](int(episodes[begin]) // _REPLICAS)
+                    color = colormaps["tab20"](int(episodes[begin]) // _REPLICAS)
                     width = (end - begin) * cfg.control_dt
                     axes.barh(env + 1, width, left=begin * cfg.control_dt, color=color, edgecolor="white", height=0.8)
         total_s, idle = len(rows) * cfg.control_dt, float((rows < 0).mean())

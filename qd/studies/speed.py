@@ -60,7 +60,8 @@ class Speed(OfRobot, OnDevice):
     train_speed: Path | None = None
     """Output of `faultline train-speed`, whose rates are taken over."""
     timeline: Path | None = None
-    """Draw which robot ran which episode when, with and without the queue, into this file; nothing is timed."""
+    """Draw which robot ran which episode when, with and without the queue, into this file, on elites of --run or else on
+    hard-random terrains; nothing is timed."""
     out: Path | None = None
     """Where to write; printed alone if left out."""
 
@@ -69,7 +70,7 @@ class Speed(OfRobot, OnDevice):
         if self.timeline is not None:
             from qd.show.timeline import draw_timeline
 
-            draw_timeline(self.timeline, self.robot or "anymal", resolve_device(self.device))
+            draw_timeline(self.timeline, self.robot or "anymal", self.run, resolve_device(self.device))
             return
         publish(self.out, lambda: measure(self), show_json)
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
 
-_SPARE_SLOTS = 32  # terrains of a process: each lot under way may not divide evenly
+_MOST_ENVS = {"cuda": 32_768, "cpu": 32}  # of a worker, when there is work for more
+_RUNNING_SHARE = 0.7  # of the episodes under way in several lots: the others wait for the last of their lot
 _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
 
 
@@ -71,6 +72,8 @@ class EvaluatorCfg:
     """Warp device name."""
     workers: str | None = None
     """Who crosses them, as :func:`parse_workers` takes it; a GPU without Ray needs one process."""
+    lots: int = 1
+    """Lots of terrains under way at once in a search, equally large."""
     num_envs: int | None = None
     """Robots at once over all workers, which take the episodes one after the other; as many as the device is good for
     if None. It changes no result."""
@@ -94,18 +97,18 @@ class EvaluatorCfg:
 
     @property
     def envs_of_worker(self) -> int:
-        """Robots of a worker, at least 4."""
-        if self.num_envs is None:
-            return best_num_envs(self.device)
-        return max(MIN_ROWS, -(-self.num_envs // self.num_workers))
+        """Robots of a worker, at least 4: by default so many that they seldom wait (results/anymal/speed.json)."""
+        wanted = self.num_envs
+        if wanted is None:
+            episodes = self.num_terrains * self.num_replicas
+            wanted = episodes if self.lots == 1 else int(_RUNNING_SHARE * episodes)
+            wanted = min(wanted, _MOST_ENVS[self.device.partition(":")[0]] * self.num_workers)
+        return max(MIN_ROWS, -(-wanted // self.num_workers))
 
-
-def best_num_envs(device: str) -> int:
-    """Robots at once with which a device crosses the most episodes a second (results/anymal/speed.json).
-
-    A GPU is full with so many; on a core, more would wait longer for the last ones to arrive.
-    """
-    return 32_768 if device.startswith("cuda") else 32
+    @property
+    def terrains_of_worker(self) -> int:
+        """Terrains that a worker may have under way: its share of each lot, which may not divide evenly."""
+        return -(-self.num_terrains // self.num_workers) + max(self.lots, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,7 +279,7 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
     processes: list[WorkerProcess] = []
     try:
         for number in range(cfg.num_workers):
-            processes.append(WorkerProcess(-(-cfg.num_terrains // cfg.num_workers) + _SPARE_SLOTS, build, cfg))
+            processes.append(WorkerProcess(cfg.terrains_of_worker, build, cfg))
             if number == 0:
                 processes[0].receive()  # it compiles the kernels; the others then find them compiled
         for process in processes[1:]:
