@@ -60,8 +60,8 @@ class Speed(OfRobot, OnDevice):
     train_speed: Path | None = None
     """Output of `faultline train-speed`, whose rates are taken over."""
     timeline: Path | None = None
-    """Draw which robot ran which episode when, with and without the queue, into this file, on elites of --run or else on
-    hard-random terrains; nothing is timed."""
+    """Draw which robot ran which episode when, with and without the queue, into this file, on elites of --run, or else
+    on hard-random terrains; nothing is timed."""
     out: Path | None = None
     """Where to write; printed alone if left out."""
 
