@@ -421,12 +421,10 @@ class Rollout:
             self._advance(watcher)
         result = self._collect(batch)
         self._batches.popleft()
-        if watcher is None and not self._waiting and not all(map(self._has_ended, self._batches)):
+        going = any(self._num_ended(other) < other.num_episodes for other in self._batches)
+        if going and not self._waiting and watcher is None:
             self._advance()
         return result
-
-    def _has_ended(self, batch: _Batch) -> bool:
-        return self._num_ended(batch) == batch.num_episodes
 
     def _num_ended(self, batch: _Batch) -> int:
         return sum(int(self._queue.num_ended[own].numpy().sum()) for own in batch.slots)
