@@ -26,7 +26,7 @@ class EpisodeQueue:
     num_replicas: int
     """Episodes a terrain."""
     counts: wp.array[int]
-    """Episodes taken and episodes ready to be taken since the ring was empty; shape (2,)."""
+    """Episodes taken and episodes ready to be taken since the ring was empty, less whole rounds of it; shape (2,)."""
     seed: wp.array[wp.uint32]
     """Seed of each slot's terrain, shape (num_slots,)."""
     num_ended: wp.array[int]
@@ -35,6 +35,8 @@ class EpisodeQueue:
     """Row of the results that each robot works on, -1 where it waits; shape (num_envs,)."""
     begins: wp.array[int]
     """1 where a robot has just taken an episode, shape (num_envs,)."""
+    busy: wp.array[int]
+    """Control steps that each robot made for an episode since the host set it to zero, shape (num_envs,)."""
     outcome: wp.array[int]
     """Results, shape (num_slots * num_replicas,): :class:`kernels.episode.Outcome`."""
     invalidity: wp.array[int]
@@ -70,6 +72,7 @@ def make_queue(
     queue.num_ended = wp.zeros(num_slots, dtype=int, device=device)
     queue.episode_of_env = wp.full(num_envs, -1, dtype=int, device=device)
     queue.begins = wp.zeros(num_envs, dtype=int, device=device)
+    queue.busy = wp.zeros(num_envs, dtype=int, device=device)
     for name in ("outcome", "invalidity", "steps"):
         setattr(queue, name, wp.zeros(rows, dtype=int, device=device))
     queue.final_pose = wp.zeros(rows, dtype=wp.transform, device=device)
@@ -124,9 +127,11 @@ def _turn_over_kernel(
     """Grid (num_envs,)."""
     env = wp.tid()
     queue_out.begins[env] = 0
+    row = queue_out.episode_of_env[env]
+    if row >= 0:
+        queue_out.busy[env] += 1
     if stepped[env] == _RUNNING:
         return
-    row = queue_out.episode_of_env[env]
     if row >= 0:
         _write_down(row, env, episodes_out, penalty_sums_out, rewards, queue_out)
     row = _take_next(queue_out)
@@ -172,8 +177,12 @@ def turn_over(
 def _make_ready_kernel(count: int, queue_out: EpisodeQueue):
     """Grid (1,)."""
     ready = queue_out.counts[_READY]
-    queue_out.counts[_TAKEN] = wp.min(queue_out.counts[_TAKEN], ready)  # robots that found none have counted on
-    queue_out.counts[_READY] = ready + count
+    taken = wp.min(queue_out.counts[_TAKEN], ready)  # robots that found none have counted on
+    # Whole rounds change no row; left in, they would outgrow an int in a search of many days.
+    size = queue_out.seed.shape[0] * queue_out.num_replicas
+    rounds = taken // size * size
+    queue_out.counts[_TAKEN] = taken - rounds
+    queue_out.counts[_READY] = ready - rounds + count
 
 
 def make_ready(count: int, queue_out: EpisodeQueue) -> None:

@@ -82,6 +82,7 @@ def crossed_iterations(
     """
     cfg, pipeline = searches[0][0], pipeline_of(evaluate)
     groups, under_way = range(cfg.scheduler.groups), 0
+    pipeline.clear()
 
     def put(iteration: int, group: int) -> None:
         parts = [_group_terrains(own, search, iteration, group) for own, search in searches]

@@ -52,7 +52,7 @@ class RolloutResult:
     robot_steps: int
     """Physics steps of all robots in that time, those that waited included."""
     busy_steps: int
-    """Physics steps of the episodes."""
+    """Those of them in which a robot had an episode, each to the end of its control step."""
     wall_s: float
     """Time that took [s]."""
     reward: np.ndarray | None = None
@@ -76,7 +76,7 @@ class RolloutResult:
     @property
     def idle_share(self) -> float:
         """Share of the robots' steps in which they waited."""
-        return 1.0 - self.busy_steps / self.robot_steps
+        return 1.0 - self.busy_steps / self.robot_steps if self.robot_steps else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -339,6 +339,7 @@ class Rollout:
         self._waiting += num_episodes
         if idle:
             self._queue.counts.zero_()
+            self._queue.busy.zero_()
             self._began = self._taken_at = self._steps
             self._taken_s = time.perf_counter()
         if idle or self._policy.memory is not Memory.WHOLE:
@@ -420,7 +421,8 @@ class Rollout:
             self._advance(watcher)
         result = self._collect(batch)
         self._batches.popleft()
-        if self._batches and not self._waiting and watcher is None:
+        going = any(self._num_ended(other) < other.num_episodes for other in self._batches)
+        if going and not self._waiting and watcher is None:
             self._advance()
         return result
 
@@ -446,6 +448,8 @@ class Rollout:
         with np.errstate(invalid="ignore"):
             upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)
         physics_steps = (self._steps - self._taken_at) * robot.decimation
+        busy_steps = int(queue.busy.numpy().sum(dtype=np.int64)) * robot.decimation
+        queue.busy.zero_()
         wall_s = time.perf_counter() - self._taken_s
         self._taken_at, self._taken_s = self._steps, self._taken_s + wall_s
         return RolloutResult(
@@ -458,7 +462,7 @@ class Rollout:
             final_position=pose[..., :3],
             physics_steps=physics_steps,
             robot_steps=physics_steps * self.num_envs,
-            busy_steps=int(steps.sum()),
+            busy_steps=busy_steps,
             wall_s=wall_s,
             reward=reward,
         )
@@ -466,11 +470,7 @@ class Rollout:
 
 @contextmanager
 def _saying_what_does_not_fit(num_envs: int, num_terrains: int, device: str) -> Iterator[None]:
-    """Says of an allocation that failed what it was for.
-
-    Raises:
-        ValueError: If memory ran out.
-    """
+    """Says of an allocation that failed what it was for, by a ValueError."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
-from qd.workers.shards import MIN_ROWS, checked_count, merged
+from qd.workers.shards import MIN_ROWS, checked_count, merged, taken
 from sim.files.provenance import provenance
 
 if TYPE_CHECKING:
@@ -107,8 +107,8 @@ class EvaluatorCfg:
 
     @property
     def terrains_of_worker(self) -> int:
-        """Terrains that a worker may have under way: its share of each lot, which may not divide evenly."""
-        return -(-self.num_terrains // self.num_workers) + max(self.lots, 2)
+        """Terrains that a process has under way at most, or as many as give 4 robots an episode."""
+        return max(-(-self.num_terrains // self.num_workers), -(-MIN_ROWS // self.num_replicas))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,6 +310,10 @@ class Pipeline(ABC):
     def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
         """Waits for the lot that was put in first; ``progress`` is told the share of it that is done."""
 
+    @abstractmethod
+    def clear(self) -> None:
+        """Has nothing under way afterwards: what an evaluation that was stopped has left is of no later one."""
+
     def __call__(
         self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
     ) -> "RolloutResult":
@@ -317,13 +321,15 @@ class Pipeline(ABC):
         count = checked_count(terrains, seeds)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-        for own in lots[:2]:
+        ahead = min(2, self.num_terrains)
+        self.clear()
+        for own in lots[:ahead]:
             self.put(terrains[own], seeds[own])
         results = []
         for number, own in enumerate(lots):
             done, share = own.start / count, (own.stop - own.start) / count
             results.append(self.take(None if progress is None else _share_of(progress, done, share)))
-            for behind in lots[number + 2 : number + 3]:
+            for behind in lots[number + ahead : number + ahead + 1]:
                 self.put(terrains[behind], seeds[behind])
         return merged(results, join=1)
 
@@ -343,6 +349,10 @@ class _Here(Pipeline):
         """Waits for the simulation."""
         return self._crosser.take(progress)
 
+    def clear(self) -> None:
+        """Lets the simulation forget."""
+        self._crosser.clear()
+
 
 class _Processes(Pipeline):
     """Processes that each cross a part of every lot, whole terrains in order."""
@@ -350,58 +360,77 @@ class _Processes(Pipeline):
     def __init__(self, processes: list[WorkerProcess], num_terrains: int) -> None:
         super().__init__(num_terrains)
         self._processes = processes
-        self._parts: deque[int] = deque()  # of each lot under way
-        self._results: list[deque[Any]] = [deque() for _ in processes]
+        self._first = 0  # process that is the first to get one of the terrains that do not divide evenly
+        self._lots: deque[dict[int, Any]] = deque()  # of each lot under way, the results by process, None to come
 
     def put(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Hands a part to each process, as far as there are terrains."""
-        count = len(terrains)
-        size = -(-count // len(self._processes))
-        parts = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-        for process, own in zip(self._processes, parts, strict=False):
-            process.send(terrains[own], seeds[own])
-        self._parts.append(len(parts))
+        """Hands a part to each process; over all lots none gets more than one terrain more than another."""
+        each, rest = divmod(len(terrains), len(self._processes))
+        parts, begin = dict[int, Any](), 0
+        for index, process in enumerate(self._processes):
+            end = begin + each + ((index - self._first) % len(self._processes) < rest)
+            if end > begin:
+                process.send(terrains[begin:end], seeds[begin:end])
+                parts[index], begin = None, end
+        self._first = (self._first + rest) % len(self._processes)
+        self._lots.append(parts)
 
     def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
         """Puts the parts of a lot together."""
-        results = self._results[: self._parts.popleft()]
-        shares = np.zeros(len(results))
-        while not all(results):
-            for index in self._ready(results):
+        parts = self._lots[0]
+        shares = dict.fromkeys(parts, 0.0)
+        while waiting := {self._processes[k].connection: k for k, result in parts.items() if result is None}:
+            for connection in wait(list(waiting)):
+                assert isinstance(connection, Connection)
+                index = waiting[connection]
                 message, value = self._processes[index].receive()
                 if message == "result":
-                    results[index].append(value)
+                    parts[index] = value
                 shares[index] = value if message == "progress" else 1.0
             if progress is not None:
-                progress(float(shares.mean()))
-        return merged([own.popleft() for own in results], join=0)
+                progress(sum(shares.values()) / len(shares))
+        self._lots.popleft()
+        return merged(list(parts.values()), join=0)
 
-    def _ready(self, results: list[deque[Any]]) -> list[int]:
-        """Processes without a result yet that have something to say, or died."""
-        waiting = {self._processes[k].connection: k for k, own in enumerate(results) if not own}
-        return [waiting[connection] for connection in wait(list(waiting)) if isinstance(connection, Connection)]
+    def clear(self) -> None:
+        """Waits for what is under way."""
+        while self._lots:
+            self.take()
 
 
-class _OneByOne(Pipeline):
-    """An evaluator that has one lot under way at a time."""
+class _AllAtOnce(Pipeline):
+    """An evaluator that knows a single evaluation at a time: it crosses together all lots that have been put in."""
 
     def __init__(self, evaluate: Evaluate) -> None:
-        super().__init__(0)
+        super().__init__(1)
         self._evaluate = evaluate
-        self._lots: deque[tuple[NDArray, NDArray]] = deque()
+        self._lots: list[tuple[NDArray, NDArray]] = []
+        self._results: deque[Any] = deque()
 
     def put(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Keeps a lot until it is waited for."""
+        """Keeps a lot until one is waited for."""
         self._lots.append((terrains, seeds))
 
     def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
-        """Crosses the lot that was put in first."""
-        return self._evaluate(*self._lots.popleft(), progress)
+        """Crosses all lots there are, unless the first of them is crossed already."""
+        if not self._results:
+            terrains, seeds = (np.concatenate(arrays) for arrays in zip(*self._lots, strict=True))
+            result, first = self._evaluate(terrains, seeds, progress), 0
+            for own, _ in self._lots:
+                self._results.append(taken(result, len(own), first=first))
+                first += len(own)
+            self._lots.clear()
+        return self._results.popleft()
+
+    def clear(self) -> None:
+        """Forgets what was put in."""
+        self._lots.clear()
+        self._results.clear()
 
 
 def pipeline_of(evaluate: Evaluate) -> Pipeline:
-    """An evaluator as a pipeline; one that knows a single lot at a time takes them one after the other."""
-    return evaluate if isinstance(evaluate, Pipeline) else _OneByOne(evaluate)
+    """An evaluator as a pipeline; one that knows a single evaluation at a time crosses together what was put in."""
+    return evaluate if isinstance(evaluate, Pipeline) else _AllAtOnce(evaluate)
 
 
 def _share_of(progress: Callable[[float], None], start: float, share: float) -> Callable[[float], None]:

@@ -32,6 +32,10 @@ class Crosser(Protocol):
         """Cross each terrain."""
         ...
 
+    def clear(self) -> None:
+        """Forget what is under way."""
+        ...
+
     def put(self, terrains: NDArray, seeds: NDArray) -> None:
         """Let terrains be crossed behind those under way."""
         ...
@@ -63,11 +67,17 @@ class WorkerProcess:
         theirs.close()  # so that its death ends the stream here
 
     def send(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Hands out terrains to evaluate, behind those handed out before."""
+        """Hands out terrains to evaluate, behind those handed out before.
+
+        Raises:
+            ValueError: If the worker refused what it had before.
+            EvaluatorError: If it failed otherwise, or is dead.
+        """
         try:
             self.connection.send((terrains, seeds))
         except OSError:
-            self._raise_death()
+            while True:  # behind its last results it may have said why it ended
+                self.receive()
 
     def receive(self) -> tuple[str, Any]:
         """The next message: ``ready``, ``progress`` or ``result``, and its value.
@@ -143,7 +153,9 @@ def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[NDArray, NDArr
         while True:
             inbox.put(connection.recv())
     except (EOFError, OSError):
-        inbox.put(None)  # the other end is gone
+        pass  # the other end is gone
+    finally:  # after any failure, or the worker would wait for ever, and the other end for it
+        inbox.put(None)
 
 
 def _send_last(connection: Connection, message: str, value: str) -> None:

@@ -117,17 +117,16 @@ class RayWorker:
         self._num_terrains = num_terrains
 
     def cross(self, terrains: NDArray, seeds: NDArray, num_terrains: int) -> tuple["RolloutResult", float]:
-        """Crosses up to ``num_terrains`` terrains; repeats some where there are fewer.
+        """Crosses up to ``num_terrains`` terrains.
 
         Returns:
             The result, and the seconds it took without building.
         """
         self.prepare(num_terrains)
         assert self._crosser is not None
-        filled = np.arange(num_terrains) % len(terrains)
         began = time.perf_counter()
         try:
-            result = self._crosser.evaluate(terrains[filled], seeds[filled], progress=self._note)
+            result = self._crosser.evaluate(terrains, seeds, progress=self._note)
             return result, time.perf_counter() - began
         finally:
             self._share = 0.0
@@ -279,7 +278,7 @@ class RayWorkers:
             elif time.monotonic() - busy_at > _PATIENCE_S:
                 raise self._nobody_came()
             self._wait()
-            waiting.extendleft(shard for worker in self._busy if (shard := self._failed_shard(worker, size)))
+            waiting.extendleft(shard for worker in self._busy if (shard := self._failed_shard(worker)))
             done = sum(shard.result is not None for shard in shards) + sum(map(_share_of, self._ready))
             shown = max(shown, min(1.0, done / len(shards)))
             progress(shown)
@@ -352,7 +351,7 @@ class RayWorkers:
             raise EvaluatorError(f"no worker can be used: {worker} {reason}")
         _tell(f"{worker} {reason}; the others go on without it")
 
-    def _failed_shard(self, worker: _Worker, size: int) -> _Shard | None:
+    def _failed_shard(self, worker: _Worker) -> _Shard | None:
         """Takes a worker's result if it is there; returns the shard if it failed or hangs and must be crossed again.
 
         Raises:
@@ -368,11 +367,12 @@ class RayWorkers:
         try:
             if there:
                 result, seconds = ray.get(worker.task)
-                flaw = flaw_of(result, size, replicas)
+                count = shard.part.stop - shard.part.start
+                flaw = flaw_of(result, count, replicas)
                 if flaw is None:
-                    shard.result = taken(result, shard.part.stop - shard.part.start)
+                    shard.result = taken(result, count)
                     worker.task, worker.share = None, 0.0
-                    worker.episodes_per_s = size * replicas / seconds
+                    worker.episodes_per_s = count * replicas / seconds
                     return None
                 trouble = f"answered with nonsense: {flaw}"
         except RayError as raised:

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 MIN_ROWS = 4
 """Fewest robots of a simulation: torch's linear layers give the same bits for batches of 4 rows and more only."""
 
+_STEPS = ("physics_steps", "robot_steps", "busy_steps")
+
 
 def checked_count(terrains: NDArray, seeds: NDArray) -> int:
     """Number of terrains to evaluate.
@@ -23,10 +25,13 @@ def checked_count(terrains: NDArray, seeds: NDArray) -> int:
 
 
 def taken(result: Any, count: int, *, first: int = 0) -> Any:
-    """Some of a result's terrains: ``count`` from ``first`` on."""
-    own = slice(first, first + count)
-    arrays = {name: value[own].copy() for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(result, **arrays)  # copies, since what Ray delivers can only be read
+    """Some of a result's terrains: ``count`` from ``first`` on, and their share of what all took."""
+    own, total = slice(first, first + count), len(result.penalties)
+    # Copies, since what Ray delivers can only be read.
+    fields = {name: value[own].copy() for name, value in _fields(result).items() if isinstance(value, np.ndarray)}
+    for name in _STEPS:  # parts make the whole again
+        fields[name] = getattr(result, name) * own.stop // total - getattr(result, name) * own.start // total
+    return dataclasses.replace(result, **fields, wall_s=result.wall_s * count / total)
 
 
 def merged(results: list[Any], *, join: int) -> Any:

@@ -73,6 +73,22 @@ def test_rows_are_taken_round_the_ring(device):
     robots.turn()
     # 35 episodes on 3 terrains of 4: rows 0 to 10 were run three times, row 11 twice.
     assert robots.queue.num_ended.numpy().tolist() == [12, 12, 11]
+    # The numbers do not grow for ever: of 30 taken before the last five, two whole rounds of 12 are taken off.
+    assert robots.queue.counts.numpy()[1] == 11
+
+
+def test_the_steps_of_robots_with_an_episode_are_counted(device):
+    robots = Robots(4, device)
+    make_ready(2, robots.queue)
+    rows = robots.turn()  # no step yet
+    assert not robots.queue.busy.numpy().any()
+    for _ in range(3):
+        robots.turn()
+    assert robots.queue.busy.numpy().tolist() == np.where(rows >= 0, 3, 0).tolist()
+    robots.end(np.flatnonzero(rows >= 0))
+    robots.turn()  # the step in which an episode ended counts, one of waiting does not
+    robots.turn()
+    assert robots.queue.busy.numpy().tolist() == np.where(rows >= 0, 4, 0).tolist()
 
 
 def test_what_came_of_an_episode_stands_in_its_row(device):

@@ -22,6 +22,9 @@ class Crosser:
         self.lots.append((terrains, seeds))
         assert sum(len(lot) for lot, _ in self.lots) <= self.num_terrains
 
+    def clear(self):
+        self.lots.clear()
+
     def take(self, progress=None):
         return self.evaluate(*self.lots.pop(0), progress=progress)
 

@@ -24,11 +24,11 @@ class Result:
     invalid: np.ndarray
     invalidity: np.ndarray
     duration_s: np.ndarray
-    physics_steps: int = 4000
-    robot_steps: int = 4000
-    busy_steps: int = 3000
+    physics_steps: int
+    robot_steps: int
+    busy_steps: int
+    wall_s: float
     idle_share: float = 0.25
-    wall_s: float = 0.5
     reward: np.ndarray | None = None
 
 
@@ -47,6 +47,11 @@ def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES
         invalid=excluded,
         invalidity=np.where(excluded, np.uint8(2), np.uint8(0)),  # Invalidity.STATE
         duration_s=np.full(never.shape, 15.0, dtype=np.float32),
+        # In proportion, so that a search among others or in groups comes to the same.
+        physics_steps=400 * len(penalties),
+        robot_steps=400 * len(penalties),
+        busy_steps=300 * len(penalties),
+        wall_s=0.5 * len(penalties),
     )
 
 

@@ -16,12 +16,12 @@ import pytest
 from qd.archive import read_archive
 from qd.search import run_search
 from qd.show import figures
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, Pipeline, open_evaluator
 from qd.workers.invalid import AllInvalidError
 from sim.files import atomic as files
 from sim.files.command import Interrupted
 from sim.files.provenance import provenance
-from tests.qd import stand_in
+from tests.qd import crossers, stand_in
 from tests.qd.searches import CFG, make_job, rows_of, run
 
 KEPT = ("archive.json", "archive.npz", "archive.png", "checkpoint.bin", "config.json", "curves.png", "metrics.jsonl",
@@ -98,6 +98,84 @@ def test_a_finished_run_is_extended_as_if_it_had_been_longer_from_the_start(tmp_
     run(tmp_path / "pieces", iterations=9, resumes=True)
     assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
     assert json.loads((tmp_path / "pieces/config.json").read_text())["iterations"] == 9
+
+
+GROUPS = {
+    "iterations": 5,
+    "reevaluate_every": 2,
+    "scheduler": dataclasses.replace(CFG.scheduler, emitters=5, batch_size=3, method="cma_mae+map_elites"),
+}
+
+
+def in_groups(path, count, *, open_evaluator=stand_in.open_stand_in, iterations=5, resumes=False):
+    settings = {**GROUPS, "iterations": iterations, "scheduler": dataclasses.replace(GROUPS["scheduler"], groups=count)}
+    return run_search(make_job(path, resumes=resumes, **settings), open_evaluator=open_evaluator)
+
+
+def by_two_processes(cfg: EvaluatorCfg):
+    return open_evaluator(dataclasses.replace(cfg, workers="2"), build=crossers.Crosser)
+
+
+class Lost(Pipeline):
+    """Lots crossed by the stand-in; it is lost when so many were taken."""
+
+    def __init__(self, left, lots):
+        super().__init__(1000)  # a look at the elites is one lot
+        self.left, self.lots, self.most = left, lots, 0
+
+    def put(self, terrains, seeds):
+        self.lots.append((terrains, seeds))
+        self.most = max(self.most, len(self.lots))
+
+    def take(self, progress=None):
+        self.left -= 1
+        if self.left < 0:
+            raise EvaluatorError("a worker process died")
+        return stand_in.evaluate(*self.lots.pop(0))
+
+    def clear(self):
+        assert not self.lots  # whatever is crossed anew finds nothing under way
+
+
+@pytest.mark.parametrize("groups", [2, 3])
+def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path, plain_figures, groups):
+    """Five emitters make groups of two and three, or of one, two and two; elites are looked at again."""
+    whole = in_groups(tmp_path / "whole", groups)
+    assert whole.iterations == 5 and len(whole) > 10
+    expected = (tmp_path / "whole/archive.npz").read_bytes(), rows_of(tmp_path / "whole")
+    # Lost within the second iteration, at the look at its end, and within the third, of five.
+    for lots in (groups + 1, 2 * groups, 2 * groups + 2):
+        path = tmp_path / f"lost-{lots}"
+
+        @contextmanager
+        def losing(cfg, left=lots):
+            yield Lost(left, [])
+
+        with pytest.raises(EvaluatorError, match="a worker process died"):
+            in_groups(path, groups, open_evaluator=losing)
+        in_groups(path, groups, resumes=(path / "checkpoint.bin").exists() or (path / "config.json").exists())
+        assert ((path / "archive.npz").read_bytes(), rows_of(path)) == expected, lots
+
+
+def test_groups_are_put_in_ahead(tmp_path, plain_figures):
+    lots = []
+    pipeline = Lost(99, lots)
+
+    @contextmanager
+    def opened(cfg):
+        yield pipeline
+
+    in_groups(tmp_path / "run", 3, open_evaluator=opened)
+    assert pipeline.most == 3 and not lots
+
+
+@pytest.mark.parametrize("groups", [1, 2, 3])
+def test_who_crosses_the_lots_of_groups_changes_nothing(tmp_path, plain_figures, groups):
+    in_groups(tmp_path / "whole", groups)
+    for iterations in (1, 3, 5):  # extended twice
+        path = tmp_path / "pieces"
+        in_groups(path, groups, open_evaluator=by_two_processes, iterations=iterations, resumes=path.exists())
+    assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
 
 
 def test_every_session_of_a_run_is_told_with_what_it_came_to(tmp_path, plain_figures):

@@ -11,6 +11,7 @@ from sim.crossing import CrossingCfg
 from sim.policy.loaders import load_policy
 from sim.recording.recorder import FRAME_ARRAYS, record
 from sim.rollout import Rollout
+from sim.space import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
 from tests.sim.policies import stretch
 from tests.sim.scenes import FLAT, spike
@@ -96,13 +97,63 @@ def test_lots_run_into_each_other(anymal):
     rest = [rollout.take(), rollout.take()]
     for own, got in zip((slice(0, 2), slice(2, 3), slice(3, 5)), (first, *rest), strict=True):
         same(expected, got, own)
-    # No step is counted twice: what the three took together is what was made.
+    # No step is counted twice: what the three took together is what was made, of which episodes to the end of their
+    # last control step were busy.
     robot_steps = sum(one.robot_steps for one in (first, *rest))
     used = sum(np.ceil(one.duration_s / anymal.control_dt - 1e-3).sum() for one in (first, *rest)) * anymal.decimation
+    assert sum(one.busy_steps for one in (first, *rest)) == used
     assert 0.5 * robot_steps < used <= robot_steps
+    assert all(0.0 <= one.idle_share <= 1.0 for one in (first, *rest))
     with pytest.raises(RuntimeError, match="nothing under way"):
         rollout.take()
     same(expected, rollout.evaluate(GRIDS[3:], SEEDS[3:]), slice(3, 5))
+
+
+def test_genes_and_heights_share_the_ring(anymal):
+    genes = SUPER_GAUSSIAN.hard_random(2, 0)
+    rollout = rollout_of(anymal, 5, num_terrains=3)
+    lots = [(genes[:1], SEEDS[:1]), (GRIDS[1:3], SEEDS[1:3]), (genes, SEEDS[:2])]  # the last lie round the ring's end
+    for terrains, seeds in lots[:2]:
+        rollout.put(terrains, seeds)
+    results = [rollout.take()]
+    with pytest.raises(ValueError, match="1 to 1 at once here, got 2"):
+        rollout.put(*lots[2])
+    results.append(rollout.take())
+    rollout.put(GRIDS[:1], SEEDS[:1])
+    rollout.put(*lots[2])
+    rollout.take()
+    results.append(rollout.take())
+    for (terrains, seeds), got in zip(lots, results, strict=True):
+        same(rollout_of(anymal, None).evaluate(terrains, seeds), got)
+
+
+def test_lots_in_which_robots_go_on_after_the_goal(anymal):
+    cfg = dataclasses.replace(NEAR, reward=True)
+    expected = rollout_of(anymal, None, cfg=cfg).evaluate(GRIDS, SEEDS)
+    rollout = rollout_of(anymal, 6, cfg=cfg, num_terrains=4)
+    lots = slice(0, 2), slice(2, 4), slice(4, 5)
+    for own in lots[:2]:
+        rollout.put(GRIDS[own], SEEDS[own])
+    results = [rollout.take()]
+    rollout.put(GRIDS[lots[2]], SEEDS[lots[2]])  # where robots of the first lot stood
+    results += [rollout.take(), rollout.take()]
+    for own, got in zip(lots, results, strict=True):
+        same(expected, got, own)
+        assert 0.0 <= got.idle_share <= 1.0
+    # A robot at the goal stands there and is paid: it does not wait. It has more steps than its crossing.
+    assert sum(one.busy_steps for one in results) * anymal.physics_dt > sum(one.duration_s.sum() for one in results)
+
+
+def test_a_world_that_broke_is_whole_for_the_next_episode(anymal):
+    """Every robot's first episode ends in a state that is not finite; no later one differs by that."""
+    alone = rollout_of(anymal, None).evaluate(GRIDS, SEEDS)
+    rollout = rollout_of(anymal, 4)
+    rollout.put(GRIDS[:1], SEEDS[:1])
+    rollout.control_step()
+    for array in (rollout.sim.joint_qd, rollout.sim.solver.mjw_data.qacc_warmstart):
+        array.fill_(np.nan)
+    assert (rollout.take().outcome == Outcome.INVALID).all()
+    same(alone, rollout.evaluate(GRIDS, SEEDS))
 
 
 def test_more_may_be_put_in_while_one_waits(anymal):
@@ -177,6 +228,39 @@ def test_a_failure_leaves_a_rollout_that_works(anymal):
     with pytest.raises(KeyboardInterrupt):
         rollout.evaluate(GRIDS, SEEDS, progress=stop)
     same(rollout_of(anymal, None).evaluate(GRIDS, SEEDS), rollout.evaluate(GRIDS, SEEDS))
+
+
+class FailsOnce(FearsDepth):
+    """Fails in the thirtieth step."""
+
+    calls = 0
+
+    def __call__(self, row):
+        self.calls += 1
+        if self.calls == 30:
+            raise ValueError("no memory left")
+        return super().__call__(row)
+
+
+def test_a_policy_that_fails_between_two_lots_leaves_a_rollout_that_works(anymal):
+    rollout = rollout_of(anymal, 6, FailsOnce(anymal, "cpu"))
+    rollout.put(GRIDS[:2], SEEDS[:2])
+    rollout.put(GRIDS[2:], SEEDS[2:])
+    with pytest.raises(ValueError, match=r"FailsOnce failed .* crossing.*no memory left"):
+        rollout.take()
+    same(rollout_of(anymal, None).evaluate(GRIDS[:3], SEEDS[:3]), rollout.evaluate(GRIDS[:3], SEEDS[:3]))
+
+
+def test_lots_taken_without_a_step_between_have_waited_for_nothing(anymal):
+    cfg = dataclasses.replace(NEAR, start=(2.0, 4.0), max_duration_s=0.2)
+    rollout = rollout_of(anymal, 8, CountsTogether(), cfg)
+    for first in range(3):
+        rollout.put(GRIDS[first : first + 1], SEEDS[:1])
+    results = [rollout.take() for _ in range(3)]
+    # The first begins alone, with 4 of 8 robots. The others then begin together and end after 0.2 s: the third is
+    # there when the second is taken, and no step is made for it.
+    assert [one.physics_steps for one in results] == [40, 40, 0]
+    assert [one.idle_share for one in results] == [0.5, 0.0, 0.0]
 
 
 def test_never_more_robots_than_episodes(anymal):

@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 
 from qd.workers import evaluator
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, Workers, open_evaluator, parse_workers, resolve_device
+from qd.workers.evaluator import (
+    EvaluatorCfg,
+    EvaluatorError,
+    Workers,
+    open_evaluator,
+    parse_workers,
+    pipeline_of,
+    resolve_device,
+)
 from qd.workers.process import _serve
+from qd.workers.shards import merged
 from tests.qd import crossers, stand_in
 
 CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", workers="1")
@@ -31,10 +40,19 @@ class Crosser(crossers.Crosser):
             os.kill(os.getpid(), signal.SIGKILL)
         if self.cfg.policy == "fail":
             raise RuntimeError("the solver is broken")
+        if self.cfg.policy == f"fail at {seeds[0]}":
+            raise ValueError("terrains of another kind")
         if self.cfg.policy == "sleep":
             time.sleep(60)
         result = super().evaluate(terrains, seeds, progress=progress)
         return dataclasses.replace(result, wall_s=float(seeds[0]), physics_steps=int(seeds[0]))
+
+
+class Echo(crossers.Crosser):
+    """Returns the terrains as penalties."""
+
+    def evaluate(self, terrains, seeds, *, progress=None):
+        return dataclasses.replace(stand_in.evaluate(np.zeros((2, 64)), seeds), penalties=terrains)
 
 
 def same(a, b) -> bool:
@@ -75,8 +93,9 @@ def test_how_terrains_are_spread_changes_nothing(num_processes):
 def test_shards_run_at_the_same_time_and_turns_one_after_the_other():
     with open_evaluator(dataclasses.replace(CFG, workers="2"), build=Crosser) as evaluate:
         assert evaluate(GENES[:6], SEEDS[:6]).wall_s == 103.0  # shards begin at seeds 100 and 103
-        # Twelve, of which six fit, go in lots of three, each as parts of two and one: the second begin at 102, 105, ...
-        assert evaluate(GENES[:12], SEEDS[:12]).physics_steps == 102 + 105 + 108 + 111
+        # Twelve, of which six fit, go in lots of three, as parts of two and one, one and two, ... in turn: the second
+        # parts begin at 102, 104, 108 and 110.
+        assert evaluate(GENES[:12], SEEDS[:12]).physics_steps == 102 + 104 + 108 + 110
 
 
 def test_progress_rises_to_one():
@@ -86,6 +105,68 @@ def test_progress_rises_to_one():
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
     assert len(seen) >= 9  # three turns of at least a result and a half-way mark
+
+
+def test_lots_of_one_terrain_are_dealt_round():
+    """Six terrains on four processes that have room for two each: a crosser with more than that fails."""
+    cfg = dataclasses.replace(CFG, workers="4")
+    assert cfg.terrains_of_worker == 2
+    with open_evaluator(cfg, build=Crosser) as evaluate:
+        for own in (slice(k, k + 1) for k in range(6)):
+            evaluate.put(GENES[own], SEEDS[own])
+        results = [evaluate.take() for _ in range(6)]
+    assert same(merged(results, join=1), stand_in.evaluate(GENES[:6], SEEDS[:6], 4))
+
+
+@pytest.mark.parametrize(
+    ("num_terrains", "num_replicas", "workers", "expected"),
+    [(6, 4, "4", 2), (6, 4, "1", 6), (1, 1, "8", 4)],  # no fewer than 4 robots
+)
+def test_terrains_of_a_process(num_terrains, num_replicas, workers, expected):
+    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, num_replicas=num_replicas, workers=workers)
+    assert cfg.terrains_of_worker == expected
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
+def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(device):
+    def stop(share: float) -> None:
+        raise KeyboardInterrupt
+
+    cfg = dataclasses.replace(CFG, device=device, workers="2" if device == "cpu" else None)
+    with open_evaluator(cfg, build=Crosser) as evaluate:
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(GENES, SEEDS, stop)  # of lots of three, two are in
+        assert same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
+def test_one_terrain_at_once(device):
+    with open_evaluator(dataclasses.replace(CFG, device=device, num_terrains=1), build=Crosser) as evaluate:
+        assert same(evaluate(GENES[:3], SEEDS[:3]), stand_in.evaluate(GENES[:3], SEEDS[:3], 4))
+
+
+def test_an_evaluator_of_one_evaluation_at_a_time_crosses_all_lots_together():
+    counts, seen = [], []
+
+    def evaluate(terrains, seeds, progress=None):
+        counts.append(len(terrains))
+        result = stand_in.evaluate(terrains, seeds)
+        return dataclasses.replace(result, robot_steps=1000, busy_steps=700, physics_steps=100, wall_s=10.0)
+
+    pipeline = pipeline_of(evaluate)
+    lots = [slice(0, 3), slice(3, 7), slice(7, 15)]
+    for own in lots[:2]:
+        pipeline.put(GENES[own], SEEDS[own])
+    results = [pipeline.take(seen.append)]
+    pipeline.put(GENES[lots[2]], SEEDS[lots[2]])
+    results += [pipeline.take(), pipeline.take()]
+    assert counts == [7, 8]
+    assert same(merged(results, join=1), stand_in.evaluate(GENES, SEEDS))
+    # Two evaluations of 1000 steps; of the first, 3 and 4 of 7 terrains have 428 and 572.
+    assert [one.robot_steps for one in results] == [428, 572, 1000]
+    whole = merged(results, join=1)
+    assert (whole.robot_steps, whole.busy_steps, whole.physics_steps) == (2000, 1400, 200)
+    assert whole.wall_s == pytest.approx(20.0)
 
 
 def test_on_cuda_everything_stays_in_this_process():
@@ -128,6 +209,30 @@ def test_a_failure_in_a_worker_names_its_reason():
         pytest.raises(EvaluatorError, match="RuntimeError: the solver is broken"),
     ):
         evaluate(GENES, SEEDS)
+
+
+def test_a_worker_that_ended_in_between_is_heard_when_it_gets_the_next_lot():
+    """It refuses its second lot while nobody listens: the third cannot be sent, and the reason is no death."""
+    with open_evaluator(dataclasses.replace(CFG, policy="fail at 102"), build=Crosser) as evaluate:
+        for own in (slice(0, 2), slice(2, 4)):
+            evaluate.put(GENES[own], SEEDS[own])
+        assert same(evaluate.take(), stand_in.evaluate(GENES[:2], SEEDS[:2], 4))
+        end = time.monotonic() + 20
+        with pytest.raises(ValueError, match="terrains of another kind"):
+            while time.monotonic() < end:
+                evaluate.put(GENES[4:5], SEEDS[4:5])
+                time.sleep(0.02)
+
+
+def test_large_height_maps_go_in_while_results_come_out():
+    """8 lots of 3 MB each way through pipes of 64 KB: neither side waits for the other to read."""
+    maps = np.zeros((8, 2, 161, 321, 7), np.float32)
+    maps[..., 0] = GENES[:8, :1, None, None]
+    with open_evaluator(dataclasses.replace(CFG, num_terrains=16), build=Echo) as evaluate:
+        for lot in maps:
+            evaluate.put(lot, SEEDS[:2])
+        for lot in maps:
+            np.testing.assert_array_equal(evaluate.take().penalties, lot)
 
 
 @pytest.mark.parametrize(("policy", "error"), [("refuse to build", ValueError), ("fail", EvaluatorError)])
