@@ -38,7 +38,7 @@ SMALL: dict[str, dict[str, str]] = {
     "stand": {**CPU, "--drops": "2"},
     "calibrate": {**CPU, "--terrains": "20", "--replicas": "4", "--workers": "2"},
     "compare": {**CPU, "--preset": "small", "--iterations": "1", "--seeds": "1", "--workers": "2"},
-    "ablation": {**CPU, "--preset": "small", "--iterations": "1", "--workers": "2"},
+    "ablation": {**CPU, "--preset": "small", "--iterations": "2", "--workers": "2"},
     "beside": {},
     "crosscheck": {**CPU, "--terrains": "1", "--episodes": "2", "--plain-episodes": "2"},
     "distances": {},
