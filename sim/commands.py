@@ -70,9 +70,9 @@ class ExportPolicy(Who):
 class Crosscheck(Who, OnDevice):
     """Compare the crossings of the parallel simulation with the same crossings in plain MuJoCo C.
 
-    Of a pool of terrains, those are taken on which a first set of episodes succeeds in 30 to 90 %, or those that
-    --elite names. On each of them, fresh episodes are compared with more episodes of plain MuJoCo C: the same robot
-    file, height grid, controller and starts, but MuJoCo's own heightfield contact, a converged solver, and a second
+    Of a pool of terrains it takes those on which 30 to 90 % of a first set of episodes succeed, or those named by
+    --elite. On each of them, fresh episodes are compared with more episodes of plain MuJoCo C: the same robot file,
+    height grid, controller and starts, but MuJoCo's own heightfield contact, a converged solver, and a second
     implementation of everything round it.
 
     The full check is 20 terrains x 200 episodes of MuJoCo: half an hour on two cores, two minutes on 16. Try the cheap

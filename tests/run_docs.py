@@ -1,7 +1,8 @@
 """Runs every command of README and docs/ once, small, on the CPU: ``python -m tests.run_docs``; some 20 minutes.
 
-It works in a folder of its own with a copy of results/, and says which commands it leaves out and why. ``--only WORD``
-runs those of one word after what they need.
+It works in a folder of its own with a copy of results/, and says which commands it leaves out and why. ``--only WORD
+...`` runs those of some words, after the runs that the pages go on with. Name what a word needs too: a search
+of a robot of one's own is ``--only train calibrate archive``.
 """
 
 import argparse
@@ -38,7 +39,7 @@ SMALL: dict[str, dict[str, str]] = {
     "stand": {**CPU, "--drops": "2"},
     "calibrate": {**CPU, "--terrains": "20", "--replicas": "4", "--workers": "2"},
     "compare": {**CPU, "--preset": "small", "--iterations": "1", "--seeds": "1", "--workers": "2"},
-    "ablation": {**CPU, "--preset": "small", "--iterations": "1", "--workers": "2"},
+    "ablation": {**CPU, "--preset": "small", "--iterations": "2", "--workers": "2"},
     "beside": {},
     "crosscheck": {**CPU, "--terrains": "1", "--episodes": "2", "--plain-episodes": "2"},
     "distances": {},
@@ -123,7 +124,7 @@ def run(words: list[str], folder: Path) -> str:
     with (folder / "log.txt").open("w+") as log:
         process = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
         try:
-            status = process.wait(timeout=30 if words[0] == "view" else 600)
+            status = process.wait(timeout=30 if words[0] == "view" else 1200)
         except subprocess.TimeoutExpired:
             process.terminate()
             status = process.wait()
@@ -141,7 +142,7 @@ def faultline_words(line: Line) -> list[str]:
 def main() -> int:
     """Runs them all; returns the number of those that failed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", help="the word of the commands to run; all if left out")
+    parser.add_argument("--only", nargs="+", default=(), metavar="WORD", help="words to run; all if left out")
     only = parser.parse_args().only
     lines = {str(line): line for page in PAGES for line in commands_of(page)}
     left = {name: why for name in lines for pattern, why in LEFT_OUT.items() if re.match(pattern, name)}
@@ -149,11 +150,11 @@ def main() -> int:
     unnamed = {word for group in COMMANDS.values() for word in group} - {words[0] for words in jobs}
     unnamed -= {name.split()[1] for name in left}
     assert not unnamed, f"no page shows {', '.join(sorted(unnamed))}"
-    failed, done = 0, set()
+    failed, done, start = 0, set(), time.monotonic()
     with tempfile.TemporaryDirectory() as name:
         prepare(folder := Path(name))
         for number, words in enumerate(map(small, jobs)):
-            if str(words) in done or (only and words[0] != only and number >= len(first_commands())):
+            if str(words) in done or (only and words[0] not in only and number >= len(first_commands())):
                 continue
             done.add(str(words))
             if words[0] == "beside":
@@ -167,7 +168,8 @@ def main() -> int:
                 print(wrong, flush=True)
     for command, why in left.items():
         print(f"left out        {command}: {why}")
-    print(f"{len(done)} commands run, {failed} failed, {len(left)} left out")
+    minutes = (time.monotonic() - start) / 60
+    print(f"{len(done)} commands run in {minutes:.0f} minutes, {failed} failed, {len(left)} left out")
     return failed
 
 

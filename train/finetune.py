@@ -48,7 +48,8 @@ class Finetune(TrainingFlags):
     swap_every: int | None = setting(None, least=1)
     """Iterations after which they are exchanged; on CUDA 400 (Cassie: 200), on the CPU 50."""
     critic_iterations: int | None = setting(None, least=0)
-    """Iterations at first in which the critic learns alone, where the controller comes without one; 50, or half."""
+    """Iterations at first in which the critic learns alone, where the controller comes without one; 50, or half of all
+    if they are fewer than 100."""
     ppo: PpoCfg = field(default_factory=lambda: _PPO)
     """The learner; its layers are those of the controller."""
 

@@ -39,7 +39,7 @@ class Archive(Who, Where):
     """
 
     preset: str | None = None
-    """Size of the search: wide or paper (for a GPU), or small (minutes on a CPU); by default what the device can do."""
+    """Size of the search: wide (the default on a GPU), paper (the paper's), or small (the default on the CPU)."""
     iterations: int | None = None
     """Iterations to reach; with --resume, more than before extend a finished run."""
     seed: int | None = None

@@ -50,9 +50,9 @@ class Cross(Who, OnDevice, Mapped):
     level. Its size in metres is given here, or as `size_m` in the .npz, or with `scale_m` and `offset_m` in a .json of
     the same name beside the .png, such as `faultline export` writes.
 
-    Robots start near x = 2 m, y = 4 m and walk to x = 14 m, y = 4 m. The middle of the map lies on the middle of the
-    16 m x 8 m that they cross: of a larger map the rest is cut off, a smaller one is continued by the height of its
-    edge. It is resampled to 0.05 m: linearly, or where it is finer by weighted means.
+    Robots start near x = 2 m, y = 4 m and walk to x = 14 m, y = 4 m. The middle of the map lies on the middle of what
+    they cross, 16 m x 8 m. The rest of a larger map is cut off, a smaller one goes on at the height of its edge. The
+    map is resampled to 0.05 m: linearly, or by weighted means where it is finer.
     """
 
     terrain: Path

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
 _ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
-_DEFAULTS = {"paper": (150, 50), "small": (6, 2)}  # iterations, and how often elites cross fresh episodes
+# Iterations, and after how many of them elites cross fresh episodes; of wide as many terrains as of paper.
+_DEFAULTS = {"wide": (18, 6), "paper": (150, 50), "small": (6, 2)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class Ablation(StudyFlags):
     run: Path | None = None
     """A run with alpha 1 whose first iterations are taken, with its preset and seed; left out, one is made too."""
     iterations: int | None = None
-    """Iterations to compare; 150 of preset paper, 6 of small."""
+    """Iterations to compare; 18 of preset wide, 150 of paper, 6 of small."""
     seed: int | None = None
     """Seed of the searches; that of --run, or 0."""
 

@@ -32,7 +32,7 @@ class StudyFlags(Who, Where):
     """The flags of every study."""
 
     preset: str | None = None
-    """Size of the searches: paper (a GPU's work) or small; left out, what the device can do."""
+    """Size of the searches: wide or paper (for a GPU), or small; left out, paper on a GPU and small on the CPU."""
     run_dir: Path | None = None
     """The study's folder, new or to go on with; runs/<robot>-<the command's name>."""
     out: Path | None = None

@@ -247,7 +247,7 @@ class CrossingPanel:
         switches = (
             ("Follow", app.scene.set_follow, False),
             ("Foot forces (1 m: 1,000 N)", app.set_forces, True),
-            ("All ways", app.scene.set_show_paths, True),
+            ("All paths", app.scene.set_show_paths, True),
         )
         for label, switch, initial in switches:
             box = gui.add_checkbox(label, initial)

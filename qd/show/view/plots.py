@@ -76,7 +76,8 @@ class Axes:
     def details(self, number: int) -> str:
         """All that the archive says of an elite, as Markdown."""
         archive, elites = self.archive, self.elites
-        of = f"{elites.counted[number]} {'fresh' if elites.fresh[number] else 'found'} episodes"
+        count = elites.counted[number]
+        of = f"{count} fresh episodes" if elites.fresh[number] else f"the {count} episodes that found it"
         lines = [
             f"**Elite {number}** of {len(elites)} · fitness **{elites.fitness[number]:.2f}** "
             f"({archive.fitness[number]:.2f} as found in iteration {archive.iteration[number]})",

@@ -123,7 +123,7 @@ class Scene:
             )
 
     def set_show_paths(self, show: bool) -> None:
-        """Show or hide the ways of all episodes."""
+        """Show or hide the paths of all episodes."""
         self.show_paths = show
         if self._paths is not None:
             self._paths.visible = show

@@ -109,9 +109,10 @@ def test_what_cannot_be_compared_is_named(finished, tmp_path, changes, message):
     assert message in str(error.value)
 
 
-def test_too_few_iterations_are_refused_before_any_search(tmp_path):
-    with pytest.raises(ValueError, match=r"no iteration up to 1 .* give at least 2 --iterations"):
-        config(tmp_path, iterations=1).execute(open_evaluator=never)
+@pytest.mark.parametrize(("preset", "every"), [("small", 2), ("paper", 50), ("wide", 6)])
+def test_too_few_iterations_are_refused_before_any_search(tmp_path, preset, every):
+    with pytest.raises(ValueError, match=rf"no iteration up to 1 .* give at least {every} --iterations"):
+        config(tmp_path, preset=preset, iterations=1).execute(open_evaluator=never)
     assert not (tmp_path / "both").exists()
 
 

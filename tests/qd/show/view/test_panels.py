@@ -67,7 +67,7 @@ def test_numbers_of_fresh_episodes_come_first():
     # Wilson, z^2 = 3.8415, of 20 of 40: .5 +- 1.96 sqrt(.25/40 + 3.8415/6400) / 1.0960 = .5 +- .148
     assert axes.rate_text("collision_rate", 0) == "50% (35 to 65%)"
     assert "collision 50% (35 to 65%)" in axes.line(0) and "of 40 fresh episodes" in axes.details(0)
-    assert "of 4 found episodes" in axes.details(2)
+    assert "of the 4 episodes that found it" in axes.details(2)
 
 
 def test_an_axis_reaches_over_all_values_in_whole_steps(axes):
