@@ -10,8 +10,9 @@ from qd.fitness import FitnessCfg
 from qd.run.settings import SchedulerCfg
 from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
+from sim.crossing import CrossingCfg
 from sim.robots.robot import get_robot
-from sim.rollout import RolloutResult
+from sim.rollout import Rollout, RolloutResult
 from sim.space import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.searches import make_job, rows_of
@@ -82,3 +83,35 @@ def test_a_resumed_search_equals_the_uninterrupted_one(tmp_path, evaluate, devic
     if device == "cpu":  # a GPU's crossings are not repeated bit for bit
         assert (whole / "archive.npz").read_bytes() == (killed / "archive.npz").read_bytes()
     assert len(archive) >= 1
+
+
+def short_rollout(cfg, num_terrains):
+    return Rollout(
+        ROBOT, cfg.policy, num_terrains=num_terrains, num_replicas=cfg.num_replicas, num_envs=4, device=cfg.device,
+        cfg=CrossingCfg(start=(12.5, 4.0), max_duration_s=1.6, poll_every_s=0.2),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("groups", [2, 3])
+def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go(tmp_path, groups, device, monkeypatch):
+    """Robots go on with the terrains of other groups; three emitters make groups of one and two, or of one each."""
+    if device != "cpu":
+        pytest.skip("a GPU adds in any order")
+    monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
+    scheduler = SchedulerCfg(emitters=3, batch_size=2, sigma0=1.0, groups=groups)
+    settings = {**SETTINGS, "scheduler": scheduler, "replicas": 3, "reevaluate_every": 0}
+
+    def searched(path, iterations, *, workers="1", resumes=False):
+        def opened(cfg):
+            mine = dataclasses.replace(cfg, policy=CFG.policy, workers=workers)
+            return open_evaluator(mine, build=short_rollout)
+
+        return run_search(make_job(path, iterations=iterations, resumes=resumes, **settings), open_evaluator=opened)
+
+    whole = searched(tmp_path / "whole", 3)
+    searched(tmp_path / "pieces", 1, workers="2")
+    pieces = searched(tmp_path / "pieces", 3, workers="1", resumes=True)
+    assert len(whole) > 1
+    for name in ("genes", "cell", "fitness", "iteration", "ratios"):
+        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name), err_msg=name)
+    assert all(0.0 <= row["idle_share"] <= 1.0 for row in rows_of(tmp_path / "pieces"))
