@@ -10,7 +10,7 @@ import json
 import multiprocessing
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,14 +30,23 @@ _SHOWN = 12  # digits of a hash that a message shows
 def robot_digest(robot: "RobotCfg") -> str:
     """SHA-256 of a robot: its settings without those of training, its model and its meshes.
 
+    A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
+
     Raises:
         ValueError: If a file is missing.
     """
-    settings = {name: value for name, value in asdict(robot).items() if name not in _NOT_IN_DIGEST}
+    values = {one.name: (getattr(robot, one.name), _default(one)) for one in fields(robot)}
+    settings = {
+        name: value for name, (value, default) in values.items() if name not in _NOT_IN_DIGEST and value != default
+    }
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for file in read_model_files(robot.model_file).files:
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
+
+
+def _default(setting: "Field[Any]") -> Any:
+    return setting.default if setting.default_factory is MISSING else setting.default_factory()
 
 
 def robot_identity(robot: "RobotCfg") -> dict[str, str]:

@@ -13,7 +13,7 @@ from sim.robots.identity import robot_digest
 from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
-from sim.robots.robot import get_robot
+from sim.robots.robot import RobotCfg, get_robot
 from tests.sim.dogs import GAINS, KINDS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
 
 
@@ -294,6 +294,24 @@ def test_the_hash_tells_robots_apart(tmp_path, anymal):
     found.add(digest())
     mesh.write_bytes(stl(TRUNK))
     assert len(found) == 4 and digest() == first
+
+
+def test_a_setting_that_is_new_changes_no_hash_while_it_has_its_default(anymal):
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Later(RobotCfg):
+        toes: int = 0
+
+    later = Later(**{one.name: getattr(anymal, one.name) for one in dataclasses.fields(RobotCfg)})
+    assert robot_digest(later) == robot_digest(anymal) != robot_digest(dataclasses.replace(later, toes=1))
+
+
+def test_the_defaults_that_hashes_leave_out_stay():
+    """If this fails, robots have changed whose hashes have not: give the setting another name, or keep its default."""
+    assert {
+        "default_base_height": 0.0, "action_scale": 0.5, "physics_dt": 0.005, "decimation": 4, "max_speed": 100.0,
+        "nconmax": 40, "njmax": 100, "stiffness": None, "damping": None, "effort_limit": None, "armature": None,
+        "friction": None, "contact_time_constant_s": None,
+    }.items() <= {one.name: one.default for one in dataclasses.fields(RobotCfg)}.items()  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)
