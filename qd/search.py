@@ -216,8 +216,9 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
     invalid = invalid_iterations(metrics)
     if invalid is not None:
         print(f"Warning: {invalid}")
-    worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
-    print(f"Next, see the worst terrain:  {worst}")
+    if len(archive):
+        worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
+        print(f"Next, see the worst terrain:  {worst}")
     return archive
 
 

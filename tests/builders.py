@@ -1,5 +1,8 @@
 """Small things that tests of several rooms are made of: archives, terrains and controllers."""
 
+import hashlib
+from pathlib import Path
+
 import numpy as np
 import torch
 import warp as wp
@@ -81,3 +84,9 @@ def save_checkpoint(path, state, **more):
     """As rsl_rl's runner saves it."""
     torch.save({"actor_state_dict": state, "critic_state_dict": {}, "iter": 7, "infos": None} | more, path)
     return path
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of all files below a folder, but for what Python compiles."""
+    files = [file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+    return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}

@@ -1,7 +1,6 @@
 """A robot, controller or definition of the penalties that is another now: every reader says so and changes nothing."""
 
 import dataclasses
-import hashlib
 import json
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,7 +29,7 @@ from sim.files.command import run_command
 from sim.recording.file import write_recording
 from sim.robots.identity import identity, robot_digest
 from sim.robots.robot import ROBOTS, get_robot
-from tests.builders import rsl_rl_actor, save_checkpoint
+from tests.builders import hashes, rsl_rl_actor, save_checkpoint
 from tests.qd import stand_in
 from tests.qd.show.view.made import make_recording
 from tests.sim.dogs import KINDS, write_dog
@@ -88,18 +87,12 @@ def change_robot(file: Path) -> None:
     file.write_text(text)
 
 
-def hashes(folder: Path = Path()) -> dict[str, str]:
-    """SHA-256 of all files below a folder, but for what Python compiles."""
-    files = [file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
-    return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-
-
 def refused(capsys, command, *argv: str) -> str:
     """The line that a command ends with, which must change no file."""
-    before = hashes()
+    before = hashes(Path())
     capsys.readouterr()
     assert run_command(command, argv, name="it") == 2
-    assert hashes() == before
+    assert hashes(Path()) == before
     (line,) = capsys.readouterr().err.splitlines()
     return line.removeprefix("error: ")
 

@@ -377,3 +377,10 @@ def test_many_invalid_episodes_are_told_in_the_progress_line_and_at_the_end(tmp_
     assert "25% invalid (12 non-finite state)" in said.err
     assert "Warning: In 1 of 2 iterations" in said.out and "12 of 48 episodes" in said.out
     assert [row["invalid_reasons"] for row in rows_of(tmp_path / "run")] == [{}, {"state": 12}]
+    assert "replay" in said.out
+
+
+def test_an_archive_without_elites_names_no_elite_to_look_at(tmp_path, plain_figures, capsys):
+    # Two of four episodes of each terrain: over a quarter, so that every terrain is invalid.
+    archive = run_search(make_job(tmp_path / "run"), open_evaluator=invalid_from(1, 0.5, []))
+    assert len(archive) == 0 and "replay" not in capsys.readouterr().out
