@@ -22,7 +22,14 @@ from tests.qd.stand_in import open_stand_in
 POLICY = "tests.sim.policies:stand"
 SIZE = ["--emitters", "2", "--batch-size", "4", "--replicas", "2", "--seed", "5", "--restart-rule", "4"]
 SIZE += ["--intervals", "3"]  # few cells: a small checkpoint
-_TIMES = ("wall_s", "episodes_per_s", "rollout_s")
+_TIMES = (
+    "wall_s",
+    "episodes_per_s",
+    "rollout_s",
+    "physics_steps",
+    "robot_steps",
+    "idle_share",
+)  # of this machine and session
 
 
 def arguments(path: Path, iterations: int, *, policy: str = POLICY) -> list[str]:
