@@ -115,10 +115,15 @@ class Scheduler:
             seed=stream,
         )
 
-    def _group(self, group: int) -> list[Emitter]:
+    def _group(self, group: int) -> slice:
         """Emitters of a group: equal parts of them, as far as that goes."""
-        first, last = (k * len(self.emitters) // len(self._asked) for k in (group, group + 1))
-        return self.emitters[first:last]
+        return slice(*(k * len(self.emitters) // len(self._asked) for k in (group, group + 1)))
+
+    def places(self, group: int) -> slice:
+        """Places of a group's terrains among those of an iteration."""
+        emitters = self._group(group)
+        ends = np.cumsum([0, *(emitter.batch_size for emitter in self.emitters)])
+        return slice(int(ends[emitters.start]), int(ends[emitters.stop]))
 
     def ask(self, group: int = 0) -> NDArray[np.float32]:
         """The next terrains of a group of emitters to evaluate; the same until it is told of them.
@@ -131,7 +136,9 @@ class Scheduler:
         """
         asked = self._asked[group]
         if asked is None:
-            asked = self._asked[group] = np.concatenate([emitter.ask() for emitter in self._group(group)])
+            asked = self._asked[group] = np.concatenate(
+                [emitter.ask() for emitter in self.emitters[self._group(group)]]
+            )
         return clipped(asked)
 
     def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
@@ -159,7 +166,7 @@ class Scheduler:
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
-        for emitter in self._group(group):
+        for emitter in self.emitters[self._group(group)]:
             own = slice(first, first + emitter.batch_size)
             added = plain if emitter.archive is self.result else learned
             emitter.tell(

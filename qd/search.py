@@ -96,8 +96,9 @@ def crossed_iterations(
         for group in groups:
             result, first = pipeline.take(bar.within(iteration, group, len(groups))), 0
             for (own, search), told in zip(searches, results, strict=True):
-                told.append(taken(result, len(search.ask(group)), first=first))
-                first += len(search.ask(group))
+                places = search.places(group)
+                told.append(taken(result, places.stop - places.start, first=first))
+                first += places.stop - places.start
                 _tell(own, search, told[-1], iteration, group)
             if ahead:
                 put(iteration + 1, group)
@@ -109,9 +110,8 @@ def _group_terrains(
     cfg: SearchCfg, search: "Scheduler", iteration: int, group: int
 ) -> "tuple[NDArray[np.float32], NDArray[np.uint32]]":
     """Genes that a group asks for, and their seeds, which are those of their place in the iteration."""
-    first = sum(len(search.ask(before)) for before in range(group))
-    genes = search.ask(group)
-    return genes, episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[first : first + len(genes)]
+    seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)
+    return search.ask(group), seeds[search.places(group)]
 
 
 def _tell(cfg: SearchCfg, search: "Scheduler", result: "RolloutResult", iteration: int, group: int) -> None:

@@ -169,6 +169,8 @@ class SolverOptions(Who, OnDevice):
     """Constraint rows an environment to try with the shipped caps, beside the robot's own."""
     nconmax: tuple[int, ...] = setting((), least=1)
     """Contacts an environment to try with each of them, as many as --njmax."""
+    resolved: bool = False
+    """Cross with contact resolved too (steps of 1 ms), and say how far each choice's rates of terrains lie from it."""
     rounds: int = setting(3, least=1)
     """Rollouts of each choice; the median counts."""
     seed: int = setting(0, least=0)

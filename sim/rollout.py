@@ -114,7 +114,7 @@ class Watcher(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Batch:
+class _Lot:
     """Terrains that were put in together."""
 
     slots: tuple[slice, ...]
@@ -185,7 +185,7 @@ class Rollout:
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
         bank = TerrainBank(self.num_terrains, device=device)
         self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
-        self._batches: deque[_Batch] = deque()
+        self._lots: deque[_Lot] = deque()
         self._first_free = self._waiting = 0  # the ring's next slot, and episodes that no robot may take yet
         self._most = round(self.cfg.max_duration_s / self.robot.control_dt)
         self._steps = self._began = self._taken_at = 0  # control steps: now, when all waited, at the last result
@@ -273,7 +273,7 @@ class Rollout:
     @property
     def num_free(self) -> int:
         """Terrains that may be put in now."""
-        return self.num_terrains - sum(batch.num_episodes for batch in self._batches) // self.num_replicas
+        return self.num_terrains - sum(lot.num_episodes for lot in self._lots) // self.num_replicas
 
     def evaluate(
         self,
@@ -305,9 +305,9 @@ class Rollout:
 
     def clear(self) -> None:
         """Forget all that is under way."""
-        if not self._batches:
+        if not self._lots:
             return
-        self._batches.clear()
+        self._lots.clear()
         self._waiting = 0
         for _, episode in self._latches:
             episode.outcome.fill_(int(Outcome.TIME_OUT))
@@ -324,7 +324,7 @@ class Rollout:
         Raises:
             ValueError: As of :meth:`evaluate`.
         """
-        count, idle = len(terrains), not self._batches
+        count, idle = len(terrains), not self._lots
         if seeds.shape != (count,):
             raise ValueError(f"seeds must have shape ({count},), one a terrain, got {seeds.shape}")
         if not 1 <= count <= self.num_free:
@@ -334,7 +334,7 @@ class Rollout:
         self._write_terrains(terrains, seeds, slots)
         num_episodes = count * self.num_replicas
         most_steps = self._most * -(-num_episodes // self.num_envs)
-        self._batches.append(_Batch(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._steps))
+        self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._steps))
         self._first_free = (first + count) % self.num_terrains
         self._waiting += num_episodes
         if idle:
@@ -405,33 +405,33 @@ class Rollout:
         Raises:
             RuntimeError: If nothing is under way.
         """
-        if not self._batches:
+        if not self._lots:
             raise RuntimeError("take() must follow put(), got nothing under way")
-        batch, share = self._batches[0], 0.0
+        lot, share = self._lots[0], 0.0
         while True:
-            ended = self._num_ended(batch)
-            share = max(share, ended / batch.num_episodes, (self._steps - batch.put_at) / batch.most_steps)
-            if progress is not None and self._steps > batch.put_at:
+            ended = self._num_ended(lot)
+            share = max(share, ended / lot.num_episodes, (self._steps - lot.put_at) / lot.most_steps)
+            if progress is not None and self._steps > lot.put_at:
                 progress(min(1.0, share))
-            if ended == batch.num_episodes:
+            if ended == lot.num_episodes:
                 break
-            under_way = sum(other.num_episodes for other in self._batches) - self._waiting
-            if self._waiting and sum(map(self._num_ended, self._batches)) == under_way:
+            under_way = sum(other.num_episodes for other in self._lots) - self._waiting
+            if self._waiting and sum(map(self._num_ended, self._lots)) == under_way:
                 self._release(begin=True)
             self._advance(watcher)
-        result = self._collect(batch)
-        self._batches.popleft()
-        going = any(self._num_ended(other) < other.num_episodes for other in self._batches)
+        result = self._collect(lot)
+        self._lots.popleft()
+        going = any(self._num_ended(other) < other.num_episodes for other in self._lots)
         if going and not self._waiting and watcher is None:
             self._advance()
         return result
 
-    def _num_ended(self, batch: _Batch) -> int:
-        return sum(int(self._queue.num_ended[own].numpy().sum()) for own in batch.slots)
+    def _num_ended(self, lot: _Lot) -> int:
+        return sum(int(self._queue.num_ended[own].numpy().sum()) for own in lot.slots)
 
-    def _collect(self, batch: _Batch) -> RolloutResult:
+    def _collect(self, lot: _Lot) -> RolloutResult:
         queue, robot = self._queue, self.robot
-        rows = [slice(own.start * self.num_replicas, own.stop * self.num_replicas) for own in batch.slots]
+        rows = [slice(own.start * self.num_replicas, own.stop * self.num_replicas) for own in lot.slots]
 
         def of(array: Any) -> np.ndarray:
             values = np.concatenate([array[own].numpy() for own in rows])  # a copy: on the CPU numpy() is a view

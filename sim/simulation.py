@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -23,6 +23,8 @@ GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
 CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 """mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
+_RESOLVED_DT = 0.001
+_RESOLVED_TIME_CONSTANT_S = 0.003
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +43,17 @@ class SolverCfg:
     """Line-search iterations at most."""
     time_constant_s: float | None = None
     """Contact time constant [s] at critical damping; that of the robot's file if None."""
+
+
+def resolved(robot: RobotCfg) -> tuple[RobotCfg, SolverCfg]:
+    """Robot and solver with contact resolved: steps of 1 ms and contacts of 3 ms, against which a search's are judged.
+
+    Four times the steps: about five times the time.
+    """
+    steps = round(robot.control_dt / _RESOLVED_DT)
+    return replace(robot, physics_dt=_RESOLVED_DT, decimation=steps), SolverCfg(
+        time_constant_s=_RESOLVED_TIME_CONSTANT_S
+    )
 
 
 def resolve_device(name: str | None) -> str:

@@ -57,8 +57,8 @@ class Speed(OfRobot, OnDevice):
     """Run of preset wide, made on this GPU, whose iterations are told of."""
     before: Path | None = None
     """speed.json of another commit, made on this GPU, whose curve is kept beside this one's."""
-    train_speed: Path | None = None
-    """Output of `faultline train-speed`, whose rates are taken over."""
+    train_speed: tuple[Path, ...] = ()
+    """Outputs of `faultline train-speed`, on one and on two GPUs, whose rates are taken over."""
     timeline: Path | None = None
     """Draw which robot ran which episode when, with and without the queue, into this file, on elites of --run, or else
     on hard-random terrains; nothing is timed."""
@@ -168,14 +168,22 @@ def kernel_shares(evaluator: EvaluatorCfg, terrains: NDArray[Any], num_envs: int
     return profile_kernels(rollout)
 
 
-def training_rates(file: Path | None) -> dict[str, float | None]:
+def training_rates(files: tuple[Path, ...]) -> dict[str, float | None]:
     """PPO's env-steps a second with learning, as `faultline train-speed` wrote them; None where it did not run."""
-    try:
-        rows = read_json(file)["training"] if file else []
-        rate = {row["num_envs"]: float(row["train_env_steps_per_s"]) for row in rows}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file} must be the output of faultline train-speed, but: {error}: give its --out") from None
-    return {"train_env_steps_per_s": rate.get(4096), "train_env_steps_per_s_8192": rate.get(8192)}
+    rate = dict[tuple[int, int], float]()
+    for file in files:
+        try:
+            rows = read_json(file)["training"]
+            rate |= {(row["gpus"], row["num_envs"]): float(row["train_env_steps_per_s"]) for row in rows}
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{file} must be the output of faultline train-speed, but: {error}: give its --out"
+            ) from None
+    return {
+        "train_env_steps_per_s": rate.get((1, 4096)),
+        "train_env_steps_per_s_8192": rate.get((1, 8192)),
+        "train_env_steps_per_s_2gpu": rate.get((2, 8192)),
+    }
 
 
 def measure(args: Speed) -> dict[str, Any]:

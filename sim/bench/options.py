@@ -6,20 +6,21 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from sim.commands import SolverOptions
-from sim.files.intervals import value_words
+from sim.files.intervals import bootstrap_interval, value_words
 from sim.files.provenance import provenance
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
-from sim.simulation import SolverCfg, resolve_device
+from sim.simulation import SolverCfg, resolve_device, resolved
 from sim.space import SUPER_GAUSSIAN
 
 
 def choices(cfg: SolverOptions, robot: RobotCfg) -> list[tuple[SolverCfg, RobotCfg]]:
-    """Every choice of solver options, then of capacities.
+    """Every choice of solver options, then of capacities; resolved contact before them, if asked for.
 
     Raises:
         ValueError: If capacities do not come in pairs, or there is nothing to try.
@@ -30,10 +31,34 @@ def choices(cfg: SolverOptions, robot: RobotCfg) -> list[tuple[SolverCfg, RobotC
         raise ValueError(f"--nconmax needs as many numbers as --njmax, got {cfg.nconmax} and {cfg.njmax}")
     caps = itertools.product(cfg.iterations, cfg.ls_iterations)
     capacities = zip(cfg.njmax, cfg.nconmax, strict=True)
+    fine, fine_solver = resolved(robot)
     return [
+        *([(fine_solver, fine)] if cfg.resolved else []),
         *((SolverCfg(iterations=newton, ls_iterations=line), robot) for newton, line in caps),
         *((SolverCfg(), replace(robot, njmax=rows, nconmax=contacts)) for rows, contacts in capacities),
     ]
+
+
+def _agreement(result: RolloutResult, fine: RolloutResult, seed: int) -> dict[str, Any]:
+    """How far rates of terrains lie from those with contact resolved, terrains without a valid episode left out."""
+
+    def rates(of: RolloutResult, hits: NDArray[np.bool_]) -> NDArray[np.float64]:
+        valid = (~of.invalid).sum(axis=1)
+        return np.where(valid > 0, (hits & ~of.invalid).sum(axis=1) / np.maximum(valid, 1), np.nan)
+
+    found: dict[str, Any] = {}
+    for kind, ours, theirs in (
+        ("success", ~result.base_collision, ~fine.base_collision),
+        ("goal", result.reached_goal, fine.reached_goal),
+    ):
+        apart = rates(result, ours) - rates(fine, theirs)
+        apart = apart[np.isfinite(apart)]
+        found[kind] = {
+            "bias": float(apart.mean()) if len(apart) else None,
+            "bias_interval": bootstrap_interval(apart, seed),
+            "difference": float(np.abs(apart).mean()) if len(apart) else None,
+        }
+    return found
 
 
 def _means(result: RolloutResult) -> dict[str, Any]:
@@ -60,7 +85,7 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
     genes = SUPER_GAUSSIAN.hard_random(cfg.terrains, rng)
     seeds = rng.integers(2**32, size=cfg.terrains, dtype=np.uint32)
     tried = choices(cfg, robot)
-    rows = []
+    rows, fine = [], None
     for solver, sized in tqdm(tried, desc="choices", disable=None):
         rollout = Rollout(
             sized,
@@ -72,9 +97,12 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
         )
         results = [rollout.evaluate(genes, seeds) for _ in range(cfg.rounds)]
         last = results[-1]
+        if cfg.resolved and fine is None:
+            fine = last
         wall_s = statistics.median(result.wall_s for result in results)
         rows.append(
             {
+                "physics_dt": sized.physics_dt,
                 "iterations": solver.iterations,
                 "ls_iterations": solver.ls_iterations,
                 "njmax": sized.njmax,
@@ -82,6 +110,7 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
                 "wall_s": wall_s,
                 "world_steps_per_s": last.outcome.size * last.physics_steps / wall_s,
                 **_means(last),
+                **({} if fine is None or fine is last else {"against_resolved": _agreement(last, fine, cfg.seed)}),
             }
         )
         del rollout
@@ -96,13 +125,19 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
 def print_rows(report: dict[str, Any]) -> None:
     """Prints a row a choice."""
     names = list(report["rows"][0]["penalties"])
-    head = f"{'iterations':>10} {'search':>6} {'rows':>5} {'contacts':>8} {'wall s':>7} {'M steps/s':>9}"
+    head = f"{'step':>5} {'iterations':>10} {'search':>6} {'rows':>5} {'contacts':>8} {'wall s':>7} {'M steps/s':>9}"
     print(f"{head} {'success':>7} {'goal':>6} {'invalid':>7} " + " ".join(f"{name:>13}" for name in names))
     for row in report["rows"]:
         print(
-            f"{row['iterations']:>10} {row['ls_iterations']:>6} {row['njmax']:>5} {row['nconmax']:>8} "
+            f"{row['physics_dt']:>5g} {row['iterations']:>10} {row['ls_iterations']:>6} {row['njmax']:>5} "
+            f"{row['nconmax']:>8} "
             f"{row['wall_s']:>7.2f} {row['world_steps_per_s'] / 1e6:>9.3f} "
             f"{value_words(row['success_rate'], None, '.4f'):>7} {value_words(row['goal_rate'], None, '.4f'):>6} "
             f"{row['invalid']:>7} "
             + " ".join(f"{value_words(row['penalties'][name], None, '.4f'):>13}" for name in names)
         )
+        for kind, apart in row.get("against_resolved", {}).items():
+            bias = value_words(apart["bias"], apart["bias_interval"], "+.4f")
+            print(
+                f"{'':>16} {kind}: {bias} of resolved contact's, {value_words(apart['difference'], None, '.4f')} apart"
+            )

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +23,11 @@ from sim.mujoco_c.model import crossing_model
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
-from sim.simulation import SolverCfg, resolve_device
+from sim.simulation import SolverCfg, resolve_device, resolved
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
-_FINE_DT = 0.001
-_FINE_TIME_CONSTANT_S = 0.003
 
 
 def read_pool(path: Path) -> tuple[NDArray[np.float32], TerrainSpace]:
@@ -141,8 +139,8 @@ class Comparison:
         """The robot as a simulator steps it, and its contact time constant [s], None for the file's."""
         if not fine:
             return self.robot, None
-        decimation = round(self.robot.control_dt / _FINE_DT)
-        return replace(self.robot, physics_dt=_FINE_DT, decimation=decimation), _FINE_TIME_CONSTANT_S
+        robot, solver = resolved(self.robot)
+        return robot, solver.time_constant_s
 
     def run(self) -> dict[str, Any]:
         """Choose, cross in both simulators, compare; everything of the results file."""

@@ -104,13 +104,7 @@ def check_robot(there: Mapping[str, Any], robot: "RobotCfg", file: Path, remedy:
 
 
 def check_identity(there: Mapping[str, Any], robot: "RobotCfg", file: Path, remedy: str) -> None:
-    """Refuses a record of a robot that has changed since, or of penalties that are defined otherwise now.
-
-    Args:
-        there: What the record names.
-        robot: The robot of that name, as it is now.
-        file: The record, for the message.
-        remedy: What to do about it.
+    """Refuses a record of a robot that has changed since (:func:`check_robot`), or of penalties defined otherwise now.
 
     Raises:
         ValueError: If one of the two is another.

@@ -149,15 +149,16 @@ class CapturedPPO(PPO):
                 self._run_minibatch()
 
     def _run_minibatch(self) -> None:
-        # A collective is not captured: processes would have to capture and replay in step.
-        if self._stream is None or self._eager_steps < _EAGER_STEPS or self.is_multi_gpu:
+        # Processes of one training capture and replay in step, collectives included: each has taken as many steps.
+        if self._stream is None or self._eager_steps < _EAGER_STEPS:
             self._learn_minibatch()
             self._eager_steps += 1
             return
         if self._graph is None:
             self.optimizer.zero_grad(set_to_none=True)
             self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph, stream=self._stream):
+            # NCCL's watchdog asks for its events from a thread of its own, which a capture of all threads forbids.
+            with torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local"):
                 self._learn_minibatch()
         self._graph.replay()
 

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSpeed(OfRobot, OnDevice):
-    """Time training iterations, simulation and learning together."""
+    """Time training iterations, simulation and learning together.
+
+    On several GPUs: torchrun --nproc-per-node 2 -m faultline train-speed; each has --num-envs robots.
+    """
 
     num_envs: tuple[int, ...] = setting((4096, 8192), least=1)
     """Numbers of robots to time."""
@@ -36,16 +39,21 @@ class TrainSpeed(OfRobot, OnDevice):
         from sim.files.provenance import provenance
         from sim.robots.robot import get_robot
         from sim.simulation import resolve_device
+        from train.ppo.learner import Ranks
 
         check(self)
-        robot, device = get_robot(self.robot), resolve_device(self.device)
+        ranks = Ranks.of_environment()
+        robot, device = get_robot(self.robot), ranks.device(resolve_device(self.device))
 
         def measure() -> dict[str, Any]:
             size = {"iterations": self.iterations, "device": device, "seed": self.seed}
             runs = [time_training(robot, count, **size) for count in self.num_envs]
             return {**provenance(device, self.seed), "robot": robot.name, "training": runs}
 
-        publish(self.out, measure, show_json)
+        if ranks.is_first:
+            publish(self.out, measure, show_json)
+        else:
+            measure()
 
 
 def time_training(robot: "RobotCfg", num_envs: int, *, iterations: int, device: str, seed: int) -> dict[str, Any]:
@@ -71,6 +79,7 @@ def time_training(robot: "RobotCfg", num_envs: int, *, iterations: int, device: 
     seconds = statistics.median(step.collection_s + step.learning_s for step in timed)
     return {
         "num_envs": num_envs,
+        "gpus": learner.ranks.size,
         "iteration_s": seconds,
         "collection_s": statistics.median(step.collection_s for step in timed),
         "learning_s": statistics.median(step.learning_s for step in timed),
