@@ -9,6 +9,8 @@ from kernels.heightfield import Terrain, node_height
 from kernels.observation import Sensors
 from kernels.rewards import Rewards
 
+_CLEARING_THREADS = 64  # a row
+
 
 @wp.struct
 class StartRanges:
@@ -130,11 +132,12 @@ def restart_episodes(
 
 
 @wp.kernel
-def _clear_rows_kernel(mask: wp.array[int], rows_out: wp.array2d[float]):
-    """Grid (num_envs, num_columns)."""
-    env, k = wp.tid()
+def _clear_rows_kernel(mask: wp.array[int], stride: int, rows_out: wp.array2d[float]):
+    """Grid (num_envs, stride); a thread a number would mostly look at masks, since rows are long and seldom cleared."""
+    env, first = wp.tid()
     if mask[env] != 0:
-        rows_out[env, k] = 0.0
+        for k in range(first, rows_out.shape[1], stride):
+            rows_out[env, k] = 0.0
 
 
 def clear_rows(mask: Any, rows_out: Any) -> None:
@@ -145,4 +148,6 @@ def clear_rows(mask: Any, rows_out: Any) -> None:
     """
     if mask.shape[0] != rows_out.shape[0]:
         raise ValueError(f"mask must have shape ({rows_out.shape[0]},), got {tuple(mask.shape)}")
-    wp.launch(_clear_rows_kernel, dim=rows_out.shape, inputs=[mask], outputs=[rows_out], device=rows_out.device)
+    stride = min(_CLEARING_THREADS, rows_out.shape[1])
+    size = (rows_out.shape[0], stride)
+    wp.launch(_clear_rows_kernel, dim=size, inputs=[mask, stride], outputs=[rows_out], device=rows_out.device)

@@ -51,8 +51,8 @@ class Speed(OfRobot, OnDevice):
     """Physics steps of the bare measurement."""
     curve: tuple[int, ...] = setting((1024, 2048, 4096, 8192, 16384, 32768), least=1)
     """Numbers of robots of the curve, each of which runs 20 episodes; none to leave it out."""
-    kernels: int = setting(0, least=0)
-    """Robots with which every kernel of a control step is timed, on a GPU; 0: none is."""
+    kernels: tuple[int, ...] = setting((), least=1)
+    """Numbers of robots with which every kernel of a control step is timed, on a GPU."""
     wide: Path | None = None
     """Run of preset wide, made on this GPU, whose iterations are told of."""
     before: Path | None = None
@@ -157,7 +157,7 @@ def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[in
     return rows
 
 
-def kernel_shares(evaluator: EvaluatorCfg, terrains: NDArray[Any], num_envs: int) -> list[dict[str, Any]]:
+def kernel_shares(evaluator: EvaluatorCfg, terrains: NDArray[Any], num_envs: int) -> dict[str, Any]:
     """:func:`sim.bench.physics.profile_kernels` of so many robots' crossings; terrains repeated as needed."""
     from sim.bench.physics import profile_kernels
 
@@ -165,7 +165,7 @@ def kernel_shares(evaluator: EvaluatorCfg, terrains: NDArray[Any], num_envs: int
     sizes = {"num_envs": num_envs, "num_terrains": num_terrains, "num_replicas": _CURVE_REPLICAS}
     rollout: Any = build_rollout(replace(evaluator, **sizes), num_terrains)
     rollout.put(terrains[np.arange(num_terrains) % len(terrains)], np.arange(num_terrains, dtype=np.uint32))
-    return profile_kernels(rollout)
+    return {"num_envs": num_envs, "kernels": profile_kernels(rollout)}
 
 
 def training_rates(files: tuple[Path, ...]) -> dict[str, float | None]:
@@ -240,7 +240,7 @@ def measure(args: Speed) -> dict[str, Any]:
         "envs_curve": time_curve(evaluator, terrains, args.curve) or None,
         "before": before,
         "wide": wide,
-        "kernels": kernel_shares(evaluator, terrains, args.kernels) if args.kernels else None,
+        "kernels": [kernel_shares(evaluator, terrains, count) for count in args.kernels] or None,
     }
 
 

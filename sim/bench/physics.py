@@ -24,7 +24,7 @@ _SEGMENT_STEPS = 10
 _SEGMENT_EVERY = 20
 _LOST_M = 1.0
 _PROFILED_STEPS = 50  # control steps
-_NAMED_KERNELS = 30
+_NAMED_KERNELS = 40
 
 
 @dataclass(frozen=True, kw_only=True)

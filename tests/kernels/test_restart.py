@@ -137,10 +137,12 @@ def test_only_masked_rows_are_cleared(device):
     np.testing.assert_array_equal(rows.numpy(), [[1, 2, 3], [0, 0, 0], [7, 8, 9], [0, 0, 0]])
 
 
-def test_rows_that_are_not_finite_are_cleared(device):
-    rows = wp.array(np.full((1, 2), np.nan, np.float32), device=device)
-    clear_rows(wp.array([1], dtype=int, device=device), rows)
-    assert not rows.numpy().any()
+@pytest.mark.parametrize("columns", [2, 64, 1801])
+def test_rows_that_are_not_finite_are_cleared_whole(device, columns):
+    rows = wp.array(np.full((2, columns), np.nan, np.float32), device=device)
+    clear_rows(wp.array([1, 0], dtype=int, device=device), rows)
+    assert not rows.numpy()[0].any()
+    assert np.isnan(rows.numpy()[1]).all()
 
 
 def test_wrong_mask_is_named(device):
