@@ -37,9 +37,9 @@ class SolverCfg:
     fail on slopes that would hold them (``sim.mujoco_c.crosscheck``).
     """
 
-    iterations: int = 4
-    """Newton iterations a step at most. With 4, rates and forces lie as near to resolved contact as with 5, in 3 to 6 %
-    less time; with 3, forces are 3 to 15 % larger (results/bench/options-*.json)."""
+    iterations: int = 5
+    """Newton iterations a step at most. Caps of 3 to 50 give the same rates (results/bench/options-*.json), but with 4
+    the forces of a hard landing are off by up to 2 % of its impulse (tests/sim/robots/test_standing.py notices)."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
     time_constant_s: float | None = None
@@ -194,6 +194,8 @@ class Simulation:
             kinematic_switchable_roots=False,
         )
         self.solver.mjw_model.opt.warn_overflow = 0
+        # Of thousands of robots one always needs the last iteration: a loop that the device may leave only costs.
+        self.solver.mjw_model.opt.graph_conditional = not self.model.device.is_cuda
         if cfg.time_constant_s is not None:
             self.solver.mjw_model.geom_solref.fill_(wp.vec2(cfg.time_constant_s, 1.0))
         self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
