@@ -121,9 +121,8 @@ class Scheduler:
 
     def places(self, group: int) -> slice:
         """Places of a group's terrains among those of an iteration."""
-        emitters = self._group(group)
-        ends = np.cumsum([0, *(emitter.batch_size for emitter in self.emitters)])
-        return slice(int(ends[emitters.start]), int(ends[emitters.stop]))
+        emitters, sizes = self._group(group), [int(emitter.batch_size) for emitter in self.emitters]
+        return slice(sum(sizes[: emitters.start]), sum(sizes[: emitters.stop]))
 
     def ask(self, group: int = 0) -> NDArray[np.float32]:
         """The next terrains of a group of emitters to evaluate; the same until it is told of them.

