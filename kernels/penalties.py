@@ -1,13 +1,15 @@
-"""Contact force of every geom, and the raw penalties of one physics step (the paper's section III-B), on the device."""
+"""Contact force of every geom, and the raw penalties of one physics step (the paper's section III-B), on the device.
 
+A penalty is one ``@_penalty`` function here, under whose name robots choose it. Its NumPy counterpart, by which MuJoCo
+C is compared, stands in :func:`sim.mujoco_c.model.step_penalties`; its label and colour in :mod:`qd.show.figures`.
+"""
+
+from collections.abc import Callable
 from typing import Any
 
 import warp as wp
 
 from kernels.state import base_ang_vel_b, base_lin_vel_b
-
-PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
-"""Columns of the penalty sums."""
 
 PENALTY_DEFINITION = "absolute"
 """How yaw_rate, vel_x and vel_y measure an error; runs, scales and recordings name it, and none of another is read."""
@@ -37,7 +39,7 @@ class SolverContacts:
 
 
 @wp.func
-def contact_force(contacts: SolverContacts, c: int) -> wp.vec3:
+def force_of_contact(contacts: SolverContacts, c: int) -> wp.vec3:
     """Force of a contact on its second geom, world frame [N].
 
     An elliptic cone has a constraint row for the normal and one for each tangent (MuJoCo, Computation, "Friction
@@ -64,7 +66,7 @@ def _sum_geom_forces_kernel(
     # The robot's geom is second in every contact that kernels.contact writes.
     column = column_of_geom[contacts.geom[c][1]]
     if column >= 0:
-        wp.atomic_add(geom_force_out, contacts.world[c], column, contact_force(contacts, c))
+        wp.atomic_add(geom_force_out, contacts.world[c], column, force_of_contact(contacts, c))
 
 
 def sum_geom_forces(contacts: SolverContacts, column_of_geom: Any, geom_force_out: Any) -> None:
@@ -80,18 +82,6 @@ def sum_geom_forces(contacts: SolverContacts, column_of_geom: Any, geom_force_ou
     wp.launch(
         _sum_geom_forces_kernel, contacts.capacity, inputs, outputs=[geom_force_out], device=geom_force_out.device
     )
-
-
-@wp.func
-def yaw_rate_error(ang_vel_b: wp.vec3, command: wp.vec3) -> float:
-    """Absolute error of the yaw rate [rad/s], base frame."""
-    return wp.abs(ang_vel_b[2] - command[2])
-
-
-@wp.func
-def velocity_error(lin_vel_b: wp.vec3, command: wp.vec3, axis: int) -> float:
-    """Absolute velocity error along an axis of the base frame [m/s]."""
-    return wp.abs(lin_vel_b[axis] - command[axis])
 
 
 @wp.func
@@ -116,16 +106,6 @@ def is_stumbling(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env:
 
 
 @wp.func
-def count_collisions(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env: int) -> float:
-    """Number of base and limb geoms touched with more than 0.1 N."""
-    count = float(0.0)
-    for g in range(geom_role.shape[0]):
-        if (geom_role[g] & (BASE | LIMB)) != 0 and wp.length(geom_force[env, g]) > COLLISION_FORCE:
-            count += 1.0
-    return count
-
-
-@wp.func
 def max_base_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env: int) -> float:
     """Largest contact force on a base geom [N]."""
     largest = float(0.0)
@@ -135,32 +115,89 @@ def max_base_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], en
     return largest
 
 
+@wp.struct
+class PenaltyStep:
+    """What a physics step ended in; one row an environment. Shapes are those of :func:`add_penalties`."""
+
+    joint_q: wp.array2d[float]
+    joint_qd: wp.array2d[float]
+    base_com: wp.vec3
+    command: wp.array2d[float]
+    geom_force: wp.array2d[wp.vec3]
+    geom_role: wp.array[int]
+    force_limit: float
+
+
+_FUNCTIONS: dict[str, Any] = {}
+
+
+def _penalty(function: Callable[..., Any]) -> Any:
+    """Make a Warp function of a penalty, and its name a column of the sums."""
+    _FUNCTIONS[function.__name__] = wp.func(function)
+    return _FUNCTIONS[function.__name__]
+
+
+@wp.func
+def _velocity_error(step: PenaltyStep, env: int, axis: int) -> float:
+    velocity = base_lin_vel_b(step.joint_q, step.joint_qd, step.base_com, env)
+    return wp.abs(velocity[axis] - step.command[env, axis])
+
+
+@_penalty
+def yaw_rate(step: PenaltyStep, env: int) -> float:
+    """Absolute error of the yaw rate [rad/s], base frame."""
+    return wp.abs(base_ang_vel_b(step.joint_q, step.joint_qd, env)[2] - step.command[env, 2])
+
+
+@_penalty
+def vel_x(step: PenaltyStep, env: int) -> float:
+    """Absolute error of the forward velocity of the base link [m/s], base frame."""
+    return _velocity_error(step, env, 0)
+
+
+@_penalty
+def vel_y(step: PenaltyStep, env: int) -> float:
+    """Absolute error of the sideways velocity of the base link [m/s], base frame."""
+    return _velocity_error(step, env, 1)
+
+
+@_penalty
+def contact_force(step: PenaltyStep, env: int) -> float:
+    """Sum over the feet of the contact force beyond what costs nothing [N]."""
+    return excess_contact_force(step.geom_force, step.geom_role, step.force_limit, env)
+
+
+@_penalty
+def stumble(step: PenaltyStep, env: int) -> float:
+    """1 if any foot hits a vertical surface, else 0."""
+    return is_stumbling(step.geom_force, step.geom_role, env)
+
+
+@_penalty
+def collision(step: PenaltyStep, env: int) -> float:
+    """Number of base and limb geoms touched with more than 0.1 N."""
+    count = float(0.0)
+    for g in range(step.geom_role.shape[0]):
+        touched = wp.length(step.geom_force[env, g]) > COLLISION_FORCE
+        if (step.geom_role[g] & (BASE | LIMB)) != 0 and touched:
+            count += 1.0
+    return count
+
+
+PENALTIES = tuple(_FUNCTIONS)
+"""Columns of the penalty sums."""
+_IN_ORDER = tuple(_FUNCTIONS.values())
+_NUM_PENALTIES = wp.constant(len(PENALTIES))
+wp.set_module_options({"max_unroll": max(16, len(PENALTIES))})  # the loop calls another function each time
+
+
 @wp.kernel
-def _add_penalties_kernel(
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    base_com: wp.vec3,
-    command: wp.array2d[float],
-    geom_force: wp.array2d[wp.vec3],
-    geom_role: wp.array[int],
-    force_limit: float,
-    dt: float,
-    counted: wp.array[int],
-    sums_out: wp.array2d[float],
-):
+def _add_penalties_kernel(step: PenaltyStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
     """Grid (num_envs,)."""
     env = wp.tid()
-    if counted[env] == 0:
-        return
-    wanted = wp.vec3(command[env, 0], command[env, 1], command[env, 2])
-    lin_vel = base_lin_vel_b(joint_q, joint_qd, base_com, env)
-    ang_vel = base_ang_vel_b(joint_q, joint_qd, env)
-    sums_out[env, 0] += dt * yaw_rate_error(ang_vel, wanted)
-    sums_out[env, 1] += dt * velocity_error(lin_vel, wanted, 0)
-    sums_out[env, 2] += dt * velocity_error(lin_vel, wanted, 1)
-    sums_out[env, 3] += dt * excess_contact_force(geom_force, geom_role, force_limit, env)
-    sums_out[env, 4] += dt * is_stumbling(geom_force, geom_role, env)
-    sums_out[env, 5] += dt * count_collisions(geom_force, geom_role, env)
+    if counted[env] != 0:
+        for k in range(_NUM_PENALTIES):
+            sums_out[env, k] += dt * wp.static(_IN_ORDER[k])(step, env)
 
 
 def add_penalties(
@@ -189,5 +226,8 @@ def add_penalties(
             f"sums_out must have shape ({counted.shape[0]}, {len(PENALTIES)}), got {tuple(sums_out.shape)}: "
             f"one column for each of {', '.join(PENALTIES)}"
         )
-    inputs = [joint_q, joint_qd, base_com, command, geom_force, geom_role, force_limit, dt, counted]
+    step = PenaltyStep()
+    step.joint_q, step.joint_qd, step.base_com, step.command = joint_q, joint_qd, base_com, command
+    step.geom_force, step.geom_role, step.force_limit = geom_force, geom_role, force_limit
+    inputs = [step, dt, counted]
     wp.launch(_add_penalties_kernel, counted.shape[0], inputs, outputs=[sums_out], device=sums_out.device)
