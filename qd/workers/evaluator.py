@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sim.rollout import RolloutResult
 
 _MOST_ENVS = {"cuda": 32_768, "cpu": 32}  # of a worker, when there is work for more
-_RUNNING_SHARE = 0.6  # of the episodes under way in several lots: the others wait for the last of their lot
+_RUNNING_SHARE = 0.7  # of the episodes under way in several lots: the others wait for the last of their lot
 _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
 
 
