@@ -204,7 +204,7 @@ JSON_LOADERS = {
         lambda made: made / "search/config.json",
         lambda file: RunDirectory(file.parent).read_cfg(),
     ),
-    "the rates of a training": (lambda made: None, training_rates),
+    "the rates of a training": (lambda made: None, lambda file: training_rates((file,))),
 }
 
 
@@ -212,7 +212,7 @@ JSON_LOADERS = {
 def test_mutated_json(made, tmp_path, what):
     find, read = JSON_LOADERS[what]
     source = find(made)
-    rates = {"training": [{"num_envs": count, "train_env_steps_per_s": 1e5} for count in (4096, 8192)]}
+    rates = {"training": [{"num_envs": count, "gpus": 1, "train_env_steps_per_s": 1e5} for count in (4096, 8192)]}
     whole = source.read_bytes() if source else json.dumps(rates).encode()
     file = tmp_path / "config.json"
     assert load(what, read, file, whole) is not None

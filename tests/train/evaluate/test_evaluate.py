@@ -203,7 +203,7 @@ def test_sizes(capsys):
         (["--sets", "easy"], "sets must be some of hand_crafted, hard_random, generated, generated_far, got easy"),
         (
             ["--sets", "generated"],
-            "generated is made of elites: give the run that found them (--archive results/anymal/archive)",
+            "generated is made of elites: give the run that found them (--archive ",
         ),
         (["--sets", "hard_random hard_random"], "each set may be named once"),
         (["--archive", "{folder}/none"], "no archive at {folder}/none"),
