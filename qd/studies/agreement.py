@@ -109,7 +109,7 @@ class Agreement(Who, Where):
         def measure() -> dict[str, Any]:
             print(_plan(self, terrains, evaluator), flush=True)
             crossings = Crossings(terrains, evaluator, kept)
-            with naming_what_is_next(kept.state, lambda: "The same command goes on."):
+            with naming_what_is_next(kept.state, crossings.what_is_next):
                 crossings.cross(open_evaluator)
             return {
                 **origin_of(evaluator.device, self.seed, self.workers),
@@ -244,6 +244,8 @@ def _archive(cfg: Agreement, robot: "RobotCfg") -> "Found":
     try:
         found = find_archive(cfg.robot, cfg.run or published_or_newest(robot, cfg.policy), cfg.policy)
     except FileNotFoundError as error:
+        if cfg.run is not None:
+            raise
         raise FileNotFoundError(f"{error}; --elites 0 crosses hard-random terrains alone") from None
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites: {found.go_on}, or leave elites out with --elites 0")
@@ -321,6 +323,11 @@ class Crossings:
                         self._cross(name, evaluate)
         for name in _PLAIN:
             self._cross_plain(name, resolved=name != "mujoco_c")
+
+    def what_is_next(self) -> str:
+        """What the same command does after a stop."""
+        begun = any(array.any() for array in self.outcome.values())
+        return "The same command goes on." if begun else "The same command begins anew."
 
     def _left(self, name: str) -> NDArray[np.intp]:
         """Terrains that are still to be crossed in a way."""
@@ -443,7 +450,7 @@ def _show(report: dict[str, Any]) -> None:
             found = own[way]
             if not found["terrains"]:
                 continue
-            print(f"{found['terrains']} {title}: {words}")
+            print(f"{title} ({found['terrains']}): {words}")
             for kind in KINDS:
                 bias = value_words(found[f"{kind}_bias"], found[f"{kind}_bias_interval"], "+.3f")
                 print(f"  {kind:<8} {bias}, {found[f'{kind}_difference']:.3f} apart")
@@ -452,7 +459,7 @@ def _show(report: dict[str, Any]) -> None:
     if report["failing"] is not None:
         title = _NAMES["elites" if report["elites"] else "named"]
         print(
-            f"{report['failing']} {title} fail in the first episodes; of these fail in other episodes "
+            f"failing {title}: {report['failing']} in the first episodes; of these in other episodes "
             f"{report['failing_again']} at the same settings, {report['failing_resolved']} with contact resolved"
         )
     if any(report["invalid_episodes"].values()):
