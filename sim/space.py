@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -167,3 +168,24 @@ def get_space(name: str) -> TerrainSpace:
     if name not in SPACES:
         raise ValueError(f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}")
     return SPACES[name]
+
+
+def read_pool(path: Path) -> tuple[NDArray[np.float32], TerrainSpace]:
+    """Genes of a pool, shape (num_terrains, num_genes), and the space that its file names, the paper's if none.
+
+    Raises:
+        ValueError: If the file holds no genes of a known space.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            genes = content["genes"]
+            space = get_space(str(content["space"])) if "space" in content else SUPER_GAUSSIAN
+    except Exception as error:  # a damaged zip archive can fail with anything
+        raise ValueError(f"--genes {path}: expected an .npz file with an array 'genes', got: {error}") from error
+    try:
+        if not len(genes) or genes.dtype.kind != "f":
+            raise ValueError(f"they must be floats, one row a terrain, got {genes.dtype} of shape {genes.shape}")
+        with np.errstate(over="ignore"):
+            return space.validate(genes.astype(np.float32)), space
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"--genes {path}: 'genes': {error}") from None

@@ -4,9 +4,6 @@ The scale of a penalty is its mean over all valid episodes or, where it is 0 in 
 Scales are measured once with the shipped controller, before any search, and never tuned on an archive.
 """
 
-import hashlib
-import io
-import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -16,13 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.studies.kept import Kept
 from qd.workers.invalid import tell_invalid
-from sim.files.atomic import write_atomically
 from sim.files.command import Where, Who, naming_what_is_next, publish
-from sim.files.provenance import code_fingerprint
 from sim.files.settings import check, setting
-from sim.policy.spec import controller_hash
-from sim.robots.identity import identity, robot_identity
+from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.fresh import Open
@@ -94,10 +89,13 @@ class Calibrate(Who, Where):
         genes = get_space(self.space).hard_random(self.terrains, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self.terrains, np.uint32)
         out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
-        kept = _Kept(out.with_name(f"{out.stem}.part.npz"), robot, evaluator, [self.seed, self.terrains])
+        kept = Kept(out, robot, evaluator, [self.seed, self.terrains])
+
+        def keep(crossed: Crossed) -> None:
+            kept.write(penalties=crossed.penalties, invalidity=crossed.invalidity)
 
         def measure() -> dict[str, Any]:
-            crossed = kept.read()
+            crossed = _crossed_before(kept.read(), robot, self.replicas)
             if len(crossed):
                 print(f"{len(crossed)} terrains are kept from before in {kept.file}.", flush=True)
             elif device == "cpu" and math.prod(_LOOK) < self.terrains * self.replicas / 2:
@@ -108,7 +106,7 @@ class Calibrate(Who, Where):
                     naming_what_is_next(kept.state, lambda: "The same command goes on."),
                     opened(evaluator) as evaluate,
                 ):
-                    crossed = _cross(evaluate, evaluator.num_terrains, genes, seeds, crossed, kept.write)
+                    crossed = _cross(evaluate, evaluator.num_terrains, genes, seeds, crossed, keep)
             tell_invalid(crossed, "hard-random terrains")
             return {
                 **workers.origin_of(device, self.seed, self.workers),
@@ -119,7 +117,7 @@ class Calibrate(Who, Where):
             }
 
         report = publish(out, measure, _show)
-        kept.file.unlink(missing_ok=True)
+        kept.remove()
         absent = [name for name in robot.penalties if name not in report["scales"]]
         if absent:
             raise ValueError(
@@ -147,56 +145,18 @@ class Crossed:
         return self.invalidity != 0
 
 
-class _Kept:
-    """What is crossed so far, in a file; only what was crossed in the same way is read.
-
-    Args:
-        file: The file.
-        robot: The robot.
-        evaluator: What crosses.
-        drawn: What the terrains were drawn by.
-    """
-
-    def __init__(self, file: Path, robot: "RobotCfg", evaluator: "EvaluatorCfg", drawn: list[int]) -> None:
-        self.file, self._names = file, robot.penalties
-        self._empty = Crossed(
-            penalties=np.zeros((0, evaluator.num_replicas, len(self._names))),
-            invalidity=np.zeros((0, evaluator.num_replicas), np.uint8),
-            penalty_names=self._names,
-        )
-        controller = controller_hash(evaluator.policy)
-        way = [robot_identity(robot), controller, evaluator.space, evaluator.num_replicas, *drawn]
-        way += [evaluator.device.startswith("cuda"), code_fingerprint(("kernels", "sim")), *self._names]
-        self._key = None if controller is None else hashlib.sha256(json.dumps(way).encode()).hexdigest()
-
-    @property
-    def state(self) -> str:
-        """What is kept, in words."""
-        where = f"what is crossed is kept in {self.file}"
-        return where if self._key else "nothing is kept, since the controller's code has no file"
-
-    def read(self) -> Crossed:
-        """What is kept; nothing if the file is damaged or of something else."""
-        try:
-            with np.load(self.file, allow_pickle=False) as content:
-                if str(content["key"]) != self._key:
-                    return self._empty
-                crossed = replace(self._empty, penalties=content["penalties"], invalidity=content["invalidity"])
-        except Exception:  # zip, zlib and npy headers answer damage with a dozen types
-            return self._empty
-        fits = crossed.penalties.shape == (*crossed.invalidity.shape, len(self._names))
-        return crossed if fits else self._empty
-
-    def write(self, crossed: Crossed) -> None:
-        """Keeps it.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
-        if self._key is not None:
-            buffer = io.BytesIO()
-            np.savez(buffer, key=self._key, penalties=crossed.penalties, invalidity=crossed.invalidity)
-            write_atomically(self.file, buffer.getvalue())
+def _crossed_before(arrays: dict[str, NDArray[Any]], robot: "RobotCfg", num_replicas: int) -> Crossed:
+    """What was crossed before; nothing if the arrays do not fit."""
+    nothing = Crossed(
+        penalties=np.zeros((0, num_replicas, len(robot.penalties))),
+        invalidity=np.zeros((0, num_replicas), np.uint8),
+        penalty_names=robot.penalties,
+    )
+    if arrays.keys() != {"penalties", "invalidity"}:
+        return nothing
+    crossed = replace(nothing, **arrays)
+    fits = crossed.penalties.shape == (*crossed.invalidity.shape, len(robot.penalties))
+    return crossed if fits else nothing
 
 
 def _look(opened: "Open", evaluator: "EvaluatorCfg", genes: NDArray[Any], seeds: NDArray[Any]) -> None:

@@ -83,6 +83,8 @@ class EvaluatorCfg:
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
     """Terrain space of the genes."""
+    resolved: bool = False
+    """Whether contact is resolved (:func:`sim.simulation.resolved`), which takes five times as long."""
 
     @property
     def num_workers(self) -> int:
@@ -222,16 +224,20 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
     from sim.robots.robot import get_robot
     from sim.rollout import CrossingCfg, Rollout
+    from sim.simulation import SolverCfg, resolved
     from sim.space import get_space
 
+    robot = get_robot(cfg.robot)
+    robot, solver = resolved(robot) if cfg.resolved else (robot, SolverCfg())
     return Rollout(
-        get_robot(cfg.robot),
+        robot,
         cfg.policy,
         num_terrains=num_terrains,
         num_replicas=cfg.num_replicas,
         num_envs=cfg.envs_of_worker,
         device=cfg.device,
         cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
+        solver=solver,
         space=get_space(cfg.space),
     )
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
+from sim.agreement import KINDS, agreement
 from sim.commands import SolverOptions
-from sim.files.intervals import bootstrap_interval, value_words
+from sim.files.intervals import value_words
 from sim.files.provenance import provenance
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
@@ -37,28 +37,6 @@ def choices(cfg: SolverOptions, robot: RobotCfg) -> list[tuple[SolverCfg, RobotC
         *((SolverCfg(iterations=newton, ls_iterations=line), robot) for newton, line in caps),
         *((SolverCfg(), replace(robot, njmax=rows, nconmax=contacts)) for rows, contacts in capacities),
     ]
-
-
-def _agreement(result: RolloutResult, fine: RolloutResult, seed: int) -> dict[str, Any]:
-    """How far rates of terrains lie from those with contact resolved, terrains without a valid episode left out."""
-
-    def rates(of: RolloutResult, hits: NDArray[np.bool_]) -> NDArray[np.float64]:
-        valid = (~of.invalid).sum(axis=1)
-        return np.where(valid > 0, (hits & ~of.invalid).sum(axis=1) / np.maximum(valid, 1), np.nan)
-
-    found: dict[str, Any] = {}
-    for kind, ours, theirs in (
-        ("success", ~result.base_collision, ~fine.base_collision),
-        ("goal", result.reached_goal, fine.reached_goal),
-    ):
-        apart = rates(result, ours) - rates(fine, theirs)
-        apart = apart[np.isfinite(apart)]
-        found[kind] = {
-            "bias": float(apart.mean()) if len(apart) else None,
-            "bias_interval": bootstrap_interval(apart, seed),
-            "difference": float(np.abs(apart).mean()) if len(apart) else None,
-        }
-    return found
 
 
 def _means(result: RolloutResult) -> dict[str, Any]:
@@ -110,7 +88,11 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
                 "wall_s": wall_s,
                 "world_steps_per_s": last.outcome.size * last.physics_steps / wall_s,
                 **_means(last),
-                **({} if fine is None or fine is last else {"against_resolved": _agreement(last, fine, cfg.seed)}),
+                **(
+                    {}
+                    if fine is None or fine is last
+                    else {"against_resolved": agreement(last.outcome, fine.outcome, cfg.seed)}
+                ),
             }
         )
         del rollout
@@ -136,8 +118,8 @@ def print_rows(report: dict[str, Any]) -> None:
             f"{row['invalid']:>7} "
             + " ".join(f"{value_words(row['penalties'][name], None, '.4f'):>13}" for name in names)
         )
-        for kind, apart in row.get("against_resolved", {}).items():
-            bias = value_words(apart["bias"], apart["bias_interval"], "+.4f")
-            print(
-                f"{'':>16} {kind}: {bias} of resolved contact's, {value_words(apart['difference'], None, '.4f')} apart"
-            )
+        apart = row.get("against_resolved")
+        for kind in KINDS if apart else ():
+            bias = value_words(apart[f"{kind}_bias"], apart[f"{kind}_bias_interval"], "+.4f")
+            size = value_words(apart[f"{kind}_difference"], None, ".4f")
+            print(f"{'':>16} {kind}: {bias} of resolved contact's, {size} apart")

@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,42 +12,22 @@ from tqdm import tqdm
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
+from sim.agreement import count_hits, crossing_rates
 from sim.bank import heights_of
 from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
 from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
 from sim.files.provenance import provenance
-from sim.mujoco_c.crossing import draw_starts, run_plain
+from sim.mujoco_c.crossing import cross_plain
 from sim.mujoco_c.model import crossing_model
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
 from sim.simulation import SolverCfg, resolve_device, resolved
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
+from sim.space import SUPER_GAUSSIAN, read_pool
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
-
-
-def read_pool(path: Path) -> tuple[NDArray[np.float32], TerrainSpace]:
-    """Genes of a pool, shape (num_terrains, num_genes), and the space that its file names, the paper's if none.
-
-    Raises:
-        ValueError: If the file holds no genes of a known space.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            genes = content["genes"]
-            space = get_space(str(content["space"])) if "space" in content else SUPER_GAUSSIAN
-    except Exception as error:  # a damaged zip archive can fail with anything
-        raise ValueError(f"--genes {path}: expected an .npz file with an array 'genes', got: {error}") from error
-    try:
-        if not len(genes) or genes.dtype.kind != "f":
-            raise ValueError(f"they must be floats, one row a terrain, got {genes.dtype} of shape {genes.shape}")
-        with np.errstate(over="ignore"):
-            return space.validate(genes.astype(np.float32)), space
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"--genes {path}: 'genes': {error}") from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +86,7 @@ class Comparison:
                 batch = order[np.arange(looked_at, looked_at + at_once) % len(pool)]
                 new = min(at_once, len(pool) - looked_at)
                 result = rollout.evaluate(pool[batch], self._seeds(at_once))
-                first = np.array([_rate(outcome, "success") for outcome in result.outcome[:new]])
+                first = crossing_rates(result.outcome[:new], "success")
                 hits = np.flatnonzero((first >= cfg.between[0]) & (first <= cfg.between[1]))
                 hits = hits[: cfg.terrains - len(chosen)]
                 chosen += batch[hits].tolist()
@@ -149,15 +128,16 @@ class Comparison:
         genes, seeds = choice.genes, self._seeds(len(choice.index))
         robot, time_constant_s = self._resolved(cfg.fine == "both")
         ours = self._rollout(robot, len(genes), time_constant_s).evaluate(genes, seeds)
-        heights = heights_of(genes, self.space, device=self.device)
-        starts = [
-            draw_starts(self.robot, grid, int(seed), cfg.plain_episodes, self.device)
-            for grid, seed in zip(heights, seeds, strict=True)
-        ]
         simulated, plain_time_constant_s = self._resolved(cfg.fine != "neither")
-        processes = cfg.workers or os.cpu_count() or 1
-        plain = run_plain(
-            simulated, str(self.policy), heights, starts, processes=processes, time_constant_s=plain_time_constant_s
+        plain = cross_plain(
+            simulated,
+            str(self.policy),
+            heights_of(genes, self.space, device=self.device),
+            seeds,
+            num_episodes=cfg.plain_episodes,
+            device=self.device,
+            processes=cfg.workers or os.cpu_count() or 1,
+            time_constant_s=plain_time_constant_s,
         )
         plain_penalties = np.concatenate([crossings.penalties for crossings in plain])
         pairs = [
@@ -197,22 +177,15 @@ class Pair:
 
 
 def _hits(outcome: NDArray[np.uint8], kind: str) -> tuple[int, int]:
-    """Episodes that count as a hit, and valid ones."""
-    valid = outcome[outcome != Outcome.INVALID]
-    hit = valid != Outcome.BASE_COLLISION if kind == "success" else valid == Outcome.GOAL
-    return int(hit.sum()), len(valid)
-
-
-def _rate(outcome: NDArray[np.uint8], kind: str) -> float:
-    hits, count = _hits(outcome, kind)
-    return hits / count if count else float("nan")
+    hits, count = count_hits(outcome, kind)
+    return int(hits), int(count)
 
 
 def _compare(pair: Pair, kind: str) -> dict[str, Any]:
     low, high = wilson_interval(*_hits(pair.ours, kind))
-    plain_rate = _rate(pair.plain, kind)
+    plain_rate = float(crossing_rates(pair.plain, kind))
     return {
-        "ours": _rate(pair.ours, kind),
+        "ours": float(crossing_rates(pair.ours, kind)),
         "interval": [low, high],
         "mujoco_c": plain_rate,
         "mujoco_c_interval": list(wilson_interval(*_hits(pair.plain, kind))),

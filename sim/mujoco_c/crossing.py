@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -249,6 +249,7 @@ def run_plain(
     *,
     processes: int,
     time_constant_s: float | None = None,
+    crossed: Callable[[int, PlainCrossings], None] | None = None,
 ) -> list[PlainCrossings]:
     """Cross every terrain from its starts in plain MuJoCo, shared out over processes.
 
@@ -259,8 +260,13 @@ def run_plain(
         starts: Of each terrain.
         processes: How many at once.
         time_constant_s: Contact time constant [s]; that of the robot's file if None.
+        crossed: Called with the number of a terrain and its crossings once it has been crossed from all its starts.
+
+    Raises:
+        OSError: If a process dies.
     """
     context = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(
         processes, mp_context=context, initializer=_start_worker, initargs=(robot, policy, os.getpid())
     )
@@ -272,11 +278,55 @@ def run_plain(
             ]
             for grid, start in zip(heights, starts, strict=True)
         ]
+        terrain_of = {part: number for number, terrain in enumerate(parts) for part in terrain}
         with tqdm(desc="plain MuJoCo", total=sum(len(s.qpos) for s in starts), unit="episode", disable=None) as bar:
-            for done in as_completed([part for terrain in parts for part in terrain]):
+            for done in as_completed(terrain_of):
                 bar.update(len(done.result().outcome))
+                number = terrain_of.pop(done)
+                if crossed is not None and number not in terrain_of.values():
+                    crossed(number, join([part.result() for part in parts[number]]))
     except BrokenProcessPool as error:
         raise OSError(f"a process of plain MuJoCo died: {error}") from None
+    except KeyboardInterrupt:
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()  # a part may have minutes to go
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
     return [join([part.result() for part in terrain]) for terrain in parts]
+
+
+def cross_plain(
+    robot: RobotCfg,
+    policy: str,
+    heights: NDArray[np.float32],
+    seeds: NDArray[np.uint32],
+    *,
+    num_episodes: int,
+    device: str,
+    processes: int,
+    time_constant_s: float | None = None,
+    crossed: Callable[[int, PlainCrossings], None] | None = None,
+) -> list[PlainCrossings]:
+    """Cross terrains in plain MuJoCo from the starts that a rollout of the same seeds has (:func:`run_plain`).
+
+    Args:
+        robot: Robot settings.
+        policy: The controller.
+        heights: Height grids [m], shape (num_terrains, nrow, ncol).
+        seeds: One a terrain, uint32.
+        num_episodes: Episodes a terrain; the first of them begin as a rollout's do, which may have fewer.
+        device: Warp device that draws the starts.
+        processes: How many at once.
+        time_constant_s: Contact time constant [s]; that of the robot's file if None.
+        crossed: As of :func:`run_plain`.
+
+    Raises:
+        OSError: If a process dies.
+    """
+    starts = [
+        draw_starts(robot, grid, int(seed), num_episodes, device) for grid, seed in zip(heights, seeds, strict=True)
+    ]
+    return run_plain(
+        robot, policy, heights, starts, processes=processes, time_constant_s=time_constant_s, crossed=crossed
+    )

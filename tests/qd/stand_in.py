@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kernels.episode import Outcome
 from qd.workers.evaluator import EvaluatorCfg
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
@@ -30,6 +31,13 @@ class Result:
     wall_s: float
     idle_share: float = 0.25
     reward: np.ndarray | None = None
+
+    @property
+    def outcome(self) -> np.ndarray:
+        """Outcome of each episode, out of time where nothing else is said."""
+        cases = [self.invalid, self.base_collision, self.reached_goal]
+        kinds = [Outcome.INVALID, Outcome.BASE_COLLISION, Outcome.GOAL]
+        return np.select(cases, kinds, Outcome.TIME_OUT).astype(np.uint8)
 
 
 def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES) -> Result:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.bank import heights_of
-from sim.space import SPACES, SUPER_GAUSSIAN, SuperGaussian, clipped, get_space
+from sim.space import SPACES, SUPER_GAUSSIAN, SuperGaussian, clipped, get_space, read_pool
 
 
 def test_a_space_is_found_by_its_name():
@@ -79,3 +79,29 @@ def test_a_bump_in_words():
     words = SuperGaussian(num_bumps=1).describe(genes)
     assert words == "hollow of 0.25 m at (9.0, 4.0) m, half widths 0.5 m and 3.0 m, turned by 90 degrees"
     assert len(SUPER_GAUSSIAN.parts(np.tile(genes, 8))) == 8
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"other": np.zeros((3, 64))},
+        {"genes": np.zeros((3, 63))},
+        {"genes": np.full((3, 64), np.nan)},
+        {"genes": np.full((3, 64), 1e300)},
+        {"genes": np.zeros((0, 64))},
+        {"genes": np.array([[None]], dtype=object)},
+    ],
+    ids=["no genes", "shape", "not finite", "too large", "empty", "objects"],
+)
+def test_a_pool_that_is_none_is_refused(tmp_path, content):
+    file = tmp_path / "pool.npz"
+    np.savez(file, **content)
+    with pytest.raises(ValueError, match="--genes"):
+        read_pool(file)
+
+
+def test_a_pool_that_is_no_file_is_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("not an archive")
+    for name in ("missing.npz", "text.npz", "."):
+        with pytest.raises(ValueError, match="--genes"):
+            read_pool(tmp_path / name)

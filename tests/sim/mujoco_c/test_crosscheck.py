@@ -8,7 +8,7 @@ import pytest
 from kernels.episode import Outcome
 from sim.commands import Crosscheck
 from sim.files.command import run_command
-from sim.mujoco_c.crosscheck import Comparison, Pair, read_pool, summarise
+from sim.mujoco_c.crosscheck import Comparison, Pair, summarise
 from sim.space import SUPER_GAUSSIAN
 
 
@@ -43,32 +43,6 @@ def test_a_terrain_without_valid_episodes_is_left_out_and_named():
     fine = Pair(index=3, first=0.5, ours=outcomes(1, 1, 0), plain=outcomes(1, 1, 0))
     report = summarise([lost, fine], seed=0)
     assert report["left_out"] == [7] and len(report["terrains"]) == 1 and report["invalid"]["ours"] == 3
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"other": np.zeros((3, 64))},
-        {"genes": np.zeros((3, 63))},
-        {"genes": np.full((3, 64), np.nan)},
-        {"genes": np.full((3, 64), 1e300)},
-        {"genes": np.zeros((0, 64))},
-        {"genes": np.array([[None]], dtype=object)},
-    ],
-    ids=["no genes", "shape", "not finite", "too large", "empty", "objects"],
-)
-def test_a_pool_that_is_none_is_refused(tmp_path, content):
-    file = tmp_path / "pool.npz"
-    np.savez(file, **content)
-    with pytest.raises(ValueError, match="--genes"):
-        read_pool(file)
-
-
-def test_a_pool_that_is_no_file_is_refused(tmp_path):
-    (tmp_path / "text.npz").write_text("not an archive")
-    for name in ("missing.npz", "text.npz", "."):
-        with pytest.raises(ValueError, match="--genes"):
-            read_pool(tmp_path / name)
 
 
 @pytest.mark.parametrize(

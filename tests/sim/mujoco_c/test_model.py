@@ -230,7 +230,9 @@ def test_episodes_shared_out_over_processes_come_back_in_order(anymal):
     for start in starts:
         start.qpos[:, 1] = 10.5  # over at once, but for one
         start.qpos[27, :2] = 13.8, 4.0
-    found = run_plain(anymal, str(anymal.policy_file), heights, starts, processes=1)
+    told = {}
+    found = run_plain(anymal, str(anymal.policy_file), heights, starts, processes=1, crossed=told.__setitem__)
+    assert sorted(told) == [0, 1] and all((told[k].outcome == found[k].outcome).all() for k in told)
     for crossings in found:
         assert len(crossings.outcome) == 30
         assert np.flatnonzero(crossings.outcome == Outcome.GOAL).tolist() == [27]

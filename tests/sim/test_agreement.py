@@ -1,0 +1,34 @@
+"""How far rates lie apart, by hand."""
+
+import numpy as np
+import pytest
+
+from kernels.episode import Outcome
+from sim.agreement import agreement, count_hits, crossing_rates
+
+GOAL, HIT, LATE = Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT
+INVALID, RUNNING = Outcome.INVALID, Outcome.RUNNING
+
+OURS = np.uint8([[GOAL, GOAL, HIT, LATE], [HIT, HIT, HIT, INVALID], [INVALID] * 4, [GOAL] * 4])
+THEIRS = np.uint8([[GOAL, LATE, LATE, LATE], [GOAL, HIT, HIT, HIT], [GOAL] * 4, [RUNNING] * 4])
+
+
+def test_rates_are_of_valid_episodes():
+    np.testing.assert_array_equal(crossing_rates(OURS, "success"), [0.75, 0.0, np.nan, 1.0])
+    np.testing.assert_array_equal(crossing_rates(OURS, "goal"), [0.5, 0.0, np.nan, 1.0])
+    assert count_hits(OURS[1], "success") == (0, 3) and count_hits(THEIRS[3], "goal") == (0, 0)
+
+
+def test_bias_and_distance_are_of_terrains_that_both_have():
+    # Success .75 and 0 against 1 and .25: both .25 lower. Goal .5 and 0 against .25 and .25: once more, once less.
+    found = agreement(OURS, THEIRS, seed=0)
+    assert found["terrains"] == 2
+    assert found["success_bias"] == -0.25 and found["success_difference"] == 0.25
+    assert found["success_bias_interval"] == pytest.approx([-0.25, -0.25])
+    assert found["goal_bias"] == 0.0 and found["goal_difference"] == 0.25
+    assert found["goal_bias_interval"] == pytest.approx([-0.25, 0.25])
+
+
+def test_without_terrains_nothing_is_said():
+    found = agreement(OURS[2:], THEIRS[2:], seed=0)
+    assert found.pop("terrains") == 0 and set(found.values()) == {None}
