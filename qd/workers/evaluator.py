@@ -83,6 +83,8 @@ class EvaluatorCfg:
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
     """Terrain space of the genes."""
+    resolved: bool = False
+    """Whether contact is resolved (:func:`sim.simulation.resolved`), at about five times the time."""
 
     @property
     def num_workers(self) -> int:
@@ -222,16 +224,21 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
     from sim.robots.robot import get_robot
     from sim.rollout import CrossingCfg, Rollout
+    from sim.simulation import resolved
     from sim.space import get_space
 
+    robot, solver = get_robot(cfg.robot), None
+    if cfg.resolved:
+        robot, solver = resolved(robot)
     return Rollout(
-        get_robot(cfg.robot),
+        robot,
         cfg.policy,
         num_terrains=num_terrains,
         num_replicas=cfg.num_replicas,
         num_envs=cfg.envs_of_worker,
         device=cfg.device,
         cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
+        solver=solver,
         space=get_space(cfg.space),
     )
 
@@ -318,20 +325,36 @@ class Pipeline(ABC):
         self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
     ) -> "RolloutResult":
         """Crosses each terrain once a replica; nothing else may be under way."""
-        count = checked_count(terrains, seeds)
+        count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
+        return merged([result for _, result in self.in_lots(terrains, seeds, size, progress)], join=1)
+
+    def in_lots(
+        self, terrains: NDArray, seeds: NDArray, size: int, progress: Callable[[float], None] | None = None
+    ) -> "Iterator[tuple[slice, RolloutResult]]":
+        """Crosses each terrain once a replica, in lots; nothing else may be under way.
+
+        Args:
+            terrains: As of :class:`Evaluate`.
+            seeds: One a terrain.
+            size: Terrains of a lot.
+            progress: Called now and then with the share that is done.
+
+        Yields:
+            Which terrains a lot has, and its result. The next lot is under way meanwhile if there is room for two.
+        """
+        count = checked_count(terrains, seeds)
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-        ahead = min(2, self.num_terrains)
+        ahead = max(1, min(2, self.num_terrains // size))
         self.clear()
         for own in lots[:ahead]:
             self.put(terrains[own], seeds[own])
-        results = []
         for number, own in enumerate(lots):
             done, share = own.start / count, (own.stop - own.start) / count
-            results.append(self.take(None if progress is None else _share_of(progress, done, share)))
+            result = self.take(None if progress is None else _share_of(progress, done, share))
             for behind in lots[number + ahead : number + ahead + 1]:
                 self.put(terrains[behind], seeds[behind])
-        return merged(results, join=1)
+            yield own, result
 
 
 class _Here(Pipeline):
