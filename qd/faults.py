@@ -293,7 +293,8 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
     return numbers
 
 
-def _or(names: Sequence[str]) -> str:
+def any_of(names: Sequence[str]) -> str:
+    """Names in words: ``a, b or c``."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
@@ -311,14 +312,26 @@ def fault_words(archive: Archive) -> list[str]:
         )
     if numbers["mujoco_c"]["crossed"]:
         there = rate_words(numbers["mujoco_c"]["failing"], numbers["mujoco_c"]["crossed"])
-        told.append(f"In MuJoCo C {there} of those crossed fail.")
+        told.append(f"In plain MuJoCo C {there} of those crossed there fail.")
     if faults.certifiers:
-        who, rest = _or(faults.certifiers), int((archive.failing & ~archive.certified).sum())
+        who, rest = any_of(faults.certifiers), int((archive.failing & ~archive.certified).sum())
         one = numbers["faults"] == 1
         what = "fault: a terrain" if one else "faults: terrains"
         told.append(f"{numbers['faults']:,} {what} that {who} crosses and this controller does not.")
         told.append(f"{rest:,} failing elite{' is' if rest == 1 else 's are'} not known to be passable.")
     return told
+
+
+VERDICTS = ("", "failing", "confirmed", "certified", "fault")
+"""What an elite is, in a word."""
+
+
+def verdict_of(archive: Archive, number: int) -> str:
+    """The verdict on an elite: empty if it does not fail."""
+    confirmed, certified = bool(archive.confirmed[number]), bool(archive.certified[number])
+    if confirmed and certified:
+        return "fault"
+    return "confirmed" if confirmed else "certified" if certified else "failing" if archive.failing[number] else ""
 
 
 def elite_words(archive: Archive, number: int) -> list[str]:
