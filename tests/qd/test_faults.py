@@ -76,7 +76,10 @@ def test_confirming_crosses_with_contact_resolved_what_was_not_crossed_before(fa
     assert [(cfg.resolved, cfg.num_replicas, cfg.policy) for cfg in opened] == [(True, 20, "p")]
     assert archive.confirmed.tolist() == [True, False, True, False, False, True]
     assert archive.faults.resolved_outcomes[2].tolist() == [9, 11, 0, 0]
-    assert [int(one.faults.resolved_outcomes.any(axis=1).sum()) for one in saved] == [2, 3]  # lots of a terrain a worker
+    assert [int(one.faults.resolved_outcomes.any(axis=1).sum()) for one in saved] == [
+        2,
+        3,
+    ]  # lots of a terrain a worker
     again = confirm(archive, range(6), work(lambda cfg, genes: [10] * len(genes), [], opened))
     assert again.confirmed.tolist() == archive.confirmed.tolist()
     assert again.faults.resolved_outcomes.sum(axis=1).tolist() == [20] * 6
