@@ -221,7 +221,7 @@ def _crossed(
     lot = _LOT[cfg.device.partition(":")[0]] * cfg.num_workers
     cfg = replace(cfg, num_terrains=min(len(missing), 2 * lot))
     seeds, reasons = elite_seeds(archive, work.seed, stream=stream)[missing], dict[str, int]()
-    print(f"{len(missing):,} elites are crossed {EPISODES} times each by {what}.", flush=True)
+    print(f"Elites to be crossed {EPISODES} times each by {what}: {len(missing):,}", flush=True)
     with work.open_evaluator(cfg) as evaluate, share_bar(f"by {what}") as progress:
         for part, result in pipeline_of(evaluate).in_lots(archive.genes[missing], seeds, lot, progress):
             archive = column.filled(archive, missing[part], outcome_counts(result))

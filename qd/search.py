@@ -216,7 +216,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                 write_results(run, archive, metrics, origin, reproduced_by=by)
         if job.confirm:
             later = f"Go on with:  {job.confirm_command}"
-            with naming_what_is_next("its fresh episodes are saved", lambda: later):
+            with naming_what_is_next("what was crossed is kept", lambda: later):
                 archive = confirm_all(run, archive, job.evaluator, open_evaluator, cfg.seed)
         for line in fault_words(archive):
             print(line)

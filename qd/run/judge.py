@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qd.archive import Archive, read_archive
+from qd.archive import ARCHIVE_FILE, Archive, read_archive
 from qd.faults import Work, certify, confirm, confirm_in_mujoco_c, fault_words, known_names, saving
 from qd.fresh import Open
 from qd.run.arguments import evaluator_of
-from qd.run.directory import RESULTS, RunDirectory, claimed, newest_run
-from qd.run.settings import SearchCfg, as_settings, is_searched, own_policy
+from qd.run.directory import CONFIG_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed, newest_run
+from qd.run.settings import SearchCfg, as_settings, code_of, is_searched, own_policy
 from qd.workers.evaluator import check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.command import OfRobot, Where, Who, chosen_elites, command_line, naming_what_is_next
 from sim.files.intervals import rate_words
@@ -105,8 +105,15 @@ def _judged(path: Path, cfg: SearchCfg, robot: "RobotCfg", elite: str) -> Iterat
     """
     with claimed(path):
         archive = read_archive(path)
+        if (archive.robot, archive.penalties, archive.scales) != (
+            cfg.robot, cfg.fitness.penalties, cfg.fitness.scales,
+        ):  # fmt: skip
+            raise ValueError(
+                f"{path / ARCHIVE_FILE} must be the archive of {CONFIG_FILE} beside it, got one of another robot, "
+                "other penalties or scales: put back the one that is not this run's"
+            )
         if archive.fresh is None:
-            remedy = command_line("reevaluate", robot=robot.spec, run=path)
+            remedy = command_line("reevaluate", robot=robot.spec, run=path, policy=code_of(cfg))
             raise ValueError(
                 f"{path} must have fresh episodes of its elites, which say what fails, got none: run `{remedy}` first"
             )
@@ -130,10 +137,10 @@ def _failing(archive: Archive, elite: str, path: Path) -> list[int]:
         if not fresh.failing[number]:
             count = int(fresh.episodes[number] - fresh.invalid_episodes[number])
             rate = rate_words(round(float(fresh.goal_rate[number]) * count), count)
-            raise ValueError(
-                f"elite {number} of {path} does not fail: {rate} of its fresh episodes reach the goal, expected under "
-                "half: name failing ones, or leave out --elite"
-            )
+            why = f"{rate} of its fresh episodes reach the goal, expected under half"
+            if not fresh.valid[number]:
+                why = f"{fresh.invalid_episodes[number]} of its {fresh.episodes[number]} fresh episodes are invalid"
+            raise ValueError(f"elite {number} of {path} does not fail: {why}: name failing ones, or leave out --elite")
     return numbers
 
 
@@ -219,14 +226,14 @@ def certify_run(args: Certify, *, open_evaluator: Open = open_evaluator, cross: 
             archive = certify(judged.archive, judged.chosen, certifiers, work)
             saving(judged.run)(archive)
             if args.record:
-                from qd.show.evidence import record_certificates
+                from qd.show.evidence import FOLDER, record_certificates
                 from qd.show.recordings import Simulation
 
                 kept = record_certificates(
                     path, archive, judged.chosen, certifiers, seed=cfg.seed, device=device,
                     cross=cross or Simulation(robot, device),
                 )  # fmt: skip
-                print(f"{kept} crossings recorded under {path / 'recordings'}")
+                print(f"Crossings recorded under {path / FOLDER}: {kept}")
     _tell(archive, path)
     faults = np.flatnonzero(archive.confirmed & archive.certified)
     if len(faults):
@@ -274,4 +281,4 @@ def _tell(archive: Archive, path: Path) -> None:
         print(f"No elite of {path} fails by its fresh episodes: there is nothing to cross.")
     for line in fault_words(archive):
         print(line)
-    print(f"In {path / 'archive.json'} and {path / 'archive.npz'}.")
+    print(f"In {path / SUMMARY_FILE} and {path / ARCHIVE_FILE}.")

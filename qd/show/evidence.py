@@ -12,7 +12,6 @@ from qd.faults import EPISODES, certificate_seeds
 from qd.run.directory import directory_of
 from qd.run.progress import share_bar
 from qd.show.recordings import AT_ONCE, Cross, Wanted
-from sim.files.command import command_line
 from sim.recording.file import read_recording, write_recording
 
 if TYPE_CHECKING:
@@ -42,8 +41,10 @@ def read_evidence(run: Path, archive: Archive, number: int, name: str) -> "Recor
     """
     file, faults = evidence_file(run, archive, number, name), archive.faults
     if faults is None or name not in faults.certifiers or not file.exists():
-        remedy = command_line("certify", run=directory_of(run), elite=number, by=[f"{name}=FILE"], record=True)
-        raise FileNotFoundError(f"no crossing of elite {number} by {name} is kept at {file}: `{remedy}` makes it")
+        raise FileNotFoundError(
+            f"no crossing of elite {number} by {name} is kept at {file}: `faultline certify --record` keeps one of "
+            "each certificate"
+        )
     recording = read_recording(file)
     digest = faults.certifier_sha256[faults.certifiers.index(name)]
     if recording.genes is None or not np.array_equal(recording.genes, archive.genes[number][None]):

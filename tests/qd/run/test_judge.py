@@ -3,12 +3,13 @@
 import json
 import shutil
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qd.archive import read_archive
+from qd.archive import read_archive, write_archive
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run
 from qd.search import run_search
@@ -165,7 +166,7 @@ def test_a_search_confirms_at_its_end(tmp_path, capsys):
     assert numbers_in(tmp_path / "run")["confirmed"] == archive.confirmed.sum() > 0
     assert archive.faults.resolved_outcomes.any(axis=1).sum() == archive.failing.sum()
     assert "fail there too and are confirmed" in capsys.readouterr().out
-    with pytest.raises(Interrupted, match=r"its fresh episodes are saved. Go on with:  faultline confirm --run"):
+    with pytest.raises(Interrupted, match=r"what was crossed is kept\. Go on with:  faultline confirm --run"):
         run_search(
             make_job(tmp_path / "stopped", reproduce=True, confirm=True, iterations=6),
             open_evaluator=lambda cfg: (judges(stop_after=0) if cfg.resolved else open_stand_in)(cfg),
@@ -190,7 +191,9 @@ def test_certificates_are_recorded_once_and_replayed(path, monkeypatch, tmp_path
     text = describe(done)
     assert "C-G.pt" in text and "a terrain that C-G crosses and this one not." in text
     uncertified = str(int(np.flatnonzero(~archive.certified)[0]))
-    with pytest.raises(FileNotFoundError, match=f"no crossing of elite {uncertified} by C-G is kept at .* makes it"):
+    with pytest.raises(
+        FileNotFoundError, match=f"no crossing of elite {uncertified} by C-G is kept at .*certify --record"
+    ):
         replay(ReplayElite(run=path, elite=uncertified, certificate="C-G"))
     file.write_bytes(evidence_file(path, archive, int(np.flatnonzero(archive.certified)[1]), "C-G").read_bytes())
     with pytest.raises(ValueError, match=f"must be of elite {number}, got another terrain"):
@@ -234,6 +237,21 @@ def test_the_panel_leaves_out_the_controller_that_was_searched(path, tmp_path, m
         certified(path, by=())
     shutil.copy(RESULTS / "anymal" / "C-G.pt", panel / "C-G.pt")
     assert certified(path, by=()).faults.certifiers == ("C-G",)
+
+
+def test_an_elite_whose_fresh_episodes_are_invalid_does_not_fail(path):
+    archive = read_archive(path)
+    number = int(np.flatnonzero(archive.failing)[0])
+    invalid = archive.fresh.invalid_episodes.copy()
+    invalid[number] = 11
+    write_archive(path / "archive.npz", replace(archive, fresh=replace(archive.fresh, invalid_episodes=invalid)))
+    with pytest.raises(
+        ValueError, match=f"elite {number} of .* does not fail: 11 of its 40 fresh episodes are invalid"
+    ):
+        confirmed(path, elite=str(number))
+    write_archive(path / "archive.npz", replace(archive, scales=(1.0,) * 6))
+    with pytest.raises(ValueError, match=r"must be the archive of config\.json beside it"):
+        confirmed(path)
 
 
 def test_a_robot_that_has_changed_is_refused(path):
