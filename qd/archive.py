@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.descriptors import Cells
-from qd.fitness import FITNESS_FLOOR, Evaluation
+from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, MAX_INVALID_SHARE, Evaluation
 from sim.files.atomic import write_atomically
+from sim.files.intervals import wilson_interval
 from sim.robots.identity import FIRST_DEFINITION
 
 ARCHIVE_FILE = "archive.npz"
@@ -32,6 +33,11 @@ class FreshValues(Evaluation):
     """Upper limit, shape (N,); 1 of an invalid elite."""
     reproduced: NDArray[np.bool_]
     """Whether an elite lands in its cell or a neighbour of it again, shape (N,)."""
+
+    @property
+    def failing(self) -> NDArray[np.bool_]:
+        """Whether an elite is valid and under half of the robots reach the goal, shape (N,)."""
+        return self.valid & (self.goal_rate < FAILING_GOAL_RATE)
 
     def std(self) -> NDArray[np.float64]:
         """Sum over penalties of the standard deviation over the episodes, of the valid elites, shape (num_valid,)."""
@@ -54,6 +60,70 @@ class FreshValues(Evaluation):
 
 FRESH = tuple(field.name for field in fields(FreshValues))
 """Names of the arrays of fresh values; in the file ``fresh_`` goes before them."""
+
+OUTCOMES = ("goal", "base_collision", "other", "invalid")
+"""How episodes are counted: ``other`` are those out of time or off the terrain."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultCounts:
+    """How further episodes on N elites ended, by :data:`OUTCOMES`; an elite that was not crossed has none."""
+
+    resolved_outcomes: NDArray[np.int64]
+    """By the controller that was searched, with contact resolved, shape (N, 4)."""
+    mujoco_c_outcomes: NDArray[np.int64]
+    """The same in plain MuJoCo C, shape (N, 4)."""
+    certifiers: tuple[str, ...] = ()
+    """Names of C other controllers."""
+    certifier_sha256: tuple[str, ...] = ()
+    """Their hashes."""
+    certifier_outcomes: NDArray[np.int64]
+    """By them at the search's settings, shape (N, C, 4)."""
+    certifier_resolved_outcomes: NDArray[np.int64]
+    """By them with contact resolved, shape (N, C, 4)."""
+
+    @classmethod
+    def none_of(cls, num_elites: int) -> "FaultCounts":
+        """Of elites that nobody has crossed yet."""
+        none, nobody = np.zeros((num_elites, 4), np.int64), np.zeros((num_elites, 0, 4), np.int64)
+        return cls(
+            resolved_outcomes=none,
+            mujoco_c_outcomes=none,
+            certifier_outcomes=nobody,
+            certifier_resolved_outcomes=nobody,
+        )
+
+    def rows(self, chosen: NDArray[np.int64]) -> "FaultCounts":
+        """Those of some of the elites alone, in the order given."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in COUNTS})
+
+    def certificates(self) -> NDArray[np.bool_]:
+        """Whether a controller reaches the goal in at least half of both kinds of episodes, shape (N, C)."""
+        both = (self.certifier_outcomes, self.certifier_resolved_outcomes)
+        return np.all([goal_rates(counts) >= FAILING_GOAL_RATE for counts in both], axis=0)
+
+
+COUNTS = tuple(field.name for field in fields(FaultCounts) if field.name.endswith("_outcomes"))
+"""Names of the arrays of counts, which have one row an elite."""
+
+
+def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Share of valid episodes that reached the goal, of counts of shape (..., 4).
+
+    Returns:
+        Shape (...); NaN where nothing was crossed, or too many episodes are invalid.
+    """
+    episodes, invalid = counts.sum(axis=-1), counts[..., OUTCOMES.index("invalid")]
+    known = (episodes > 0) & (invalid <= MAX_INVALID_SHARE * episodes)
+    return np.where(known, counts[..., 0] / np.maximum(episodes - invalid, 1), np.nan)
+
+
+def _goal_intervals(counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """95 % intervals of the rates (Wilson), shape (..., 2); 0 to 1 without an episode."""
+    valid = counts.sum(axis=-1) - counts[..., OUTCOMES.index("invalid")]
+    pairs = zip(counts[..., 0].ravel().tolist(), valid.ravel().tolist(), strict=True)
+    limits = [wilson_interval(*pair) for pair in pairs]
+    return np.array(limits, np.float64).reshape(*counts.shape[:-1], 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +158,8 @@ class Archive(Evaluation):
     """How its penalties are defined (:data:`kernels.penalties.PENALTY_DEFINITION`)."""
     fresh: FreshValues | None = None
     """What fresh episodes say of the elites; None if there were none."""
+    faults: FaultCounts | None = None
+    """What became of those that fail under other conditions; only beside fresh values."""
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and definition of the penalties, as :func:`sim.robots.identity.identity` names them."""
@@ -127,6 +199,23 @@ class Archive(Evaluation):
         """Whether any of the episodes that found an elite had a base collision, as the paper counts, shape (N,)."""
         return self.collision_rate > 0.0
 
+    @property
+    def failing(self) -> NDArray[np.bool_]:
+        """Whether fresh episodes say that the controller fails an elite, shape (N,)."""
+        return np.zeros(len(self), bool) if self.fresh is None else self.fresh.failing
+
+    @property
+    def confirmed(self) -> NDArray[np.bool_]:
+        """Whether it fails an elite with contact resolved too, shape (N,)."""
+        if self.faults is None:
+            return np.zeros(len(self), bool)
+        return self.failing & (goal_rates(self.faults.resolved_outcomes) < FAILING_GOAL_RATE)
+
+    @property
+    def certified(self) -> NDArray[np.bool_]:
+        """Whether it fails an elite that another controller crosses, shape (N,)."""
+        return np.zeros(len(self), bool) if self.faults is None else self.failing & self.faults.certificates().any(1)
+
     def has_elites_of(self, other: "Archive") -> bool:
         """Whether the elites and all that was found of them are another's too, in whatever order."""
         if len(self) != len(other):
@@ -137,23 +226,32 @@ class Archive(Evaluation):
     def rows(self, chosen: NDArray[np.int64]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
         fresh = None if self.fresh is None else self.fresh.rows(chosen)
-        return replace(self, fresh=fresh, **{name: getattr(self, name)[chosen] for name in PER_ELITE})
+        faults = None if self.faults is None else self.faults.rows(chosen)
+        return replace(self, fresh=fresh, faults=faults, **{name: getattr(self, name)[chosen] for name in PER_ELITE})
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with what fresh episodes say, by descending corrected fitness, the invalid elites last."""
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
+
+    def with_faults_of(self, other: "Archive") -> "Archive":
+        """The archive with the fault counts of another that has its elites, in whatever order; else as it is."""
+        if other.faults is None or not self.has_elites_of(other):
+            return self
+        place = np.argsort(other.cell)[np.searchsorted(np.sort(other.cell), self.cell)]
+        return replace(self, faults=other.faults.rows(place))
 
 
 _HASHES = ("robot_sha256", "policy_sha256", "penalty_definition")  # which a file may lack
 _SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations", *_HASHES)
 _PREFIX = "fresh_"
 _KINDS = {
-    **dict.fromkeys(("robot", "space", "penalties", *_HASHES), "U"),
-    **dict.fromkeys(("collision_bit", "reproduced"), "b"),
+    **dict.fromkeys(("robot", "space", "penalties", "certifiers", "certifier_sha256", *_HASHES), "U"),
+    **dict.fromkeys(("collision_bit", "reproduced", "confirmed", "certified"), "b"),
+    **dict.fromkeys(COUNTS, "i"),
     **dict.fromkeys(("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"),
 }
 _MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
-PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, "fresh"))
+PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, "fresh", "faults"))
 """Names of the arrays that have one row an elite."""
 
 
@@ -167,7 +265,7 @@ def write_archive(path: Path, archive: Archive) -> None:
     buffer = io.BytesIO()
     settings = {name: getattr(archive, name) for name in _SETTINGS}
     content: dict[str, Any] = {name: np.asarray(value) for name, value in settings.items() if value is not None}
-    content |= _arrays(archive)
+    content |= _arrays(archive) | _fault_arrays(archive)
     np.savez_compressed(buffer, **content)
     write_atomically(path, buffer.getvalue())
 
@@ -178,6 +276,24 @@ def _arrays(archive: Archive) -> dict[str, NDArray[Any]]:
     if archive.fresh is None:
         return arrays
     return arrays | {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
+
+
+_CERTIFIERS = ("certifiers", "certifier_sha256")
+_RATES = tuple(name.replace("_outcomes", ending) for name in COUNTS for ending in ("_goal_rate", "_goal_interval"))
+_FAULT_NAMES = (*_CERTIFIERS, *COUNTS, *_RATES, "confirmed", "certified")
+
+
+def _fault_arrays(archive: Archive) -> dict[str, NDArray[Any]]:
+    """Fault counts by their names in the file, and what follows from them; nothing where there are none."""
+    faults = archive.faults
+    if faults is None:
+        return {}
+    arrays: dict[str, NDArray[Any]] = {name: np.array(getattr(faults, name), dtype=np.str_) for name in _CERTIFIERS}
+    for name in COUNTS:
+        counts, what = getattr(faults, name), name.removesuffix("_outcomes")
+        arrays |= {name: counts, f"{what}_goal_rate": goal_rates(counts)}
+        arrays[f"{what}_goal_interval"] = _goal_intervals(counts)
+    return arrays | {"confirmed": archive.confirmed, "certified": archive.certified}
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -203,13 +319,18 @@ def read_archive(path: str | Path) -> Archive:
             names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _HASHES or f"{name}.npy" in there]
             if any(name.startswith(_PREFIX) for name in there):  # then all of them, or it is damage
                 names += [_PREFIX + name for name in FRESH]
+            if any(f"{name}.npy" in there for name in _FAULT_NAMES):  # likewise
+                names += _FAULT_NAMES
             content = {name: _read_array(members.read(f"{name}.npy")) for name in names}
         _check_kinds(content)
+        judged = {name: content.pop(name) for name in _FAULT_NAMES if name in content}
         fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
         found = {name: _from_array(name, value) for name, value in content.items()}
         archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
         _check_shapes(archive)
         _check_values(archive)
+        if judged:
+            archive = _with_faults(archive, judged)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         raise ValueError(
             f"{file} must be the archive of a search, but it is damaged or another file: {error}: going on with its "
@@ -262,3 +383,21 @@ def _check_values(archive: Archive) -> None:
     cells = [archive.cell] if archive.fresh is None else [archive.cell, archive.fresh.cell]
     if not all(((cell >= 0) & (cell < num_cells)).all() for cell in cells):
         raise ValueError(f"cell must lie in 0 to {num_cells - 1}")
+
+
+def _with_faults(archive: Archive, judged: dict[str, NDArray[Any]]) -> Archive:
+    """The archive with the fault counts of its file, whose other arrays must follow from them."""
+    names = [tuple(judged[name].tolist()) for name in _CERTIFIERS]
+    num_elites, num_certifiers = len(archive), len(names[0])
+    if archive.fresh is None or len(names[1]) != num_certifiers:
+        raise ValueError("faults need fresh episodes, and every certifier a hash")
+    for name in COUNTS:
+        expected = (num_elites, num_certifiers, 4) if name.startswith("certifier") else (num_elites, 4)
+        if judged[name].shape != expected or (judged[name] < 0).any():
+            raise ValueError(f"{name} must be counts of shape {expected}, got {judged[name].shape}")
+    counts = {name: judged[name].astype(np.int64) for name in COUNTS}
+    archive = replace(archive, faults=FaultCounts(certifiers=names[0], certifier_sha256=names[1], **counts))
+    for name, value in _fault_arrays(archive).items():
+        if not np.array_equal(judged[name], value, equal_nan=value.dtype.kind == "f"):
+            raise ValueError(f"{name} must follow from the outcomes")
+    return archive

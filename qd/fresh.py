@@ -71,7 +71,9 @@ def reevaluate(
     if not sum(counts):
         return [_nothing(archive.cells) for archive in archives]
     genes = np.concatenate([archive.genes for archive in archives]).repeat(times, axis=0)
-    drawn = [_elite_seeds(archive, seed, times) for archive, seed in zip(archives, seeds, strict=True)]
+    drawn = [
+        elite_seeds(archive, seed, times, stream=_FRESH_STREAM) for archive, seed in zip(archives, seeds, strict=True)
+    ]
     result = evaluate(genes, np.concatenate(drawn), progress)
     tell_invalid(result, "fresh episodes")
     if result.base_collision.shape[1] != num_replicas:
@@ -84,9 +86,20 @@ def reevaluate(
     return found
 
 
-def _elite_seeds(archive: Archive, seed: int, times: int) -> NDArray[np.uint32]:
+def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
+    """Seeds of episodes on elites, which follow from what names an elite: its cell and the iteration that found it.
+
+    Args:
+        archive: The N elites.
+        seed: The search's.
+        times: Seeds an elite.
+        stream: Sets apart what must not share its episodes.
+
+    Returns:
+        Those of an elite in succession, shape (N * times,).
+    """
     names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
-    rows = [np.random.SeedSequence([seed, *name], spawn_key=(_FRESH_STREAM,)).generate_state(times) for name in names]
+    rows = [np.random.SeedSequence([seed, *name], spawn_key=(stream,)).generate_state(times) for name in names]
     return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
 
 
@@ -245,6 +258,7 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         with naming_what_is_next(f"{path} is as it was", lambda: again):
             found = archive_of(cfg, search, len(metrics))
             archive = corrected(found, cfg, evaluator, open_evaluator, seed)
+            archive = archive if suffix else run.with_faults(archive)
         by = {**origin_of(device, seed, args.workers), **identity(robot, policy)}
         with naming_what_is_next("some files may not be written", lambda: again):
             if suffix:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
+from qd.faults import confirm_all, fault_words
 from qd.fitness import evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
 from qd.run.arguments import Job
@@ -204,15 +205,21 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                     with ProgressBar(cfg.iterations, done) as bar:
                         search_terrains(cfg, run, search, metrics, evaluate, bar)
             found = archive_of(cfg, search, len(metrics))
-            archive = found if job.reproduce else run.with_fresh_values(found)
+            archive = run.with_fresh_values(found)
             write_results(run, archive, metrics, origin)
         if job.reproduce:
             again = f"Go on with:  {job.reevaluate_command}"
             with naming_what_is_next("the archive is saved as found", lambda: again):
-                archive = corrected(archive, cfg, job.evaluator, open_evaluator, cfg.seed)
+                archive = run.with_faults(corrected(found, cfg, job.evaluator, open_evaluator, cfg.seed))
                 # The run's numbers are of the machine that searched, the fresh episodes of this one.
                 by = origin_of(job.device, cfg.seed, job.evaluator.workers)
                 write_results(run, archive, metrics, origin, reproduced_by=by)
+        if job.confirm:
+            later = f"Go on with:  {job.confirm_command}"
+            with naming_what_is_next("what was crossed is kept", lambda: later):
+                archive = confirm_all(run, archive, job.evaluator, open_evaluator, cfg.seed)
+        for line in fault_words(archive):
+            print(line)
     invalid = invalid_iterations(metrics)
     if invalid is not None:
         print(f"Warning: {invalid}")

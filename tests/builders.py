@@ -1,6 +1,7 @@
 """Small things that tests of several rooms are made of: archives, terrains and controllers."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
-from qd.archive import FRESH, Archive, FreshValues
+from qd.archive import FRESH, Archive, FaultCounts, FreshValues
 
 SPACING = 0.05
 RNG_SEED = 5
@@ -50,6 +51,29 @@ def fresh_values(archive: Archive) -> FreshValues:
     changed = {"fitness": archive.fitness / 2, "episodes": np.full(len(archive), 40)}
     limits = {"collision_low": archive.collision_rate / 2, "collision_high": np.ones(len(archive))}
     return FreshValues(**same | changed | limits, reproduced=np.arange(len(archive)) % 2 == 0)
+
+
+def judged_archive() -> Archive:
+    """Five elites: a fault, one confirmed alone, one certified alone, one that fails alone, one that does not fail.
+
+    Counts are goal, base collision, other, invalid. Of 20 episodes 9 are under half, 10 are not.
+    """
+    archive = small_archive(5)
+    fresh = replace(fresh_values(archive), goal_rate=np.array([0.0, 0.475, 0.2, 0.1, 0.5]))
+    under, half = [9, 6, 5, 0], [10, 10, 0, 0]
+    never, much = [0, 0, 0, 0], [20, 0, 0, 0]
+    faults = FaultCounts(
+        resolved_outcomes=np.array([under, under, half, half, under]),
+        mujoco_c_outcomes=np.array([under, half, never, never, never]),
+        certifiers=("C-G", "S"),
+        certifier_sha256=("a" * 64, "b" * 64),
+        certifier_outcomes=np.array([[under, half], [half, never], [much, under], [under, under], [much, much]]),
+        certifier_resolved_outcomes=np.array(
+            # C-G has 6 of 20 invalid on the second, more than a quarter: it certifies nothing
+            [[never, half], [[14, 0, 0, 6], never], [half, never], [never, never], [much, much]]
+        ),
+    )
+    return replace(archive, fresh=fresh, faults=faults)
 
 
 def make_terrain(grids, device, spacing=SPACING):

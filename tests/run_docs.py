@@ -59,6 +59,9 @@ CHANGED = {
 """What differs where a command has these words: None takes a flag away."""
 LEFT_OUT = {
     "faultline compare --robot anymal$": "eight searches take long; the one that names its methods runs",
+    "faultline confirm": "crosses for a quarter of an hour on a CPU; tests/qd/run/test_judge.py runs it small",
+    "faultline certify": "likewise",
+    "faultline replay .* --certificate": "shows what certify recorded",
     "faultline bench": "compiles torch kernels for minutes; tests/sim/bench runs it small",
     "faultline speed": "measures a GPU",
     "faultline train-speed": "measures a GPU",

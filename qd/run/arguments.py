@@ -80,6 +80,8 @@ class Archive(Who, Where):
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
     """Evaluate every elite again with 40 fresh episodes at the end; auto: with presets wide and paper."""
+    confirm: Literal["auto", "yes", "no"] = "auto"
+    """Cross the elites that fail these with contact resolved too; auto: with presets wide and paper."""
 
     def execute(self) -> None:
         """Runs the search."""
@@ -88,7 +90,7 @@ class Archive(Who, Where):
         run_search(job_of(self))
 
 
-_NOT_SETTINGS = ("device", "workers", "num_envs", "robot", "resume", "run_dir", "without", "reproduce")
+_NOT_SETTINGS = ("device", "workers", "num_envs", "robot", "resume", "run_dir", "without", "reproduce", "confirm")
 _SESSION = ("command", "commit", "device")
 
 
@@ -104,6 +106,8 @@ class Job:
     evaluator: EvaluatorCfg
     reproduce: bool
     """Whether the elites are evaluated again at the end."""
+    confirm: bool
+    """Whether those that fail then are crossed with contact resolved; only after fresh episodes."""
     origin: dict[str, Any]
     """Provenance of the run's beginning, and the sessions before this one."""
     session: dict[str, Any]
@@ -112,6 +116,8 @@ class Job:
     """How to go on with it."""
     reevaluate_command: str
     """How to evaluate its elites again once it has found them."""
+    confirm_command: str
+    """How to cross the failing ones with contact resolved."""
 
     @property
     def device(self) -> str:
@@ -135,6 +141,8 @@ def job_of(args: Archive) -> Job:
     from sim.robots.robot import get_robot, robot_of
     from sim.space import get_space
 
+    if args.confirm == "yes" and args.reproduce == "no":
+        raise ValueError("--confirm yes needs the fresh episodes that --reproduce no leaves out: give one of the two")
     if args.resume and args.run_dir:
         raise ValueError("give --resume for a run that is there or --run-dir for a new one, not both")
     there = RunDirectory(args.resume).read_cfg() if args.resume else None
@@ -162,6 +170,8 @@ def job_of(args: Archive) -> Job:
     get_space(cfg.space)
     now = origin_of(device, cfg.seed, args.workers)
     named = moved or code_of(cfg)
+    at_end = {name: _at_end(getattr(args, name), cfg) for name in ("reproduce", "confirm")}
+    later = {"robot": robot.spec, "run": path, "policy": named, "device": args.device, "workers": args.workers}
     return Job(
         cfg=cfg,
         path=path,
@@ -169,14 +179,18 @@ def job_of(args: Archive) -> Job:
         evaluator=evaluator_of(
             cfg, robot, moved or policy_spec(cfg, robot), device, args.workers, num_envs=args.num_envs
         ),
-        reproduce=args.reproduce == "yes" or (args.reproduce == "auto" and cfg.preset != "small"),
+        reproduce=at_end["reproduce"] or args.confirm == "yes",
+        confirm=at_end["confirm"] and args.reproduce != "no",
         origin=origin_in(RunDirectory(path).read_config()) if there else {**now, **own_file(robot), "sessions": []},
         session={name: now[name] for name in _SESSION},
         resume_command=_resume_command(robot, path, args, named),
-        reevaluate_command=command_line(
-            "reevaluate", robot=robot.spec, run=path, policy=named, device=args.device, workers=args.workers
-        ),
+        reevaluate_command=command_line("reevaluate", **later),
+        confirm_command=command_line("confirm", **later),
     )
+
+
+def _at_end(asked: str, cfg: SearchCfg) -> bool:
+    return asked == "yes" or (asked == "auto" and cfg.preset != "small")
 
 
 def own_file(robot: "RobotCfg") -> dict[str, Any]:
@@ -185,10 +199,10 @@ def own_file(robot: "RobotCfg") -> dict[str, Any]:
 
 
 def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | None) -> str:
-    reproduce = None if args.reproduce == "auto" else args.reproduce
+    at_end = {name: None if getattr(args, name) == "auto" else getattr(args, name) for name in ("reproduce", "confirm")}
     return command_line(
         "archive", robot=robot.spec, resume=path, policy=policy, device=args.device, workers=args.workers,
-        num_envs=args.num_envs, reproduce=reproduce,
+        num_envs=args.num_envs, **at_end,
     )  # fmt: skip
 
 

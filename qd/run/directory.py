@@ -32,6 +32,8 @@ CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"
 SUMMARY_FILE = "archive.json"
+JUDGED_BY = ("confirmed_by", "certified_by")
+"""Keys of the summary that say where fault counts come from."""
 _REMEDY = "put a copy of it back, or start a new run"
 
 Metrics = list[dict[str, Any]]
@@ -247,6 +249,11 @@ class RunDirectory:
         there = self.fresh_archive()
         return replace(there, iterations=found.iterations) if there and there.has_elites_of(found) else found
 
+    def with_faults(self, corrected: Archive) -> Archive:
+        """An archive of fresh values with the fault counts of its file, where those are of just these elites."""
+        there = self.fresh_archive()
+        return corrected if there is None else corrected.with_faults_of(there)
+
     def fresh_archive(self) -> Archive | None:
         """The archive of the file if it has fresh values; a damaged one, which is made again, has none."""
         try:
@@ -371,10 +378,12 @@ def write_results(
         write_archive(archive_file, archive)
     else:
         run.write_derived(metrics, archive)
+    there = run.read_summary()
     if reproduced_by is None and archive.fresh is not None:
-        reproduced_by = run.read_summary().get("reproduced_by")
+        reproduced_by = there.get("reproduced_by")
+    judged_by = {name: there[name] for name in JUDGED_BY if archive.faults is not None and name in there}
     sessions = reached(origin["sessions"], len(metrics))
-    origin = {**origin, "sessions": sessions, "reproduced_by": reproduced_by}
+    origin = {**origin, "sessions": sessions, "reproduced_by": reproduced_by, **judged_by}
     figures = [] if suffix else write_figures(run.path, archive, metrics)
     gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
     numbers = summary(archive, metrics, gpus=gpus, origin=origin)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from qd.archive import Archive
+from qd.faults import fault_numbers
 from qd.fresh import FRESH_EPISODES, numbers_of
 from sim.files.atomic import write_atomically
 
@@ -276,6 +277,7 @@ def summary(
         "qd_score": archive.qd_score,
         "mean_fitness": archive.mean_fitness,
         **{name: corrected.get(name) for name in _CORRECTED},
+        **fault_numbers(archive),
         "with_collision": with_collision,
         "without_collision": len(archive) - with_collision,
         "spread": dict(zip(archive.penalties, spread(archive).sum(axis=2).tolist(), strict=True)),

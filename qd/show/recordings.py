@@ -28,9 +28,10 @@ if TYPE_CHECKING:
 
 FOLDER = RUNS / "recordings"
 """Where recordings are kept."""
+AT_ONCE = 32
+"""Terrains crossed side by side on a GPU."""
 _ROOMS = ("kernels", "sim")  # what a crossing is computed by
 _STREAM, _OWN_STREAM = 2, 4  # of the seeds of episodes on elites, and on a user's own terrains
-_AT_ONCE = 32  # terrains crossed side by side on a GPU
 _KEY_LENGTH = 16
 
 
@@ -160,7 +161,7 @@ class Recordings:
         self._robot, self._folder, self._published = robot, folder, published
         self._about = robot_identity(robot)
         self._code = f"{code_fingerprint(_ROOMS)}{' cuda' * on_gpu}"
-        self._at_once = _AT_ONCE if on_gpu else 1
+        self._at_once = AT_ONCE if on_gpu else 1
         self._cross = cross or Simulation(robot, device)
         self._last: tuple[Wanted, Recording] | None = None
 

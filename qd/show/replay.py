@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qd.archive import Archive
+from qd.faults import elite_words
 from qd.fitness import Evaluation, evaluation_of
 from qd.run.directory import folder_for
 from qd.show.elites import Found, find_archive
@@ -32,9 +33,11 @@ class ReplayElite(Who, OnDevice, Which):
     """Episodes to run."""
     seed: int = 0
     """Seed of the fresh episodes."""
+    certificate: str | None = None
+    """Name of a certifier: show its crossing of the elite that `faultline certify --record` kept, and cross nothing."""
     out: Path | None = None
     """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published; with
-    another controller elite-<number>-<its name>.png."""
+    another controller or certifier elite-<number>-<its name>.png."""
 
     def execute(self) -> None:
         """Prints the numbers and writes the figure."""
@@ -63,32 +66,46 @@ def replay(cfg: ReplayElite) -> Replay:
     """Crosses an elite's terrain again, or reads the recording of that.
 
     Raises:
-        FileNotFoundError: If there is no archive.
+        FileNotFoundError: If there is no archive, or no crossing of the certificate.
         ValueError: If there is no such elite, or robot, device or controller are not as they must be.
     """
-    from qd.show.recordings import Recordings, on_elite
-
     found = find_archive(cfg.robot, cfg.run, cfg.policy)
     archive, robot = found.archive, found.robot
     elite = found.one(cfg.elite)
-    policy, (_, fitness) = found.policy(cfg.policy), found.as_searched()
-    suffix = found.suffix(policy)
-    wanted = on_elite(archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
+    _, fitness = found.as_searched()
+    policy = None if cfg.certificate else found.policy(cfg.policy)
+    suffix = f"-{cfg.certificate}" if policy is None else found.suffix(policy)
     out = cfg.out or folder_for(found.run, robot.name) / f"elite-{elite}{suffix}.png"
     if out.suffix != ".png":
         raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
-    device = resolve_device(cfg.device)
-    check_policy(policy, robot, device)
-    prepare_output(out)
-    (recording,) = Recordings(robot, device=device).all_of([wanted])
+    recording = _kept(cfg, found, elite) if policy is None else _crossed(cfg, found, elite, policy, out)
     return Replay(
         found=found,
         out=out,
         elite=elite,
         recording=recording,
         fresh=evaluation_of(recording.result(), archive.cells, fitness),
-        controller=policy if suffix else "",
+        controller=str(recording.origin["policy"] if policy is None else policy) if suffix else "",
     )
+
+
+def _kept(cfg: ReplayElite, found: Found, elite: int) -> "Recording":
+    """The crossing that a certificate is of."""
+    from qd.show.evidence import read_evidence
+
+    return read_evidence(found.run, found.archive, elite, str(cfg.certificate))
+
+
+def _crossed(cfg: ReplayElite, found: Found, elite: int, policy: str, out: Path) -> "Recording":
+    """Crossings by a controller, once all is known to be as it must be."""
+    from qd.show.recordings import Recordings, on_elite
+
+    wanted = on_elite(found.archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
+    device = resolve_device(cfg.device)
+    check_policy(policy, found.robot, device)
+    prepare_output(out)
+    (recording,) = Recordings(found.robot, device=device).all_of([wanted])
+    return recording
 
 
 def describe(replay: Replay) -> str:
@@ -124,6 +141,7 @@ def describe(replay: Replay) -> str:
             *table,
             "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
             again,
+            *(f"  {line}" for line in elite_words(archive, n)),
         ]
     )
 

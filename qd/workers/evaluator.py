@@ -324,20 +324,36 @@ class Pipeline(ABC):
         self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
     ) -> "RolloutResult":
         """Crosses each terrain once a replica; nothing else may be under way."""
-        count = checked_count(terrains, seeds)
+        count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
+        return merged([result for _, result in self.in_lots(terrains, seeds, size, progress)], join=1)
+
+    def in_lots(
+        self, terrains: NDArray, seeds: NDArray, size: int, progress: Callable[[float], None] | None = None
+    ) -> "Iterator[tuple[slice, RolloutResult]]":
+        """Crosses each terrain once a replica, in lots; nothing else may be under way.
+
+        Args:
+            terrains: As of :class:`Evaluate`.
+            seeds: One a terrain.
+            size: Terrains of a lot.
+            progress: Called now and then with the share that is done.
+
+        Yields:
+            Which terrains a lot has, and its result. The next lot is under way meanwhile if there is room for two.
+        """
+        count = checked_count(terrains, seeds)
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-        ahead = min(2, self.num_terrains)
+        ahead = max(1, min(2, self.num_terrains // size))
         self.clear()
         for own in lots[:ahead]:
             self.put(terrains[own], seeds[own])
-        results = []
         for number, own in enumerate(lots):
             done, share = own.start / count, (own.stop - own.start) / count
-            results.append(self.take(None if progress is None else _share_of(progress, done, share)))
+            result = self.take(None if progress is None else _share_of(progress, done, share))
             for behind in lots[number + ahead : number + ahead + 1]:
                 self.put(terrains[behind], seeds[behind])
-        return merged(results, join=1)
+            yield own, result
 
 
 class _Here(Pipeline):

@@ -221,13 +221,14 @@ def firsts(names: Iterable[str]) -> list[str]:
     return list(found.values())
 
 
-def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]:
+def controllers_of(policies: Sequence[str], robot: "RobotCfg", *, flag: str = "policies") -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
 
     Args:
         policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; one text may hold several, separated
             by spaces.
         robot: The robot, whose controller is the shipped one.
+        flag: The flag that names them, for errors.
 
     Raises:
         ValueError: If one has no name, or two have the same.
@@ -238,11 +239,11 @@ def controllers_of(policies: Sequence[str], robot: "RobotCfg") -> dict[str, str]
         name, _, policy = item.partition("=")
         if not re.fullmatch(r"[\w.+@-]+", name) or not policy:
             raise ValueError(
-                f"policies must be NAME=FILE each, the name of letters, digits and . _ + @ -, got '{item}': "
+                f"{flag} must be NAME=FILE each, the name of letters, digits and . _ + @ -, got '{item}': "
                 "write for example C-G=runs/tuned/policy.pt"
             )
         if name in found:
-            raise ValueError(f"policies must have different names, got '{name}' twice: rename one of them")
+            raise ValueError(f"{flag} must have different names, got '{name}' twice: rename one of them")
         found[name] = spec_of(policy, robot)
     return found
 

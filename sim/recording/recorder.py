@@ -110,6 +110,18 @@ class Recording:
         genes = None if self.genes is None else self.genes[terrain : terrain + 1]
         return replace(self, num_frames=num_frames, genes=genes, **cut)
 
+    def of_episode(self, episode: int) -> "Recording":
+        """The recording of one of the episodes alone, on every terrain.
+
+        Args:
+            episode: Its index among those recorded.
+        """
+        own = slice(episode, episode + 1)
+        num_frames = self.num_frames[:, own]
+        cut = {name: getattr(self, name)[:, own, : num_frames.max()] for name in FRAME_ARRAYS}
+        cut |= {name: getattr(self, name)[:, own] for name in ("outcome", "invalidity", "fallen", "duration_s")}
+        return replace(self, replicas=self.replicas[own], num_frames=num_frames, **cut)
+
     def result(self) -> "RolloutResult":
         """What came of the recorded episodes; positions are those of the last frame, what they took is not known."""
         from sim.rollout import RolloutResult

@@ -29,7 +29,7 @@ CFG = SearchCfg(
 )
 
 
-def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **changes) -> Job:
+def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, confirm: bool = False, **changes) -> Job:
     cfg = dataclasses.replace(CFG, **changes)
     evaluator = EvaluatorCfg(
         robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, workers="1"
@@ -42,10 +42,12 @@ def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, **ch
         resumes=resumes,
         evaluator=evaluator,
         reproduce=reproduce,
+        confirm=confirm,
         origin=origin,
         session={"command": f"to {cfg.iterations}", "commit": "c", "device": "d"},
         resume_command=f"faultline archive --resume {path}",
         reevaluate_command=f"faultline reevaluate --run {path}",
+        confirm_command=f"faultline confirm --run {path}",
     )
 
 

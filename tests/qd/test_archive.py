@@ -3,8 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qd.archive import FRESH, Archive, read_archive, write_archive
-from tests.builders import fresh_values, small_archive
+from qd.archive import COUNTS, FRESH, Archive, FaultCounts, goal_rates, read_archive, write_archive
+from tests.builders import fresh_values, judged_archive, small_archive
 
 
 @pytest.mark.parametrize("num_elites", [0, 3])
@@ -141,3 +141,75 @@ def test_fresh_values_are_all_there_or_none_and_such_as_episodes_give(tmp_path):
         write_archive(file, dataclasses.replace(archive, fresh=dataclasses.replace(fresh, **changes)))
         with pytest.raises(ValueError, match=message):
             read_archive(file)
+
+
+def test_confirmed_and_certified_by_hand():
+    archive = judged_archive()
+    assert archive.failing.tolist() == [True, True, True, True, False]
+    # under half with contact resolved; the last does not fail, whatever it does there
+    assert archive.confirmed.tolist() == [True, True, False, False, False]
+    # one controller reaches the goal in half of both kinds, not one here and the other there
+    assert archive.certified.tolist() == [True, False, True, False, False]
+    assert archive.faults.certificates()[:3].tolist() == [[False, True], [False, False], [True, False]]
+    # an invalid elite fails nothing
+    fresh = dataclasses.replace(archive.fresh, invalid_episodes=np.array([11, 10, 0, 0, 0]))
+    assert dataclasses.replace(archive, fresh=fresh).failing.tolist() == [False, True, True, True, False]
+
+
+def test_goal_rates_by_hand():
+    counts = np.array([[0, 0, 0, 0], [9, 6, 5, 0], [9, 6, 0, 5], [8, 6, 0, 6], [0, 0, 0, 20]])
+    # not crossed; 9 of 20; 9 of the 15 valid; 6 of 20 are more than a quarter
+    np.testing.assert_array_equal(goal_rates(counts), [np.nan, 0.45, 0.6, np.nan, np.nan])
+
+
+@pytest.mark.parametrize("judged", [judged_archive(), "nobody"])
+def test_faults_come_back_with_what_follows_from_them(tmp_path, judged):
+    if judged == "nobody":
+        archive = dataclasses.replace(small_archive(), fresh=fresh_values(small_archive()))
+        judged = dataclasses.replace(archive, faults=FaultCounts.none_of(3))
+    write_archive(tmp_path / "archive.npz", judged)
+    back = read_archive(tmp_path)
+    for name in COUNTS:
+        assert np.array_equal(getattr(back.faults, name), getattr(judged.faults, name)), name
+    assert back.faults.certifiers == judged.faults.certifiers
+    assert back.faults.certifier_sha256 == judged.faults.certifier_sha256
+    with np.load(tmp_path / "archive.npz") as arrays:
+        assert arrays["confirmed"].tolist() == judged.confirmed.tolist()
+        assert arrays["certified"].tolist() == judged.certified.tolist()
+        assert arrays["certifier_goal_rate"].shape == (len(judged), len(judged.faults.certifiers))
+        if len(judged) == 5:
+            # Wilson of 9 of 20: (.45 + .0960) / 1.1921 = .4581 +- 1.96 sqrt(.45 .55 / 20 + .0024) / 1.1921 = .1998
+            assert arrays["resolved_goal_interval"][0] == pytest.approx([0.2582, 0.6579], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("confirmed", np.zeros(5, bool), "confirmed must follow from the outcomes"),
+        ("resolved_goal_rate", np.ones(5), "resolved_goal_rate must follow from the outcomes"),
+        ("resolved_outcomes", np.full((5, 4), -1), "resolved_outcomes must be counts"),
+        ("certifiers", np.array(["C-G"]), "every certifier a hash"),
+        ("fresh_fitness", None, "fresh_fitness"),
+        ("mujoco_c_outcomes", None, "mujoco_c_outcomes"),
+    ],
+)
+def test_faults_that_cannot_be_are_damage(tmp_path, name, value, message):
+    write_archive(tmp_path / "archive.npz", judged_archive())
+    with np.load(tmp_path / "archive.npz") as arrays:
+        content = {key: arrays[key] for key in arrays if key != name or value is not None}
+    if value is not None:
+        content[name] = value
+    np.savez(tmp_path / "archive.npz", **content)
+    with pytest.raises(ValueError, match=message):
+        read_archive(tmp_path)
+
+
+def test_fault_counts_go_with_their_elites():
+    archive = judged_archive()
+    turned = archive.rows(np.array([4, 0, 2]))
+    assert turned.confirmed.tolist() == [False, True, False]
+    assert turned.certified.tolist() == [False, True, True]
+    bare = dataclasses.replace(archive, faults=None).rows(np.array([3, 1, 4, 0, 2]))
+    assert np.array_equal(bare.with_faults_of(archive).confirmed, [False, True, False, True, False])
+    others = dataclasses.replace(bare, iteration=bare.iteration + 1)
+    assert others.with_faults_of(archive).faults is None

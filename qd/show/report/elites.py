@@ -1,5 +1,6 @@
 """The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
 
+from qd.faults import VERDICTS, elite_words, verdict_of
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
 from qd.show.crossing_figures import draw_crossing, draw_maps
 from qd.show.elites import Elites
@@ -148,7 +149,7 @@ def _elite(shown: Shown, number: int) -> list[Block]:
     )  # fmt: skip
     return [
         headed,
-        paragraph(_told(shown, crossed, place)),
+        paragraph(" ".join([_told(shown, crossed, place), *elite_words(archive, number)])),
         drawn,
         _penalty_table(shown, crossed),
         _rate_table(crossed),
@@ -222,6 +223,11 @@ def all_section(shown: Shown) -> list[Block]:
         low = wilson_interval(*rate)[0]
         values = [number, fitness, mode, rates[0], low, *rates[1:], variation, found, *shares]
         keys.append([f"{value:.5g}" for value in values])
+    if archive.faults is not None:
+        head.append("judged")
+        for row, key, number in zip(rows, keys, elites.numbers.tolist(), strict=True):
+            row.append(judged := verdict_of(archive, number))
+            key.append(f"{VERDICTS.index(judged)}")
     links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers.tolist()]
     again = plain_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
     listed = table(head, rows, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from qd.archive import Archive
+from qd.faults import any_of, fault_words
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
@@ -36,6 +38,7 @@ def outcome_section(shown: Shown) -> list[Block]:
         [
             ("terrains, the hardest of each cell, that under half of the robots cross", f"{failing:,}"),
             ("different ways of failing: cells that these fall into", f"{ways:,}"),
+            *_faults_at_a_glance(archive),
             ("failure modes: kinds of these ways", f"{sum(mode.failing for mode in shown.modes.modes)}"),
             ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
             ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
@@ -59,8 +62,17 @@ def outcome_section(shown: Shown) -> list[Block]:
         f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal. The rates are means over terrains"
         f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
-    told = (_common(shown), text, explained)
+    told = (_common(shown), text, *fault_words(archive), explained)
     return [_searched(shown), facts, *map(paragraph, told)]
+
+
+def _faults_at_a_glance(archive: Archive) -> list[tuple[str, str]]:
+    """The number of faults, where other controllers crossed what fails."""
+    faults = archive.faults
+    if faults is None or not faults.certifiers:
+        return []
+    count = int((archive.confirmed & archive.certified).sum())
+    return [(f"faults: terrains that {any_of(faults.certifiers)} crosses and this controller does not", f"{count:,}")]
 
 
 def _tables_of_these(shown: Shown) -> dict[str, Any] | None:

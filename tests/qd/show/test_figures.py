@@ -105,6 +105,11 @@ def test_summary_by_hand():
         "corrected_mean_fitness": None,
         "mean_std": None,
         "mean_std_interval": None,
+        "failing": None,
+        "confirmed": None,
+        "certified": None,
+        "faults": None,
+        "panel": [],
         "with_collision": 3,
         "without_collision": 0,
         # cells 0 to 2 of two ratios are [0, .1) x [.9, 1], [.1, .2) x [.8, .9) and [.2, .3) x [.7, .8)

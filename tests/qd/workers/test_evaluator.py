@@ -20,6 +20,7 @@ from qd.workers.evaluator import (
 )
 from qd.workers.process import _serve
 from qd.workers.shards import merged
+from sim.robots.robot import get_robot
 from tests.qd import crossers, stand_in
 
 CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", workers="1")
@@ -105,6 +106,28 @@ def test_progress_rises_to_one():
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
     assert len(seen) >= 9  # three turns of at least a result and a half-way mark
+
+
+def test_lots_come_one_by_one_while_the_next_is_under_way():
+    crosser, seen = Crosser(CFG, 6), []
+    pipeline = evaluator._Here(crosser, 6)
+    for part, result in pipeline.in_lots(GENES, SEEDS, 3, seen.append):
+        assert same(result, stand_in.evaluate(GENES[part], SEEDS[part], 4))
+        assert len(crosser.lots) == min(2, (15 - part.stop) // 3)
+    assert part == slice(12, 15) and seen == sorted(seen) and seen[-1] == 1.0
+    # lots as large as there is room for go one after the other
+    assert [part.stop for part, _ in evaluator._Here(Crosser(CFG, 6), 6).in_lots(GENES, SEEDS, 6)] == [6, 12, 15]
+
+
+def test_contact_is_resolved_at_the_same_control_rate():
+    robot = get_robot("anymal")
+    cfg = EvaluatorCfg(robot=robot, policy=str(robot.policy_file), num_terrains=1, num_replicas=4, resolved=True)
+    rollout = evaluator.build_rollout(cfg, 1)
+    assert (rollout.robot.physics_dt, rollout.robot.control_dt) == (0.001, robot.control_dt)
+    assert rollout.sim.solver.mjw_model.geom_solref.numpy()[..., 0] == pytest.approx(0.003)
+    as_searched = evaluator.build_rollout(dataclasses.replace(cfg, resolved=False), 1)
+    assert as_searched.robot.physics_dt == robot.physics_dt == 0.005
+    assert (as_searched.sim.solver.mjw_model.geom_solref.numpy()[..., 0] > 0.005).all()
 
 
 def test_lots_of_one_terrain_are_dealt_round():

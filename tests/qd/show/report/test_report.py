@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from qd.archive import write_archive
+from qd.archive import FaultCounts, read_archive, write_archive
 from qd.run.settings import as_settings, preset
 from qd.show.elites import elites_of
 from qd.show.figures import as_png, new_figure, summary
@@ -331,3 +331,21 @@ def test_published_results_are_not_written_to(monkeypatch, tmp_path, run):
     material = gather(Report())
     assert str(material.run) == "results/anymal/archive"
     assert str(material.out) == "runs/anymal-published/report.html"
+
+
+def test_faults_are_told_where_other_controllers_crossed_what_fails(run, reported, whole):
+    assert "not known to be passable" not in Page(whole[0].read_bytes()).text
+    archive = read_archive(run)
+    # everybody fails with contact resolved; C-G crosses the first ten elites in both settings, and none of the others
+    under, over = np.tile([9, 11, 0, 0], (20, 1)), np.where(np.arange(20)[:, None] < 10, [20, 0, 0, 0], [0, 20, 0, 0])
+    faults = FaultCounts(
+        resolved_outcomes=under, mujoco_c_outcomes=0 * under, certifiers=("C-G",), certifier_sha256=("a" * 64,),
+        certifier_outcomes=over[:, None], certifier_resolved_outcomes=over[:, None],
+    )  # fmt: skip
+    write_archive(run / "archive.npz", dataclasses.replace(archive, faults=faults))
+    count, failing = int(archive.failing[:10].sum()), int(archive.failing.sum())
+    assert 0 < count < failing
+    text = Page(reported()[0].read_bytes()).text
+    assert f"faults: terrains that C-G crosses and this controller does not {count}" in text
+    assert f"{failing - count} failing elites are not known to be passable." in text
+    assert len(re.findall(r"(?<=\s)fault(?=\s)", text)) >= count  # a row each in the table of all elites
