@@ -9,6 +9,10 @@ from kernels.restart import StartRanges
 from sim.robots.robot import RobotCfg
 
 
+FALLEN_TILT_DEG = 60.0
+"""A robot that leans further than this has fallen [degrees]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CrossingCfg:
     """A crossing: start, goal, command and ends (the paper's task; the rest in the terms of the field)."""
