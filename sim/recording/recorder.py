@@ -84,8 +84,9 @@ class Recording:
     geom_names: tuple[str, ...] = ()
     """Of the G geoms whose touch is known: base, limbs and feet; none in the first files."""
     touching: NDArray[np.bool_] | None = None
-    """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); False from
-    ``num_frames`` on, None in the first files."""
+    """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also in
+    the frame that its collision ends, whenever in that control step it was. False from ``num_frames`` on, None in the
+    first files."""
 
     @property
     def num_terrains(self) -> int:
@@ -167,6 +168,7 @@ class _Frames:
         robot = rollout.robot
         self._shape = (num_terrains, rollout.num_replicas)
         self._feet = [robot.geom_names.index(name) for name in robot.foot_geoms]
+        self._num_base = len(robot.base_geoms)  # the first ones
         self._columns = [PENALTIES.index(name) for name in robot.penalties]
         self._num_frames = np.zeros(num_terrains * rollout.num_replicas, dtype=np.int32)
         self._over = np.zeros(len(self._num_frames), dtype=bool)
@@ -207,6 +209,10 @@ class _Frames:
         with np.errstate(over="ignore", invalid="ignore"):  # of an episode that broke
             rounded = {name: values[name].astype(dtype) for name, dtype in FRAME_ARRAYS.items()}
             rounded["touching"] = np.linalg.norm(force, axis=-1) > COLLISION_FORCE
+        if ended:  # the base may have touched in an earlier physics step of the last control step
+            hit = state.outcome.numpy()[envs] == Outcome.BASE_COLLISION
+            missed = hit & ~rounded["touching"][:, : self._num_base].any(axis=1)
+            rounded["touching"][missed, : self._num_base] = True
         self._taken.append((row, frame, rounded))
         self._num_frames[row] += 1
 

@@ -118,8 +118,8 @@ def ending_words(recording: Recording, replica: int) -> str:
 def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:
     """What happens in an episode of one terrain that has frames, in the order of time; what never happens has no mark.
 
-    A stumble and a collision are those that the penalties count; robots that are not penalised for collisions have a mark
-    at the first recorded touch of base or limb. A robot falls when it leans further than the limit for the first time.
+    A stumble and a collision are those that the penalties count; a robot that is not penalised for collisions has one
+    at the first recorded touch of base or limb. It falls when it leans further than the limit for the first time.
 
     Args:
         recording: The recording.
@@ -142,14 +142,15 @@ def _grows(recording: Recording, replica: int, penalty: str) -> NDArray[np.bool_
     if penalty not in recording.penalty_names:
         return np.zeros(frames, dtype=bool)
     sums = recording.penalties[0, replica, :frames, recording.penalty_names.index(penalty)]
-    return np.diff(sums, prepend=sums[:1]) > 0.0
+    return np.asarray(np.diff(sums, prepend=sums[:1]) > 0.0)
 
 
 def _collides(recording: Recording, replica: int) -> NDArray[np.bool_]:
     if "collision" in recording.penalty_names or recording.touching is None:
         return _grows(recording, replica, "collision")
     bodies = [k for k, name in enumerate(recording.geom_names) if name not in recording.foot_names]
-    return recording.touching[0, replica, : int(recording.num_frames[0, replica])][:, bodies].any(axis=1)
+    touching = recording.touching[0, replica, : int(recording.num_frames[0, replica]), bodies]  # geoms come first
+    return np.asarray(touching.any(axis=0))
 
 
 def _upright(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
