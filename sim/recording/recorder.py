@@ -84,9 +84,9 @@ class Recording:
     geom_names: tuple[str, ...] = ()
     """Of the G geoms whose touch is known: base, limbs and feet; none in the first files."""
     touching: NDArray[np.bool_] | None = None
-    """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also in
-    the frame that its collision ends, whenever in that control step it was. False from ``num_frames`` on, None in the
-    first files."""
+    """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also
+    where its collision ended the episode, whenever in the last control step that was. False from ``num_frames`` on,
+    None in the first files."""
 
     @property
     def num_terrains(self) -> int:
