@@ -20,7 +20,7 @@ _FRAME_S = 0.04
 """Real time from one shown frame to the next."""
 _IDLE_S = 0.5
 """Real time from one look at the cameras to the next while nothing plays."""
-_ASPECT = 1.2  # of the picture of a window that is not known yet
+_WINDOW = (1400, 900)  # one that is not known yet [pixels]
 
 Asked = tuple[Callable[..., None], tuple[Any, ...]]
 
@@ -63,7 +63,7 @@ class App:
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=False)
-        self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(_ASPECT)
+        self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(*_WINDOW)
         self.page.on_client_connect(self._greet)
         self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
 

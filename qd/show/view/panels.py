@@ -25,7 +25,7 @@ SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4
 STEP_S = 0.1
 """Time that a step goes on or back [s]."""
 _WIDTH, _NARROW_WIDTH = 380, 300  # of a panel [pixels]
-_WIDE = 1200  # a window from here on has room for two wide panels [pixels]
+_WIDE = 1200  # a window from here on has room for two wide panels; in another the archive is folded at first [pixels]
 _PICKED, _OTHER = (213, 94, 0), (73, 80, 87)
 _CONTROL_DT = 0.02  # step of the time slider [s]
 
@@ -154,7 +154,9 @@ class ArchivePanel:
         self._axes, self._selection, self._tab, self._gui = axes, selection, tab, client.gui
         self._panel = client.gui.add_panel()
         self._panel.dock_left()
-        self._panel.set_width(_width_in(client))
+        self._panel.set_width(_WIDTH)
+        if client.camera.image_width < _WIDE:
+            self._panel.minimize()
         with self._panel.add_tab("Archive"):
             words = escape(title)  # of a folder called anything
             self._title = self._gui.add_html(f'<div style="padding:0.2em 0.6em">{words}</div>')
@@ -236,7 +238,7 @@ class CrossingPanel:
         """
         gui, self._post = client.gui, tab.common.post
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(_width_in(client))
+        gui.main_panel.set_width(_WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH)
         self._details = gui.add_markdown("")
         self._controller = gui.add_dropdown("Controller", tuple(controllers) or ("none",), disabled=not controllers)
         _on_visit(self._controller, lambda name: self._post(tab.choose_controller, str(name)))
@@ -368,11 +370,6 @@ def add_keys(client: viser.ClientHandle, tab: "Tab") -> None:
     for label, (key, act) in asked.items():
         command = client.gui.add_command(label, hotkey=key)
         command.on_trigger(lambda event, act=act: tab.common.post(*act))
-
-
-def _width_in(client: viser.ClientHandle) -> int:
-    """Width of a panel in a browser's window [pixels]."""
-    return _WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH
 
 
 def _add_choices(gui: Any, label: str, choices: dict[str, Any], act: Callable[[Any], None]) -> None:

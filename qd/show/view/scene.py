@@ -22,36 +22,41 @@ FORCE_COLOR, COMMAND_COLOR = (215, 25, 28), (0, 158, 115)
 _START_COLOR, _GOAL_COLOR = (240, 200, 60), (0, 158, 115)
 _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
+_PHONE = 576
+"""Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
 _PATH_RADIUS, _PATH_OPACITY = 0.008, 0.35
 _WAY_LIFT = 0.03  # over the ground [m]
 _POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
 _DISC_HEIGHT, _DISC_RADIUS = 0.03, 0.15  # at the start, where a post would stand in the robot
-_LABEL_HEIGHT = 1.35
 _NAME_HEIGHT = 0.12  # of a foot's name over it [m]
 
 Points = NDArray[np.floating]
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
-def overview_of(aspect: float) -> View:
+def overview_of(width: int, height: int) -> View:
     """Where the camera stands and what it looks at [m], to see the whole terrain.
 
     Args:
-        aspect: Width of the picture by its height.
+        width: Of the picture [pixels].
+        height: Of the picture [pixels].
     """
-    if aspect < 1.0:  # the terrain's length goes up the picture
-        return (-4.5, 4.0, 11.5), (6.8, 4.0, 0.0)
-    return (8.0, -4.6 - 3.2 / aspect, 7.4 + 5.2 / aspect), (8.0, 3.4, 0.0)
+    if width < _PHONE:
+        return (-9.0, 4.0, 9.0), (-2.4, 4.0, 0.0)
+    if width < height:  # the terrain's length goes up the picture
+        return (-2.6, 4.0, 9.6), (6.6, 4.0, 0.0)
+    return (8.0, -6.3, 10.5), (8.0, 3.4, 0.0)
 
 
-def first_view_of(aspect: float) -> View:
+def first_view_of(width: int, height: int) -> View:
     """Where the camera stands and what it looks at [m] at first: over the robot's start along its way.
 
     Args:
-        aspect: Width of the picture by its height.
+        width: Of the picture [pixels].
+        height: Of the picture [pixels].
     """
-    if aspect < 1.0:
-        return (-1.6, 3.0, 4.2), (4.6, 4.0, 0.0)
+    if width < _PHONE:
+        return (-3.0, 3.4, 4.2), (0.3, 3.7, 0.0)
     return (-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)
 
 
@@ -122,8 +127,24 @@ class Scene:
             self.hide_crossing()
             mesh = terrain_mesh(heights)
             self._client.scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=False)
-            self._mark("start", self._cfg.start, _START_COLOR, heights, height=_DISC_HEIGHT, radius=_DISC_RADIUS)
-            self._mark("goal", self._cfg.goal, _GOAL_COLOR, heights, height=_POST_HEIGHT, radius=_POST_RADIUS)
+            self._mark(
+                "start",
+                self._cfg.start,
+                _START_COLOR,
+                heights,
+                height=_DISC_HEIGHT,
+                radius=_DISC_RADIUS,
+                label_from=(-0.9, 0.15),
+            )
+            self._mark(
+                "goal",
+                self._cfg.goal,
+                _GOAL_COLOR,
+                heights,
+                height=_POST_HEIGHT,
+                radius=_POST_RADIUS,
+                label_from=(0.0, 1.35),
+            )
             self._draw_way(heights)
 
     def _mark(
@@ -135,13 +156,14 @@ class Scene:
         *,
         height: float,
         radius: float,
+        label_from: tuple[float, float],
     ) -> None:
-        """A post or a disc [m] with a name over it."""
+        """A post or a disc [m] with a name, so far behind and above it."""
         ground = float(_heights_at(heights, np.array([place]))[0])
         scene = self._client.scene
         middle = (*place, ground + 0.5 * height)
         scene.add_cylinder(f"/{name}/post", radius=radius, height=height, color=color, position=middle)
-        scene.add_label(f"/{name}/label", name, position=(*place, ground + _LABEL_HEIGHT))
+        scene.add_label(f"/{name}/label", name, position=(place[0] + label_from[0], place[1], ground + label_from[1]))
 
     def _draw_way(self, heights: Points) -> None:
         """The straight way from start to goal along the ground."""

@@ -162,10 +162,10 @@ class Tab:
     def _no_elite(self, number: object) -> str:
         return f"There is no elite {number} here: there are 0 to {len(self._archive) - 1}."
 
-    def look(self, view_of: Callable[[float], View]) -> None:
-        """Move the camera to a view that depends on the picture's width by its height."""
+    def look(self, view_of: Callable[[int, int], View]) -> None:
+        """Move the camera to a view that depends on the picture's width and height."""
         camera = self.client.camera
-        self.scene.go_to(view_of(camera.image_width / max(camera.image_height, 1)))
+        self.scene.go_to(view_of(camera.image_width, camera.image_height))
 
     def overview(self) -> None:
         """Show the whole terrain, and stop following."""

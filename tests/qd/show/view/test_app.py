@@ -174,7 +174,7 @@ def test_the_address_follows_the_camera(shown):
 def test_a_camera_in_the_address_is_left_where_it_is(shown):
     tab = shown.come("?initialCameraPosition=1,2,3&initialCameraLookAt=4,5,0")
     assert tab.client.camera.position.tolist() == [1.0, 2.0, 3.0]
-    assert shown.tab.client.camera.position.tolist() == list(first_view_of(WIDTH / HEIGHT)[0])
+    assert shown.tab.client.camera.position.tolist() == list(first_view_of(WIDTH, HEIGHT)[0])
 
 
 def test_what_is_not_there_is_refused_in_words(shown):
