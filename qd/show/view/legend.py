@@ -51,4 +51,4 @@ def _heights() -> str:
     bar = (
         f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(90deg, {stops})"></span>'
     )
-    return f"low {bar} high; between blue and brown it is at the height of the start's level, a line every metre"
+    return f"low {bar} high; grey is the level of the start, and a line stands every metre"
