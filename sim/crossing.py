@@ -8,6 +8,9 @@ from kernels.episode import Task
 from kernels.restart import StartRanges
 from sim.robots.robot import RobotCfg
 
+FALLEN_TILT_DEG = 60.0
+"""A robot that leans further than this has fallen [degrees]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CrossingCfg:

@@ -19,15 +19,13 @@ from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.bank import TerrainBank
-from sim.crossing import CrossingCfg, make_start_ranges, make_task
+from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, make_start_ranges, make_task
 from sim.policy.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.policy.runner import Memory, PolicyRunner
 from sim.reward import Reward
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation, SolverCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
-
-_FALLEN_TILT_DEG = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -457,7 +455,7 @@ class Rollout:
             penalty_names=robot.penalties,
             outcome=outcome,
             invalidity=of(queue.invalidity).astype(np.uint8),
-            fallen=upright < np.cos(np.deg2rad(_FALLEN_TILT_DEG)),
+            fallen=upright < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
             duration_s=(steps * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],
             physics_steps=physics_steps,

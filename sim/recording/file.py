@@ -24,9 +24,10 @@ from sim.space import get_space
 FORMAT = "faultline recording 1"
 """Name and version in every file."""
 
-_WORDS = ("robot", "joint_names", "foot_names", "penalty_names", "labels", "origin")
+_WORDS = ("robot", "joint_names", "foot_names", "penalty_names", "geom_names", "labels", "origin")
 _KINDS = dict.fromkeys(_WORDS, "U") | {
     "seeds": "u", "outcome": "u", "invalidity": "u", "replicas": "i", "num_frames": "i", "fallen": "b",
+    "touching": "b",
 }  # fmt: skip
 _NAMES = tuple(field.name for field in fields(Recording))
 _LIMITS = {"base_position": 1e3, "base_quaternion": 1.001, "joint_position": 1e3, "command": 1e3}
@@ -44,8 +45,11 @@ def write_recording(path: Path, recording: Recording) -> None:
         OSError: If it cannot be written.
     """
     content: dict[str, Any] = {
-        name: np.asarray(getattr(recording, name)) for name in _NAMES if name not in ("origin", "genes")
+        name: np.asarray(value)
+        for name in _NAMES
+        if name not in ("origin", "genes") and (value := getattr(recording, name)) is not None
     }
+    content["geom_names"] = content["geom_names"].astype(str)  # none has no type of its own
     content |= {name: content[name].astype(kept) for name, kept in FRAME_ARRAYS.items()}
     if recording.genes is not None:
         content["genes"] = recording.genes
@@ -87,9 +91,10 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     if version != FORMAT:
         raise ValueError(f"its format must be '{FORMAT}', got {version}")
     absent = "heights" if "genes" in found else "genes"
-    late = {"invalidity"} - {*found}  # the first recordings have none
+    late = {"invalidity", "geom_names", "touching"} - {*found}  # the first recordings have none
     content = read_arrays(path, [name for name in _NAMES if name != absent and name not in late])
-    return content | {name: np.zeros(content["outcome"].shape, np.uint8) for name in late}
+    made = {"invalidity": np.zeros(content["outcome"].shape, np.uint8), "geom_names": np.array((), str)}
+    return content | {name: made[name] for name in late & made.keys()}
 
 
 def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
@@ -117,6 +122,8 @@ def _check_shapes(content: dict[str, NDArray[Any]]) -> None:
     expected = {name: (*each, *frames, *rest) for name, rest in row.items()}
     expected |= dict.fromkeys(("outcome", "invalidity", "fallen", "duration_s", "num_frames"), each)
     expected |= {"labels": (terrains,), "robot": (), "dt": (), "origin": ()}
+    if "touching" in content:
+        expected["touching"] = (*each, *frames, *content["geom_names"].shape)
     for name, shape in expected.items():
         if content[name].shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {content[name].shape}")
@@ -162,6 +169,8 @@ def _check_values(recording: Recording) -> None:
             raise ValueError(f"{name} must be finite in the frames that an episode has, and NaN after them")
         if np.nanmax(np.abs(values), initial=0.0) > _LIMITS.get(name, np.inf):
             raise ValueError(f"{name} must be at most {_LIMITS[name]:g}")
+    if recording.touching is not None and recording.touching[~there].any():
+        raise ValueError("touching must be False after the frames that an episode has")
     length = np.linalg.norm(recording.base_quaternion[there], axis=1)
     if np.abs(length - 1.0).max() > 1e-3:
         raise ValueError(f"base_quaternion must have length 1, got {length.min():g} to {length.max():g}")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from kernels.penalties import PENALTIES
+from kernels.penalties import COLLISION_FORCE, PENALTIES
 from sim.files.provenance import provenance
 from sim.robots.identity import identity
 
@@ -81,6 +81,12 @@ class Recording:
     """Command of the coming control step: v_x, v_y [m/s], yaw rate [rad/s], yaw frame; 0 once ended; (T, K, F, 3)."""
     origin: dict[str, Any]
     """Where it comes from: :func:`sim.robots.identity.identity`, command, commit, device, versions, seed, date."""
+    geom_names: tuple[str, ...] = ()
+    """Of the G geoms whose touch is known: base, limbs and feet; none in the first files."""
+    touching: NDArray[np.bool_] | None = None
+    """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also
+    where its collision ended the episode, whenever in the last control step that was. False from ``num_frames`` on,
+    None in the first files."""
 
     @property
     def num_terrains(self) -> int:
@@ -108,7 +114,8 @@ class Recording:
         each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s")
         cut |= {name: getattr(self, name)[terrain : terrain + 1] for name in each}
         genes = None if self.genes is None else self.genes[terrain : terrain + 1]
-        return replace(self, num_frames=num_frames, genes=genes, **cut)
+        touching = None if self.touching is None else self.touching[terrain : terrain + 1, :, : num_frames.max()]
+        return replace(self, num_frames=num_frames, genes=genes, touching=touching, **cut)
 
     def of_episode(self, episode: int) -> "Recording":
         """The recording of one of the episodes alone, on every terrain.
@@ -173,6 +180,7 @@ class _Frames:
         robot = rollout.robot
         self._shape = (num_terrains, rollout.num_replicas)
         self._feet = [robot.geom_names.index(name) for name in robot.foot_geoms]
+        self._num_base = len(robot.base_geoms)  # the first ones
         self._columns = [PENALTIES.index(name) for name in robot.penalties]
         self._num_frames = np.zeros(num_terrains * rollout.num_replicas, dtype=np.int32)
         self._over = np.zeros(len(self._num_frames), dtype=bool)
@@ -199,19 +207,24 @@ class _Frames:
         row = state.episode.numpy()[envs]
         frame = self._num_frames[row]
         joint_q = state.joint_q.numpy()[envs]
-        force = state.geom_force.numpy()[envs][:, self._feet]
+        force = state.geom_force.numpy()[envs]
         force[frame == 0] = 0.0  # at the start there was no step yet, and what is there is of another episode
         command = state.command.numpy()[envs]
         values = {
             "base_position": joint_q[:, :3],
             "base_quaternion": joint_q[:, [6, 3, 4, 5]],
             "joint_position": joint_q[:, 7:],
-            "foot_force": np.clip(force, -_MAX_FORCE, _MAX_FORCE),
+            "foot_force": np.clip(force[:, self._feet], -_MAX_FORCE, _MAX_FORCE),
             "penalties": state.penalty_sums.numpy()[envs][:, self._columns],
             "command": np.zeros_like(command) if ended else command,
         }
         with np.errstate(over="ignore", invalid="ignore"):  # of an episode that broke
             rounded = {name: values[name].astype(dtype) for name, dtype in FRAME_ARRAYS.items()}
+            rounded["touching"] = np.linalg.norm(force, axis=-1) > COLLISION_FORCE
+        if ended:  # the base may have touched in an earlier physics step of the last control step
+            hit = state.outcome.numpy()[envs] == Outcome.BASE_COLLISION
+            missed = hit & ~rounded["touching"][:, : self._num_base].any(axis=1)
+            rounded["touching"][missed, : self._num_base] = True
         self._taken.append((row, frame, rounded))
         self._num_frames[row] += 1
 
@@ -219,8 +232,9 @@ class _Frames:
         """All frames by name once the episodes are over, and how many each episode has."""
         most = int(self._num_frames.max())
         stacks: dict[str, Any] = {"num_frames": self._num_frames.reshape(self._shape)}
-        for name in FRAME_ARRAYS:
-            stack = np.full((len(self._num_frames), most, *self._taken[0][2][name].shape[1:]), np.nan, np.float32)
+        for name, first in self._taken[0][2].items():
+            fill, dtype = (np.nan, np.float32) if name in FRAME_ARRAYS else (False, np.bool_)
+            stack = np.full((len(self._num_frames), most, *first.shape[1:]), fill, dtype)
             for row, frame, values in self._taken:
                 stack[row, frame] = values[name]
             stacks[name] = stack.reshape(*self._shape, *stack.shape[1:])
@@ -266,6 +280,7 @@ def record(
         joint_names=robot.joint_names,
         foot_names=robot.foot_geoms,
         penalty_names=robot.penalties,
+        geom_names=robot.geom_names,
         dt=robot.control_dt,
         labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
         heights=heights.copy(),  # on the CPU numpy() is a view

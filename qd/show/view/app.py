@@ -2,30 +2,27 @@
 
 import queue
 import time
-from collections.abc import Callable
-from html import escape
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import viser
 
-from qd.show.recordings import Recordings, Wanted, on_elite
+from qd.show.recordings import Recordings
+from qd.show.view.address import ask_query, read_address
 from qd.show.view.command import Show
-from qd.show.view.meshes import body_meshes
-from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
-from qd.show.view.playing import Crossing, crossing_of, endings, moment_text, paths_of
-from qd.show.view.plots import Curves, axes_of
+from qd.show.view.plots import axes_of
 from qd.show.view.recorder import Recorder, Report
-from qd.show.view.scene import Scene
-from sim.bank import heights_of
-from sim.crossing import CrossingCfg
-from sim.recording.recorder import Recording
+from qd.show.view.scene import first_view_of, shapes_of
+from qd.show.view.tab import Common, Tab
 from sim.robots.skeleton import Skeleton
-from sim.space import get_space
 
 _FRAME_S = 0.04
 """Real time from one shown frame to the next."""
-_NUMBERS_S = 0.2
-"""Real time from one update of curves and numbers to the next."""
+_IDLE_S = 0.5
+"""Real time from one look at the cameras to the next while nothing plays."""
+_WINDOW = (1400, 900)  # one that is not known yet [pixels]
+
+Asked = tuple[Callable[..., None], tuple[Any, ...]]
 
 
 class Page(viser.ViserServer):
@@ -37,10 +34,10 @@ class Page(viser.ViserServer):
 
 
 class App:
-    """What is shown, and what happens when a visitor does something."""
+    """The page and its tabs."""
 
     def __init__(self, show: Show, recordings: Recordings) -> None:
-        """Open the page and show an elite.
+        """Open the page.
 
         Args:
             show: What to show.
@@ -49,36 +46,64 @@ class App:
         Raises:
             ValueError: If the robot's file cannot be shown.
         """
-        self._show, self._recordings = show, recordings
-        self._archive = show.found.archive
-        self._skeleton = Skeleton(show.robot)
-        self._axes = axes_of(self._archive)
-        self._selection, self._clock = Selection(self._axes), Clock()
-        self._controller = next(iter(show.controllers), None)
-        self._replica = 0
-        self._recording: Recording | None = None
-        self._crossing: Crossing | None = None
-        self._curves: Curves | None = None
-        self._asked: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]] = queue.SimpleQueue()
-        self.page = Page(host=show.cfg.host, port=show.cfg.port, label="faultline", verbose=False)
+        self._recordings, self.tabs = recordings, dict[int, Tab]()
+        self._asked: queue.SimpleQueue[tuple[Hashable, Asked]] = queue.SimpleQueue()
+        skeleton = Skeleton(show.robot)
+        self._common = Common(
+            show=show,
+            axes=axes_of(show.found.archive),
+            skeleton=skeleton,
+            shapes=shapes_of(skeleton, show.robot),
+            recordings=recordings,
+            record=lambda wanted, tab: self._recorder.record(wanted, tab=tab),
+            post=self.post,
+        )
         self._recorder = Recorder(show.robot, lambda report: self.post(self.show_report, report))
-        self._open()
+        self.page = Page(host=show.cfg.host, port=show.cfg.port, label="faultline", verbose=False)
+        self.page.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.page.scene.set_up_direction("+z")
+        self.page.scene.configure_default_lights(enabled=True, cast_shadow=False)
+        self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(*_WINDOW)
+        self.page.on_client_connect(self._greet)
+        self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
 
-    def _open(self) -> None:
-        gui, show = self.page.gui, self._show
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        bodies, num_feet = body_meshes(self._skeleton, show.robot), len(show.robot.foot_geoms)
-        self.scene = Scene(self.page, bodies, num_feet, CrossingCfg())
-        title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
-        self._list = ArchivePanel(self.page, self._axes, self._selection, title, self)
-        self._panel = CrossingPanel(self.page, list(show.controllers), show.cfg.replicas, self)
-        self._selection.pick(show.elite)
-        self._list.show()
-        self._show_elite()
+    def _greet(self, client: viser.ClientHandle) -> None:
+        """In a thread of viser's, since it waits for the browser to answer."""
+        self.post(self.open, client, ask_query(client))
 
-    def post(self, act: Callable[..., None], *args: Any) -> None:
-        """Have one of the methods below called by the loop; from any thread."""
-        self._asked.put((act, args))
+    def post(self, act: Callable[..., None], *args: Any, only_last: Hashable = None) -> None:
+        """Have something done by the loop; from any thread.
+
+        Args:
+            act: What to call.
+            args: What to call it with.
+            only_last: Of several that are asked for at once and have this in common, as dragging makes them, only the
+                last one is done.
+        """
+        self._asked.put((object() if only_last is None else only_last, (act, args)))
+
+    def open(self, client: viser.ClientHandle, query: str) -> None:
+        """Lay out the page of a browser that came.
+
+        Args:
+            client: The browser.
+            query: What its address says behind the question mark.
+        """
+        if client.client_id in self.page.get_clients():
+            self.tabs[client.client_id] = Tab(client, self._common, *read_address(query))
+
+    def leave(self, number: int) -> None:
+        """Forget a tab that is closed."""
+        tab = self.tabs.pop(number, None)
+        if tab is not None:
+            tab.leave()
+
+    def show_report(self, report: Report) -> None:
+        """Keep what was recorded, and tell all tabs how it goes on."""
+        if report.recording is not None:
+            self._recordings.keep(report.wanted, report.recording)
+        for tab in self.tabs.values():
+            tab.show_report(report)
 
     def close(self) -> None:
         """End the recording processes and the page."""
@@ -87,170 +112,30 @@ class App:
 
     def run(self) -> None:
         """Serve until interrupted."""
-        last = told = time.perf_counter()
+        last = time.perf_counter()
         while True:
-            self.do_asked(wait_s=_FRAME_S if self._clock.playing else 1.0)
+            self.do_asked(wait_s=_FRAME_S if self._playing else _IDLE_S)
             now = time.perf_counter()
-            if self._clock.playing and self._crossing is not None:
-                self._clock.tick(now - last)
-                self._show_frame()
-                if now - told > _NUMBERS_S or not self._clock.playing:
-                    told = now
-                    self._show_moment()
+            for tab in self.tabs.values():
+                tab.tick(now - last)
             last = now
 
-    def do_asked(self, wait_s: float) -> None:
-        """Do what was asked for, or wait for it; while playing, the whole time.
+    @property
+    def _playing(self) -> bool:
+        return any(tab.playing for tab in self.tabs.values())
 
-        Of several settings of one control, as dragging makes, only the last one counts.
-        """
+    def do_asked(self, wait_s: float) -> None:
+        """Do what was asked for, or wait for it; while a tab plays, the whole time."""
         until = time.perf_counter() + wait_s
-        only_last = (self.seek, self.choose_replica, self.show_report)
-        found: dict[Any, tuple[Callable[..., None], tuple[Any, ...]]] = {}
+        found: dict[Hashable, Asked] = {}
         while (left := until - time.perf_counter()) > 0.0:
             try:
-                act, args = self._asked.get(timeout=left)
+                key, asked = self._asked.get(timeout=left)
             except queue.Empty:
                 break
-            key: Any = act if act in only_last else (act, args[0]) if act == self._list.brush else object()
             found.pop(key, None)
-            found[key] = (act, args)
-            if not self._clock.playing and self._asked.empty():
+            found[key] = asked
+            if not self._playing and self._asked.empty():
                 break
         for act, args in found.values():
             act(*args)
-
-    def pick_line(self, line: int) -> None:
-        """Show the elite on a line of the list."""
-        listed = self._selection.listed
-        if line < len(listed):  # else the list was drawn anew while the click was on its way
-            self.pick(listed[line])
-
-    def step(self, by: int) -> None:
-        """Show the next (1) or previous (-1) elite of the list."""
-        self.pick(self._selection.step(by))
-
-    def pick(self, number: int) -> None:
-        """Show an elite."""
-        if not 0 <= number < len(self._archive):  # a number field can be typed into
-            return
-        changed = self._selection.pick(number)
-        self._list.show()
-        if changed:
-            self._show_elite()
-
-    def choose_controller(self, name: str) -> None:
-        """Show the crossings of another controller."""
-        if name in self._show.controllers and name != self._controller:
-            self._controller = name
-            self._show_crossings()
-
-    def choose_replica(self, replica: int) -> None:
-        """Show another episode, counted from 0."""
-        self._replica = min(max(replica, 0), self._show.cfg.replicas - 1)
-        if self._recording is not None:
-            self._show_episode()
-
-    def play(self) -> None:
-        """Play or pause."""
-        if self._crossing is not None:
-            self._clock.toggle()
-            self._show_moment()
-
-    def seek(self, time_s: float) -> None:
-        """Show a time [s]."""
-        if self._crossing is not None:
-            self._clock.seek(time_s)
-            self._show_frame()
-            self._show_moment()
-
-    def set_speed(self, speed: float) -> None:
-        """Play so many simulated seconds in a real one."""
-        self._clock.speed = speed
-
-    def set_forces(self, shown: bool) -> None:
-        """Show or hide the forces of the feet."""
-        self.scene.show_forces = shown
-        self._show_frame()
-
-    def show_report(self, report: Report) -> None:
-        """Say how a recording goes on, keep it, and show it if it is still wanted."""
-        if report.recording is not None:
-            self._recordings.keep(report.wanted, report.recording)
-        if report.wanted != self._wanted():
-            return
-        if report.recording is not None:
-            self._show_recording(report.recording)
-        elif report.failed:
-            self._panel.show_status(f"No crossing: {escape(report.text)}")
-        else:
-            text = f"Recording {report.wanted.replicas} episodes of {self._controller}: {report.text} …"
-            self._panel.show_status(text, report.share)
-
-    def _wanted(self) -> Wanted | None:
-        """The crossings that are to be shown; None without a controller."""
-        if self._controller is None:
-            return None
-        policy, replicas = self._show.controllers[self._controller], self._show.cfg.replicas
-        return on_elite(self._archive, self._selection.picked, policy=policy, replicas=replicas)
-
-    def _show_elite(self) -> None:
-        elite = self._selection.picked
-        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], get_space(self._archive.space))[0])
-        self._panel.show_elite(self._axes.details(elite))
-        self._show_crossings()
-
-    def _show_crossings(self) -> None:
-        """Show the picked elite's crossings if they are recorded, else have them recorded."""
-        self._recording = self._crossing = self._curves = None
-        self.scene.hide_crossing()
-        self._clock.load(0.0)
-        self._panel.show_controls(self._clock, self._replica, enabled=False)
-        self._panel.show_moment("", "")
-        wanted = self._wanted()
-        recording = None if wanted is None else self._recordings.read(wanted)
-        self._recorder.record(None if recording is not None else wanted)
-        if recording is not None:
-            self._show_recording(recording)
-        elif wanted is None:
-            self._panel.show_status(f"No crossing: {escape(self._show.note)}")
-        else:
-            self._panel.show_status(f"Recording {wanted.replicas} episodes of {self._controller} …", 0.0)
-
-    def _show_recording(self, recording: Recording) -> None:
-        self._recording = recording
-        self.scene.set_paths(paths_of(recording))
-        self._show_episode()
-
-    def _show_episode(self) -> None:
-        assert self._recording is not None
-        archive = self._archive
-        crossing = crossing_of(self._recording, self._replica, self._skeleton, archive.penalties, archive.scales)
-        self._crossing = crossing
-        origin = self._recording.origin
-        made = escape(f"recorded {str(origin.get('date', ''))[:10]} at {str(origin.get('commit', ''))[:8]}")
-        all_of_them = f"All {self._recording.num_episodes}: {endings(self._recording)} ({made})."
-        if crossing is None:
-            self._clock.load(0.0)
-            self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
-        else:
-            self._clock.load(crossing.duration_s)
-            self._curves = Curves(crossing.times_s, crossing.penalties, self._archive.penalties)
-            ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
-            self._panel.show_status(f"{ended} {all_of_them}")
-            self._show_frame()
-            self._show_moment()
-        self._panel.show_controls(self._clock, self._replica, enabled=crossing is not None)
-
-    def _show_frame(self) -> None:
-        if self._crossing is not None:
-            self.scene.show_frame(self._crossing, self._clock.frame(self._crossing.dt, self._crossing.num_frames))
-
-    def _show_moment(self) -> None:
-        crossing, curves = self._crossing, self._curves
-        if crossing is not None and curves is not None:
-            frame = self._clock.frame(crossing.dt, crossing.num_frames)
-            self._panel.show_moment(
-                curves.at(self._clock.time_s), moment_text(crossing, frame, self._archive.penalties)
-            )
-        self._panel.show_time(self._clock)

@@ -28,9 +28,12 @@ class View(OfRobot, Which):
 
     Left, the archive on parallel axes. Under "Ranges" drag the ends of an axis: elites outside turn grey and leave the
     list under "Worst first". Click a line of the list to see that terrain. Right, its crossing: play, pause, drag the
-    time, choose the episode, the speed and the controller. Arrows at the feet are contact forces (1 m is 1,000 N), the
-    green one over the robot is its command; curves are what it is penalised for. Crossings that were not recorded
-    before are run on the CPU, which takes seconds, and are kept under --cache.
+    time, go from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are contact forces
+    (1 m is 1,000 N), the green one over the robot is its command; curves are what it is penalised for. Crossings that
+    were not recorded before are run on the CPU, which takes seconds, and are kept under --cache.
+
+    Every tab of a browser is on its own, and its address holds what it shows: ?elite=12&controller=C-G&t=8.4 opens
+    just that.
 
     Ctrl-C ends it. No GPU and no screen are needed: over ssh, forward the port (ssh -L 8080:localhost:8080 HOST) and
     open the page at home.

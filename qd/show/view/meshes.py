@@ -19,6 +19,7 @@ _LINE_DARKNESS = 0.84
 _BASE, _LIMB, _FOOT, _BONE = (112, 124, 146), (150, 160, 176), (230, 92, 34), (182, 188, 198)
 _BONE_RADIUS = 0.35  # in that of the robot's thinnest limb or foot
 _SEGMENTS = 20  # round a capsule
+_TOUCH_MARGIN = 0.01  # by which a coloured shape is longer than the one under it [m]
 
 
 def in_linear_light(colors: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -105,6 +106,34 @@ def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     half = np.array([1.0 + z, -y, x, 0.0])  # the half turn between z and it
     size = float(np.linalg.norm(half))
     return (half / size if size > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])), length
+
+
+def path_mesh(points: NDArray[np.floating], radius: float) -> trimesh.Trimesh:
+    """A thin tube of three sides along a way, in one piece that can be translucent.
+
+    Args:
+        points: Of the way [m], shape (num_points, 3), at least 2.
+        radius: From its middle to its edges [m].
+    """
+    ahead = np.gradient(points, axis=0)
+    left = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(points))], axis=1)
+    length = np.linalg.norm(left, axis=1, keepdims=True)
+    left = np.where(length > 1e-6, left / np.maximum(length, 1e-6), np.array([0.0, 1.0, 0.0]))
+    angles = 2.0 * np.pi * np.arange(3) / 3.0
+    round_it = np.cos(angles)[:, None] * left[:, None] + np.sin(angles)[:, None] * np.array([0.0, 0.0, 1.0])
+    vertices = (points[:, None] + radius * round_it).reshape(-1, 3)
+    k, side = np.divmod(np.arange(3 * (len(points) - 1)), 3)
+    a, b = 3 * k + side, 3 * k + (side + 1) % 3
+    faces = np.concatenate([np.stack([a, b, a + 3], axis=1), np.stack([b, b + 3, a + 3], axis=1)])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def touch_mesh(geom: Geom) -> trimesh.Trimesh:
+    """A shape in its body's frame, a little larger, to be shown over it."""
+    mesh = geom_mesh(geom, (255, 255, 255))
+    middle = mesh.bounds.mean(axis=0)
+    mesh.vertices = middle + (mesh.vertices - middle) * (1.0 + _TOUCH_MARGIN / np.maximum(mesh.extents, _TOUCH_MARGIN))
+    return mesh
 
 
 def body_meshes(skeleton: Skeleton, robot: RobotCfg) -> list[trimesh.Trimesh | None]:

@@ -1,6 +1,6 @@
-"""The panels of the page, the archive left and the crossing right, and what they stand at.
+"""The panels of a tab, the archive left and the crossing right, its keys, and what they stand at.
 
-They hand on what a visitor does to the :class:`qd.show.view.app.App`, which does it in its loop.
+They hand on what a visitor does to the :class:`qd.show.view.tab.Tab`, by the viewer's loop.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,15 +12,20 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from qd.show.view.legend import legend_html
 from qd.show.view.plots import Axes, axes_svg
+from qd.show.view.scene import first_view_of
 
 if TYPE_CHECKING:
-    from qd.show.view.app import App
+    from qd.show.view.tab import Tab
 
 PAGE = 8
 """Lines of the list at once."""
 SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "4 x": 4.0}
-_WIDTH = 380  # of a panel [pixels]: between two of them a window of 1,400 shows the terrain from start to goal
+STEP_S = 0.1
+"""Time that a step goes on or back [s]."""
+_WIDTH, _NARROW_WIDTH = 380, 300  # of a panel [pixels]
+_WIDE = 1200  # a window from here on has room for two wide panels; in another the archive is folded at first [pixels]
 _PICKED, _OTHER = (213, 94, 0), (73, 80, 87)
 _CONTROL_DT = 0.02  # step of the time slider [s]
 
@@ -134,28 +139,30 @@ class Clock:
 
 
 class ArchivePanel:
-    """The parallel axes, their ranges, and the list of the elites."""
+    """The elites on parallel axes, their ranges, and the list of those in the ranges."""
 
-    def __init__(self, server: viser.ViserServer, axes: Axes, selection: Selection, title: str, app: "App") -> None:
+    def __init__(self, client: viser.ClientHandle, axes: Axes, selection: Selection, title: str, tab: "Tab") -> None:
         """Lay it out.
 
         Args:
-            server: The page.
+            client: The tab's browser.
             axes: The elites.
             selection: Those listed, and the one picked.
             title: What archive it is.
-            app: Does what a visitor asks for.
+            tab: Does what a visitor asks for.
         """
-        self._axes, self._selection, self._app, self._gui = axes, selection, app, server.gui
-        self._panel = server.gui.add_panel()
+        self._axes, self._selection, self._tab, self._gui = axes, selection, tab, client.gui
+        self._panel = client.gui.add_panel()
         self._panel.dock_left()
         self._panel.set_width(_WIDTH)
+        if client.camera.image_width < _WIDE:
+            self._panel.minimize()
         with self._panel.add_tab("Archive"):
             words = escape(title)  # of a folder called anything
-            self._title = server.gui.add_html(f'<div style="padding:0.2em 0.6em">{words}</div>')
-            self._plot = server.gui.add_html("")
-            self._count = server.gui.add_markdown("")
-            tabs = server.gui.add_tab_group()
+            self._title = self._gui.add_html(f'<div style="padding:0.2em 0.6em">{words}</div>')
+            self._plot = self._gui.add_html("")
+            self._count = self._gui.add_markdown("")
+            tabs = self._gui.add_tab_group()
             with tabs.add_tab("Worst first"):
                 self._add_list()
             with tabs.add_tab("Ranges"):
@@ -164,18 +171,21 @@ class ArchivePanel:
 
     def _add_list(self) -> None:
         self._gui.add_markdown("Elite: fitness · base collision · goal reached, with 95 % intervals")
-        self._lines = [self._add_button("", self._app.pick_line, k) for k in range(PAGE)]
-        pages = self._gui.add_button_group("Page", ("first", "previous", "next", "last"))
-        turns = {"first": -len(self._axes.elites), "previous": -1, "next": 1, "last": len(self._axes.elites)}
-        pages.on_click(lambda event: self._app.post(self.change, self._selection.turn, turns[event.target.value]))
-        steps = self._gui.add_button_group("Elite", ("worse", "milder"))
-        steps.on_click(lambda event: self._app.post(self._app.step, -1 if event.target.value == "worse" else 1))
-        self._number = self._gui.add_number("Number", 0, min=0, max=len(self._axes.elites) - 1, step=1)
-        _on_visit(self._number, lambda value: self._app.post(self._app.pick, int(value)))
+        self._lines = [self._add_button("", self._tab.pick_line, k) for k in range(PAGE)]
+        count = len(self._axes.elites)
+        turns = {"first": -count, "previous": -1, "next": 1, "last": count}
+        _add_choices(self._gui, "Page", turns, lambda by: self._post(self.change, self._selection.turn, by))
+        _add_choices(self._gui, "Elite", {"worse": -1, "milder": 1}, lambda by: self._post(self._tab.step, by))
+        with self._gui.add_form(None) as form:
+            self._number = self._gui.add_text("Number, Enter", "0")
+        form.on_submit(lambda event: self._post(self._tab.pick_typed, self._number.value))
+
+    def _post(self, act: Callable[..., None], *args: object, only_last: object = None) -> None:
+        self._tab.common.post(act, *args, only_last=only_last)
 
     def _add_button(self, label: str, act: Callable[..., None], *args: object) -> Any:
         button = self._gui.add_button(label)
-        button.on_click(lambda event: self._app.post(act, *args))
+        button.on_click(lambda event: self._post(act, *args))
         return button
 
     def _add_slider(self, name: str) -> Any:
@@ -183,7 +193,7 @@ class ArchivePanel:
         slider = self._gui.add_multi_slider(
             axis.label, min=axis.low, max=axis.high, step=axis.step, initial_value=(axis.low, axis.high)
         )
-        _on_visit(slider, lambda value: self._app.post(self.brush, name, *value))
+        _on_visit(slider, lambda value: self._post(self.brush, name, *value, only_last=(self, name)))
         return slider
 
     def change(self, act: Callable[..., object], *args: object) -> None:
@@ -208,7 +218,7 @@ class ArchivePanel:
             if there:
                 button.label = self._axes.line(listed[k])
                 button.color = _PICKED if listed[k] == selection.picked else _OTHER
-        self._number.value = selection.picked
+        self._number.value = str(selection.picked)
         for name, slider in self._sliders.items():
             axis = self._axes.axis(name)
             if name not in selection.ranges and slider.value != (axis.low, axis.high):
@@ -218,46 +228,80 @@ class ArchivePanel:
 class CrossingPanel:
     """The picked elite, and the controls of its crossing."""
 
-    def __init__(self, server: viser.ViserServer, controllers: Sequence[str], replicas: int, app: "App") -> None:
+    def __init__(self, client: viser.ClientHandle, controllers: Sequence[str], tab: "Tab") -> None:
         """Lay it out.
 
         Args:
-            server: The page.
+            client: The tab's browser.
             controllers: Their names.
-            replicas: Episodes of each elite.
-            app: Does what a visitor asks for.
+            tab: Does what a visitor asks for.
         """
-        gui = server.gui
+        gui, self._post = client.gui, tab.common.post
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(_WIDTH)
+        gui.main_panel.set_width(_WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH)
         self._details = gui.add_markdown("")
         self._controller = gui.add_dropdown("Controller", tuple(controllers) or ("none",), disabled=not controllers)
-        _on_visit(self._controller, lambda name: app.post(app.choose_controller, str(name)))
-        self._replica = gui.add_slider("Episode", min=1, max=max(replicas, 2), step=1, initial_value=1)
-        self._replica.disabled = replicas == 1
-        _on_visit(self._replica, lambda value: app.post(app.choose_replica, int(value) - 1))
+        _on_visit(self._controller, lambda name: self._post(tab.choose_controller, str(name)))
+        self._groups: Any = gui.add_dropdown("Episodes", ("none",), disabled=True)
+        _on_visit(self._groups, lambda name: self._post(tab.choose_group, str(name)))
+        self._episode: Any = gui.add_dropdown("Episode", ("none",), disabled=True)
+        _on_visit(self._episode, lambda name: self._post(tab.choose_replica, int(str(name).split(":")[0]) - 1))
         self._status = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
-        self._play.on_click(lambda event: app.post(app.play))
+        self._play.on_click(lambda event: self._post(tab.play))
         self._time = gui.add_slider("Time [s]", min=0.0, max=20.0, step=_CONTROL_DT, initial_value=0.0)
-        _on_visit(self._time, lambda value: app.post(app.seek, float(value)))
-        self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 x")
-        _on_visit(self._speed, lambda value: app.post(app.set_speed, SPEEDS[value]))
-        switches = (
-            ("Follow", app.scene.set_follow, False),
-            ("Foot forces (1 m: 1,000 N)", app.set_forces, True),
-            ("All paths", app.scene.set_show_paths, True),
-        )
-        for label, switch, initial in switches:
-            box = gui.add_checkbox(label, initial)
-            _on_visit(box, lambda value, switch=switch: app.post(switch, bool(value)))
+        _on_visit(self._time, lambda value: self._post(tab.seek, float(value), only_last=(self, "time")))
+        steps = {f"-{STEP_S} s": (tab.go_on, -STEP_S), f"+{STEP_S} s": (tab.go_on, STEP_S)}
+        steps |= {"next mark": (tab.go_to_next_mark,), "next episode": (tab.step_replica, 1)}
+        _add_choices(gui, "Go", steps, lambda asked: self._post(*asked))
         self._curves = gui.add_html("")
+        self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 x")
+        _on_visit(self._speed, lambda value: self._post(tab.set_speed, SPEEDS[value]))
+        views = {"overview": (tab.overview,), "near": (tab.look, first_view_of), "copy link": (tab.copy_link,)}
+        _add_choices(gui, "View", views, lambda asked: self._post(*asked))
+        self._follow = self._add_switch(gui, "Follow", tab.set_follow, False)
+        self._add_switch(gui, "Foot forces", tab.set_forces, True)
+        self._add_switch(gui, "All paths", tab.scene.set_show_paths, True)
+        self._add_switch(gui, "Names of feet", tab.set_names, False)
         self._numbers = gui.add_markdown("")
+        with gui.add_folder("Legend", expand_by_default=False):
+            gui.add_html(legend_html(controllers))
+        with gui.add_folder("Keys", expand_by_default=False):
+            gui.add_markdown("\n".join(f"- **{key}** {words.lower()}" for key, words in KEY_WORDS))
+
+    def _add_switch(self, gui: Any, label: str, switch: Callable[[bool], None], initial: bool) -> Any:
+        box = gui.add_checkbox(label, initial)
+        _on_visit(box, lambda value: self._post(switch, bool(value)))
+        return box
 
     def show_elite(self, details: str) -> None:
         """Say what the archive knows of the picked elite, as Markdown."""
         self._details.content = details
+
+    def show_controller(self, name: str | None) -> None:
+        """Say whose crossings are shown."""
+        if name is not None:
+            self._controller.value = name
+
+    def show_episodes(self, groups: Sequence[str], group: str, episodes: dict[int, str], shown: int) -> None:
+        """Offer episodes.
+
+        Args:
+            groups: What episodes can have in common, in words.
+            group: That of those offered.
+            episodes: Words of each, by its number from 0.
+            shown: Number of the one that is shown.
+        """
+        offered: tuple[tuple[Any, tuple[str, ...], str], ...] = (
+            (self._groups, tuple(groups), group),
+            (self._episode, tuple(episodes.values()), episodes[shown]),
+        )
+        for handle, options, value in offered:
+            handle.disabled = False
+            if handle.options != options:
+                handle.options = options
+            handle.value = value
 
     def show_status(self, text: str, share: float | None = None) -> None:
         """Say how the crossing ended, as HTML, or how far its recording is (0 to 1)."""
@@ -266,11 +310,12 @@ class CrossingPanel:
         if share is not None:
             self._progress.value = 100.0 * share
 
-    def show_controls(self, clock: Clock, replica: int, *, enabled: bool) -> None:
+    def show_controls(self, clock: Clock, *, enabled: bool) -> None:
         """Set the controls to where the crossing stands; without one they are off."""
-        self._replica.value = replica + 1
         for handle in (self._play, self._time):
             handle.disabled = not enabled
+        if not enabled:
+            self._groups.disabled = self._episode.disabled = True
         self._time.max = max(round(clock.duration_s, 2), _CONTROL_DT)
         self.show_time(clock)
 
@@ -282,10 +327,55 @@ class CrossingPanel:
             self._play.label = label
             self._play.icon = viser.Icon.PLAYER_PAUSE if clock.playing else viser.Icon.PLAYER_PLAY
 
+    def show_follow(self, follow: bool) -> None:
+        """Set the switch that follows."""
+        self._follow.value = follow
+
     def show_moment(self, curves: str, numbers: str) -> None:
         """Show the penalties up to a time, as SVG, and the numbers of the moment, as Markdown."""
         self._curves.content = curves
         self._numbers.content = numbers
+
+
+KEY_WORDS = (
+    ("Space", "Plays or pauses"),
+    ("Left, Right", f"Go {STEP_S} s back or on"),
+    ("M", "Goes to the next mark"),
+    ("N, P", "Show the next or the previous elite of the list"),
+    ("1 to 9", "Show an episode"),
+    ("F", "Follows the robot, or stays"),
+    ("O", "Shows the whole terrain"),
+)
+"""Keys and what they do."""
+
+
+def add_keys(client: viser.ClientHandle, tab: "Tab") -> None:
+    """Have keys do what the panels do; those of a text field stay with it.
+
+    Args:
+        client: The tab's browser.
+        tab: Does what a visitor asks for.
+    """
+    asked: dict[str, tuple[Any, tuple[Callable[..., None], object] | tuple[Callable[..., None]]]] = {
+        "Play or pause": ("space", (tab.play,)),
+        "Go back": ("arrowleft", (tab.go_on, -STEP_S)),
+        "Go on": ("arrowright", (tab.go_on, STEP_S)),
+        "Next mark": ("M", (tab.go_to_next_mark,)),
+        "Next elite": ("N", (tab.step, 1)),
+        "Previous elite": ("P", (tab.step, -1)),
+        "Follow": ("F", (tab.toggle_follow,)),
+        "Overview": ("O", (tab.overview,)),
+        **{f"Episode {k}": (str(k), (tab.choose_replica, k - 1)) for k in range(1, 10)},
+    }
+    for label, (key, act) in asked.items():
+        command = client.gui.add_command(label, hotkey=key)
+        command.on_trigger(lambda event, act=act: tab.common.post(*act))
+
+
+def _add_choices(gui: Any, label: str, choices: dict[str, Any], act: Callable[[Any], None]) -> None:
+    """Buttons side by side, each with what to call ``act`` with."""
+    buttons = gui.add_button_group(label, tuple(choices))
+    buttons.on_click(lambda event: act(choices[event.target.value]))
 
 
 def _on_visit(handle: Any, act: Callable[[Any], None]) -> None:

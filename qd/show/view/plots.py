@@ -16,7 +16,7 @@ _SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites b
 _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
 _WIDTH, _HEIGHT = 460, 350
 _TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 16
-_CURVES_HEIGHT, _MARGIN = 170, 24
+_CURVES_HEIGHT, _MARGIN, _MARK_ROW = 170, 24, 14
 _RATES = {"collision_rate": "base collision", "goal_rate": "goal reached", "fallen_rate": "fallen"}
 _RATE_STEP, _FITNESS_STEP = 0.01, 0.1
 
@@ -177,21 +177,30 @@ def _svg(height: int, parts: Iterable[str]) -> str:
 class Curves:
     """Running penalties of one crossing, drawn once; only the mark of the shown time moves."""
 
-    def __init__(self, times_s: NDArray[np.floating], sums: NDArray[np.floating], penalties: Sequence[str]) -> None:
+    def __init__(
+        self,
+        times_s: NDArray[np.floating],
+        sums: NDArray[np.floating],
+        penalties: Sequence[str],
+        marks: Sequence[tuple[float, str]] = (),
+    ) -> None:
         """Draw the curves.
 
         Args:
             times_s: Time of each frame [s], shape (num_frames,).
             sums: Scaled penalty sums so far, shape (num_frames, num_penalties).
             penalties: Their names.
+            marks: Times [s] and words of what happened, above the curves.
         """
+        self._top = _MARK_ROW * len(marks)
         self._end = max(float(times_s[-1]), 1e-9)
         most = max(float(np.max(sums)), 1e-9)
         step = max(1, len(times_s) // 200)
         chosen = np.unique([*range(0, len(times_s), step), len(times_s) - 1])
         x = self._x(times_s[chosen])
-        bottom, top = _CURVES_HEIGHT - 18, 12
+        bottom, top = self._top + _CURVES_HEIGHT - 18, self._top + 12
         parts = [
+            *(self._mark(row, when, words) for row, (when, words) in enumerate(marks)),
             f'<line x1="{_MARGIN + 8}" y1="{bottom}" x2="{_WIDTH - 8}" y2="{bottom}" stroke="#444"/>',
             _text(_MARGIN + 4, top + 4, f"{most:.3g}", "end"),
             _text(_MARGIN + 4, bottom, "0", "end"),
@@ -210,8 +219,17 @@ class Curves:
     def _x(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
         return _MARGIN + 8 + np.asarray(times_s, dtype=np.float64) / self._end * (_WIDTH - _MARGIN - 16)
 
+    def _mark(self, row: int, time_s: float, words: str) -> str:
+        """A dashed line at a time [s], and its words in a row of their own, on the side with more room."""
+        x = float(self._x(np.array([time_s]))[0])
+        y, bottom = _MARK_ROW * (row + 1) - 3, self._top + _CURVES_HEIGHT - 18
+        line = f'<line x1="{x:.1f}" y1="{y - 8}" x2="{x:.1f}" y2="{bottom}" stroke="#555" stroke-dasharray="2 3"/>'
+        side, anchor = (4, "start") if x < 0.5 * _WIDTH else (-4, "end")
+        return line + _text(x + side, y, f"{words}, {time_s:.1f} s", anchor)
+
     def at(self, time_s: float) -> str:
         """The curves with a mark at a time [s]."""
         x = float(self._x(np.array([time_s]))[0])
-        mark = f'<line x1="{x:.1f}" y1="6" x2="{x:.1f}" y2="{_CURVES_HEIGHT - 18}" stroke="#d00" stroke-width="1.5"/>'
-        return _svg(_CURVES_HEIGHT, [self._drawn, mark])
+        bottom = self._top + _CURVES_HEIGHT - 18
+        mark = f'<line x1="{x:.1f}" y1="6" x2="{x:.1f}" y2="{bottom}" stroke="#d00" stroke-width="1.5"/>'
+        return _svg(self._top + _CURVES_HEIGHT, [self._drawn, mark])

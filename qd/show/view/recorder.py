@@ -61,7 +61,7 @@ Build = Callable[["tuple[RobotCfg, Wanted]", int], Any]
 
 
 class Recorder:
-    """Records the crossings asked for last; what was asked for before and is not begun is dropped."""
+    """Records the crossings that each tab asked for last; what it asked for before and is not begun is dropped."""
 
     def __init__(self, robot: "RobotCfg", report: Callable[[Report], None], *, build: Build = build_recording) -> None:
         """Start to wait for work.
@@ -73,16 +73,18 @@ class Recorder:
         """
         self._robot, self._report, self._build = robot, report, build
         self._workers: dict[str, WorkerProcess] = {}  # by controller, the one used last at the end
-        self._wish: Wanted | None = None
+        self._wishes: dict[int, Wanted] = {}  # by tab, the oldest first
         self._stopped = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, wanted: Wanted | None) -> None:
-        """Record these crossings next; with None, nothing more after those at hand."""
+    def record(self, wanted: Wanted | None, *, tab: int = 0) -> None:
+        """Record these crossings for a tab when its turn comes; with None, nothing more for it after those at hand."""
         with self._changed:
-            self._wish = wanted
+            self._wishes.pop(tab, None)
+            if wanted is not None:
+                self._wishes[tab] = wanted
             self._changed.notify()
 
     def stop(self) -> None:
@@ -97,12 +99,15 @@ class Recorder:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopped or self._wish is not None)
-                if self._stopped or self._wish is None:
+                self._changed.wait_for(lambda: self._stopped or bool(self._wishes))
+                if self._stopped:
                     return
-                wanted, self._wish = self._wish, None
+                wanted = self._wishes.pop(next(iter(self._wishes)))
             try:
-                self._report(self._recorded(wanted))
+                report = self._recorded(wanted)
+                with self._changed:  # others may have asked for the same meanwhile
+                    self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
+                self._report(report)
             except (ValueError, EvaluatorError, OSError) as error:
                 if self._stopped:
                     return

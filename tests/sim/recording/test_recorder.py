@@ -98,6 +98,34 @@ def test_feet_that_push_are_on_the_ground(recording, anymal):
     assert gaps.min() > -0.01 and gaps.max() > 0.02
 
 
+def test_geoms_that_touch_are_those_that_are_pushed(recording, anymal):
+    assert recording.geom_names == anymal.geom_names and recording.touching.shape == (2, 4, 51, 13)
+    assert not recording.touching[:, :, 0].any()
+    feet = [recording.geom_names.index(name) for name in recording.foot_names]
+    force = np.nan_to_num(np.linalg.norm(recording.foot_force, axis=-1))
+    near = np.abs(force - 0.1) < 1e-3  # forces are kept in float16
+    assert (recording.touching[..., feet] == (force > 0.1))[~near].all()
+    # On the spike every episode ends with a touch of the base; the slope is walked over on the feet alone.
+    last = recording.num_frames[0] - 1
+    assert recording.touching[0, np.arange(4), last, recording.geom_names.index("base")].all()
+    assert recording.touching[1][:, :, feet].any() and not np.delete(recording.touching[1], feet, axis=-1).any()
+    # A body that touches at the end of a control step has been counted in it.
+    limbs = np.delete(recording.touching[0], feet, axis=-1).any(axis=-1)
+    counted = np.diff(recording.penalties[0, :, :, recording.penalty_names.index("collision")], axis=1) > 0
+    assert counted[limbs[:, 1:]].all()
+
+
+def test_a_file_of_before_touches_were_kept_has_none(recording, tmp_path):
+    write_recording(tmp_path / "new.npz", recording)
+    with np.load(tmp_path / "new.npz") as content:
+        old = {name: content[name] for name in content.files if name not in ("touching", "geom_names")}
+    np.savez(tmp_path / "old.npz", **old)
+    back = read_recording(tmp_path / "old.npz")
+    assert back.touching is None and back.geom_names == ()
+    write_recording(tmp_path / "again.npz", back)
+    assert read_recording(tmp_path / "again.npz").touching is None
+
+
 def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
     def break_one(share):
         values = np.array(rollout.sim.joint_q.numpy())

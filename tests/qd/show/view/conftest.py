@@ -9,7 +9,7 @@ import pytest
 from qd.show.view.plots import axes_of
 from tests.builders import small_archive
 
-collect_ignore = [] if find_spec("viser") else ["test_app.py", "test_panels.py"]
+collect_ignore = [] if find_spec("viser") else ["test_app.py", "test_panels.py", "test_address.py", "test_browser.py"]
 
 
 @pytest.fixture

@@ -18,6 +18,9 @@ from qd.show.recordings import Recordings
 from qd.show.view.app import App
 from qd.show.view.command import View, show_of
 from qd.show.view.recorder import Report
+from qd.show.view.scene import first_view_of
+from qd.show.view.tab import Tab
+from tests.qd.show.view.visitor import HEIGHT, WIDTH, Visitor
 
 ROOT = Path(__file__).parents[4]
 PICK_LIMIT_S = 1.0
@@ -38,34 +41,70 @@ def show(anymal):
     return show_of(View(run=ARCHIVE, port=free_port(), policies=policies))
 
 
+class Shown:
+    """A viewer with one tab, and what its visitor does; what it would record is kept in ``asked``."""
+
+    def __init__(self, show, recordings, query=""):
+        self.app = App(show, recordings)
+        self.asked = []
+        self.app._recorder.record = lambda wanted, tab=0: self.asked.append(wanted)
+        self.visitors = []
+        self.tab = self.come(query)
+
+    def come(self, query="") -> Tab:
+        """The tab of another visitor, whose address says so."""
+        before = set(self.app.tabs)
+        self.visitors.append(Visitor(self.app.page.get_port(), query))
+        until = time.perf_counter() + 20.0
+        while not (new := set(self.app.tabs) - before):
+            assert time.perf_counter() < until, "no tab was opened"
+            self.app.do_asked(wait_s=0.1)
+        return self.app.tabs[new.pop()]
+
+    def do(self, *asked):
+        """What visitors do, done by the loop."""
+        for act, *args in asked:
+            self.app.post(act, *args)
+            self.app.do_asked(wait_s=0.2)
+
+    def close(self):
+        for visitor in self.visitors:
+            visitor.close()
+        self.app.close()
+
+
 @pytest.fixture
-def app(show, tmp_path, monkeypatch):
-    """The viewer as it opens; what it would record is kept in ``app.asked``."""
-    app = App(show, Recordings(show.robot, folder=tmp_path, published=show.published))
-    app.asked = []
-    monkeypatch.setattr(app._recorder, "record", app.asked.append)
-    yield app
-    app.close()
+def shown(show, tmp_path):
+    shown = Shown(show, Recordings(show.robot, folder=tmp_path, published=show.published))
+    yield shown
+    shown.close()
 
 
-def done(app, *asked):
-    """What visitors do, done by the loop."""
-    for act, *args in asked:
-        app.post(act, *args)
-        app.do_asked(wait_s=0.2)
+@pytest.fixture
+def tab(shown):
+    return shown.tab
 
 
-def status(app) -> str:
-    return re.sub(r"<.*?>", "", app._panel._status.content)
+def status(tab) -> str:
+    return re.sub(r"<.*?>", "", tab._panel._status.content)
 
 
-def test_the_worst_elite_is_there_with_its_crossing(app):
-    assert "Elite 0" in app._panel._details.content
-    assert status(app).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
-    assert app.scene._robot.visible and not app._panel._play.disabled
-    worst = app._axes.axis("fitness").values[0]
-    assert app._list._lines[0].label.startswith(f"0: {worst:.1f} ")
-    assert app._clock.duration_s == pytest.approx(20.0)
+def notes(shown, count, visitor=0):
+    """The last notes at the top of a page, once there are so many."""
+    until = time.perf_counter() + 10.0
+    while len(found := shown.visitors[visitor].notes) < count:
+        assert time.perf_counter() < until, found
+        time.sleep(0.05)
+    return found
+
+
+def test_the_worst_elite_is_there_with_its_crossing(tab):
+    assert "Elite 0" in tab._panel._details.content
+    assert status(tab).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
+    assert tab.scene._robot.visible and not tab._panel._play.disabled
+    worst = tab.common.axes.axis("fitness").values[0]
+    assert tab._list._lines[0].label.startswith(f"0: {worst:.1f} ")
+    assert tab._clock.duration_s == pytest.approx(20.0)
 
 
 def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
@@ -73,24 +112,158 @@ def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
     folder.mkdir()
     (folder / "archive.npz").write_bytes((ARCHIVE / "archive.npz").read_bytes())
     odd = show_of(dataclasses.replace(show.cfg, run=folder, port=free_port()))
-    app = App(odd, Recordings(odd.robot, folder=tmp_path / "cache"))
+    shown = Shown(odd, Recordings(odd.robot, folder=tmp_path / "cache"))
     try:
-        assert "a`&lt;img src=x onerror=alert(1)&gt;" in app._list._title.content
+        assert "a`&lt;img src=x onerror=alert(1)&gt;" in shown.tab._list._title.content
     finally:
-        app.close()
+        shown.close()
 
 
-def test_paths_have_the_colours_of_the_words(app):
-    assert "#0072b2" in app._panel._status.content and "#d55e00" in app._panel._status.content
-    # the browser takes a vertex's colour c as ((c / 255 + 0.055) / 1.055)^2.4 of full light
-    found = np.unique(np.asarray(app.scene._paths.colors).reshape(-1, 3), axis=0)
-    assert found.tolist() == [[0, 43, 114], [170, 29, 0]]
+def test_what_one_tab_does_no_other_tab_sees(shown):
+    one, two = shown.tab, shown.come("?elite=171&t=3")
+    assert "Elite 0" in one._panel._details.content and "Elite 171" in two._panel._details.content
+    before = two._list._count.content
+    shown.do(
+        (one.choose_replica, 16), (one.seek, 2.0), (one._list.brush, "goal_rate", 0.9, 1.0), (one.set_follow, True)
+    )
+    shown.do((one.play,))
+    assert one.playing and not two.playing and not two.scene.follow
+    assert two._list._count.content == before and two._selection.picked == 171 and two._replica == 0
+    shown.do((two.pick, 0))
+    assert status(two).startswith("Episode 1: out of time") and two._clock.time_s == 0.0
+    assert status(one).startswith("Episode 17: base collision")
+    shown.visitors[1].close()
+    until = time.perf_counter() + 10.0
+    while len(shown.app.tabs) > 1 and time.perf_counter() < until:
+        shown.app.do_asked(wait_s=0.1)
+    assert list(shown.app.tabs.values()) == [one] and one.playing  # one is left alone
 
 
-def test_penalties_are_called_alike_on_axes_curves_and_in_numbers(app):
-    for shown in (app._list._plot, app._panel._curves, app._panel._numbers):
+def test_a_link_opens_what_it_was_copied_from(shown):
+    shown.do(
+        (shown.tab.choose_replica, 16),
+        (shown.tab.choose_controller, "other"),
+        (shown.tab.seek, 1.25),
+        (shown.tab.set_follow, True),
+        (shown.tab.copy_link,),
+    )
+    query = shown.tab._query
+    assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
+    two = shown.come(f"?{query}&darkMode=")
+    assert (two._controller, two._replica, two._clock.time_s) == ("other", 16, 1.25)
+    assert two._panel._controller.value == "other" and two._panel._episode.value.startswith("17: base collision")
+    assert two.scene.follow and two._panel._follow.value
+    two.show_address()
+    assert two._query.startswith("darkMode=&elite=0&controller=other&episode=17&t=1.25&follow=1")
+    until = time.perf_counter() + 10.0
+    while not any(two._query in script for script in shown.visitors[1].scripts):
+        assert time.perf_counter() < until
+        time.sleep(0.05)
+
+
+def test_the_address_follows_the_camera(shown):
+    visitor, tab = shown.visitors[0], shown.tab
+    visitor.look((1.0, 2.0, 9.0), (3.0, 4.0, 0.5))
+    until = time.perf_counter() + 10.0
+    while "initialCameraPosition=1.00,2.00,9.00&initialCameraLookAt=3.00,4.00,0.50" not in tab._query:
+        assert time.perf_counter() < until, tab._query
+        time.sleep(0.05)
+        tab.show_address()
+
+
+def test_a_camera_in_the_address_is_left_where_it_is(shown):
+    tab = shown.come("?initialCameraPosition=1,2,3&initialCameraLookAt=4,5,0")
+    assert tab.client.camera.position.tolist() == [1.0, 2.0, 3.0]
+    assert shown.tab.client.camera.position.tolist() == list(first_view_of(WIDTH, HEIGHT)[0])
+
+
+def test_what_is_not_there_is_refused_in_words(shown):
+    shown.come("?elite=480&controller=C-HR&episode=21&t=soon")
+    assert notes(shown, 4, visitor=1) == [
+        "t=soon in the address is no time in seconds: it is left out.",
+        "There is no elite 480 here: there are 0 to 479.",
+        "There is no controller 'C-HR' here: there are base, other.",
+        "There is no episode 21 here: there are 1 to 20.",
+    ]
+    shown.do((shown.tab.pick_typed, "999"), (shown.tab.pick_typed, "-3"), (shown.tab.pick_typed, "17.5"))
+    assert [words.split(" here")[0] for words in notes(shown, 3)] == [
+        f"There is no elite '{text}'" for text in ("999", "-3", "17.5")
+    ]
+    assert shown.tab._selection.picked == 0 and shown.tab._list._number.value == "0"
+    shown.do((shown.tab.pick_typed, " 171 "))
+    assert shown.tab._selection.picked == 171
+
+
+def test_paths_have_the_colours_of_the_words_and_hide_nothing(shown):
+    tab = shown.tab
+    assert "#0072b2" in tab._panel._status.content and "#d55e00" in tab._panel._status.content
+    found = {path.color: path for path in tab.scene._paths}
+    assert set(found) == {(0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)}
+    assert all(path.visible and path.opacity < 0.5 for path in found.values())
+    shown.do((tab.set_follow, True))
+    assert not any(path.visible for path in found.values())
+    shown.do((tab.set_follow, False))
+    assert all(path.visible for path in found.values())
+
+
+def test_what_touches_is_coloured_while_it_touches(shown):
+    tab = shown.tab
+    touching, names = tab._recording.touching[0, 0], tab._recording.geom_names
+    shank = names.index("RF_SHANK")
+    for frame in (int(np.argmax(touching[:, shank])), int(np.flatnonzero(~touching[:, shank])[0])):
+        shown.do((tab.seek, 0.02 * frame))
+        assert [tab.scene._touches[name].visible for name in names] == touching[frame].tolist()
+    tab._recording = dataclasses.replace(tab._recording, touching=None, geom_names=())
+    tab._show_episode()
+    assert not any(handle.visible for handle in tab.scene._touches.values())
+    assert "before touches of bodies were kept" in status(tab)
+
+
+def test_one_goes_from_mark_to_mark(shown):
+    tab, found = shown.tab, []
+    for _ in range(4):
+        shown.do((tab.go_to_next_mark,))
+        found.append(tab._clock.time_s)
+    marks = tab._crossing.marks
+    assert [mark.words for mark in marks] == ["first stumble", "first collision", "end: out of time"]
+    assert found == pytest.approx([mark.time_s for mark in (*marks, marks[0])])
+    assert all(f"{mark.words}, {mark.time_s:.1f} s" in tab._panel._curves.content for mark in marks)
+
+
+def test_steps_stop_the_clock(shown):
+    tab = shown.tab
+    shown.do((tab.play,), (tab.go_on, 0.1))
+    assert not tab.playing and tab._panel._play.label == "Play"
+    shown.do((tab.seek, 5.0), (tab.go_on, -0.1))
+    assert tab._clock.time_s == pytest.approx(4.9)
+
+
+def test_episodes_are_chosen_by_their_outcome(shown):
+    tab = shown.tab
+    assert tab._panel._groups.options == (
+        "all 20 episodes", "the 19 that ended: out of time", "the 1 that ended: base collision",
+    )  # fmt: skip
+    shown.do((tab.choose_group, "the 1 that ended: base collision"))
+    assert status(tab).startswith("Episode 17: base collision")
+    assert tab._panel._episode.options == ("17: base collision",)
+    shown.do((tab.choose_group, "the 19 that ended: out of time"), (tab.step_replica, -1))
+    assert status(tab).startswith("Episode 20: out of time")  # round again
+    shown.do((tab.choose_replica, 16))  # by a key, not one of the group
+    assert tab._panel._groups.value == "all 20 episodes" and tab._panel._episode.value == "17: base collision"
+
+
+def test_feet_have_names(shown):
+    tab = shown.tab
+    assert all(name in tab._panel._numbers.content for name in ("LF_FOOT", "RH_FOOT"))
+    assert not any(label.visible for label in tab.scene._names)
+    shown.do((tab.set_names, True))
+    assert all(label.visible for label in tab.scene._names)
+
+
+def test_penalties_are_called_alike_on_axes_curves_and_in_numbers(tab):
+    for shown in (tab._list._plot, tab._panel._curves, tab._panel._numbers):
         assert "yaw-rate error" in shown.content and "yaw_rate" not in shown.content
-    assert "multiples of its scale" in app._panel._numbers.content
+    assert "multiples of its scale" in tab._panel._numbers.content
 
 
 def test_opening_waits_for_no_simulation():
@@ -106,91 +279,97 @@ def test_opening_waits_for_no_simulation():
     assert done.stdout.split()[-1:] == ["False"], done.stderr
 
 
-def test_a_pick_shows_its_terrain_within_a_second(app):
+def test_a_pick_shows_its_terrain_within_a_second(shown):
+    tab = shown.tab
     for number in (171, 0, 171, 0):  # without a recording and with one
         began = time.perf_counter()
-        done(app, (app.pick, number))
+        shown.do((tab.pick, number))
         assert time.perf_counter() - began < PICK_LIMIT_S
-        assert f"Elite {number}" in app._panel._details.content
-    assert "All 20: 19 out of time, 1 base collision" in status(app)
+        assert f"Elite {number}" in tab._panel._details.content
+    assert "All 20: 19 out of time, 1 base collision" in status(tab)
 
 
-def test_the_list_follows_the_ranges(app):
-    done(app, (app._list.brush, "goal_rate", 0.9, 1.0))
-    assert (app._axes.axis("goal_rate").values[app._selection.kept] >= 0.9).all()
-    assert 0 < len(app._selection.kept) < len(app._archive)
-    first = int(app._selection.kept[0])
-    assert app._list._lines[0].label.startswith(f"{first}: ")
-    done(app, (app.pick_line, 0))
-    assert app._selection.picked == first and app._list._number.value == first
-    done(app, (app._list.change, app._selection.clear), (app.step, 1))
-    assert app._selection.picked == first + 1
-    assert len(app._selection.kept) == len(app._archive)
+def test_the_list_follows_the_ranges(shown):
+    tab = shown.tab
+    shown.do((tab._list.brush, "goal_rate", 0.9, 1.0))
+    assert (tab.common.axes.axis("goal_rate").values[tab._selection.kept] >= 0.9).all()
+    assert 0 < len(tab._selection.kept) < len(tab._archive)
+    first = int(tab._selection.kept[0])
+    assert tab._list._lines[0].label.startswith(f"{first}: ")
+    shown.do((tab.pick_line, 0))
+    assert tab._selection.picked == first and tab._list._number.value == str(first)
+    shown.do((tab._list.change, tab._selection.clear), (tab.step, 1))
+    assert tab._selection.picked == first + 1
+    assert len(tab._selection.kept) == len(tab._archive)
 
 
-def test_playing_and_dragging_move_the_robot(app):
-    before = app.scene._bodies[0].position.copy()
-    done(app, (app.seek, 5.0))
-    assert app.scene._bodies[0].position[0] > before[0] + 1.0
-    assert app._panel._time.value == 5.0
-    done(app, (app.play,))
-    assert app._clock.playing and app._panel._play.label == "Pause"
-    done(
-        app,
-        (app.play,),
-        (app.set_speed, 0.25),
-        (app.scene.set_follow, True),
-        (app.set_forces, False),
-        (app.scene.set_show_paths, False),
+def test_playing_and_dragging_move_the_robot(shown):
+    tab = shown.tab
+    before = tab.scene._bodies[0].position.copy()
+    shown.do((tab.seek, 5.0))
+    assert tab.scene._bodies[0].position[0] > before[0] + 1.0
+    assert tab._panel._time.value == 5.0
+    shown.do((tab.play,))
+    assert tab._clock.playing and tab._panel._play.label == "Pause"
+    shown.do(
+        (tab.play,),
+        (tab.set_speed, 0.25),
+        (tab.set_follow, True),
+        (tab.set_forces, False),
+        (tab.scene.set_show_paths, False),
     )
-    assert not app._clock.playing and app._clock.speed == 0.25
-    assert not any(arrow.visible for arrow in app.scene._forces) and not app.scene._paths.visible
-    pushing = app._crossing.force_newtons >= 100.0
+    assert not tab._clock.playing and tab._clock.speed == 0.25
+    assert not any(arrow.visible for arrow in tab.scene._forces) and not any(path.visible for path in tab.scene._paths)
+    pushing = tab._crossing.force_newtons >= 100.0
     frame = int(np.flatnonzero(pushing.any(axis=1))[0])
-    done(app, (app.set_forces, True), (app.seek, 0.02 * frame))
-    seen = np.array([arrow.visible for arrow in app.scene._forces])
+    shown.do((tab.set_forces, True), (tab.seek, 0.02 * frame))
+    seen = np.array([arrow.visible for arrow in tab.scene._forces])
     assert seen.any() and seen[pushing[frame]].all()
 
 
-def test_episodes_are_stepped_through(app):
-    done(app, (app.seek, 5.0), (app.choose_replica, 16))
-    assert status(app).startswith("Episode 17: base collision")
-    assert app._clock.time_s == 0.0 and app._clock.duration_s < 20.0
-    done(app, (app.choose_replica, 99))  # typed into the field
-    assert status(app).startswith("Episode 20:")
+def test_episodes_are_stepped_through(shown):
+    tab = shown.tab
+    shown.do((tab.seek, 5.0), (tab.choose_replica, 16))
+    assert status(tab).startswith("Episode 17: base collision")
+    assert tab._clock.time_s == 0.0 and tab._clock.duration_s < 20.0
+    shown.do((tab.step_replica, 1))
+    assert status(tab).startswith("Episode 18:")
 
 
-def test_another_controller_has_its_own_crossing(app):
-    done(app, (app.choose_controller, "other"))  # it is the same file
-    assert status(app).startswith("Episode 1: out of time")
-    assert app.asked[-1] is None
+def test_another_controller_has_its_own_crossing(shown):
+    tab = shown.tab
+    shown.do((tab.choose_controller, "other"))  # it is the same file
+    assert status(tab).startswith("Episode 1: out of time")
+    assert shown.asked[-1] is None
 
 
-def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(app):
-    recording = app._recording
-    done(app, (app.pick, 7))
-    wanted = app.asked[-1]
+def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
+    tab = shown.tab
+    recording = tab._recording
+    shown.do((tab.pick, 7))
+    wanted = shown.asked[-1]
     assert (wanted.label, wanted.replicas) == ("elite 7 of anymal", 20)
-    assert not app.scene._robot.visible and app._panel._play.disabled
-    done(app, (app.show_report, Report(wanted=wanted, text="crossing", share=0.4)))
-    assert status(app) == "Recording 20 episodes of base: crossing …" and app._panel._progress.value == 40.0
+    assert not tab.scene._robot.visible and tab._panel._play.disabled
+    shown.do((shown.app.show_report, Report(wanted=wanted, text="crossing", share=0.4)))
+    assert status(tab) == "Recording 20 episodes of base: crossing …" and tab._panel._progress.value == 40.0
     other = dataclasses.replace(wanted, terrain_seed=8)
-    done(app, (app.show_report, Report(wanted=other, text="no", failed=True)))
-    assert "crossing" in status(app)  # of what is not shown nothing is said
-    done(app, (app.show_report, Report(wanted=wanted, text="it <broke>", failed=True)))
-    assert status(app) == "No crossing: it &lt;broke&gt;"
-    done(app, (app.show_report, Report(wanted=wanted, text="recorded", recording=recording)))
-    assert status(app).startswith("Episode 1: out of time") and app.scene._robot.visible
+    shown.do((shown.app.show_report, Report(wanted=other, text="no", failed=True)))
+    assert "crossing" in status(tab)  # of what is not shown nothing is said
+    shown.do((shown.app.show_report, Report(wanted=wanted, text="it <broke>", failed=True)))
+    assert status(tab) == "No crossing: it &lt;broke&gt;"
+    shown.do((shown.app.show_report, Report(wanted=wanted, text="recorded", recording=recording)))
+    assert status(tab).startswith("Episode 1: out of time") and tab.scene._robot.visible
 
 
 def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
     bare = dataclasses.replace(show, controllers={}, note="it is <lost>")
-    app = App(bare, Recordings(show.robot, folder=tmp_path))
+    shown = Shown(bare, Recordings(show.robot, folder=tmp_path))
+    tab = shown.tab
     try:
-        done(app, (app.pick, 3), (app.play,), (app.seek, 1.0), (app.choose_replica, 2), (app.scene.set_follow, True))
-        assert status(app) == "No crossing: it is &lt;lost&gt;" and "Elite 3" in app._panel._details.content
+        shown.do((tab.pick, 3), (tab.play,), (tab.seek, 1.0), (tab.choose_replica, 2), (tab.set_follow, True))
+        assert status(tab) == "No crossing: it is &lt;lost&gt;" and "Elite 3" in tab._panel._details.content
     finally:
-        app.close()
+        shown.close()
 
 
 def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qd.show.view.meshes import arrow_mesh, arrow_pose, body_meshes, geom_mesh, terrain_mesh
+from qd.show.view.meshes import arrow_mesh, arrow_pose, body_meshes, geom_mesh, path_mesh, terrain_mesh, touch_mesh
 from qd.show.view.playing import rotated
 from sim.mujoco_c.model import surface_heights
 from sim.robots.skeleton import Geom, Skeleton
@@ -114,3 +114,24 @@ def test_an_arrow_points_from_its_beginning_to_its_end(way):
     np.testing.assert_allclose(tip, [0.0, 0.0, 1.0], atol=1e-6)
     assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
     np.testing.assert_allclose(begin + rotated(quaternion, tip * [1.0, 1.0, length]), begin + way, atol=1e-5)
+
+
+def test_a_path_is_a_thin_tube_round_its_points():
+    points = np.array([[2.0, 4.0, 0.5], [2.5, 4.0, 0.6], [2.5, 4.5, 0.6], [2.5, 4.5, 0.6], [2.5, 4.5, 0.9]])
+    mesh = path_mesh(points, 0.01)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices.reshape(5, 3, 3) - points[:, None], axis=2), 0.01)
+    assert len(mesh.faces) == 6 * 4 and mesh.faces.max() == 14
+    straight = path_mesh(np.linspace([0, 0, 0], [2, 0, 0], 5), 0.1)
+    # three sides of length 0.1 sqrt(3) along 2 m, and their normals look outward
+    assert straight.area == pytest.approx(3 * 0.1 * np.sqrt(3) * 2)
+    outward = straight.triangles_center - [1.0, 0.0, 0.0]
+    assert (np.einsum("tk,tk->t", outward[:, 1:], straight.face_normals[:, 1:]) > 0.0).all()
+
+
+def test_a_touch_is_shown_round_the_shape_that_touches(robot):
+    skeleton = Skeleton(robot)
+    for name in robot.geom_names:
+        geom = skeleton.geom(name)
+        inner, outer = geom_mesh(geom, (0, 0, 0)), touch_mesh(geom)
+        np.testing.assert_allclose(outer.extents, inner.extents + 0.01, atol=1e-6)
+        np.testing.assert_allclose(outer.bounds.mean(axis=0), inner.bounds.mean(axis=0), atol=1e-6)

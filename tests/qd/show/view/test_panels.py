@@ -3,6 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from qd.show.crossed import ENDINGS
+from qd.show.view.legend import legend_html
 from qd.show.view.panels import PAGE, Clock, Selection
 from qd.show.view.plots import axes_of
 from tests.builders import fresh_values, small_archive
@@ -101,3 +103,11 @@ def test_time_goes_by_at_its_speed():
     assert clock.frame(0.02, 90) == 0
     clock.load(1.0)
     assert clock.duration_s == 1.0
+
+
+def test_the_legend_has_all_colours_and_names_as_text():
+    legend = legend_html(["base", "<tuned>"])
+    assert "base, &lt;tuned&gt;" in legend
+    for ending in ENDINGS.values():
+        assert f"background:{ending.color}" in legend and ending.words in legend
+    assert "#d6167a" in legend and "#ffd60a" in legend  # (214, 22, 122) of bodies, (255, 214, 10) of feet that touch

@@ -1,9 +1,23 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
-from qd.show.view.playing import crossing_of, endings, moment_text, paths_of, rotated
+from kernels.episode import Outcome
+from qd.show.view.playing import (
+    Mark,
+    crossing_of,
+    endings,
+    episodes_by_outcome,
+    marks_of,
+    moment_text,
+    next_mark,
+    paths_of,
+    rotated,
+)
 from qd.show.view.plots import Curves, axes_svg
 from sim.robots.skeleton import Skeleton
+from tests.qd.recordings import recording_of
 from tests.qd.show.view.made import FRAMES, make_recording
 
 
@@ -39,7 +53,8 @@ def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
     # it looks along y: .75 forward is along y, .25 to its left against x
     np.testing.assert_allclose(end - begin, [-0.25, 0.75, 0.0], atol=1e-6)
     np.testing.assert_allclose(begin[:2], [2.0, 4.0], atol=1e-6)
-    text = moment_text(crossing, 0, ())
+    text = moment_text(crossing, 0, (), recording.foot_names)
+    assert f"{recording.foot_names[0]} 0 · {recording.foot_names[1]} 0" in text
     assert "Command: 0.75, 0.25 m/s, 0.50 rad/s" in text and "base at 2.00, 4.00, 0.60 m" in text
 
 
@@ -77,3 +92,51 @@ def test_the_plot_greys_what_ranges_leave_out(axes):
     assert lines(everything) == 21 and lines(some) == 20
     assert everything.count("<rect") == 0 and some.count("<rect") == 1
     assert axes_svg(axes, np.array([], int), {}, None).count('stroke="#d8d8d8"') == 1
+
+
+def test_marks_stand_where_things_happen_first():
+    made = recording_of([Outcome.BASE_COLLISION, Outcome.GOAL], [6.0, 14.0])
+    sums = np.zeros((1, 2, 21, 6), np.float32)
+    sums[0, 0, 8:, 4] = 0.005  # a stumble in the control step before frame 8, 0.16 s
+    sums[0, 0, 12:, 5] = 0.005
+    quaternion = made.base_quaternion.copy()
+    tilts = np.deg2rad(np.where(np.arange(21) < 15, 59.0, 61.0))
+    quaternion[0, 0] = np.stack([np.cos(tilts / 2), np.sin(tilts / 2), 0 * tilts, 0 * tilts], axis=1)
+    made = dataclasses.replace(made, penalties=sums, base_quaternion=quaternion)
+    found = marks_of(made, 0)
+    assert [mark.words for mark in found] == ["first stumble", "first collision", "fall", "end: base collision"]
+    np.testing.assert_allclose([mark.time_s for mark in found], [0.16, 0.24, 0.30, 0.40])
+    assert marks_of(made, 1) == (Mark(pytest.approx(0.4), "end: reached the goal"),)
+    assert next_mark(found, 0.0) == found[0] and next_mark(found, 0.16) == found[1]
+    assert next_mark(found, 0.4) == found[0]  # round again
+
+
+def test_without_a_penalty_the_first_collision_is_the_first_touch_of_a_body():
+    made = recording_of([Outcome.TIME_OUT], [6.0])
+    touching = np.zeros((1, 1, 21, 2), bool)
+    touching[0, 0, 3:, 1] = True
+    touching[0, 0, 7, 0] = True
+    made = dataclasses.replace(
+        made, penalty_names=(*made.penalty_names[:5], "other"), geom_names=("base", "foot"), touching=touching,
+        penalties=np.zeros_like(made.penalties),
+    )  # fmt: skip
+    assert marks_of(made, 0)[0] == Mark(pytest.approx(0.14), "first collision")
+
+
+def test_episodes_are_chosen_by_what_they_have_in_common():
+    outcomes = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT, Outcome.BASE_COLLISION]
+    made = recording_of(outcomes, [6.0] * 4, fallen=[False, False, True, True])
+    assert episodes_by_outcome(made) == {
+        "all 4 episodes": [0, 1, 2, 3],
+        "the 2 that ended: out of time": [0, 2],
+        "the 1 that ended: reached the goal": [1],
+        "the 1 that ended: base collision": [3],
+        "the 2 that fell": [2, 3],
+    }
+
+
+def test_marks_are_named_above_the_curves():
+    marks = ((0.5, "first <stumble>"), (1.9, "end"))
+    drawn = Curves(np.array([0.0, 1.0, 2.0]), np.ones((3, 1)), ("one",), marks).at(0.0)
+    assert "first &lt;stumble&gt;, 0.5 s" in drawn and "end, 1.9 s" in drawn
+    assert drawn.count("stroke-dasharray") == 2

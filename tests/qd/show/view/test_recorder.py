@@ -75,6 +75,18 @@ def test_of_several_wishes_the_last_one_counts(recorder, reports):
     assert all(report.wanted.terrain_seed == 5 for report in iter_now(reports))
 
 
+def test_each_tab_has_a_wish_of_its_own(recorder, reports):
+    recorder.record(wish(1, "slow"))
+    while reports.get(timeout=60).share == 0.0:
+        pass
+    for number, tab in ((2, 1), (3, 2), (4, 1), (1, 3)):
+        recorder.record(wish(number, "slow"), tab=tab)
+    found = [last_of(reports)[-1].recording for _ in range(3)]
+    assert found == ["slow on 1", "slow on 3", "slow on 4"]  # tab 3 is served by the first
+    time.sleep(0.3)
+    assert reports.empty()
+
+
 def iter_now(reports):
     while not reports.empty():
         yield reports.get()

@@ -1,0 +1,379 @@
+"""A browser tab: what it shows, and what happens when its visitor does something. No tab knows of another."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING
+
+import viser
+
+from qd.show.recordings import Recordings, Wanted, on_elite
+from qd.show.view.address import Address, copy_link, keep_keys, show_query
+from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection, add_keys
+from qd.show.view.playing import (
+    Crossing,
+    crossing_of,
+    ending_words,
+    endings,
+    episodes_by_outcome,
+    moment_text,
+    next_mark,
+    paths_of,
+)
+from qd.show.view.plots import Axes, Curves
+from qd.show.view.recorder import Report
+from qd.show.view.scene import Scene, Shapes, View, first_view_of, overview_of
+from sim.bank import heights_of
+from sim.crossing import CrossingCfg
+from sim.recording.recorder import Recording
+from sim.robots.skeleton import Skeleton
+from sim.space import get_space
+
+if TYPE_CHECKING:
+    from qd.show.view.command import Show
+
+_NUMBERS_S = 0.2
+"""Real time from one update of curves and numbers to the next, while playing."""
+_ADDRESS_S = 1.0
+"""Real time from one update of the address to the next; browsers take no more than some three a second."""
+_KEPT_KEYS = ("ArrowLeft", "ArrowRight")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """What all tabs share."""
+
+    show: "Show"
+    axes: Axes
+    skeleton: Skeleton
+    shapes: Shapes
+    recordings: Recordings
+    record: Callable[[Wanted | None, int], None]
+    """Asks for crossings on behalf of a tab, by its number; of each tab the last ones count."""
+    post: Callable[..., None]
+    """Has something done by the loop, with arguments; of what has equal ``only_last``, the last."""
+
+
+class Tab:
+    """What one tab shows; all methods are called by the loop."""
+
+    def __init__(self, client: viser.ClientHandle, common: Common, address: Address, refused: list[str]) -> None:
+        """Lay out the page and show what its address asks for.
+
+        Args:
+            client: Its browser.
+            common: What all tabs share.
+            address: What its address says.
+            refused: What of its address means nothing, in words.
+        """
+        self.client, self.common = client, common
+        show = common.show
+        self._archive, self._others = show.found.archive, address.others
+        self._selection, self._clock = Selection(common.axes), Clock()
+        self._controller = next(iter(show.controllers), None)
+        self._replica = 0
+        self._begin_s = address.time_s or 0.0  # of the next crossing to be shown
+        self._recording: Recording | None = None
+        self._groups: dict[str, list[int]] = {}
+        self._group = ""  # of the episodes to choose from
+        self._crossing: Crossing | None = None
+        self._curves: Curves | None = None
+        self._query, self._told, self._addressed = "", 0.0, time.perf_counter()
+        self.scene = Scene(client, common.shapes, CrossingCfg())
+        title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
+        self._list = ArchivePanel(client, common.axes, self._selection, title, self)
+        self._panel = CrossingPanel(client, list(show.controllers), self)
+        add_keys(client, self)
+        keep_keys(client, _KEPT_KEYS)
+        self._open(address, refused)
+
+    def _open(self, address: Address, refused: list[str]) -> None:
+        show, episodes = self.common.show, self.common.show.cfg.replicas
+        elite = show.elite if address.elite is None else address.elite
+        if not 0 <= elite < len(self._archive):
+            refused.append(self._no_elite(elite))
+            elite = show.elite
+        if address.controller in show.controllers:
+            self._controller = address.controller
+        elif address.controller is not None:
+            there = ", ".join(show.controllers) or "none"
+            refused.append(f"There is no controller '{address.controller}' here: there are {there}.")
+        if address.episode is not None and not 1 <= address.episode <= episodes:
+            refused.append(f"There is no episode {address.episode} here: there are 1 to {episodes}.")
+        elif address.episode is not None:
+            self._replica = address.episode - 1
+        for words in refused:
+            self._refuse(words)
+        if address.camera is None:
+            self.look(first_view_of)
+        self._selection.pick(elite)
+        self._list.show()
+        self._panel.show_controller(self._controller)
+        self._show_elite()
+        if address.follow:
+            self.set_follow(True)
+
+    @property
+    def playing(self) -> bool:
+        """Whether time goes by."""
+        return self._clock.playing and self._crossing is not None
+
+    def tick(self, real_s: float) -> None:
+        """Let real time go by [s]: show the next frame if it plays, and keep the address up to date."""
+        now = time.perf_counter()
+        if self.playing:
+            self._clock.tick(real_s)
+            self._show_frame()
+            if now - self._told > _NUMBERS_S or not self._clock.playing:
+                self._told = now
+                self._show_moment()
+        if now - self._addressed > _ADDRESS_S:
+            self.show_address()
+
+    def show_address(self) -> None:
+        """Have the browser's address say what the tab shows."""
+        self._addressed = time.perf_counter()
+        camera = self.client.camera
+        position, look_at = ((float(x), float(y), float(z)) for x, y, z in (camera.position, camera.look_at))
+        shown = Address(
+            elite=self._selection.picked,
+            controller=self._controller,
+            episode=self._replica + 1,
+            time_s=self._clock.time_s if self._crossing is not None else self._begin_s,
+            follow=self.scene.follow,
+            camera=(position, look_at),
+            others=self._others,
+        )
+        query = shown.query()
+        if query != self._query:
+            self._query = query
+            show_query(self.client, query)
+
+    def copy_link(self) -> None:
+        """Copy the link to what the tab shows."""
+        self.show_address()
+        copy_link(self.client)
+        self.client.add_notification("Link copied", "It opens what this tab shows.", auto_close_seconds=3.0)
+
+    def _refuse(self, words: str) -> None:
+        self.client.add_notification("Not here", words, color="red", auto_close_seconds=12.0)
+
+    def _no_elite(self, number: object) -> str:
+        return f"There is no elite {number} here: there are 0 to {len(self._archive) - 1}."
+
+    def look(self, view_of: Callable[[int, int], View]) -> None:
+        """Move the camera to a view that depends on the picture's width and height."""
+        camera = self.client.camera
+        self.scene.go_to(view_of(camera.image_width, camera.image_height))
+
+    def overview(self) -> None:
+        """Show the whole terrain, and stop following."""
+        self.set_follow(False)
+        self.look(overview_of)
+
+    def pick_line(self, line: int) -> None:
+        """Show the elite on a line of the list."""
+        listed = self._selection.listed
+        if line < len(listed):  # else the list was drawn anew while the click was on its way
+            self.pick(listed[line])
+
+    def step(self, by: int) -> None:
+        """Show the next (1) or previous (-1) elite of the list."""
+        self.pick(self._selection.step(by))
+
+    def pick_typed(self, text: str) -> None:
+        """Show the elite whose number was typed, or say that there is none."""
+        number = int(text) if text.strip().isdecimal() else -1
+        if number < len(self._archive) and number >= 0:
+            self.pick(number)
+        else:
+            self._refuse(self._no_elite(f"'{text}'"))
+            self._list.show()
+
+    def pick(self, number: int) -> None:
+        """Show an elite."""
+        changed = self._selection.pick(number)
+        self._list.show()
+        if changed:
+            self._begin_s = 0.0
+            self._show_elite()
+
+    def choose_controller(self, name: str) -> None:
+        """Show the crossings of another controller."""
+        if name in self.common.show.controllers and name != self._controller:
+            self._controller = name
+            self._begin_s = 0.0
+            self._show_crossings()
+
+    def choose_group(self, name: str) -> None:
+        """Choose from the episodes that have something in common."""
+        if name in self._groups:
+            self._group = name
+            if self._replica not in self._groups[name]:
+                self.choose_replica(self._groups[name][0])
+            self._show_episodes()
+
+    def step_replica(self, by: int) -> None:
+        """Show the next (1) or previous (-1) episode of those to choose from; the first follows the last."""
+        episodes = self._groups.get(self._group, [])
+        if episodes:
+            place = episodes.index(self._replica) if self._replica in episodes else -1
+            self.choose_replica(episodes[(place + by) % len(episodes)])
+
+    def choose_replica(self, replica: int) -> None:
+        """Show another episode, counted from 0."""
+        if not 0 <= replica < self.common.show.cfg.replicas:
+            self._refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.cfg.replicas}.")
+            return
+        self._replica, self._begin_s = replica, 0.0
+        if self._recording is not None:
+            self._show_episode()
+
+    def play(self) -> None:
+        """Play or pause."""
+        if self._crossing is not None:
+            self._clock.toggle()
+            self._show_moment()
+
+    def seek(self, time_s: float) -> None:
+        """Show a time [s]."""
+        if self._crossing is not None:
+            self._clock.seek(time_s)
+            self._show_frame()
+            self._show_moment()
+
+    def go_on(self, by_s: float) -> None:
+        """Stop, some time later or earlier [s]."""
+        self._clock.playing = False
+        self.seek(self._clock.time_s + by_s)
+
+    def go_to_next_mark(self) -> None:
+        """Stop at the next thing that happens."""
+        if self._crossing is not None:
+            self._clock.playing = False
+            self.seek(next_mark(self._crossing.marks, self._clock.time_s).time_s)
+
+    def set_speed(self, speed: float) -> None:
+        """Play so many simulated seconds in a real one."""
+        self._clock.speed = speed
+
+    def set_follow(self, follow: bool) -> None:
+        """Go along with the robot, or stay."""
+        self.scene.set_follow(follow)
+        self._panel.show_follow(follow)
+
+    def toggle_follow(self) -> None:
+        """Go along with the robot if the camera does not, or stay if it does."""
+        self.set_follow(not self.scene.follow)
+
+    def set_forces(self, shown: bool) -> None:
+        """Show or hide the forces of the feet."""
+        self.scene.show_forces = shown
+        self._show_frame()
+
+    def set_names(self, shown: bool) -> None:
+        """Show or hide the names of the feet."""
+        self.scene.show_names = shown
+        self._show_frame()
+
+    def show_report(self, report: Report) -> None:
+        """Say how a recording goes on, and show it, if it is the one that is wanted here."""
+        if report.wanted != self._wanted() or self._recording is not None:
+            return
+        if report.recording is not None:
+            self._show_recording(report.recording)
+        elif report.failed:
+            self._panel.show_status(f"No crossing: {escape(report.text)}")
+        else:
+            text = f"Recording {report.wanted.replicas} episodes of {escape(str(self._controller))}: {report.text} …"
+            self._panel.show_status(text, report.share)
+
+    def leave(self) -> None:
+        """Ask for nothing more; the browser is gone."""
+        self._clock.playing = False
+        self.common.record(None, self.client.client_id)
+
+    def _wanted(self) -> Wanted | None:
+        """The crossings that are to be shown; None without a controller."""
+        show = self.common.show
+        if self._controller is None:
+            return None
+        policy, replicas = show.controllers[self._controller], show.cfg.replicas
+        return on_elite(self._archive, self._selection.picked, policy=policy, replicas=replicas)
+
+    def _show_elite(self) -> None:
+        elite = self._selection.picked
+        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], get_space(self._archive.space))[0])
+        self._panel.show_elite(self.common.axes.details(elite))
+        self._show_crossings()
+
+    def _show_crossings(self) -> None:
+        """Show the picked elite's crossings if they are recorded, else have them recorded."""
+        self._recording = self._crossing = self._curves = None
+        self._groups = {}
+        self.scene.hide_crossing()
+        self._clock.load(0.0)
+        self._panel.show_controls(self._clock, enabled=False)
+        self._panel.show_moment("", "")
+        wanted = self._wanted()
+        recording = None if wanted is None else self.common.recordings.read(wanted)
+        self.common.record(None if recording is not None else wanted, self.client.client_id)
+        if recording is not None:
+            self._show_recording(recording)
+        elif wanted is None:
+            self._panel.show_status(f"No crossing: {escape(self.common.show.note)}")
+        else:
+            self._panel.show_status(f"Recording {wanted.replicas} episodes of {escape(str(self._controller))} …", 0.0)
+
+    def _show_recording(self, recording: Recording) -> None:
+        self._recording = recording
+        self._groups = episodes_by_outcome(recording)
+        self._group = next(iter(self._groups))
+        self.scene.set_paths(paths_of(recording))
+        self._show_episode()
+
+    def _show_episodes(self) -> None:
+        """Offer the episodes to choose from, and say which is shown."""
+        recording = self._recording
+        if recording is not None:
+            named = {k: f"{k + 1}: {ending_words(recording, k)}" for k in self._groups[self._group]}
+            self._panel.show_episodes(list(self._groups), self._group, named, self._replica)
+
+    def _show_episode(self) -> None:
+        assert self._recording is not None
+        archive, recording = self._archive, self._recording
+        if self._replica not in self._groups[self._group]:
+            self._group = next(iter(self._groups))
+        crossing = crossing_of(recording, self._replica, self.common.skeleton, archive.penalties, archive.scales)
+        self._crossing = crossing
+        made = escape(
+            f"recorded {str(recording.origin.get('date', ''))[:10]} at {str(recording.origin.get('commit', ''))[:8]}"
+        )
+        all_of_them = f"All {recording.num_episodes}: {endings(recording)} ({made})."
+        if crossing is None:
+            self._clock.load(0.0)
+            self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
+        else:
+            self._clock.load(crossing.duration_s)
+            self._clock.seek(self._begin_s)
+            self._curves = Curves(crossing.times_s, crossing.penalties, archive.penalties, crossing.marks)
+            ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
+            unknown = "" if crossing.touching is not None else " It was recorded before touches of bodies were kept."
+            self._panel.show_status(f"{ended} {all_of_them}{unknown}")
+            self._show_frame()
+            self._show_moment()
+        self._show_episodes()
+        self._panel.show_controls(self._clock, enabled=crossing is not None)
+
+    def _show_frame(self) -> None:
+        if self._crossing is not None:
+            self.scene.show_frame(self._crossing, self._clock.frame(self._crossing.dt, self._crossing.num_frames))
+
+    def _show_moment(self) -> None:
+        crossing, curves = self._crossing, self._curves
+        if crossing is not None and curves is not None:
+            frame = self._clock.frame(crossing.dt, crossing.num_frames)
+            numbers = moment_text(crossing, frame, self._archive.penalties, self.common.shapes.feet)
+            self._panel.show_moment(curves.at(self._clock.time_s), numbers)
+        self._panel.show_time(self._clock)

@@ -1,0 +1,33 @@
+import pytest
+
+from qd.show.view.address import Address, read_address
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        Address(),
+        Address(elite=12, controller="C-G", episode=3, time_s=8.4, follow=True),
+        Address(elite=0, controller="as searched & more=50%", time_s=0.0),
+        Address(camera=((1.0, -2.5, 3.25), (4.0, 5.0, 0.0)), others=(("darkMode", ""), ("websocket", "ws://x:1/?a=b"))),
+    ],
+)
+def test_what_an_address_says_comes_back(address):
+    assert read_address(address.query()) == (address, [])
+    assert read_address("?" + address.query()) == (address, [])
+
+
+def test_an_address_can_be_written_by_hand():
+    found, refused = read_address("?elite=12&controller=C-G&t=8.4")
+    assert (found, refused) == (Address(elite=12, controller="C-G", time_s=8.4), [])
+    assert found.query() == "elite=12&controller=C-G&t=8.4"
+
+
+def test_what_means_nothing_is_said_and_left_out():
+    found, refused = read_address("elite=twelve&episode=1.5&t=nan&initialCameraPosition=1,2&initialCameraLookAt=1,2,3")
+    assert found == Address()
+    assert refused == [
+        "elite=twelve in the address is no elite: it is left out.",
+        "episode=1.5 in the address is no episode: it is left out.",
+        "t=nan in the address is no time in seconds: it is left out.",
+    ]

@@ -1,0 +1,203 @@
+"""The page in a real browser: chromium without a screen, driven by playwright."""
+
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+from tests.qd.show.view.test_app import ARCHIVE, ROOT, free_port
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="there is no browser: apt-get install chromium"),
+]
+LIMIT_MS = 60_000
+"""From a click to what it shows, on a busy machine that draws without a GPU."""
+WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """Of a viewer of the published archive, with one controller under two names."""
+    port = free_port()
+    command = [sys.executable, "-m", "faultline", "view", "--run", str(ARCHIVE), "--port", str(port)]
+    command += ["--cache", str(tmp_path_factory.mktemp("cache")), "--policies", "base=shipped", "C-G=shipped"]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell's background ignores it
+    )  # fmt: skip
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if line.startswith("Open "):
+            break
+    assert process.poll() is None, "".join(lines)
+    yield f"http://127.0.0.1:{port}/"
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[0]
+    assert process.returncode == 0 and "Traceback" not in rest, rest
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=BROWSER, args=WITHOUT_GPU)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(chromium, address):
+    """Opens tabs; in the end, none of them may have had an error."""
+    errors = []
+    context = chromium.new_context(permissions=["clipboard-read", "clipboard-write"])
+    context.set_default_timeout(LIMIT_MS)
+
+    def open_tab(query="", width=1400, height=900):
+        page = context.new_page()
+        page.set_viewport_size({"width": width, "height": height})
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.goto(address + query if not query.startswith("http") else query)
+        return page
+
+    yield open_tab
+    context.close()
+    assert errors == []
+
+
+def said(page):
+    """What the page's address says."""
+    return {name: values[0] for name, values in parse_qs(urlsplit(page.url).query).items()}
+
+
+def wait_until(page, true):
+    """Waits until something is true of what the address says."""
+    until = time.perf_counter() + LIMIT_MS / 1000
+    while not true(said(page)):
+        assert time.perf_counter() < until, page.url
+        page.wait_for_timeout(100)
+
+
+def see(page, text):
+    page.get_by_text(re.compile(text)).first.wait_for()
+
+
+def test_an_elite_is_chosen_and_the_address_says_so(opened):
+    page = opened()
+    see(page, "^Episode 1: out of time after 20.0 s")
+    wait_until(page, lambda now: now.get("elite") == "0" and now.get("controller") == "base")
+    page.get_by_role("button", name=re.compile("^3: ")).click()
+    see(page, "^Elite 3$")
+    wait_until(page, lambda now: now["elite"] == "3")
+
+
+def test_two_tabs_have_states_of_their_own(opened):
+    one, two = opened("?elite=0"), opened("?elite=0&controller=C-G")
+    for page in (one, two):
+        see(page, "^Episode 1: out of time")
+    one.bring_to_front()
+    one.keyboard.press("m")
+    wait_until(one, lambda now: 3.0 < float(now["t"]) < 5.0)
+    one.keyboard.press("o")
+    two.bring_to_front()
+    two.wait_for_timeout(1500)
+    assert (said(two)["controller"], said(two)["t"]) == ("C-G", "0")
+    two.get_by_role("button", name=re.compile("^5: ")).click()
+    see(two, "^Elite 5$")
+    wait_until(two, lambda now: now["elite"] == "5")
+    one.bring_to_front()
+    one.wait_for_timeout(1500)
+    assert said(one)["elite"] == "0" and said(one)["controller"] == "base"
+    assert said(one)["initialCameraPosition"] != said(two)["initialCameraPosition"]
+
+
+def test_a_link_opens_what_it_shows_and_a_reload_keeps_it(opened):
+    one = opened("?elite=0&controller=C-G&episode=17&t=4.4")
+    see(one, "^Episode 17: base collision after 5.3 s")
+    one.keyboard.press("o")
+    one.wait_for_timeout(1500)
+    one.get_by_role("button", name="copy link").click()
+    see(one, "^Link copied$")
+    link = one.evaluate("navigator.clipboard.readText()")
+    before = said(one)
+    assert (before["t"], before["episode"], before["controller"]) == ("4.4", "17", "C-G")
+    two = opened(link)
+    one.reload()
+    for page in (one, two):
+        page.bring_to_front()  # a browser draws nothing in a tab behind another
+        see(page, "^Episode 17: base collision")
+        page.wait_for_timeout(2000)
+        assert said(page) == before
+
+
+def test_what_is_not_there_is_refused_in_words(opened):
+    page = opened("?elite=480")
+    see(page, "^There is no elite 480 here: there are 0 to 479.$")
+    see(page, "^Episode 1: ")
+    number = page.locator("form input[type=text], form input:not([type])").first
+    number.fill("")
+    number.press_sequentially("999", delay=100)
+    page.wait_for_timeout(1000)
+    assert said(page)["elite"] == "0"  # nothing happens before Enter
+    number.press("Enter")
+    see(page, "^There is no elite '999' here")
+    number.fill("")
+    number.press_sequentially("12", delay=100)
+    number.press("Enter")
+    see(page, "^Elite 12$")
+
+
+def test_keys_do_what_the_panels_do(opened):
+    page = opened("?elite=0")
+    see(page, "^Episode 1: out of time")
+    page.wait_for_timeout(1500)
+    page.keyboard.press("ArrowRight")
+    wait_until(page, lambda now: now["t"] == "0.1")
+    camera = said(page)["initialCameraPosition"]
+    page.keyboard.press("ArrowLeft")
+    wait_until(page, lambda now: now["t"] == "0")
+    assert said(page)["initialCameraPosition"] == camera  # arrows are the time's, not the camera's
+    page.keyboard.press("Space")
+    wait_until(page, lambda now: float(now["t"]) > 0.5)
+    see(page, "^Pause$")
+    page.get_by_role("button", name="Pause").click()
+    see(page, "^Play$")
+    page.keyboard.press("Space")  # with the button in focus: once, not twice
+    see(page, "^Pause$")
+    page.keyboard.press("f")
+    wait_until(page, lambda now: now.get("follow") == "1")
+    page.keyboard.press("3")
+    see(page, "^Episode 3: ")
+    page.keyboard.press("n")
+    wait_until(page, lambda now: now["elite"] == "1")
+    page.keyboard.press("p")
+    wait_until(page, lambda now: now["elite"] == "0")
+
+
+@pytest.mark.parametrize("size", [(1400, 900), (1024, 768), (390, 844)])
+def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
+    page = opened("?elite=0", *size)
+    see(page, "^Episode 1: out of time")
+    page.wait_for_timeout(2000)
+    width = size[0]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    play = page.get_by_role("button", name="Play").bounding_box()
+    assert play is not None and play["x"] >= 0 and play["x"] + play["width"] <= width
+    canvas = page.locator("canvas").first.bounding_box()
+    assert canvas is not None and canvas["width"] >= 0.4 * width
+    if width < 1200:
+        assert not page.get_by_text("Worst first").first.is_visible()  # the archive is folded
+    if width < 576:
+        panel = page.get_by_text("faultline", exact=True).first
+        panel.click()  # folds the rest
+        page.get_by_role("button", name="Play").wait_for(state="hidden")

@@ -1,0 +1,64 @@
+"""A browser's part of viser's protocol, as far as a tab needs it: it comes, answers, and looks somewhere."""
+
+import threading
+
+import msgspec
+import viser
+import zstandard
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+WIDTH, HEIGHT = 1400, 900
+
+
+class Visitor:
+    """One tab without a browser; what its address says is what it was made with."""
+
+    def __init__(self, port: int, query: str = "") -> None:
+        protocol = f"viser-v{viser.__version__}"
+        self._socket = connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None, compression=None)
+        self._query = query
+        self.scripts: list[str] = []
+        """What the page had it run."""
+        self.notes: list[str] = []
+        """What it was told at the top of the page."""
+        self._thread = threading.Thread(target=self._answer, daemon=True)
+        self._thread.start()
+        self.look((1.0, 2.0, 3.0), (4.0, 5.0, 0.0))
+
+    def look(self, position, look_at) -> None:
+        """Move its camera."""
+        self._send(
+            type="ViewerCameraMessage", wxyz=(1.0, 0.0, 0.0, 0.0), position=position, look_at=look_at, fov=1.3,
+            near=0.01, far=1000.0, image_height=HEIGHT, image_width=WIDTH, up_direction=(0.0, 0.0, 1.0),
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Leave."""
+        self._socket.close()
+        self._thread.join(timeout=5)
+
+    def _send(self, **message) -> None:
+        self._socket.send(msgspec.msgpack.encode(message))
+
+    def _answer(self) -> None:
+        try:
+            for data in self._socket:
+                size = int.from_bytes(data[8:16], "little")
+                inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
+                for message in msgspec.msgpack.decode(inner)["messages"]:
+                    self._take(message)
+        except ConnectionClosed:
+            pass
+
+    def _take(self, message) -> None:
+        if message["type"] == "RunJavascriptMessage":
+            self.scripts.append(message["source"])
+        elif message["type"] == "NotificationShowMessage":
+            self.notes.append(message["props"]["body"])
+        elif message["type"] == "LocalStorageGetItemRequestMessage":
+            asked = any(message["key"] in script and "location.search" in script for script in self.scripts)
+            self._send(
+                type="LocalStorageGetItemResponseMessage", value=self._query if asked else None, error=None,
+                request_uuid=message["request_uuid"],
+            )  # fmt: skip
