@@ -17,6 +17,8 @@ FIRST_COL, LAST_COL = 80, 240
 """Columns of the nodes between which elements lie: x = 4 m and x = 12 m."""
 CENTRE_ROW = 80
 """Row of the nodes on the way: y = 4 m."""
+SLOPE_ROWS = 40
+"""Rows to each side of the way in which a cross slope is inclined: 2 m; beyond, it stays level."""
 MAX_ELEMENTS = 6
 GENES = ("kind", "lead", "size", "length", "detail", "turn")
 """Genes of one element in order: kind, flat ground before it, and four parameters (:data:`PARAMETERS`)."""
@@ -114,6 +116,7 @@ _MAX_STEPS = wp.constant(int(PARAMETERS[Kind.STAIRS][2].high))
 _FIRST = wp.constant(FIRST_COL)
 _LAST = wp.constant(LAST_COL)
 _CENTRE = wp.constant(CENTRE_ROW)
+_SLOPE_ROWS = wp.constant(SLOPE_ROWS)
 _MOST = wp.constant(MAX_ELEMENTS)
 _GENES = wp.constant(GENES_PER_ELEMENT)
 _KINDS = wp.constant(_NUM_KINDS)
@@ -184,8 +187,11 @@ def _riser(k: int, tread: float) -> int:
 @wp.func
 def _faces(kind: int) -> int:
     """Cells of what stands on the ground that are its two faces, beside those of its top."""
-    stands = kind == _SILL or kind == _RAIL or kind == _PALLET  # noqa: SIM109 - a kernel has no `in`
-    if stands:
+    if kind == _SILL:
+        return 2
+    if kind == _RAIL:
+        return 2
+    if kind == _PALLET:
         return 2
     return 0
 
@@ -279,7 +285,8 @@ def _relief(element: Element, s: int, row: int) -> float:
         return element.rise * float(s) / float(element.cells)
     if element.kind == _CROSS_SLOPE:  # grows over a third of its length, and goes back over another
         tilt = wp.min(1.0, 3.0 * float(wp.min(s, element.cells - s)) / float(element.cells))
-        return _sign(element.turn) * element.size * tilt * float(row - _CENTRE) * _CELL
+        beside = float(wp.clamp(row - _CENTRE, -_SLOPE_ROWS, _SLOPE_ROWS)) * _CELL
+        return _sign(element.turn) * element.size * tilt * beside
     if element.kind == _SILL or element.kind == _RAIL:
         return element.size
     if element.kind == _PALLET:

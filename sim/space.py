@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels import super_gaussian
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
-from sim.policy.spec import ControllerSpec
+from sim.policy.spec import ControllerSpec, controller_hash
 from sim.spaces.base import Seed as Seed
 from sim.spaces.base import TerrainSpace as TerrainSpace
 from sim.spaces.base import clipped as clipped
@@ -84,6 +84,16 @@ def is_own(name: str) -> bool:
     return name not in SPACES and ControllerSpec.parse(name).runs_code
 
 
+def to_be_named(name: str) -> str | None:
+    """What commands have to name (--space) for a space: it, if it is a user's own code; else nothing."""
+    return name if is_own(name) else None
+
+
+def space_identity(name: str) -> str:
+    """What the terrains of a space depend on: its name, or the hash of its code where it has one."""
+    return (controller_hash(name) if is_own(name) else None) or name
+
+
 def load_space(named: str) -> TerrainSpace:
     """A space that the command line names; one of a user's own is run, and :func:`get_space` finds it from then on.
 
@@ -95,7 +105,6 @@ def load_space(named: str) -> TerrainSpace:
     """
     if not is_own(named):
         return get_space(named)
-    from sim.policy.spec import controller_hash
     from sim.spaces.own import load_own  # with torch
 
     digest = controller_hash(named)

@@ -68,7 +68,7 @@ def replay(cfg: ReplayElite) -> Replay:
     """
     from qd.show.recordings import Recordings, on_elite
 
-    found = find_archive(cfg.robot, cfg.run, cfg.policy)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot = found.archive, found.robot
     elite = found.one(cfg.elite)
     policy, (_, fitness) = found.policy(cfg.policy), found.as_searched()

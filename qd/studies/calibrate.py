@@ -49,7 +49,7 @@ class Calibrate(Who, Where):
     replicas: int = setting(20, least=1)
     """Episodes a terrain."""
     space: str = "super_gaussian"
-    """Terrain space that they are drawn from."""
+    """Terrain space that they are drawn from: super_gaussian, course, or file.py:CLASS."""
     seed: int = setting(0, least=0)
     """Draws terrains and starts."""
     out: Path | None = None
@@ -70,7 +70,7 @@ class Calibrate(Who, Where):
         from qd.workers import evaluator as workers
         from sim.crossing import CrossingCfg
         from sim.robots.robot import get_robot
-        from sim.space import get_space
+        from sim.space import load_space
 
         check(self)
         robot = get_robot(self.robot or "anymal")
@@ -91,7 +91,7 @@ class Calibrate(Who, Where):
             num_envs=self.num_envs,
             space=self.space,
         )
-        genes = get_space(self.space).hard_random(self.terrains, self.seed)
+        genes = load_space(self.space).hard_random(self.terrains, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self.terrains, np.uint32)
         out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
         kept = _Kept(out.with_name(f"{out.stem}.part.npz"), robot, evaluator, [self.seed, self.terrains])
@@ -165,7 +165,9 @@ class _Kept:
             penalty_names=self._names,
         )
         controller = controller_hash(evaluator.policy)
-        way = [robot_identity(robot), controller, evaluator.space, evaluator.num_replicas, *drawn]
+        from sim.space import space_identity
+
+        way = [robot_identity(robot), controller, space_identity(evaluator.space), evaluator.num_replicas, *drawn]
         way += [evaluator.device.startswith("cuda"), code_fingerprint(("kernels", "sim")), *self._names]
         self._key = None if controller is None else hashlib.sha256(json.dumps(way).encode()).hexdigest()
 

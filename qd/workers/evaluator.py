@@ -82,7 +82,7 @@ class EvaluatorCfg:
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
-    """Terrain space of the genes."""
+    """Terrain space of the genes, as :func:`sim.space.load_space` takes it."""
 
     @property
     def num_workers(self) -> int:
@@ -137,7 +137,7 @@ class Evaluate(Protocol):
         """Cross each terrain once a replica.
 
         Args:
-            terrains: Genes, shape (num_terrains, 64), or heights [m], shape (num_terrains, nrow, ncol).
+            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
             seeds: One a terrain, uint32.
             progress: Called now and then with the share that is done.
         """
@@ -222,7 +222,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
     from sim.robots.robot import get_robot
     from sim.rollout import CrossingCfg, Rollout
-    from sim.space import get_space
+    from sim.space import load_space
 
     return Rollout(
         get_robot(cfg.robot),
@@ -232,7 +232,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
         num_envs=cfg.envs_of_worker,
         device=cfg.device,
         cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
-        space=get_space(cfg.space),
+        space=load_space(cfg.space),
     )
 
 

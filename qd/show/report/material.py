@@ -101,7 +101,7 @@ def gather(cfg: "Report") -> Material:
         ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
     """
     _refuse_unbegun(cfg.run, cfg)
-    found = find_archive(cfg.robot, cfg.run, cfg.policy)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot, run = found.archive, found.robot, found.run
     if not len(archive):
         raise ValueError(

@@ -20,7 +20,6 @@ from sim.bank import heights_of
 from sim.crossing import CrossingCfg
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
-from sim.space import get_space
 
 _FRAME_S = 0.04
 """Real time from one shown frame to the next."""
@@ -196,7 +195,7 @@ class App:
 
     def _show_elite(self) -> None:
         elite = self._selection.picked
-        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], get_space(self._archive.space))[0])
+        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], self._show.found.space)[0])
         self._panel.show_elite(self._axes.details(elite))
         self._show_crossings()
 
