@@ -88,9 +88,7 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     version = str(read_arrays(path, ["format"])["format"]) if "format" in found else "none"
     if version != FORMAT:
         raise ValueError(f"its format must be '{FORMAT}', got {version}")
-    absent = {
-        name for name, other in (("genes", "heights"), ("heights", "genes")) if name not in found and other in found
-    }
+    absent = {"genes", "heights"} - {*found} if {"genes", "heights"} & {*found} else set()
     late = {"invalidity"} - {*found}  # the first recordings have none
     content = read_arrays(path, [name for name in _NAMES if name not in absent | late])
     return content | {name: np.zeros(content["outcome"].shape, np.uint8) for name in late}

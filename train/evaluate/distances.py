@@ -53,10 +53,9 @@ def distances(flags: Distances) -> dict[str, Any]:
     archive = read_archive_of(found, path, flags.space)
     split = split_elites(archive, robot, flags.split_seed, spec=found.spec, run=path)
     count = flags.terrains or paper_terrains(robot)
-    sets = make_sets(
-        ("hard_random", "generated"), count, flags.seed, archive=archive, split=split, space=space_of(archive)
-    )
     space = space_of(archive)
+    both = ("hard_random", "generated")
+    sets = make_sets(both, count, flags.seed, archive=archive, split=split, space=space)
     train = archive.genes[split.train]
     nearest = {name: nearest_distance(found.terrains, train, space) for name, found in sets.items()}
     nearest["generated_far"] = nearest["generated"][far_part(nearest["generated"])]
