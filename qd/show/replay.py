@@ -122,7 +122,8 @@ def describe(replay: Replay) -> str:
             f"{replay.found.run}, elite {n} of {len(archive):,} of {archive.robot}, found in iteration "
             f"{archive.iteration[n]}, with ratios in {cells.describe(int(archive.cell[n]))}",
             *table,
-            f"  The terrain: {'; '.join(replay.found.space.describe(archive.genes[n]).splitlines())}.",
+            "  Its terrain:",
+            *(f"    {line}" for line in replay.found.space.describe(archive.genes[n]).splitlines()),
             "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
             again,
         ]

@@ -149,6 +149,7 @@ def _elite(shown: Shown, number: int) -> list[Block]:
     return [
         headed,
         paragraph(_told(shown, crossed, place)),
+        paragraph(f"Its terrain: {'; '.join(shown.material.space.describe(archive.genes[number]).splitlines())}."),
         drawn,
         _penalty_table(shown, crossed),
         _rate_table(crossed),
