@@ -352,5 +352,5 @@ def test_a_training_in_a_space_of_ones_own_goes_on_only_with_it(places, tmp_path
     there = move(ridges, tmp_path / "elsewhere")
     job = job_of(resumed(tmp_path / "run", iterations=2, space=there))
     assert job.mix.space.name == there and job.settings["space"] == ridges
-    with pytest.raises(ValueError, match="begun with other settings .*space"):
+    with pytest.raises(ValueError, match=r"begun with other settings .*space"):
         job_of(resumed(tmp_path / "run", iterations=2, space="course"))
