@@ -135,7 +135,7 @@ class Archive(Evaluation):
 
     robot: str
     space: str
-    """Name of the terrain space of the genes (:data:`sim.space.SPACES`)."""
+    """Name of the terrain space of the genes (:func:`sim.space.get_space`)."""
     penalties: tuple[str, ...]
     """Names of the P penalties, in the order of the ratios."""
     scales: tuple[float, ...]
@@ -154,6 +154,8 @@ class Archive(Evaluation):
     """Hash of the robot that was searched; None in a file of a version before there was one."""
     policy_sha256: str | None = None
     """Hash of its controller; None where it has no file."""
+    space_sha256: str | None = None
+    """Hash of the code of the terrain space; None of a shipped one."""
     penalty_definition: str = FIRST_DEFINITION
     """How its penalties are defined (:data:`kernels.penalties.PENALTY_DEFINITION`)."""
     fresh: FreshValues | None = None
@@ -163,7 +165,7 @@ class Archive(Evaluation):
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and definition of the penalties, as :func:`sim.robots.identity.identity` names them."""
-        return {name: getattr(self, name) for name in ("robot", *_HASHES)}
+        return {name: getattr(self, name) for name in ("robot", *_OF_IDENTITY)}
 
     def __len__(self) -> int:
         """Number of elites."""
@@ -241,7 +243,8 @@ class Archive(Evaluation):
         return replace(self, faults=other.faults.rows(place))
 
 
-_HASHES = ("robot_sha256", "policy_sha256", "penalty_definition")  # which a file may lack
+_OF_IDENTITY = ("robot_sha256", "policy_sha256", "penalty_definition")
+_HASHES = (*_OF_IDENTITY, "space_sha256")  # which a file may lack
 _SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations", *_HASHES)
 _PREFIX = "fresh_"
 _KINDS = {
@@ -361,10 +364,12 @@ def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
 
 
 def _check_shapes(archive: Archive) -> None:
-    from sim.space import get_space  # which imports Warp: not for `--help`
+    from sim.space import get_space, is_own  # which imports Warp: not for `--help`
 
     num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
-    columns = {"genes": get_space(archive.space).num_genes, "ratios": num_penalties}
+    # How many genes a space of one's own has only its code says, and reading an archive runs none.
+    num_genes = archive.genes.shape[-1] if is_own(archive.space) else get_space(archive.space).num_genes
+    columns = {"genes": num_genes, "ratios": num_penalties}
     columns |= {"penalty_mean": num_penalties, "penalty_std": num_penalties}
     for name, array in _arrays(archive).items():
         column = columns.get(name.removeprefix(_PREFIX))

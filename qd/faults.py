@@ -244,7 +244,7 @@ def _counts_in_mujoco_c(archive: Archive, numbers: NDArray[np.int64], work: Work
     from sim.space import get_space
 
     robot, device = get_robot(work.evaluator.robot), work.evaluator.device
-    heights = heights_of(archive.genes[numbers], get_space(archive.space), device=device)
+    heights = heights_of(archive.genes[numbers], get_space(archive.space, archive.space_sha256), device=device)
     seeds = elite_seeds(archive, work.seed, stream=_CONFIRM_STREAM)[numbers]
     starts = [draw_starts(robot, grid, int(seed), EPISODES, device) for grid, seed in zip(heights, seeds, strict=True)]
     fine, solver = resolved(robot)

@@ -24,7 +24,7 @@ from qd.run.settings import SearchCfg, as_settings, own_policy, suffix_of
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, open_evaluator, origin_of, resolve_device
 from qd.workers.invalid import tell_invalid
 from qd.workers.shards import taken
-from sim.files.command import Where, Who, command_line, naming_what_is_next
+from sim.files.command import InSpace, Where, Who, command_line, naming_what_is_next
 from sim.files.intervals import bootstrap_interval, wilson_interval
 from sim.policy.spec import spec_of
 from sim.robots.identity import identity
@@ -199,7 +199,7 @@ def numbers_of(again: FreshValues, cells: Cells, *, sampled: bool = False) -> di
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reevaluate(Who, Where):
+class Reevaluate(Who, Where, InSpace):
     """Evaluate every elite of a run again with 40 fresh episodes.
 
     An elite is the best of many noisy evaluations; its fresh episodes say what it is worth. The run's archive, numbers
@@ -235,10 +235,14 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         EvaluatorError: If a worker is lost; likewise.
     """
     from sim.robots.robot import get_robot, robot_of
+    from sim.space import get_space, load_space
 
     path = args.run or newest_run(get_robot(args.robot or "anymal"), args.policy)
     run = RunDirectory(path)
     config, cfg = run.read_config(), run.read_cfg()
+    if args.space is not None:
+        load_space(args.space)
+    get_space(cfg.space, cfg.space_sha256, file=path)
     robot = robot_of(as_settings(cfg), args.robot, path)
     seed = cfg.seed if args.seed is None else args.seed
     if seed < 0:
@@ -247,12 +251,15 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
     policy = own_policy(path, cfg, robot) if args.policy is None else spec_of(args.policy, robot)
     suffix = suffix_of(cfg, policy, robot)
     evaluator = evaluator_of(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
-    given = {"run": path, "policy": args.policy, "seed": args.seed, "device": args.device, "workers": args.workers}
+    given = {"run": path, "policy": args.policy, "space": args.space, "seed": args.seed}
+    given |= {"device": args.device, "workers": args.workers}
     again = f"Start again with:  {command_line('reevaluate', robot=robot.spec, **given)}"
     with claimed(path):
         loaded = run.load(cfg)
         if loaded is None:
-            go_on = command_line("archive", robot=robot.spec, resume=path, policy=args.policy, device=args.device)
+            go_on = command_line(
+                "archive", robot=robot.spec, resume=path, policy=args.policy, space=args.space, device=args.device
+            )
             raise ValueError(f"{path} has no finished iteration, expected at least one: go on with it with `{go_on}`")
         search, metrics = loaded
         with naming_what_is_next(f"{path} is as it was", lambda: again):

@@ -25,21 +25,24 @@ class RandomEmitter:
 
     Args:
         archive: The elites, of which it learns nothing.
-        space: Name of the terrain space.
+        space: What genes mean.
         method: ``uniform_random`` or ``hard_random``.
         batch_size: Terrains asked for at once.
         stream: Seed.
     """
 
+    space_sha256: str | None = None  # a checkpoint of a shipped space may lack it
+
     def __init__(
-        self, archive: GridArchive, space: str, method: str, batch_size: int, stream: np.random.SeedSequence
+        self, archive: GridArchive, space: TerrainSpace, method: str, batch_size: int, stream: np.random.SeedSequence
     ) -> None:
-        self.archive, self.space, self.method, self.batch_size = archive, space, method, batch_size
+        self.archive, self.method, self.batch_size = archive, method, batch_size
+        self.space, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
 
     def ask(self) -> NDArray[np.float32]:
         """Genes, shape (batch_size, num_genes)."""
-        space = get_space(self.space)
+        space = get_space(self.space, self.space_sha256)
         draw = space.uniform_random if self.method == "uniform_random" else space.hard_random
         return draw(self.batch_size, self._rng)
 
@@ -89,7 +92,7 @@ class Scheduler:
 
     def _emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
         if method.endswith("random"):
-            return RandomEmitter(self.result, space.name, method, cfg.batch_size, stream)
+            return RandomEmitter(self.result, space, method, cfg.batch_size, stream)
         if method == "map_elites":
             first, later = stream.spawn(2)
             return IsoLineEmitter(

@@ -162,7 +162,7 @@ def begin(cfg: SearchCfg) -> "Scheduler":
 
     return Scheduler(
         cfg.scheduler,
-        space=get_space(cfg.space),
+        space=get_space(cfg.space, cfg.space_sha256),
         num_cells=cfg.cells.num_cells,
         num_ratios=len(cfg.fitness.penalties),
         seed=cfg.seed,
@@ -224,7 +224,10 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
     if invalid is not None:
         print(f"Warning: {invalid}")
     if len(archive):
-        worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg))
+        from sim.space import to_be_named
+
+        space = to_be_named(job.evaluator.space)
+        worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg), space=space)
         print(f"Next, see the worst terrain:  {worst}")
     return archive
 

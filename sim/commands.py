@@ -82,7 +82,11 @@ class Crosscheck(Who, OnDevice):
     workers: int | None = setting(None, least=1)
     """Processes of plain MuJoCo, which always runs on the CPU; one a core if left out."""
     genes: Path | None = None
-    """Pool of terrains: an archive.npz, or any .npz with genes (num_terrains, 64); drawn hard-random if left out."""
+    """Pool of terrains: an archive.npz, or any .npz with genes (num_terrains, num_genes) and, if it is not
+    super_gaussian, the name of their space; drawn hard-random if left out."""
+    space: str | None = None
+    """Terrain space to draw from if --genes is left out, super_gaussian if this is too; or file.py:CLASS that a pool is
+    of."""
     elite: str | None = None
     """Exactly these of --genes instead of a choice by success rates: one number, several as in --elite "97 124", or
     all; --terrains and --between then count for nothing."""

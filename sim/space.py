@@ -1,103 +1,21 @@
-"""Terrain spaces: what a row of genes in [-1, 1] means. Another space is one more class and its line in ``SPACES``."""
+"""Terrain spaces: what a row of genes in [-1, 1] means. Another one is one more class and its place in ``SPACES``."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels import super_gaussian
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
-
-Seed = int | np.random.Generator
-"""What random terrains are drawn from. A Generator gives other terrains on each call, an int the same ones."""
-
-
-class TerrainSpace(Protocol):
-    """What a search needs of its terrains."""
-
-    @property
-    def name(self) -> str:
-        """What files and command lines call the space."""
-        ...
-
-    @property
-    def num_genes(self) -> int:
-        """Length of one row of genes."""
-        ...
-
-    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
-        """Turns genes into heights on the device.
-
-        Args:
-            genes: Warp array of floats, shape (num_terrains, num_genes); clipped to [-1, 1].
-            spacing: Distance of neighbouring nodes [m].
-            heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
-        """
-        ...
-
-    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
-        """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""
-        ...
-
-    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
-        """The parts of a terrain that can be taken away, each in words.
-
-        Args:
-            genes: One row, shape (num_genes,).
-        """
-        ...
-
-    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
-        """Genes of the same terrains without some of their parts, shape (num_terrains, num_genes).
-
-        Args:
-            genes: Shape (num_terrains, num_genes).
-            parts: Indices into :meth:`parts`.
-        """
-        ...
-
-    def describe(self, genes: ArrayLike) -> str:
-        """A terrain in words, one part a line.
-
-        Args:
-            genes: One row, shape (num_genes,).
-        """
-        return "\n".join(self.parts(genes))
-
-    def uniform_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
-        """Genes drawn uniformly from [-1, 1], shape (count, num_genes).
-
-        Raises:
-            ValueError: If ``count`` is not positive.
-        """
-        if count < 1:
-            raise ValueError(f"count must be at least 1, got {count}")
-        return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, self.num_genes)).astype(np.float32)
-
-    def validate(self, genes: ArrayLike) -> NDArray[np.float32]:
-        """Genes as float32, shape (num_terrains, num_genes), not clipped.
-
-        Raises:
-            ValueError: If the shape differs or a gene is not finite.
-        """
-        array = np.asarray(genes, dtype=np.float32)
-        if array.ndim != 2 or array.shape[1] != self.num_genes:
-            raise ValueError(
-                f"genes must have shape (num_terrains, {self.num_genes}), got {array.shape}: the space is {self.name}"
-            )
-        finite = np.isfinite(array).all(axis=1)
-        if not finite.all():
-            raise ValueError(f"genes must be finite, got NaN or infinity in row {int(np.argmin(finite))}")
-        return array
-
-
-def clipped(genes: ArrayLike) -> NDArray[np.float32]:
-    """Genes as every space has them: a copy clipped to [-1, 1]; the search itself is unbounded."""
-    return np.clip(np.asarray(genes, dtype=np.float32), -1.0, 1.0)
-
+from sim.policy.spec import ControllerSpec, controller_hash
+from sim.spaces.base import Seed as Seed
+from sim.spaces.base import TerrainSpace as TerrainSpace
+from sim.spaces.base import clipped as clipped
+from sim.spaces.course import COURSE
 
 _HEIGHT = PARAMETERS.index("w")
 
@@ -155,19 +73,85 @@ def _in_words(bump: NDArray[np.float64]) -> str:
 
 
 SUPER_GAUSSIAN = SuperGaussian()
-SPACES: dict[str, TerrainSpace] = {space.name: space for space in (SUPER_GAUSSIAN,)}
-"""Every space by its name."""
+SPACES: dict[str, TerrainSpace] = {space.name: space for space in (SUPER_GAUSSIAN, COURSE)}
+"""Every shipped space by its name."""
+_named: list[TerrainSpace] = []
+"""Spaces of a user's own that this process was told to run."""
 
 
-def get_space(name: str) -> TerrainSpace:
-    """A terrain space by its name.
+def is_own(name: str) -> bool:
+    """Whether a space is code of a user's own."""
+    return name not in SPACES and ControllerSpec.parse(name).runs_code
+
+
+def to_be_named(name: str) -> str | None:
+    """What commands have to name (--space) for a space: it, if it is a user's own code; else nothing."""
+    return name if is_own(name) else None
+
+
+def space_identity(name: str) -> str:
+    """What the terrains of a space depend on: its name, or the hash of its code where it has one."""
+    return (controller_hash(name) if is_own(name) else None) or name
+
+
+def load_space(named: str) -> TerrainSpace:
+    """A space that the command line names; one of a user's own is run, and :func:`get_space` finds it from then on.
+
+    Args:
+        named: A shipped space's name, ``file.py:Space`` or ``module:Space``.
 
     Raises:
-        ValueError: If there is none of that name.
+        ValueError: If there is no such space, or it does not work.
     """
-    if name not in SPACES:
-        raise ValueError(f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}")
-    return SPACES[name]
+    if not is_own(named):
+        return get_space(named)
+    from sim.spaces.own import load_own  # with torch
+
+    digest = controller_hash(named)
+    for space in _named:
+        if space.name == named and space.sha256 == digest and digest is not None:
+            return space
+    space = load_own(named)
+    _named.insert(0, space)
+    return space
+
+
+def get_space(name: str, sha256: str | None = None, *, file: Path | None = None) -> TerrainSpace:
+    """A space that a record names; no code runs that :func:`load_space` did not run.
+
+    Args:
+        name: What the record calls it.
+        sha256: Hash of its code that the record names, by which one that has moved is known.
+        file: The record, for errors.
+
+    Raises:
+        ValueError: If there is no such space, the command line did not name it, or it has changed since.
+    """
+    if name in SPACES:
+        return SPACES[name]
+    where = "" if file is None else f"{file}: "
+    if not is_own(name):
+        raise ValueError(
+            f"{where}unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS "
+            "(docs/own-space.md)"
+        )
+    for space in _named:
+        if space.name == name if sha256 is None else space.sha256 == sha256:
+            return space
+    for space in _named:
+        if space.name == name:
+            raise ValueError(
+                f"{where}terrains are of the space {name} as it was: its code has changed since (expected SHA-256 "
+                f"{_short(sha256)}, got {_short(space.sha256)}): put back what was there then, or search anew"
+            )
+    raise ValueError(
+        f"{where}terrains are of the space {name}, which is code: name it again (--space {shlex.quote(name)}), since "
+        "no code runs that the command line does not name"
+    )
+
+
+def _short(digest: str | None) -> str:
+    return str(digest)[:12]
 
 
 def read_pool(path: Path) -> tuple[NDArray[np.float32], TerrainSpace]:
@@ -179,9 +163,11 @@ def read_pool(path: Path) -> tuple[NDArray[np.float32], TerrainSpace]:
     try:
         with np.load(path, allow_pickle=False) as content:
             genes = content["genes"]
-            space = get_space(str(content["space"])) if "space" in content else SUPER_GAUSSIAN
+            name = str(content["space"]) if "space" in content else SUPER_GAUSSIAN.name
+            digest = str(content["space_sha256"]) if "space_sha256" in content else None
     except Exception as error:  # a damaged zip archive can fail with anything
         raise ValueError(f"--genes {path}: expected an .npz file with an array 'genes', got: {error}") from error
+    space = get_space(name, digest, file=path)
     try:
         if not len(genes) or genes.dtype.kind != "f":
             raise ValueError(f"they must be floats, one row a terrain, got {genes.dtype} of shape {genes.shape}")

@@ -93,6 +93,8 @@ def prepare(folder: Path) -> None:
     (walk,) = [code for code in code_of("README.md", "python") if "def act" in code]
     (folder / "mine" / "walk.py").write_text(walk)
     (folder / "mine" / "kick.py").write_text(KICK)
+    (ridges,) = code_of("docs/own-space.md", "python")
+    (folder / "mine" / "ridges.py").write_text(ridges)
     for name in ("mine/model.pt", "a.pt", "b.pt", "c.pt"):
         shutil.copy(ROOT / "results" / "anymal" / "C-G.pt", folder / name)
     Image.fromarray(np.tile(np.linspace(0, 200, 64, dtype=np.uint8), (32, 1))).save(folder / "hill.png")

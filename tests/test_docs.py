@@ -15,9 +15,11 @@ import torch
 import tyro
 
 import faultline
+from sim.bank import heights_of
 from sim.policy.loaders import load_policy
 from sim.robots.model import build_robot, effort_limits
 from sim.robots.robot import get_robot
+from sim.space import load_space
 from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.docs import PAGES, ROOT, code_of, commands_of, mentions_of, numbers_of, run_by_make, text_of
 from tests.sim.dogs import MASS, mjcf
@@ -231,6 +233,17 @@ def test_the_map_of_a_script_is_a_ramp_across_the_way(tmp_path, monkeypatch):
         assert hill["heights"].shape == (161, 321) and hill["heights"].dtype == np.float32
         at = hill["heights"][:, [0, 140, 170, 320]]  # x = 0, 7, 8.5 and 16 m
         np.testing.assert_allclose(at, np.tile([0, 0.15, 0.3, 0], (161, 1)), atol=1e-6)
+
+
+def test_the_space_of_a_page_makes_ridges(tmp_path):
+    (text,) = code_of("docs/own-space.md", "python")
+    assert len(text.splitlines()) <= 30
+    (tmp_path / "ridges.py").write_text(text)
+    space = load_space(f"{tmp_path}/ridges.py:Ridges")
+    genes = np.array([1.0, 0.0, 0.0])  # 0.3 m high, 0.9 m apart: crests at x = 8 m and 8.9 m
+    heights = heights_of(genes[None], space)[0, 80]
+    np.testing.assert_allclose(heights[[80, 160, 169, 178, 240]], [0, 0.3, 0, 0.3, 0], atol=1e-6)
+    assert space.describe(genes) == "ridges of 0.30 m, 0.90 m apart"
 
 
 COMMANDS = ["archive", "train", "finetune", "evaluate", "report", "view", "bench"]

@@ -16,6 +16,11 @@ _REWARDS = {"termination": -200.0, "tracking_lin_vel": 2.0}  # the best of six w
 _PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005, final_kl=0.002)
 
 
+def shipped_space(settings: dict[str, Any]) -> str | None:
+    """The terrain space that a training's settings name; None for one of a user's own, which its command line names."""
+    return None if settings.get("space_sha256") else settings.get("space")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Finetune(TrainingFlags):
     """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
@@ -34,6 +39,9 @@ class Finetune(TrainingFlags):
     archive: Path | None = None
     """Run of a search, or its archive.npz, for mix generated; results/<robot>/archive, or of a robot without one
     its newest run under runs/."""
+    space: str | None = None
+    """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Elites of
+    a space of one's own, and a resumed training on it, need it named here."""
     split_seed: int = setting(0, least=0)
     """Which elites are held out for the evaluation."""
     draw: Literal["uniform", "failing"] = "uniform"
@@ -65,6 +73,7 @@ class Finetune(TrainingFlags):
             **settings["mix"],
             "policy": None if policy == "shipped" else Path(policy),
             "archive": None if archive is None else Path(archive["path"]),
+            "space": shipped_space(settings),
             "task": "crossing" if task["crosses"] else "commands",
             "rewards": task["rewards"],
         }

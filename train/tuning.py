@@ -10,8 +10,8 @@ from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
-from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, split_elites
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space, load_space, to_be_named
+from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, space_of, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import Start, read_start
 from train.ppo.run import (
@@ -103,6 +103,7 @@ class FineTuning(Training):
             robot=self.job.robot.spec,
             policies=[f"base={self.job.settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
             archive=archive and archive["path"],
+            space=to_be_named(self.mix.space.name),
             split_seed=(self.job.settings["split_seed"] or None) if archive else None,
         )
 
@@ -131,6 +132,8 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
     if size["num_envs"] < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
+    if saved is not None:
+        _check_space(flags, saved["extra"]["settings"])
     genes, space, archive = _elites(flags, robot)
     settings = {
         **common,
@@ -140,6 +143,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         "split_seed": flags.split_seed,
         "critic_iterations": alone,
         **({"trained_before": before} if before else {}),
+        **_named(space, saved),
     }
     if saved is not None:
         _refuse_changes(flags, saved, settings)
@@ -171,19 +175,42 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace,
     if flags.mix != "generated":
         if flags.archive is not None:
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
-        return np.zeros((0, SUPER_GAUSSIAN.num_genes), np.float32), SUPER_GAUSSIAN, None
+        space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
+        return np.zeros((0, space.num_genes), np.float32), space, None
     named = None if flags.policy is None else str(flags.policy)
     path = flags.archive or published_or_newest(robot, named, flag="archive")
     try:
-        archive = read_archive_of(robot, path)
+        archive = read_archive_of(robot, path, flags.space)
     except FileNotFoundError as error:
         make = command_line("archive", robot=robot.spec, policy=named)
         raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error
     rows = split_elites(archive, robot.name, flags.split_seed, spec=robot.spec, run=path).train
-    return archive.genes[rows], get_space(archive.space), {
+    return archive.genes[rows], space_of(archive), {
         "path": str(path), "archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows),
         "elites_sha256": elites_sha256(archive),
     }  # fmt: skip
+
+
+def _named(space: TerrainSpace, saved: dict[str, Any] | None) -> dict[str, Any]:
+    """What settings say of a terrain space; a run of a user's own goes on with the name that it began with."""
+    if space is SUPER_GAUSSIAN:  # the only one at first, which no settings name
+        return {}
+    there = {} if saved is None else saved["extra"]["settings"]
+    moved = space.sha256 is not None and there.get("space_sha256") == space.sha256
+    return {"space": there["space"] if moved else space.name, "space_sha256": space.sha256}
+
+
+def _check_space(flags: Finetune, there: dict[str, Any]) -> None:
+    """Refuses to go on without the terrain space that a run was begun in, or with one that has changed.
+
+    Raises:
+        ValueError: If it is a user's own that the command line does not name, or another now.
+    """
+    if there.get("space") is None:
+        return
+    if flags.space is not None:
+        load_space(flags.space)
+    get_space(there["space"], there.get("space_sha256"), file=flags.resume)
 
 
 def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, Any]) -> None:

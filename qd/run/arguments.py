@@ -27,6 +27,7 @@ from sim.files.command import Where, Who, command_line
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
+    from sim.space import TerrainSpace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +50,8 @@ class Archive(Who, Where):
     run_dir: Path | None = None
     """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
     space: str | None = None
-    """Terrain space: super_gaussian (the paper's eight bumps) is the only one so far."""
+    """Terrain space: super_gaussian, the paper's eight bumps; course, man-made elements; or one of your own,
+    file.py:CLASS. super_gaussian if left out."""
     replicas: int | None = None
     """Episodes a terrain."""
     method: str | None = None
@@ -63,7 +65,7 @@ class Archive(Who, Where):
     learning_rate: float | None = None
     """Step of a cell's acceptance threshold."""
     sigma0: float | None = None
-    """First step size of an emitter."""
+    """First step size of an emitter; what the terrain space has, 2 of super_gaussian and 0.5 of course."""
     restart_rule: str | None = None
     """When emitters restart: a number of iterations, basic or no_improvement."""
     es: str | None = None
@@ -139,7 +141,7 @@ def job_of(args: Archive) -> Job:
         ValueError: If robot, preset, device, controller, space, a setting or the run directory is not as it must be.
     """
     from sim.robots.robot import get_robot, robot_of
-    from sim.space import get_space
+    from sim.space import to_be_named
 
     if args.confirm == "yes" and args.reproduce == "no":
         raise ValueError("--confirm yes needs the fresh episodes that --reproduce no leaves out: give one of the two")
@@ -153,6 +155,8 @@ def job_of(args: Archive) -> Job:
     )
     device = resolve_device(args.device, args.workers)
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
+    space, of_space = _space_of(args, there)
+    changes |= of_space
     if args.without is not None:
         changes["penalties"] = kept_penalties(robot, args.without)
     moved = None
@@ -167,11 +171,13 @@ def job_of(args: Archive) -> Job:
         path = _free_path(args, cfg, robot)
         if told := robot.scaled_by_another(policy_spec(cfg, robot)):
             print(told)
-    get_space(cfg.space)
     now = origin_of(device, cfg.seed, args.workers)
     named = moved or code_of(cfg)
     at_end = {name: _at_end(getattr(args, name), cfg) for name in ("reproduce", "confirm")}
-    later = {"robot": robot.spec, "run": path, "policy": named, "device": args.device, "workers": args.workers}
+    later = {
+        "robot": robot.spec, "run": path, "policy": named, "space": to_be_named(space.name), "device": args.device,
+        "workers": args.workers,
+    }  # fmt: skip
     return Job(
         cfg=cfg,
         path=path,
@@ -189,6 +195,25 @@ def job_of(args: Archive) -> Job:
     )
 
 
+def _space_of(args: Archive, there: SearchCfg | None) -> "tuple[TerrainSpace, dict[str, Any]]":
+    """The terrain space of a search, loaded, and what it changes of the settings.
+
+    Raises:
+        ValueError: If there is none of that name, it does not work, or the run's own is not named or has changed.
+    """
+    from sim.space import SUPER_GAUSSIAN, get_space, load_space
+
+    given = None if args.space is None else load_space(args.space)
+    if there is None:
+        space = given or SUPER_GAUSSIAN
+        sigma0 = space.sigma0 if args.sigma0 is None else args.sigma0
+        return space, {"space": space.name, "space_sha256": space.sha256, "sigma0": sigma0}
+    moved = given is not None and given.sha256 is not None and given.sha256 == there.space_sha256
+    if given is not None and given.name != there.space and not moved:
+        return given, {"space": given.name, "space_sha256": given.sha256}  # which the run refuses
+    return get_space(there.space, there.space_sha256, file=args.resume), {"space": None}
+
+
 def _at_end(asked: str, cfg: SearchCfg) -> bool:
     return asked == "yes" or (asked == "auto" and cfg.preset != "small")
 
@@ -199,10 +224,12 @@ def own_file(robot: "RobotCfg") -> dict[str, Any]:
 
 
 def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | None) -> str:
+    from sim.space import to_be_named
+
     at_end = {name: None if getattr(args, name) == "auto" else getattr(args, name) for name in ("reproduce", "confirm")}
     return command_line(
-        "archive", robot=robot.spec, resume=path, policy=policy, device=args.device, workers=args.workers,
-        num_envs=args.num_envs, **at_end,
+        "archive", robot=robot.spec, resume=path, policy=policy, space=args.space and to_be_named(args.space),
+        device=args.device, workers=args.workers, num_envs=args.num_envs, **at_end,
     )  # fmt: skip
 
 
@@ -230,6 +257,8 @@ def evaluator_of(
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot.
     """
+    from sim.space import get_space
+
     check_policy(policy, robot, device)
     return EvaluatorCfg(
         robot=robot,
@@ -240,7 +269,7 @@ def evaluator_of(
         workers=workers,
         lots=cfg.scheduler.groups,
         num_envs=num_envs,
-        space=cfg.space,
+        space=get_space(cfg.space, cfg.space_sha256).name,  # where its code is now
     )
 
 

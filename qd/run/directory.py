@@ -107,17 +107,42 @@ def named_by(run: Path, archive: Archive) -> dict[str, Any]:
     return archive.named() | {name: settings[name] for name in ("robot_sha256", "policy_sha256") if name in settings}
 
 
-def read_archive_of(robot: "RobotCfg", run: Path) -> Archive:
+def read_archive_of(robot: "RobotCfg", run: Path, space: str | None = None) -> Archive:
     """An archive whose terrains alone are taken; of another robot's name it is for the caller to refuse.
+
+    Args:
+        robot: Who is to cross them.
+        run: Run directory or archive file.
+        space: Terrain space that the command line names.
 
     Raises:
         FileNotFoundError: If there is none.
-        ValueError: If it is damaged, or of the robot as it was before it changed.
+        ValueError: If it is damaged, of the robot as it was before it changed, or of a space of a user's own that the
+            command line does not name or that has changed.
     """
     archive = read_archive(run)
+    check_space(archive, run, space)
     if archive.robot == robot.name:
         check_robot(named_by(run, archive), robot, run, "put back what was there then, or give another archive")
     return archive
+
+
+def check_space(archive: Archive, run: Path, named: str | None) -> None:
+    """Has the terrain space of an archive at hand.
+
+    Args:
+        archive: The archive.
+        run: Where it lies, for errors.
+        named: Terrain space that the command line names.
+
+    Raises:
+        ValueError: If it is none, or one of a user's own that the command line does not name or that has changed.
+    """
+    from sim.space import get_space, load_space  # which imports Warp: not for `--help`
+
+    if named is not None:
+        load_space(named)
+    get_space(archive.space, archive.space_sha256, file=run)
 
 
 def folder_for(run: Path, robot: str) -> Path:
@@ -344,6 +369,7 @@ def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
         iterations=iterations,
         robot_sha256=cfg.robot_sha256,
         policy_sha256=cfg.policy_sha256,
+        space_sha256=cfg.space_sha256,
         penalty_definition=cfg.penalty_definition,
         **elites,
     )

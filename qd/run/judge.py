@@ -15,7 +15,7 @@ from qd.run.arguments import evaluator_of
 from qd.run.directory import CONFIG_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed, newest_run
 from qd.run.settings import SearchCfg, as_settings, code_of, is_searched, own_policy
 from qd.workers.evaluator import check_policy, open_evaluator, origin_of, resolve_device
-from sim.files.command import OfRobot, Where, Who, chosen_elites, command_line, naming_what_is_next
+from sim.files.command import InSpace, OfRobot, Where, Who, chosen_elites, command_line, naming_what_is_next
 from sim.files.intervals import rate_words
 from sim.files.settings import setting
 from sim.policy.spec import controllers_of, spec_of
@@ -30,7 +30,7 @@ PANEL_FOLDER = "panel"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Confirm(Who, Where):
+class Confirm(Who, InSpace, Where):
     """Cross the failing elites of a run again with contact resolved: are they the controller's failures?
 
     An elite fails if under half of the robots reach the goal in its 40 fresh episodes. It is confirmed if under half do
@@ -51,7 +51,7 @@ class Confirm(Who, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Certify(OfRobot, Where):
+class Certify(OfRobot, InSpace, Where):
     """Let other controllers cross the failing elites of a run: which of them can be crossed?
 
     A certificate says that a controller reaches the goal in at least half of 20 episodes at the search's settings, and
@@ -89,10 +89,14 @@ class _Judged:
 def _config_of(args: Confirm | Certify) -> tuple[Path, SearchCfg, "RobotCfg"]:
     """Directory, search and robot of the run that a command line names."""
     from sim.robots.robot import get_robot, robot_of
+    from sim.space import get_space, load_space
 
     policy = args.policy if isinstance(args, Confirm) else None
     path = args.run or newest_run(get_robot(args.robot or "anymal"), policy)
     cfg = RunDirectory(path).read_cfg()
+    if args.space is not None:
+        load_space(args.space)
+    get_space(cfg.space, cfg.space_sha256, file=path)
     return path, cfg, robot_of(as_settings(cfg), args.robot, path)
 
 

@@ -48,8 +48,8 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> st
     return "\n".join(
         [
             f"Searching for terrains that break {cfg.robot} with {controller}, each in its own way.",
-            f"  preset {cfg.preset}, seed {cfg.seed}: {iterations} of {cfg.scheduler.num_terrains} terrains x "
-            f"{cfg.replicas} episodes of up to 20 s",
+            f"  preset {cfg.preset}, seed {cfg.seed}, space {cfg.space}: {iterations} of "
+            f"{cfg.scheduler.num_terrains} terrains x {cfg.replicas} episodes of up to 20 s",
             f"  {left * cfg.episodes_per_iteration:,} episodes on {where}: about {duration}, and a minute or two more "
             "where kernels must be compiled",
             f"  {cfg.cells.num_cells:,} reachable cells of {len(cfg.fitness.penalties)} penalties; results in {path}",

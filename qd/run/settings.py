@@ -110,7 +110,9 @@ class SearchCfg:
     fitness: FitnessCfg
     scheduler: SchedulerCfg
     space: str = "super_gaussian"
-    """Terrain space (:data:`sim.space.SPACES`)."""
+    """Terrain space, as :func:`sim.space.load_space` takes it."""
+    space_sha256: str | None = None
+    """Hash of its code if it is a user's own."""
     robot_sha256: str | None = None
     """Hash of the robot's settings, model and meshes; None in a run of a version before there was one."""
     penalty_definition: str = FIRST_DEFINITION

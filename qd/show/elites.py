@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.fitness import FAILING_GOAL_RATE, FitnessCfg
-from qd.run.directory import CONFIG_FILE, RunDirectory, directory_of, named_by, newest_or_published
+from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, named_by, newest_or_published
 from qd.run.settings import SearchCfg, own_policy, suffix_of
 from sim.files.command import chosen_elites, command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, label_suffix, spec_of
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
+    from sim.space import TerrainSpace
 
 _USUAL_ROBOT = "anymal"
 
@@ -35,11 +36,21 @@ class Found:
         return directory_of(self.run)
 
     @property
+    def space(self) -> "TerrainSpace":
+        """What the genes mean."""
+        from sim.space import get_space
+
+        return get_space(self.archive.space, self.archive.space_sha256)
+
+    @property
     def go_on(self) -> str:
         """How to let the search go on, for errors."""
+        from sim.space import to_be_named
+
         searched, _ = self.as_searched()
         code = searched if ControllerSpec.parse(searched).runs_code else None
-        more = {"resume": self.folder, "policy": code, "iterations": 2 * max(self.archive.iterations, 1)}
+        more = {"resume": self.folder, "policy": code, "space": to_be_named(self.space.name)}
+        more["iterations"] = 2 * max(self.archive.iterations, 1)
         return f"let its search go on with `{command_line('archive', robot=self.robot.spec, **more)}`"
 
     def as_searched(self) -> tuple[str, FitnessCfg]:
@@ -122,17 +133,19 @@ def robot_named(name: str | None) -> "RobotCfg":
     return get_robot(name or _USUAL_ROBOT)
 
 
-def find_archive(named: str | None, run: Path | None, policy: str | None = None) -> Found:
+def find_archive(named: str | None, run: Path | None, policy: str | None = None, *, space: str | None = None) -> Found:
     """The archive of a run; without one the robot's newest under runs/, else its published one.
 
     Args:
         named: The robot, as the command line names it; left out, that of the run.
         run: Run directory or archive file.
         policy: Controller that the command line names, for the command that makes an archive.
+        space: Terrain space that the command line names.
 
     Raises:
         FileNotFoundError: If there is none.
-        ValueError: If it is damaged, of another robot, or of penalties that the robot does not have.
+        ValueError: If it is damaged, of another robot, of penalties that the robot does not have, or of a terrain space
+            that is not at hand.
     """
     from sim.robots.robot import robot_of
 
@@ -141,6 +154,7 @@ def find_archive(named: str | None, run: Path | None, policy: str | None = None)
     run = run or newest_or_published(robot_named(named), policy)
     archive = read_archive(run)
     robot = robot_of(named_by(run, archive), named, run)
+    check_space(archive, run, space)
     unknown = [name for name in archive.penalties if name not in robot.penalties]
     if unknown:
         raise ValueError(

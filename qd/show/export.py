@@ -58,9 +58,8 @@ def export(cfg: Export) -> list[Path]:
     """
     from sim.bank import heights_of
     from sim.maps.terrain_files import check_formats, write_terrain
-    from sim.space import get_space
 
-    found = find_archive(cfg.robot, cfg.run)
+    found = find_archive(cfg.robot, cfg.run, space=cfg.space)
     elites = chosen_elites(cfg.elite, len(found.archive), found.run)
     formats = list(dict.fromkeys(split_words(cfg.formats)))
     check_formats(formats)
@@ -69,15 +68,16 @@ def export(cfg: Export) -> list[Path]:
         _refuse_to_replace(folder, elites)
     _check_room(folder, len(elites), formats)
     prepare_output(folder / INDEX_FILE)
-    origin = {"run": str(found.run), **provenance("cpu", 0)}
+    of_space = {"space": found.archive.space, "space_sha256": found.archive.space_sha256}
+    origin = {"run": str(found.run), **of_space, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
     archive, files, index = found.archive, [], []
-    space = get_space(archive.space)
+    space = found.space
     with tqdm(total=len(elites), desc="exporting", unit="elite", file=sys.stderr, disable=None) as bar:
         for first in range(0, len(elites), _AT_ONCE):
             numbers = elites[first : first + _AT_ONCE]
             for elite, heights in zip(numbers, heights_of(archive.genes[numbers], space), strict=True):
-                about = about_elite(archive, elite)
+                about = {**about_elite(archive, elite), "terrain": space.describe(archive.genes[elite])}
                 stem = folder / f"elite-{elite}"
                 genes: NDArray[np.float32] = archive.genes[elite]
                 files += write_terrain(stem, heights, formats=formats, about={**about, **origin}, genes=genes)

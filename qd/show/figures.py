@@ -267,6 +267,7 @@ def summary(
         **origin,
         **archive.named(),
         "space": archive.space,
+        "space_sha256": archive.space_sha256,
         "iterations": archive.iterations,
         "terrains_evaluated": sum(row["terrains"] for row in metrics),
         "episodes": sum(row["episodes"] for row in metrics),

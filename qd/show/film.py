@@ -108,7 +108,7 @@ def _elite_orders(cfg: Film) -> Iterator[Order]:
     """Films of elites, whose recordings are written before the first is made."""
     from qd.show.recordings import Recordings, on_elite
 
-    found = find_archive(cfg.robot, cfg.run, cfg.policy)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot = found.archive, found.robot
     elites = chosen_elites(cfg.elite, len(archive), found.run)
     policy = found.policy(cfg.policy)

@@ -42,7 +42,7 @@ class Wanted:
     label: str = field(compare=False)
     """What the terrain is, in words."""
     terrain: NDArray[np.float32] = field(compare=False)
-    """Genes, shape (64,), or heights [m], shape (nrow, ncol)."""
+    """Genes, shape (num_genes,), or heights [m], shape (nrow, ncol)."""
     policy: str
     """The controller."""
     replicas: int
@@ -52,7 +52,7 @@ class Wanted:
     terrain_seed: int
     """Seed of the terrain's episodes."""
     space: str = "super_gaussian"
-    """Terrain space of genes."""
+    """Terrain space of genes, as :func:`sim.space.load_space` takes it."""
 
     def __post_init__(self) -> None:
         if self.replicas < 1 or self.seed < 0:
@@ -73,8 +73,10 @@ def on_elite(
         label: What the terrain is, in words.
 
     Raises:
-        ValueError: If a number is out of range.
+        ValueError: If a number is out of range, or the terrain space is not at hand.
     """
+    from sim.space import get_space
+
     return Wanted(
         label=label or f"elite {number} of {archive.robot}",
         terrain=archive.genes[number],
@@ -82,7 +84,7 @@ def on_elite(
         replicas=replicas,
         seed=seed,
         terrain_seed=int(episode_seeds(max(seed, 0), number, 1, stream=_STREAM)[0]),
-        space=archive.space,
+        space=get_space(archive.space, archive.space_sha256).name,
     )
 
 
@@ -116,14 +118,14 @@ class Simulation:
         """
         from sim.recording.recorder import record
         from sim.rollout import Rollout
-        from sim.space import get_space
+        from sim.space import load_space
 
         first = wanted[0]
         kind = (first.policy, len(wanted), first.replicas, first.space)
         if kind not in self._rollouts:
             self._rollouts[kind] = Rollout(
                 self._robot, first.policy, num_terrains=kind[1], num_replicas=kind[2], device=self._device,
-                space=get_space(first.space),
+                space=load_space(first.space),
             )  # fmt: skip
         _, recording = record(
             self._rollouts[kind],
@@ -243,13 +245,18 @@ class Recordings:
         return None if self._published is None else self._published / f"{self._key(wanted, '')}.npz"
 
     def _key(self, wanted: Wanted, code: str) -> str:
+        from sim.space import SUPER_GAUSSIAN, space_identity
+
         identity: list[Any] = [self._about, controller_hash(wanted.policy), [wanted.terrain_seed]]
         identity += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), code]
+        if wanted.space != SUPER_GAUSSIAN.name:  # the only one at first, which no name says
+            identity.append(space_identity(wanted.space))
         return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:_KEY_LENGTH]
 
     def _is(self, recording: "Recording", wanted: Wanted) -> bool:
         """Whether a recording is of just these crossings; a file may have been renamed."""
         from sim.recording.recorder import space_in
+        from sim.space import space_identity
 
         terrain = recording.heights if recording.genes is None else recording.genes
         return (
@@ -257,7 +264,7 @@ class Recordings:
             and self._about.items() <= recording.origin.items()
             and recording.joint_names == self._robot.joint_names
             and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
-            and space_in(recording.origin) == wanted.space
+            and (recording.origin.get("space_sha256") or space_in(recording.origin)) == space_identity(wanted.space)
             and np.array_equal(terrain, wanted.terrain[None])
             and recording.seeds.tolist() == [wanted.terrain_seed]
             and np.array_equal(recording.replicas, np.arange(wanted.replicas))

@@ -69,7 +69,7 @@ def replay(cfg: ReplayElite) -> Replay:
         FileNotFoundError: If there is no archive, or no crossing of the certificate.
         ValueError: If there is no such elite, or robot, device or controller are not as they must be.
     """
-    found = find_archive(cfg.robot, cfg.run, cfg.policy)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot = found.archive, found.robot
     elite = found.one(cfg.elite)
     _, fitness = found.as_searched()
@@ -139,6 +139,8 @@ def describe(replay: Replay) -> str:
             f"{replay.found.run}, elite {n} of {len(archive):,} of {archive.robot}, found in iteration "
             f"{archive.iteration[n]}, with ratios in {cells.describe(int(archive.cell[n]))}",
             *table,
+            "  Its terrain:",
+            *(f"    {line}" for line in replay.found.space.describe(archive.genes[n]).splitlines()),
             "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
             again,
             *(f"  {line}" for line in elite_words(archive, n)),

@@ -11,7 +11,7 @@ from qd.show.figures import save_figure
 from sim.files.atomic import prepare_output
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
 
 _ROBOTS, _TERRAINS, _REPLICAS = 8, 20, 2
 _SEED = 3
@@ -32,20 +32,24 @@ class _Timeline:
         """Adds nothing."""
 
 
-def _terrains(run: Path | None) -> NDArray[np.float32]:
-    """Genes of elites from all ranks of a run, or of hard-random terrains."""
+def _terrains(run: Path | None) -> tuple[NDArray[np.float32], TerrainSpace]:
+    """Genes of elites from all ranks of a run, or of hard-random terrains, and what they mean."""
     if run is None:
-        return SUPER_GAUSSIAN.hard_random(_TERRAINS, _SEED)
-    genes = read_archive(run).genes
-    return genes[np.linspace(0, len(genes) - 1, _TERRAINS).astype(int)]
+        return SUPER_GAUSSIAN.hard_random(_TERRAINS, _SEED), SUPER_GAUSSIAN
+    archive = read_archive(run)
+    genes = archive.genes[np.linspace(0, len(archive) - 1, _TERRAINS).astype(int)]
+    return genes, get_space(archive.space, archive.space_sha256, file=run)
 
 
-def _run(robot: RobotCfg, genes: NDArray[np.float32], device: str, *, queued: bool) -> NDArray[np.int32]:
+def _run(
+    robot: RobotCfg, genes: NDArray[np.float32], space: TerrainSpace, device: str, *, queued: bool
+) -> NDArray[np.int32]:
     """Episode of each robot at each control step, -1 where it waits, shape (steps, robots)."""
     num_terrains = _TERRAINS if queued else _ROBOTS // _REPLICAS
     rollout = Rollout(
-        robot, robot.policy_file, num_terrains=num_terrains, num_replicas=_REPLICAS, num_envs=_ROBOTS, device=device
-    )
+        robot, robot.policy_file, num_terrains=num_terrains, num_replicas=_REPLICAS, num_envs=_ROBOTS, device=device,
+        space=space,
+    )  # fmt: skip
     seeds, timeline, rows = np.arange(_TERRAINS, dtype=np.uint32), _Timeline(rollout), []
     for first in range(0, _TERRAINS, num_terrains):
         own = slice(first, first + num_terrains)
@@ -70,12 +74,12 @@ def draw_timeline(file: Path, robot: str, run: Path | None, device: str) -> None
     from matplotlib.figure import Figure
 
     prepare_output(file)
-    cfg, genes = get_robot(robot), _terrains(run)
+    cfg, (genes, space) = get_robot(robot), _terrains(run)
     figure = Figure(figsize=(8.0, 4.4), layout="constrained")
     both = figure.subplots(2, 1, sharex=True)
     titles = (False, "one lot after the other"), (True, "a queue")
     for axes, (queued, title) in zip(both, titles, strict=True):
-        rows = _run(cfg, genes, device, queued=queued)
+        rows = _run(cfg, genes, space, device, queued=queued)
         for env, episodes in enumerate(rows.T):
             cuts = np.flatnonzero(np.diff(episodes, prepend=-2, append=-2))
             for begin, end in pairwise(cuts.tolist()):

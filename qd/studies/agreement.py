@@ -27,7 +27,7 @@ from qd.workers.evaluator import (
     resolve_device,
 )
 from qd.workers.invalid import refuse_all_invalid
-from sim.files.command import Where, Who, chosen_elites, naming_what_is_next, publish
+from sim.files.command import InSpace, Where, Who, chosen_elites, naming_what_is_next, publish
 from sim.files.intervals import value_words
 from sim.files.settings import check, setting
 
@@ -55,7 +55,7 @@ _WORDS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Agreement(Who, Where):
+class Agreement(Who, InSpace, Where):
     """Measure how far rates at the search's settings lie from contact resolved and from MuJoCo C.
 
     Hard-random terrains and elites, drawn at random and not by their rates, are crossed twice at the search's settings
@@ -189,7 +189,7 @@ def drawn(cfg: Agreement) -> Drawn:
     """
     from sim.mujoco_c.model import crossing_model
     from sim.robots.robot import get_robot
-    from sim.space import SUPER_GAUSSIAN, get_space, read_pool
+    from sim.space import SUPER_GAUSSIAN, read_pool
 
     _refuse_contradictions(cfg)
     robot = get_robot(cfg.robot or "anymal")
@@ -202,7 +202,7 @@ def drawn(cfg: Agreement) -> Drawn:
     elif cfg.elites:
         found = _archive(cfg, robot)
         robot, policy, source = found.robot, found.policy(cfg.policy), str(found.run)
-        space, number = get_space(found.archive.space), _rng(cfg, _ELITES).permutation(len(found.archive))
+        space, number = found.space, _rng(cfg, _ELITES).permutation(len(found.archive))
         number = number[: cfg.elites].tolist()
         sets["elites"] = TerrainSet(number=number, genes=found.archive.genes[number])
     if cfg.genes is None and cfg.terrains:
@@ -242,7 +242,7 @@ def _archive(cfg: Agreement, robot: "RobotCfg") -> "Found":
     from qd.show.elites import find_archive
 
     try:
-        found = find_archive(cfg.robot, cfg.run or published_or_newest(robot, cfg.policy), cfg.policy)
+        found = find_archive(cfg.robot, cfg.run or published_or_newest(robot, cfg.policy), cfg.policy, space=cfg.space)
     except FileNotFoundError as error:
         if cfg.run is not None:
             raise

@@ -44,7 +44,7 @@ class Calibrate(Who, Where):
     replicas: int = setting(20, least=1)
     """Episodes a terrain."""
     space: str = "super_gaussian"
-    """Terrain space that they are drawn from."""
+    """Terrain space that they are drawn from: super_gaussian, course, or file.py:CLASS."""
     seed: int = setting(0, least=0)
     """Draws terrains and starts."""
     out: Path | None = None
@@ -65,7 +65,7 @@ class Calibrate(Who, Where):
         from qd.workers import evaluator as workers
         from sim.crossing import CrossingCfg
         from sim.robots.robot import get_robot
-        from sim.space import get_space
+        from sim.space import load_space
 
         check(self)
         robot = get_robot(self.robot or "anymal")
@@ -86,7 +86,7 @@ class Calibrate(Who, Where):
             num_envs=self.num_envs,
             space=self.space,
         )
-        genes = get_space(self.space).hard_random(self.terrains, self.seed)
+        genes = load_space(self.space).hard_random(self.terrains, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self.terrains, np.uint32)
         out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
         kept = Kept(out, robot, evaluator, [self.seed, self.terrains])

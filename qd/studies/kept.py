@@ -34,8 +34,10 @@ class Kept:
 
     def __init__(self, out: Path, robot: "RobotCfg", evaluator: "EvaluatorCfg", drawn: list[Any]) -> None:
         self.file = out.with_name(f"{out.stem}.part.npz")
+        from sim.space import space_identity  # which imports Warp: not for `--help`
+
         controller = controller_hash(evaluator.policy)
-        way = [robot_identity(robot), controller, evaluator.space, evaluator.num_replicas, *drawn]
+        way = [robot_identity(robot), controller, space_identity(evaluator.space), evaluator.num_replicas, *drawn]
         way += [evaluator.device.startswith("cuda"), code_fingerprint(("kernels", "sim")), *robot.penalties]
         self._key = None if controller is None else hashlib.sha256(json.dumps(way).encode()).hexdigest()
 

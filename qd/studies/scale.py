@@ -52,9 +52,9 @@ def time_evaluation(cfg: EvaluatorCfg, rounds: int, seed: int) -> float:
     Raises:
         EvaluatorError: If fewer workers than wanted took part, or one had to be replaced.
     """
-    from sim.space import get_space
+    from sim.space import load_space
 
-    genes = get_space(cfg.space).hard_random(cfg.num_terrains, seed)
+    genes = load_space(cfg.space).hard_random(cfg.num_terrains, seed)
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
     with open_evaluator(cfg) as evaluate:
         seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]

@@ -82,7 +82,7 @@ class EvaluatorCfg:
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
-    """Terrain space of the genes."""
+    """Terrain space of the genes, as :func:`sim.space.load_space` takes it."""
     resolved: bool = False
     """Whether contact is resolved (:func:`sim.simulation.resolved`), which takes five times as long."""
 
@@ -139,7 +139,7 @@ class Evaluate(Protocol):
         """Cross each terrain once a replica.
 
         Args:
-            terrains: Genes, shape (num_terrains, 64), or heights [m], shape (num_terrains, nrow, ncol).
+            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
             seeds: One a terrain, uint32.
             progress: Called now and then with the share that is done.
         """
@@ -225,7 +225,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     from sim.robots.robot import get_robot
     from sim.rollout import CrossingCfg, Rollout
     from sim.simulation import SolverCfg, resolved
-    from sim.space import get_space
+    from sim.space import load_space
 
     robot = get_robot(cfg.robot)
     robot, solver = resolved(robot) if cfg.resolved else (robot, SolverCfg())
@@ -238,7 +238,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
         device=cfg.device,
         cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
         solver=solver,
-        space=get_space(cfg.space),
+        space=load_space(cfg.space),
     )
 
 

@@ -48,7 +48,7 @@ _MOST_TRIES = 5  # of which three may be bad luck
 
 @dataclass(frozen=True, kw_only=True)
 class Controller:
-    """A controller with the content of its files, which other machines need not have."""
+    """A controller, or other code, with the content of its files, which other machines need not have."""
 
     spec: ControllerSpec
     files: tuple[tuple[str, bytes], ...]
@@ -75,6 +75,12 @@ def _packed_robot(robot: Any) -> Any:
     return pack_robot(robot)
 
 
+def _packed_space(space: str) -> Controller | str:
+    from sim.space import is_own
+
+    return Controller.of(space) if is_own(space) else space
+
+
 _ray: Any = ray  # its annotations leave out what it documents
 
 
@@ -86,11 +92,19 @@ class RayWorker:
         cfg: Settings of the evaluator; the device is the one that Ray gave to this process.
         controller: Its controller.
         robot: Its robot, as :func:`sim.robots.own.pack_robot` packs it.
+        space: Its terrain space: a name, or code with its file.
         build: Makes the simulation of ``cfg`` for a number of terrains.
     """
 
-    def __init__(self, cfg: Any, controller: Controller, robot: Any, build: Callable[[Any, int], Crosser]) -> None:
-        self._cfg, self._controller, self._robot, self._build = cfg, controller, robot, build
+    def __init__(
+        self,
+        cfg: Any,
+        controller: Controller,
+        robot: Any,
+        space: Controller | str,
+        build: Callable[[Any, int], Crosser],
+    ) -> None:
+        self._cfg, self._controller, self._robot, self._space, self._build = cfg, controller, robot, space, build
         self._crosser: Crosser | None = None
         self._num_terrains = 0
         self._share = 0.0
@@ -112,7 +126,8 @@ class RayWorker:
         # The process may be killed at any time, so the folder must not live as long as it does.
         with tempfile.TemporaryDirectory(prefix="faultline-") as folder:
             robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(Path(folder) / "robot")
-            cfg = replace(self._cfg, policy=self._controller.unpacked(folder), robot=robot)
+            space = self._space if isinstance(self._space, str) else self._space.unpacked(tempfile.mkdtemp(dir=folder))
+            cfg = replace(self._cfg, policy=self._controller.unpacked(folder), robot=robot, space=space)
             self._crosser = self._build(cfg, num_terrains)
         self._num_terrains = num_terrains
 
@@ -202,8 +217,9 @@ class RayWorkers:
         gpus = int(cfg.device.startswith("cuda"))
         self._cfg, self._count = cfg, parse_workers(cfg.workers).count
         self._options = {"num_gpus": gpus, "num_cpus": 1 - gpus}
-        # Controller and robot travel once a machine, however many workers it has.
-        files = ray.put(Controller.of(cfg.policy)), ray.put(_packed_robot(cfg.robot))
+        # Controller, robot and space travel once a machine, however many workers it has.
+        packed = Controller.of(cfg.policy), _packed_robot(cfg.robot), _packed_space(cfg.space)
+        files = tuple(map(ray.put, packed))
         self._arguments = replace(cfg, device="cuda:0" if gpus else "cpu", robot=""), *files, build
         self._code = code_fingerprint(_ROOMS)
         self._workers: list[_Worker] = []

@@ -62,7 +62,15 @@ class Where(OnDevice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Which:
+class InSpace:
+    """The option that names the terrain space of a run."""
+
+    space: str | None = None
+    """Terrain space of the run, where it is one of your own: file.py:CLASS. What only the run names is not run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Which(InSpace):
     """Options that say which elite of which run."""
 
     run: Path | None = None

@@ -24,7 +24,7 @@ from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
 from sim.simulation import SolverCfg, resolve_device, resolved
-from sim.space import SUPER_GAUSSIAN, read_pool
+from sim.space import SUPER_GAUSSIAN, load_space, read_pool
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
@@ -59,7 +59,8 @@ class Comparison:
         self.device = resolve_device(cfg.device)
         self.policy = cfg.policy or self.robot.policy_file
         self.rng = np.random.default_rng([_KEY, cfg.seed])
-        self._pool, self.space = (None, SUPER_GAUSSIAN) if cfg.genes is None else read_pool(cfg.genes)
+        named = SUPER_GAUSSIAN if cfg.space is None else load_space(cfg.space)
+        self._pool, self.space = (None, named) if cfg.genes is None else read_pool(cfg.genes)
         self._named: list[int] | None = None
         if cfg.elite is not None:
             if self._pool is None:
@@ -147,6 +148,7 @@ class Comparison:
         return {
             **provenance(self.device, cfg.seed),
             **identity(self.robot, self.policy),
+            "space": self.space.name,
             "pool": "hard_random" if cfg.genes is None else str(cfg.genes),
             "looked_at": choice.looked_at,
             "ours": _settings(robot, time_constant_s),

@@ -1,7 +1,8 @@
 """Recordings on disk: one npz, read as data and checked before anything is made of it.
 
 The file holds the fields of :class:`sim.recording.recorder.Recording` as arrays of those names, ``origin`` as JSON, and
-``format`` as its name and version. Of terrains given by genes it holds no heights: the reader makes them again.
+``format`` as its name and version. Of terrains given by genes of a shipped space it holds no heights: the reader makes
+them again. Of a space of a user's own it holds both, so that reading runs no code.
 """
 
 import io
@@ -19,7 +20,7 @@ from sim.bank import heights_of
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, read_arrays
 from sim.recording.recorder import FRAME_ARRAYS, Recording, space_in
-from sim.space import get_space
+from sim.space import get_space, is_own
 
 FORMAT = "faultline recording 1"
 """Name and version in every file."""
@@ -53,7 +54,8 @@ def write_recording(path: Path, recording: Recording) -> None:
     content |= {name: content[name].astype(kept) for name, kept in FRAME_ARRAYS.items()}
     if recording.genes is not None:
         content["genes"] = recording.genes
-        del content["heights"]
+        if not is_own(space_in(recording.origin)):
+            del content["heights"]
     buffer = io.BytesIO()
     np.savez_compressed(buffer, format=FORMAT, origin=json.dumps(recording.origin), **content)
     write_atomically(path, buffer.getvalue())
@@ -90,9 +92,9 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     version = str(read_arrays(path, ["format"])["format"]) if "format" in found else "none"
     if version != FORMAT:
         raise ValueError(f"its format must be '{FORMAT}', got {version}")
-    absent = "heights" if "genes" in found else "genes"
+    absent = {"genes", "heights"} - {*found} if {"genes", "heights"} & {*found} else set()
     late = {"invalidity", "geom_names", "touching"} - {*found}  # the first recordings have none
-    content = read_arrays(path, [name for name in _NAMES if name != absent and name not in late])
+    content = read_arrays(path, [name for name in _NAMES if name not in absent | late])
     made = {"invalidity": np.zeros(content["outcome"].shape, np.uint8), "geom_names": np.array((), str)}
     return content | {name: made[name] for name in late & made.keys()}
 
@@ -127,9 +129,9 @@ def _check_shapes(content: dict[str, NDArray[Any]]) -> None:
     for name, shape in expected.items():
         if content[name].shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {content[name].shape}")
-    terrain, num_axes = ("genes", 2) if "genes" in content else ("heights", 3)
-    if content[terrain].ndim != num_axes or len(content[terrain]) != terrains:
-        raise ValueError(f"{terrain} must have {num_axes} axes and {terrains} terrains, got {content[terrain].shape}")
+    for name, num_axes in (("genes", 2), ("heights", 3)):
+        if name in content and (content[name].ndim != num_axes or len(content[name]) != terrains):
+            raise ValueError(f"{name} must have {num_axes} axes and {terrains} terrains, got {content[name].shape}")
     if not terrains or not episodes or not frames or not frames[0]:
         raise ValueError(f"it must have terrains, episodes and frames, got {(*each, *frames)}")
 
@@ -145,7 +147,8 @@ def _built(content: dict[str, NDArray[Any]]) -> Recording:
     origin = json.loads(values["origin"])
     if not isinstance(origin, dict):
         raise ValueError(f"origin must be a JSON object, got {type(origin).__name__}")
-    values["heights"] = content["heights"] if genes is None else heights_of(genes, get_space(space_in(origin)))
+    if "heights" not in content and genes is not None:
+        values["heights"] = heights_of(genes, get_space(space_in(origin)))
     return Recording(**values | {"origin": origin, "dt": float(content["dt"])})
 
 

@@ -52,7 +52,7 @@ class Recording:
     heights: NDArray[np.float32]
     """Height grids [m], shape (T, nrow, ncol), row along y, column along x, 0.05 m apart."""
     genes: NDArray[np.float32] | None
-    """Genes, shape (T, 64), of terrains that were given by them."""
+    """Genes, shape (T, num_genes), of terrains that were given by them."""
     seeds: NDArray[np.uint32]
     """Seed of each terrain's episodes, shape (T,)."""
     replicas: NDArray[np.int32]
@@ -257,7 +257,7 @@ def record(
 
     Args:
         rollout: The crossing, on any device.
-        terrains: Genes, shape (T, 64), or heights [m], shape (T, nrow, ncol).
+        terrains: Genes, shape (T, num_genes), or heights [m], shape (T, nrow, ncol).
         seeds: One a terrain, shape (T,), uint32.
         policy: What the rollout's controller was loaded from, to name and hash it.
         labels: What each terrain is, in words.
@@ -291,6 +291,7 @@ def record(
             **identity(robot, str(policy)),
             "policy": str(policy),
             "space": rollout.space.name,
+            "space_sha256": rollout.space.sha256,
             **provenance(device, seed),
         },
         **{name: getattr(result, name) for name in ("outcome", "invalidity", "fallen", "duration_s")},

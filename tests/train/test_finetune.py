@@ -10,10 +10,12 @@ import pytest
 import torch
 
 from qd.archive import write_archive
+from sim import space as spaces
 from sim.files.atomic import locked
 from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
+from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
 from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
@@ -338,3 +340,17 @@ def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeyp
     lines = capsys.readouterr().err.splitlines()
     (error,) = [line for line in lines if "names no hash" not in line]  # a warning of archives made by hand
     assert message in error and error.startswith("error: ")
+
+
+def test_a_training_in_a_space_of_ones_own_goes_on_only_with_it(places, tmp_path, monkeypatch):
+    ridges = write_ridges(tmp_path / "mine")
+    own = {"mix": "hard-random", "archive": None, "space": ridges, "iterations": 1, "run_dir": tmp_path / "run"}
+    assert finetune(config(places, **own)) == 0
+    monkeypatch.setattr(spaces, "_named", [])  # as in a program that has just begun
+    with pytest.raises(ValueError, match=r"which is code: name it again \(--space .*space.py:Ridges\)"):
+        job_of(resumed(tmp_path / "run", iterations=2))
+    there = move(ridges, tmp_path / "elsewhere")
+    job = job_of(resumed(tmp_path / "run", iterations=2, space=there))
+    assert job.mix.space.name == there and job.settings["space"] == ridges
+    with pytest.raises(ValueError, match=r"begun with other settings .*space"):
+        job_of(resumed(tmp_path / "run", iterations=2, space="course"))

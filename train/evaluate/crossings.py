@@ -27,6 +27,7 @@ from sim.policy.spec import controller_hash
 from sim.robots.identity import robot_identity
 from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
+from sim.space import space_identity
 from train.evaluate.measures import terrain_rates
 from train.evaluate.sets import TerrainSet
 
@@ -61,7 +62,8 @@ class KeptCrossings:
         """Where the crossings of one controller on one set are kept."""
         parts = [hashlib.sha256(part.tobytes()).hexdigest() for part in (terrains.terrains, terrains.seeds)]
         unhashed = policy if controller_hash(policy) is None else None
-        identity = [*self._common, unhashed, controller_hash(policy), *parts]
+        of_genes = [space_identity(terrains.space)] if terrains.terrains.ndim == 2 else []
+        identity = [*self._common, unhashed, controller_hash(policy), *parts, *of_genes]
         digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
         return self.folder / f"{terrains.name}-{digest[:24]}.npz"
 

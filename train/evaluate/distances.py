@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sim.files.command import OfRobot, publish
+from sim.files.command import InSpace, OfRobot, publish
 from sim.files.settings import check, setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distances(OfRobot):
+class Distances(OfRobot, InSpace):
     """Say how far test terrains lie from the nearest elite trained on: RMS of the heights' differences [m].
 
     Elites of one archive descend from each other, and a held-out one may be a near copy of one that was trained on.
@@ -45,17 +45,17 @@ def distances(flags: Distances) -> dict[str, Any]:
     from sim.files.provenance import provenance
     from sim.robots.identity import robot_identity
     from sim.robots.robot import get_robot
-    from sim.space import get_space
-    from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, split_elites
+    from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, space_of, split_elites
 
     check(flags)
     found = get_robot(flags.robot)
     robot, path = found.name, flags.archive or published_or_newest(found, flag="archive")
-    archive = read_archive_of(found, path)
+    archive = read_archive_of(found, path, flags.space)
     split = split_elites(archive, robot, flags.split_seed, spec=found.spec, run=path)
     count = flags.terrains or paper_terrains(robot)
-    sets = make_sets(("hard_random", "generated"), count, flags.seed, archive=archive, split=split)
-    space = get_space(archive.space)
+    space = space_of(archive)
+    both = ("hard_random", "generated")
+    sets = make_sets(both, count, flags.seed, archive=archive, split=split, space=space)
     train = archive.genes[split.train]
     nearest = {name: nearest_distance(found.terrains, train, space) for name, found in sets.items()}
     nearest["generated_far"] = nearest["generated"][far_part(nearest["generated"])]

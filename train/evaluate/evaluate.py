@@ -20,6 +20,7 @@ from sim.robots.identity import identity, robot_identity
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
+    from sim.space import TerrainSpace
     from train.evaluate.sets import EliteSplit
 
 _FULL = (300, 20)  # terrains a set and episodes a terrain of the published rates; tables take the paper's terrains
@@ -43,6 +44,9 @@ class Evaluate(Who, Where):
     """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
     split_seed: int = setting(0, least=0)
     """Which elites are held out: what the fine-tuning was told."""
+    space: str | None = None
+    """Terrain space of the hard-random terrains: super_gaussian, course, or file.py:CLASS; super_gaussian if left out.
+    An archive of a space of one's own needs that named here."""
     sets: tuple[str, ...] = ()
     """Sets of the tables: hand_crafted, hard_random and, of an archive, generated and generated_far; all there are."""
     terrains: int | None = setting(None, least=1)
@@ -97,7 +101,19 @@ def evaluator_of(flags: Evaluate, robot: "RobotCfg") -> EvaluatorCfg:
         device=device,
         workers=flags.workers,
         num_envs=flags.num_envs,
+        space=space_named(flags).name,
     )
+
+
+def space_named(flags: Evaluate) -> "TerrainSpace":
+    """The space that the command line names; super_gaussian if it names none.
+
+    Raises:
+        ValueError: If there is no such space, or it does not work.
+    """
+    from sim.space import SUPER_GAUSSIAN, load_space
+
+    return SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
 
 
 def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
@@ -113,13 +129,15 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     robot = get_robot(flags.robot)
     policy = str(flags.policy or robot.policy_file)
     evaluator = replace(evaluator_of(flags, robot), policy=policy, penalties_from_s=VELOCITY_FROM_S)
+    space = space_named(flags)
     out = flags.out or Path("runs") / f"{who_crossed(robot, policy)}-rates.json"
     check_policy(policy, robot, evaluator.device)
 
     def measure() -> dict[str, Any]:
         with open_evaluator(evaluator) as evaluate:
-            rates = base_rates(evaluate, evaluator.num_terrains, flags.seed)
-        return {**origin_of(evaluator.device, flags.seed, flags.workers), **identity(robot, policy), **rates}
+            rates = base_rates(evaluate, evaluator.num_terrains, flags.seed, space)
+        origin = origin_of(evaluator.device, flags.seed, flags.workers)
+        return {**origin, **identity(robot, policy), "space": space.name, **rates}
 
     return publish(out, measure, print_rates)
 
@@ -148,7 +166,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
     robot = get_robot(flags.robot)
     evaluator = replace(evaluator_of(flags, robot), reward=True)
     controllers = controllers_of(flags.policies, robot)
-    archive = None if flags.archive is None else read_archive_of(robot, flags.archive)
+    archive = None if flags.archive is None else read_archive_of(robot, flags.archive, flags.space)
     split = (
         None
         if archive is None
@@ -164,7 +182,8 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
     own = next((policy for policy in controllers.values() if policy != str(robot.policy_file)), None)
     scales = robot.read_penalty_scales(own)
     check_seeds(controllers)
-    sets = make_sets(names, evaluator.num_terrains, flags.seed, archive=archive, split=split)
+    space = space_named(flags)
+    sets = make_sets(names, evaluator.num_terrains, flags.seed, archive=archive, split=split, space=space)
     for name in FROM_ARCHIVE:
         if name in sets:
             check_held_out(controllers, sets[name].terrains, flags.split_seed)
@@ -179,6 +198,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
             **origin_of(evaluator.device, flags.seed, flags.workers),
             "robot": robot.name,
             **robot_identity(robot),
+            "space": space.name,
             "episodes": evaluator.num_replicas,
             "controllers": {
                 who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()

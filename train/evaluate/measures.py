@@ -14,6 +14,7 @@ from qd.workers.evaluator import Evaluate
 from qd.workers.invalid import tell_invalid
 from sim.files.intervals import bootstrap_interval
 from sim.rollout import RolloutResult
+from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import CROSSING_TYPES
 from train.evaluate.sets import plain_set
 
@@ -181,15 +182,16 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
     }
 
 
-def base_rates(evaluate: Evaluate, count: int, seed: int) -> dict[str, Any]:
+def base_rates(evaluate: Evaluate, count: int, seed: int, space: TerrainSpace = SUPER_GAUSSIAN) -> dict[str, Any]:
     """What ``base.json`` says of one controller on ``count`` terrains each, hand-crafted, hard-random and flat.
 
-    Penalties of ``evaluate`` must count from :data:`VELOCITY_FROM_S` on; the seed draws the test sets.
+    Penalties of ``evaluate`` must count from :data:`VELOCITY_FROM_S` on; the seed draws the test sets, the hard-random
+    terrains from a space, the one of ``evaluate``.
 
     Raises:
         AllInvalidError: If no episode of a set is valid.
     """
-    sets = {name: plain_set(name, count, seed) for name in ("hand_crafted", "hard_random", "flat")}
+    sets = {name: plain_set(name, count, seed, space) for name in ("hand_crafted", "hard_random", "flat")}
     results = {}
     for name, chosen in sets.items():
         with share_bar(name) as show:

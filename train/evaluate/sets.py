@@ -64,7 +64,7 @@ class TerrainSet:
 
     name: str
     terrains: NDArray[np.float32]
-    """Genes, shape (T, 64), or heights [m], shape (T, NUM_ROWS, NUM_COLS)."""
+    """Genes, shape (T, num_genes), or heights [m], shape (T, NUM_ROWS, NUM_COLS)."""
     seeds: NDArray[np.uint32]
     """Seed of each terrain's episodes, shape (T,)."""
     numbers: NDArray[np.int64]
@@ -74,7 +74,7 @@ class TerrainSet:
     levels: NDArray[np.int64] | None = None
     """Level of each hand-crafted terrain, likewise."""
     space: str = SUPER_GAUSSIAN.name
-    """Terrain space of genes."""
+    """Terrain space of genes, as :func:`sim.space.load_space` takes it."""
 
     def __len__(self) -> int:
         """Number of terrains."""
@@ -137,14 +137,14 @@ def set_rng(name: str, seed: int) -> np.random.Generator:
     return np.random.default_rng([_TEST_KEY, _NUMBERS[name], seed])
 
 
-def plain_set(name: str, count: int, seed: int) -> TerrainSet:
-    """``count`` terrains of a set that needs no archive: ``hand_crafted``, ``hard_random`` or ``flat``."""
+def plain_set(name: str, count: int, seed: int, space: TerrainSpace = SUPER_GAUSSIAN) -> TerrainSet:
+    """``count`` terrains of a set that needs no archive: ``hand_crafted``, ``hard_random`` of a space, or ``flat``."""
     rng = set_rng(name, seed)
     types = levels = None
     if name == "hand_crafted":
         terrains, types, levels = hand_crafted_crossings(count, rng)
     elif name == "hard_random":
-        terrains = SUPER_GAUSSIAN.hard_random(count, rng)
+        terrains = space.hard_random(count, rng)
     else:
         terrains = np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)
     return TerrainSet(
@@ -154,6 +154,7 @@ def plain_set(name: str, count: int, seed: int) -> TerrainSet:
         numbers=np.arange(count),
         types=types,
         levels=levels,
+        space=space.name,
     )
 
 
@@ -161,9 +162,19 @@ def generated_set(archive: Archive, split: EliteSplit, count: int, seed: int) ->
     """Held-out elites: the first ``count`` drawn, or all of them; ``seed`` is that of their episodes."""
     seeds = set_rng("generated", seed).integers(2**32, size=len(split.test), dtype=np.uint32)
     rows = split.test[:count]
+    space = space_of(archive).name
     return TerrainSet(
-        name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows, space=archive.space
+        name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows, space=space
     )
+
+
+def space_of(archive: Archive) -> TerrainSpace:
+    """What an archive's genes mean.
+
+    Raises:
+        ValueError: If its space is not at hand (:func:`sim.space.get_space`).
+    """
+    return get_space(archive.space, archive.space_sha256)
 
 
 def far_part(distance: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -185,8 +196,8 @@ def nearest_distance(
     """Root mean square distance of height maps to the nearest of others.
 
     Args:
-        genes: Terrains, shape (T, 64).
-        training_genes: Terrains to be far from, shape (N, 64).
+        genes: Terrains, shape (T, num_genes).
+        training_genes: Terrains to be far from, shape (N, num_genes).
         space: What the genes of both mean.
 
     Returns:
@@ -207,7 +218,13 @@ def _heights(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.floa
 
 
 def make_sets(
-    names: Sequence[str], count: int, seed: int, *, archive: Archive | None = None, split: EliteSplit | None = None
+    names: Sequence[str],
+    count: int,
+    seed: int,
+    *,
+    archive: Archive | None = None,
+    split: EliteSplit | None = None,
+    space: TerrainSpace = SUPER_GAUSSIAN,
 ) -> dict[str, TerrainSet]:
     """The sets of the tables by name, in the order of :data:`SETS`.
 
@@ -217,6 +234,7 @@ def make_sets(
         seed: Draws the test sets.
         archive: Elites for ``generated`` and ``generated_far``.
         split: Which of them are held out.
+        space: Of the hard-random ones.
 
     Raises:
         ValueError: If a name is unknown or given twice, or a set is made of elites and there are none.
@@ -229,17 +247,17 @@ def make_sets(
     missing = [name for name in names if name in FROM_ARCHIVE and archive is None]
     if missing:
         raise ValueError(f"set {', '.join(missing)} is made of elites: give the run that found them (--archive RUN)")
-    sets = {name: plain_set(name, count, seed) for name in names if name not in FROM_ARCHIVE}
+    sets = {name: plain_set(name, count, seed, space) for name in names if name not in FROM_ARCHIVE}
     if archive is not None and split is not None:
         sets["generated"] = whole = generated_set(archive, split, count, seed)
         if "generated_far" in names:
-            far = far_part(nearest_distance(whole.terrains, archive.genes[split.train], get_space(archive.space)))
+            far = far_part(nearest_distance(whole.terrains, archive.genes[split.train], space_of(archive)))
             sets["generated_far"] = part_of(whole, far, "generated_far")
     return {name: sets[name] for name in SETS if name in names}
 
 
 def marks_of(genes: NDArray[np.float32]) -> list[str]:
-    """A short mark of each elite that depends on its genes, shape (E, 64), alone."""
+    """A short mark of each elite that depends on its genes, shape (E, num_genes), alone."""
     rows = np.ascontiguousarray(genes, np.float32)
     return [hashlib.sha256(row.tobytes()).hexdigest()[:_MARK_LENGTH] for row in rows]
 
@@ -283,7 +301,7 @@ def check_held_out(controllers: Mapping[str, str], genes: NDArray[np.float32], s
 
     Args:
         controllers: Policy of each controller by its name.
-        genes: Elites that are to be crossed, shape (T, 64), held out by the split of ``split_seed``.
+        genes: Elites that are to be crossed, shape (T, num_genes), held out by the split of ``split_seed``.
         split_seed: For the message.
 
     Raises:

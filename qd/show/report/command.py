@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from qd.run.settings import own_policy
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.atomic import write_atomically
-from sim.files.command import OnDevice, Who, naming_what_is_next
+from sim.files.command import InSpace, OnDevice, Who, naming_what_is_next
 from sim.files.settings import check, setting
 from sim.policy.spec import spec_of
 
@@ -24,7 +24,7 @@ MAX_BYTES = 15_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(Who, OnDevice):
+class Report(Who, OnDevice, InSpace):
     """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
 
     Elites shown are crossed again for it, 20 times each. The crossings are kept under runs/recordings: the same

@@ -150,6 +150,7 @@ def _elite(shown: Shown, number: int) -> list[Block]:
     return [
         headed,
         paragraph(" ".join([_told(shown, crossed, place), *elite_words(archive, number)])),
+        paragraph(f"Its terrain: {'; '.join(shown.material.space.describe(archive.genes[number]).splitlines())}."),
         drawn,
         _penalty_table(shown, crossed),
         _rate_table(crossed),

@@ -17,6 +17,7 @@ from sim.files.atomic import prepare_output
 from sim.files.command import command_line
 from sim.policy.spec import ControllerSpec, spec_of
 from sim.robots.robot import RobotCfg
+from sim.space import TerrainSpace, get_space
 
 if TYPE_CHECKING:
     from qd.show.report.command import Report
@@ -52,6 +53,11 @@ class Material:
     def summary(self) -> dict[str, Any] | None:
         """The run in numbers, as ``archive.json`` has them; None without metrics."""
         return None if self.metrics is None else summary(self.archive, self.metrics, gpus=self.gpus or 0, origin={})
+
+    @property
+    def space(self) -> TerrainSpace:
+        """What the archive's genes mean."""
+        return get_space(self.archive.space, self.archive.space_sha256)
 
     @property
     def policy(self) -> str:
@@ -101,7 +107,7 @@ def gather(cfg: "Report") -> Material:
         ValueError: If something is damaged, half-written, empty or of another robot, or OUT cannot be written.
     """
     _refuse_unbegun(cfg.run, cfg)
-    found = find_archive(cfg.robot, cfg.run, cfg.policy)
+    found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot, run = found.archive, found.robot, found.run
     if not len(archive):
         raise ValueError(

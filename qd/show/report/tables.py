@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.archive import Archive, read_archive
+from qd.run.directory import check_space
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
@@ -227,6 +228,7 @@ def _archive_of(tables: dict[str, Any], chosen: tuple[Change, ...], beside: Path
     for path in (beside / "archive", Path(about.get("path", ""))):
         try:
             archive = read_archive(path)
+            check_space(archive, path, None)
         except (OSError, ValueError) as error:
             reason = f"The archive of the tables cannot be read: {error}"
             continue

@@ -114,7 +114,7 @@ def show_of(cfg: View) -> Show:
         ValueError: If robot, archive, controllers or a number are not as they must be.
     """
     check(cfg)
-    found = find_archive(cfg.robot, cfg.run)
+    found = find_archive(cfg.robot, cfg.run, space=cfg.space)
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: {found.go_on}, or give another --run")
     elite = found.one(cfg.elite)

@@ -28,7 +28,6 @@ from sim.bank import heights_of
 from sim.crossing import CrossingCfg
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
-from sim.space import get_space
 
 if TYPE_CHECKING:
     from qd.show.view.command import Show
@@ -304,7 +303,7 @@ class Tab:
 
     def _show_elite(self) -> None:
         elite = self._selection.picked
-        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], get_space(self._archive.space))[0])
+        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], self._show.found.space)[0])
         self._panel.show_elite(self.common.axes.details(elite))
         self._show_crossings()
 

@@ -14,6 +14,7 @@ import torch
 from qd.archive import Archive, read_archive, write_archive
 from sim.bank import heights_of
 from sim.space import SUPER_GAUSSIAN
+from sim.spaces.course import COURSE
 from tests.train.archives import make_archive
 from tests.train.starts import PPO, write_actor
 from train.evaluate.distances import Distances, distances
@@ -105,6 +106,14 @@ def test_sets_have_random_numbers_of_their_own():
     draws = [set_rng(name, seed).integers(2**63) for name in names for seed in range(3)]
     draws += [np.random.default_rng(seed).integers(2**63) for seed in range(3)]
     assert len(set(draws)) == 15
+
+
+def test_hard_random_terrains_are_of_the_space_that_is_named():
+    sets = make_sets(["hand_crafted", "hard_random"], 4, 0, space=COURSE)
+    assert sets["hard_random"].terrains.shape == (4, 36) and sets["hard_random"].space == "course"
+    usual = make_sets(["hand_crafted", "hard_random"], 4, 0)
+    assert usual["hard_random"].terrains.shape == (4, 64) and usual["hard_random"].space == "super_gaussian"
+    np.testing.assert_array_equal(sets["hand_crafted"].terrains, usual["hand_crafted"].terrains)
 
 
 def test_a_set_is_the_same_whenever_it_is_made():

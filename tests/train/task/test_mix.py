@@ -5,6 +5,7 @@ import pytest
 
 from sim.bank import TerrainBank
 from sim.space import SUPER_GAUSSIAN
+from sim.spaces.course import COURSE
 from sim.terrain import CROSSING_TYPES, TILE_TYPES
 from train.task.mix import Mix, MixCfg
 
@@ -31,6 +32,14 @@ def counts(goals, episodes, time_outs=None, invalid=None):
         "episodes": np.repeat(np.float32(episodes), 2),
         "invalid": np.repeat(np.float32([0] * 6 if invalid is None else invalid), 2),
     }
+
+
+def test_hard_random_terrains_are_of_the_space():
+    cfg = MixCfg(terrains=6, swap_every=2, mix="hard-random")
+    mix = Mix(cfg=cfg, genes=np.zeros((0, 36), np.float32), space=COURSE, crosses=True, seed=0, device="cpu")
+    own = mix.next().heights[3:]
+    assert not own[:, :, :81].any() and np.abs(own).max() > 0.1  # flat up to x = 4 m
+    assert (np.ptp(own[:, :, 240:], axis=(1, 2)) == 0).all()
 
 
 def test_half_is_hand_crafted_and_half_are_elites():

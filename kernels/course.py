@@ -1,0 +1,377 @@
+"""Genes to heights: courses of man-made elements, one behind the other across the way, rasterised on the device.
+
+A course is flat up to x = 4 m and from x = 12 m on. Between lie up to six elements over the full width. Where one
+begins and ends is a whole number of cells, so its edges lie on nodes: a vertical face is the slope between two
+neighbouring nodes, 0.05 m wide. An element that is longer than what is left before x = 12 m is cut to fit, and left
+out where its shortest form does not fit.
+"""
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import warp as wp
+
+SPACING = 0.05
+"""Distance of neighbouring nodes [m], for which courses are made."""
+FIRST_COL, LAST_COL = 80, 240
+"""Columns of the nodes between which elements lie: x = 4 m and x = 12 m."""
+CENTRE_ROW = 80
+"""Row of the nodes on the way: y = 4 m."""
+SLOPE_ROWS = 40
+"""Rows to each side of the way in which a cross slope is inclined: 2 m; beyond, it stays level."""
+MAX_ELEMENTS = 6
+GENES = ("kind", "lead", "size", "length", "detail", "turn")
+"""Genes of one element in order: kind, flat ground before it, and four parameters (:data:`PARAMETERS`)."""
+GENES_PER_ELEMENT = len(GENES)
+
+
+class Kind(IntEnum):
+    """What an element is; neighbours are alike, so that a small change of the gene is a small change."""
+
+    FLAT = 0
+    RAMP = 1
+    CROSS_SLOPE = 2
+    SILL = 3
+    RAIL = 4
+    KERB = 5
+    STEP = 6
+    STAIRS = 7
+    PALLET = 8
+    DITCH = 9
+    BRIDGE = 10
+    STONES = 11
+    RUBBLE = 12
+
+
+class Range(NamedTuple):
+    """Values of a parameter over its gene from -1 to 1."""
+
+    low: float
+    high: float
+    whole: bool = False
+    """Whether it takes whole numbers, each on an equal share of the gene."""
+    hard: str = ""
+    """Which end makes it hard: low, high, or either; none if empty."""
+
+
+LEAD = Range(4, 16, whole=True)
+"""Flat ground before an element [cells]."""
+_NONE = Range(0.0, 0.0)
+_UP_OR_DOWN = Range(-1.0, 1.0, hard="either")
+
+PARAMETERS: dict[Kind, tuple[Range, Range, Range, Range]] = {
+    # size [m], for a ramp and a cross slope a gradient; length [cells], for stairs the tread [m]; detail; turn
+    Kind.FLAT: (_NONE, Range(0, 60, whole=True, hard="low"), _NONE, _NONE),
+    Kind.RAMP: (Range(1 / 12, 1 / 3, hard="high"), Range(16, 48, whole=True, hard="high"), _NONE, _UP_OR_DOWN),
+    Kind.CROSS_SLOPE: (Range(1 / 48, 1 / 3, hard="high"), Range(30, 60, whole=True, hard="high"), _NONE, _UP_OR_DOWN),
+    Kind.SILL: (Range(0.013, 0.15, hard="high"), Range(1, 3, whole=True), _NONE, _NONE),
+    Kind.RAIL: (Range(0.02, 0.172, hard="high"), Range(0, 1, whole=True), _NONE, _NONE),
+    Kind.KERB: (Range(0.03, 0.25, hard="high"), _NONE, _NONE, _UP_OR_DOWN),
+    Kind.STEP: (Range(0.10, 0.40, hard="high"), _NONE, _NONE, _UP_OR_DOWN),
+    # detail: steps
+    Kind.STAIRS: (
+        Range(0.12, 0.22, hard="high"),
+        Range(0.22, 0.35, hard="low"),
+        Range(2, 8, whole=True, hard="high"),
+        _UP_OR_DOWN,
+    ),
+    # detail: how many lie on each other
+    Kind.PALLET: (
+        Range(0.10, 0.16, hard="high"),
+        Range(16, 24, whole=True),
+        Range(1, 2, whole=True, hard="high"),
+        _NONE,
+    ),
+    Kind.DITCH: (Range(0.05, 0.80, hard="high"), Range(2, 16, whole=True, hard="high"), _NONE, _NONE),
+    # detail: width of the beam [cells]; turn: how far left of the way its middle lies [cells]
+    Kind.BRIDGE: (
+        Range(0.20, 0.80, hard="high"),
+        Range(16, 40, whole=True, hard="high"),
+        Range(6, 20, whole=True, hard="low"),
+        Range(-10, 10, whole=True),
+    ),
+    # detail: side of a stone [cells]; turn: gap between two [cells]
+    Kind.STONES: (
+        Range(0.20, 0.60, hard="high"),
+        Range(20, 48, whole=True, hard="high"),
+        Range(4, 8, whole=True, hard="low"),
+        Range(2, 6, whole=True, hard="high"),
+    ),
+    # detail: side of a block [cells]; turn: which of all rubbles, a phase in turns that -1 and 1 share
+    Kind.RUBBLE: (
+        Range(0.03, 0.20, hard="high"),
+        Range(16, 48, whole=True, hard="high"),
+        Range(2, 8, whole=True),
+        Range(-0.5, 0.5),
+    ),
+}
+"""Ranges of an element's size, length, detail and turn, by its kind."""
+
+_NUM_KINDS = len(Kind)
+_NUM_PARAMETERS = GENES_PER_ELEMENT - 2
+_Table = wp.types.matrix(shape=(_NUM_KINDS, _NUM_PARAMETERS), dtype=float)
+_LOWS, _HIGHS, _WHOLE = (_Table(*(float(row[part]) for kind in Kind for row in PARAMETERS[kind])) for part in range(3))
+
+_MAX_STEPS = wp.constant(int(PARAMETERS[Kind.STAIRS][2].high))
+_FIRST = wp.constant(FIRST_COL)
+_LAST = wp.constant(LAST_COL)
+_CENTRE = wp.constant(CENTRE_ROW)
+_SLOPE_ROWS = wp.constant(SLOPE_ROWS)
+_MOST = wp.constant(MAX_ELEMENTS)
+_GENES = wp.constant(GENES_PER_ELEMENT)
+_KINDS = wp.constant(_NUM_KINDS)
+_LEAD_LOW = wp.constant(float(LEAD.low))
+_LEAD_HIGH = wp.constant(float(LEAD.high))
+_CELL = wp.constant(SPACING)
+_CELLS_PER_M = wp.constant(20.0)
+_HALF = wp.constant(
+    0.501
+)  # rounds to the nearest node; not at .5 exactly, where round numbers lie and devices may differ
+
+_FLAT = wp.constant(int(Kind.FLAT))
+_RAMP = wp.constant(int(Kind.RAMP))
+_CROSS_SLOPE = wp.constant(int(Kind.CROSS_SLOPE))
+_SILL = wp.constant(int(Kind.SILL))
+_RAIL = wp.constant(int(Kind.RAIL))
+_KERB = wp.constant(int(Kind.KERB))
+_STEP = wp.constant(int(Kind.STEP))
+_STAIRS = wp.constant(int(Kind.STAIRS))
+_PALLET = wp.constant(int(Kind.PALLET))
+_DITCH = wp.constant(int(Kind.DITCH))
+_BRIDGE = wp.constant(int(Kind.BRIDGE))
+_STONES = wp.constant(int(Kind.STONES))
+
+
+@wp.struct
+class Element:
+    """One element as it lies: its parameters, where it begins, and the ground around it."""
+
+    kind: int
+    """:class:`Kind`; FLAT where it was left out."""
+    first: int
+    """Column of the last node before it."""
+    cells: int
+    """Cells to the first node behind it."""
+    ground: float
+    """Height of the ground before it [m]."""
+    rise: float
+    """Height of the ground behind it over that before it [m]."""
+    size: float
+    length: float
+    detail: float
+    turn: float
+
+
+@wp.func
+def _decode(gene: float, low: float, high: float, whole: float) -> float:
+    share = (wp.clamp(gene, -1.0, 1.0) + 1.0) * 0.5
+    if whole > 0.0:
+        return low + wp.min(wp.floor(share * (high - low + 1.0)), high - low)
+    return low + share * (high - low)
+
+
+@wp.func
+def _sign(turn: float) -> float:
+    """1 for up (or left), -1 for down."""
+    if turn >= 0.0:
+        return 1.0
+    return -1.0
+
+
+@wp.func
+def _riser(k: int, tread: float) -> int:
+    """Cells from the first riser of stairs to riser k, counted from 0: the nearest node."""
+    return int(wp.floor(float(k) * tread * _CELLS_PER_M + _HALF))
+
+
+@wp.func
+def _faces(kind: int) -> int:
+    """Cells of what stands on the ground that are its two faces, beside those of its top."""
+    if kind == _SILL:
+        return 2
+    if kind == _RAIL:
+        return 2
+    if kind == _PALLET:
+        return 2
+    return 0
+
+
+@wp.func
+def _fitted(element: Element, shortest: float, room: int) -> Element:
+    """The element with the cells that it takes, cut to those that are left; FLAT without cells if it does not fit."""
+    if element.kind == _KERB or element.kind == _STEP:
+        element.cells = 1
+    elif element.kind == _STAIRS:
+        for _ in range(_MAX_STEPS):
+            element.cells = _riser(int(element.detail) - 1, element.length) + 1
+            if element.cells > room and element.detail > 2.0:
+                element.detail -= 1.0
+    else:
+        element.length = wp.min(element.length, float(room - _faces(element.kind)))
+        element.cells = int(element.length) + _faces(element.kind)
+        if element.length < shortest:
+            element.cells = room + 1
+    if element.cells > room:
+        element.kind = _FLAT
+        element.cells = 0
+        element.length = 0.0
+    return element
+
+
+@wp.func
+def _rise_of(element: Element) -> float:
+    if element.kind == _RAMP:
+        return _sign(element.turn) * element.size * float(element.cells) * _CELL
+    if element.kind == _KERB or element.kind == _STEP:
+        return _sign(element.turn) * element.size
+    if element.kind == _STAIRS:
+        return _sign(element.turn) * element.size * element.detail
+    return 0.0
+
+
+@wp.kernel
+def _lay_out_kernel(
+    genes: wp.array2d[float], lows: _Table, highs: _Table, whole: _Table, elements_out: wp.array2d[Element]
+):
+    """Grid (num_terrains,)."""
+    t = wp.tid()
+    col = int(_FIRST)
+    ground = float(0.0)
+    for e in range(_MOST):
+        g = e * _GENES
+        element = Element()
+        element.kind = int(_decode(genes[t, g], 0.0, float(_KINDS - 1), 1.0))
+        k = element.kind
+        element.size = _decode(genes[t, g + 2], lows[k, 0], highs[k, 0], whole[k, 0])
+        element.length = _decode(genes[t, g + 3], lows[k, 1], highs[k, 1], whole[k, 1])
+        element.detail = _decode(genes[t, g + 4], lows[k, 2], highs[k, 2], whole[k, 2])
+        element.turn = _decode(genes[t, g + 5], lows[k, 3], highs[k, 3], whole[k, 3])
+        col = wp.min(col + int(_decode(genes[t, g + 1], _LEAD_LOW, _LEAD_HIGH, 1.0)), _LAST)
+        element = _fitted(element, lows[k, 1], _LAST - col)
+        element.first = col
+        element.ground = ground
+        element.rise = _rise_of(element)
+        elements_out[t, e] = element
+        col += element.cells
+        ground += element.rise
+
+
+@wp.func
+def _scattered(i: int, j: int) -> float:
+    """A number in [0, 1) that looks random, the same for the same i and j everywhere."""
+    h = (wp.uint32(i) * wp.uint32(73856093)) ^ (wp.uint32(j) * wp.uint32(19349663))
+    h = (h ^ (h >> wp.uint32(13))) * wp.uint32(1540483477)
+    h = h ^ (h >> wp.uint32(15))
+    return float(h & wp.uint32(16777215)) / 16777216.0
+
+
+@wp.func
+def _is_on_stone(element: Element, s: int, row: int) -> bool:
+    """Whether a node stands on a stepping stone; every other row of stones is moved by half their distance."""
+    side = int(element.detail)
+    pitch = side + int(element.turn)
+    along = s - int(element.turn)
+    if along < 0:
+        return False
+    shift = ((along / pitch) % 2) * (pitch / 2)
+    across = (row - _CENTRE + side / 2 + shift + 1000 * pitch) % pitch  # the first stones: one in the middle of the way
+    return along % pitch <= side and across <= side
+
+
+@wp.func
+def _relief(element: Element, s: int, row: int) -> float:
+    """Height over the ground before an element [m], at the node s cells in; 0 < s < its cells."""
+    if element.kind == _RAMP:
+        return element.rise * float(s) / float(element.cells)
+    if element.kind == _CROSS_SLOPE:  # grows over a third of its length, and goes back over another
+        tilt = wp.min(1.0, 3.0 * float(wp.min(s, element.cells - s)) / float(element.cells))
+        beside = float(wp.clamp(row - _CENTRE, -_SLOPE_ROWS, _SLOPE_ROWS)) * _CELL
+        return _sign(element.turn) * element.size * tilt * beside
+    if element.kind == _SILL or element.kind == _RAIL:
+        return element.size
+    if element.kind == _PALLET:
+        return element.size * element.detail
+    if element.kind == _STAIRS:
+        passed = float(0.0)
+        for k in range(_MAX_STEPS):
+            if k < int(element.detail) and s > _riser(k, element.length):
+                passed += 1.0
+        return _sign(element.turn) * element.size * passed
+    if element.kind == _FLAT:
+        return 0.0
+    if element.kind == _DITCH:
+        return -element.size
+    if element.kind == _BRIDGE:
+        off = row - _CENTRE - int(element.turn) + int(element.detail) / 2
+        if off >= 0 and off <= int(element.detail):
+            return 0.0
+        return -element.size
+    if element.kind == _STONES:
+        if _is_on_stone(element, s, row):
+            return 0.0
+        return -element.size
+    block = int(element.detail)
+    phase = _scattered((s - 1) / block, row / block) + element.turn + 1.0
+    return element.size * wp.abs(2.0 * (phase - wp.floor(phase)) - 1.0)  # evenly spread, and continuous in the phase
+
+
+@wp.kernel
+def _rasterise_elements_kernel(elements: wp.array2d[Element], heights_out: wp.array3d[float]):
+    """Grid (num_terrains, nrow, ncol)."""
+    t, row, col = wp.tid()
+    height = float(0.0)
+    for e in range(elements.shape[1]):
+        element = elements[t, e]
+        s = col - element.first
+        if s >= element.cells:
+            if s > 0:
+                height = element.ground + element.rise
+        elif s > 0:
+            height = element.ground + _relief(element, s, row)
+    heights_out[t, row, col] = height
+
+
+def lay_out(genes: Any) -> Any:
+    """The elements of courses, in order.
+
+    Args:
+        genes: Warp array, shape (num_terrains, 36); clipped to [-1, 1], six an element in the order of :data:`GENES`.
+
+    Returns:
+        Warp array of :class:`Element`, shape (num_terrains, 6).
+
+    Raises:
+        ValueError: If the shape does not fit.
+    """
+    num_genes = MAX_ELEMENTS * GENES_PER_ELEMENT
+    if genes.ndim != 2 or genes.shape[1] != num_genes:
+        raise ValueError(
+            f"genes must have shape (num_terrains, {num_genes}), got {tuple(genes.shape)}: one row is {MAX_ELEMENTS} "
+            f"elements of {GENES_PER_ELEMENT}"
+        )
+    elements = wp.empty((genes.shape[0], MAX_ELEMENTS), dtype=Element, device=genes.device)
+    inputs = [genes, _LOWS, _HIGHS, _WHOLE]
+    wp.launch(_lay_out_kernel, genes.shape[0], inputs, outputs=[elements], device=genes.device)
+    return elements
+
+
+def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
+    """Rasterise one course a terrain.
+
+    Args:
+        genes: As of :func:`lay_out`.
+        spacing: Distance of neighbouring grid nodes [m]: 0.05, in which elements are measured.
+        heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
+
+    Raises:
+        ValueError: If the shapes do not fit each other, or the spacing is another.
+    """
+    if spacing != SPACING:
+        raise ValueError(f"spacing must be {SPACING} m, got {spacing}: elements have whole numbers of such cells")
+    if heights_out.ndim != 3 or heights_out.shape[0] != genes.shape[0]:
+        raise ValueError(
+            f"heights_out must have shape ({genes.shape[0]}, nrow, ncol), got {tuple(heights_out.shape)}: "
+            "one grid per row of genes"
+        )
+    elements = lay_out(genes)
+    wp.launch(_rasterise_elements_kernel, heights_out.shape, [elements], outputs=[heights_out], device=genes.device)

@@ -1,0 +1,106 @@
+"""What every terrain space has."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Seed = int | np.random.Generator
+"""What random terrains are drawn from. A Generator gives other terrains on each call, an int the same ones."""
+DEFAULT_SIGMA0 = 2.0
+"""So wide a start asks for terrains at the genes' limits, which are the hard ones of most spaces."""
+
+
+class TerrainSpace(Protocol):
+    """What a search needs of its terrains."""
+
+    @property
+    def name(self) -> str:
+        """What files and command lines call the space."""
+        ...
+
+    @property
+    def num_genes(self) -> int:
+        """Length of one row of genes."""
+        ...
+
+    @property
+    def sha256(self) -> str | None:
+        """Hash of the code of a space of a user's own, which records name beside it; None of a shipped one."""
+        return None
+
+    @property
+    def sigma0(self) -> float:
+        """First step size of a search whose command line names none."""
+        return DEFAULT_SIGMA0
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
+        """Turns genes into heights on the device.
+
+        Args:
+            genes: Warp array of floats, shape (num_terrains, num_genes); clipped to [-1, 1].
+            spacing: Distance of neighbouring nodes [m].
+            heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
+        """
+        ...
+
+    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""
+        ...
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """The parts of a terrain that can be taken away, each in words.
+
+        Args:
+            genes: One row, shape (num_genes,).
+        """
+        ...
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes of the same terrains without some of their parts, shape (num_terrains, num_genes).
+
+        Args:
+            genes: Shape (num_terrains, num_genes).
+            parts: Indices into :meth:`parts`.
+        """
+        ...
+
+    def describe(self, genes: ArrayLike) -> str:
+        """A terrain in words, one part a line.
+
+        Args:
+            genes: One row, shape (num_genes,).
+        """
+        return "\n".join(self.parts(genes))
+
+    def uniform_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Genes drawn uniformly from [-1, 1], shape (count, num_genes).
+
+        Raises:
+            ValueError: If ``count`` is not positive.
+        """
+        if count < 1:
+            raise ValueError(f"count must be at least 1, got {count}")
+        return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, self.num_genes)).astype(np.float32)
+
+    def validate(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Genes as float32, shape (num_terrains, num_genes), not clipped.
+
+        Raises:
+            ValueError: If the shape differs or a gene is not finite.
+        """
+        array = np.asarray(genes, dtype=np.float32)
+        if array.ndim != 2 or array.shape[1] != self.num_genes:
+            raise ValueError(
+                f"genes must have shape (num_terrains, {self.num_genes}), got {array.shape}: the space is {self.name}"
+            )
+        finite = np.isfinite(array).all(axis=1)
+        if not finite.all():
+            raise ValueError(f"genes must be finite, got NaN or infinity in row {int(np.argmin(finite))}")
+        return array
+
+
+def clipped(genes: ArrayLike) -> NDArray[np.float32]:
+    """Genes as every space has them: a copy clipped to [-1, 1]; the search itself is unbounded."""
+    return np.clip(np.asarray(genes, dtype=np.float32), -1.0, 1.0)

@@ -1,0 +1,167 @@
+"""Courses: up to six man-made elements across the way, in sizes that building codes and outdoor works have."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from kernels import course
+from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, PARAMETERS, SPACING, Kind
+from sim.spaces.base import Seed, TerrainSpace, clipped
+
+_KIND, _LENGTH = GENES.index("kind"), GENES.index("length")
+_FIRST_PARAMETER = GENES.index("size")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course(TerrainSpace):
+    """Kerbs, steps, stairs, ramps, ditches and the like between x = 4 m and x = 12 m, over the full width.
+
+    An element has six genes (:data:`kernels.course.GENES`): its kind, the flat ground before it, and four parameters
+    (:data:`kernels.course.PARAMETERS`). Where their ranges come from:
+
+    - ramp, 1:12 to 1:3: the running slope of a ramp is at most 1:12 (2010 ADA Standards, 405.2), that of a ramp or
+      walkway of a scaffold at most 1:3 (29 CFR 1926.451(e)(5)(ii)).
+    - cross slope, 1:48 to 1:3: at most 1:48 on a walking surface (2010 ADA Standards, 403.3); on a roadside, slopes
+      steeper than 1:3 count as critical (AASHTO Roadside Design Guide).
+    - sill, 0.013 m to 0.15 m: a threshold is at most 1/2 in (13 mm) high (2010 ADA Standards, 404.2.5), that of an
+      outer door at most 7 3/4 in (196 mm) over the landing before it (IRC R311.3.1).
+    - rail or hose, 0.02 m to 0.172 m: up to a rail of profile 60E1 (EN 13674-1), 172 mm high.
+    - kerb, 0.03 m to 0.25 m: 3 cm where it is lowered for wheels (DIN 18040-3); raised ones are of units to EN 1340.
+    - step, 0.10 m to 0.40 m: from the lowest riser of a stair, 4 in (IBC 1011.5.2), to two of its highest.
+    - stairs, 2 to 8 steps of 0.12 m to 0.22 m on treads of 0.22 m to 0.35 m: around the risers of 7 in at most and
+      treads of 11 in at least (IBC 1011.5.2), 7 3/4 in and 10 in of homes (IRC R311.7.5) and 9 1/2 in each of work
+      places (29 CFR 1910.25(c)).
+    - pallet, one or two of 0.10 m to 0.16 m, 0.8 m to 1.2 m long: around the flat pallet of 800 mm x 1,200 mm x 144 mm
+      (EN 13698-1).
+    - ditch, 0.10 m to 0.80 m wide, 0.05 m to 0.80 m deep: from a drainage channel (EN 1433) to a trench.
+    - beam over a ditch, 0.3 m to 1.0 m wide: around the 18 in of a scaffold's walkway (29 CFR 1926.451(b)(2)).
+    - stepping stones and rubble: chosen here.
+    """
+
+    @property
+    def name(self) -> str:
+        """What files and command lines call the space."""
+        return "course"
+
+    @property
+    def num_genes(self) -> int:
+        """Six genes an element, in the order of :data:`kernels.course.GENES`, element after element."""
+        return MAX_ELEMENTS * GENES_PER_ELEMENT
+
+    @property
+    def sigma0(self) -> float:
+        """A quarter of the genes' range: a wider start asks for the first and the last kind alone."""
+        return 0.5
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
+        """Turns genes into heights on the device (:func:`kernels.course.rasterise`)."""
+        course.rasterise(genes, spacing, heights_out)
+
+    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Kinds drawn evenly, every parameter that makes an element hard at its hard end, the others uniform."""
+        genes = self.uniform_random(count, seed)
+        rows = genes.reshape(-1, GENES_PER_ELEMENT)
+        kinds = np.minimum((rows[:, _KIND] + 1.0) / 2.0 * len(Kind), len(Kind) - 1).astype(int)
+        for kind, ranges in PARAMETERS.items():
+            for column, own in enumerate(ranges, _FIRST_PARAMETER):
+                of_kind = kinds == kind
+                if own.hard == "either":
+                    rows[of_kind, column] = np.where(rows[of_kind, column] < 0.0, -1.0, 1.0)
+                elif own.hard:
+                    rows[of_kind, column] = {"low": -1.0, "high": 1.0}[own.hard]
+        return genes
+
+    def elements(self, genes: ArrayLike) -> NDArray[Any]:
+        """The elements as they lie, records of :class:`kernels.course.Element` of shape (num_terrains, 6).
+
+        Args:
+            genes: Shape (num_terrains, 36).
+
+        Raises:
+            ValueError: If the shape differs or a gene is not finite.
+        """
+        from sim.bank import host_device  # it needs the spaces
+
+        with wp.ScopedDevice(host_device()):
+            found: Any = course.lay_out(wp.array(self.validate(genes), dtype=float)).numpy()
+        return found.copy()
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """Each element in words, six of them."""
+        return tuple(map(_in_words, self.elements(np.asarray(genes)[None])[0]))
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes with flat ground as long as some elements in their place; the others stay where they are."""
+        found = self.validate(genes).copy()
+        cells = self.elements(found)["cells"]
+        (_, flat, *_) = PARAMETERS[Kind.FLAT]
+        rows = found.reshape(len(found), MAX_ELEMENTS, GENES_PER_ELEMENT)
+        for part in parts:
+            rows[:, part, _KIND] = _middle_of(Kind.FLAT, len(Kind))
+            rows[:, part, _LENGTH] = _middle_of(cells[:, part] - flat.low, flat.high - flat.low + 1)
+        return clipped(found)
+
+    def describe(self, genes: ArrayLike) -> str:
+        """The elements in words, in the order of the way, without flat ground."""
+        (found,) = self.elements(np.asarray(genes)[None])
+        return ", ".join(_in_words(element) for element in found if element["kind"] != Kind.FLAT) or "flat ground"
+
+
+def _middle_of(number: Any, count: float) -> Any:
+    """Gene in the middle of the share of one of ``count`` whole numbers, counted from 0."""
+    return (2.0 * number + 1.0) / count - 1.0
+
+
+def _in_words(element: Any) -> str:
+    kind = Kind(element["kind"])
+    if kind is Kind.FLAT:
+        return f"flat ground of {_m(element['cells'])}" if element["cells"] else "nothing"
+    return _WORDS[kind](element)
+
+
+def _m(cells: float) -> str:
+    return f"{cells * SPACING:.2f} m"
+
+
+def _way(element: Any) -> str:
+    return "up" if element["turn"] >= 0.0 else "down"
+
+
+def _pallet(element: Any) -> str:
+    count = round(float(element["detail"]))
+    what = "pallet" if count == 1 else f"{count} pallets,"
+    return f"{what} {count * element['size']:.2f} m high and {_m(element['length'])} long"
+
+
+def _ditch(element: Any) -> str:
+    return f"ditch {_m(element['cells'])} wide and {element['size']:.2f} m deep"
+
+
+def _beam(element: Any) -> str:
+    off = round(float(element["turn"]))
+    side = f", {_m(abs(off))} {'left' if off > 0 else 'right'} of the way" if off else ""
+    return f"beam {_m(element['detail'])} wide over a {_ditch(element)}{side}"
+
+
+_WORDS: dict[Kind, Callable[[Any], str]] = {
+    Kind.RAMP: lambda e: f"ramp of 1:{1 / e['size']:.1f} {_way(e)}, {_m(e['cells'])} long",
+    Kind.CROSS_SLOPE: lambda e: (
+        f"cross slope of 1:{1 / e['size']:.1f} {'left' if e['turn'] >= 0.0 else 'right'} side up, {_m(e['cells'])} long"
+    ),
+    Kind.SILL: lambda e: f"sill {e['size']:.3f} m high and {_m(e['length'])} wide",
+    Kind.RAIL: lambda e: f"rail {e['size']:.3f} m high" + (f" and {_m(e['length'])} wide" if e["length"] else ""),
+    Kind.KERB: lambda e: f"kerb {e['size']:.2f} m {_way(e)}",
+    Kind.STEP: lambda e: f"step {e['size']:.2f} m {_way(e)}",
+    Kind.STAIRS: lambda e: f"{e['detail']:.0f} stairs of {e['size']:.2f} x {e['length']:.2f} m {_way(e)}",
+    Kind.PALLET: _pallet,
+    Kind.DITCH: _ditch,
+    Kind.BRIDGE: _beam,
+    Kind.STONES: lambda e: f"stones of {_m(e['detail'])}, {_m(e['turn'])} apart, in a {_ditch(e)}",
+    Kind.RUBBLE: lambda e: f"rubble of blocks of {_m(e['detail'])} up to {e['size']:.2f} m high, {_m(e['cells'])} long",
+}
+
+COURSE = Course()

@@ -1,0 +1,187 @@
+"""A terrain space of a user's own with three genes, from a search to a page about it; nothing runs without a name."""
+
+import json
+import re
+import signal
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from qd.archive import read_archive
+from qd.fresh import Reevaluate, reevaluate_run
+from qd.run.arguments import Archive, job_of
+from qd.search import run_search
+from qd.show import figures
+from qd.show.elites import find_archive
+from qd.show.export import Export, export
+from qd.show.recordings import on_elite
+from qd.show.report import command
+from qd.show.report.command import Report
+from sim import space as spaces
+from sim.bank import heights_of
+from sim.files.command import run_command
+from sim.maps.heightmap import read_heightmap
+from sim.policy.spec import controller_hash
+from sim.recording.file import read_recording, write_recording
+from sim.robots.robot import RobotCfg
+from sim.space import load_space
+from tests.qd import stand_in
+from tests.qd.recordings import stand_in_cross
+from tests.sim.spaces.spaces import move, write_ridges
+
+TINY = ["--device", "cpu", "--emitters", "2", "--batch-size", "4", "--replicas", "2", "--method", "cma_mae+hard_random"]
+PICTURE = bytes.fromhex("89504e470d0a1a0a")
+
+
+@contextmanager
+def open_rasterising(cfg):
+    """Crosses as a worker would: it loads the space by its name, and what a terrain costs follows from its heights."""
+    space = load_space(cfg.space)
+
+    def evaluate(genes, seeds, progress=None):
+        assert genes.shape[1] == space.num_genes
+        heights = heights_of(genes, space).astype(float)
+        steep = np.abs(np.diff(heights, axis=2)).mean(axis=(1, 2))
+        rough = np.stack(
+            [heights.max(axis=(1, 2)), 9 * steep, *(heights[:, 80, col] for col in (90, 120, 160, 200))], 1
+        )
+        noise = np.stack([np.random.default_rng(int(seed)).uniform(0.9, 1.1, (cfg.num_replicas, 6)) for seed in seeds])
+        return stand_in.make_result((0.1 + rough[:, None]) * noise)
+
+    yield evaluate
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterisingArchive(Archive):
+    """The search's command, on what rasterises."""
+
+    def execute(self) -> None:
+        run_search(job_of(self), open_evaluator=open_rasterising)
+
+
+def forget(patch):
+    """As in a program that has just begun."""
+    patch.setattr(spaces, "_named", [])
+
+
+def search(*words: str) -> int:
+    return run_command(RasterisingArchive, words, name="archive")
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(figures, "write_figures", lambda *_: [])  # they take longer than the searches
+    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
+    forget(monkeypatch)
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.fixture
+def ridges(tmp_path):
+    write_ridges(tmp_path / "mine")
+    return "mine/space.py:Ridges"
+
+
+@pytest.fixture
+def searched(ridges, tmp_path, monkeypatch):
+    """A run of two iterations; the program that made it has ended."""
+    assert search("--space", ridges, "--run-dir", "run", "--iterations", "2", *TINY) == 0
+    forget(monkeypatch)
+    return tmp_path / "run"
+
+
+def test_the_run_names_the_space_and_what_to_do_next(ridges, searched, capsys):
+    archive = read_archive(searched)  # which runs nothing
+    assert (archive.space, archive.space_sha256) == (ridges, controller_hash(ridges))
+    assert archive.genes.shape == (len(archive), 3) and len(archive) > 1
+    settings = json.loads((searched / "config.json").read_text())["settings"]
+    assert (settings["space"], settings["space_sha256"]) == (ridges, archive.space_sha256)
+    assert settings["scheduler"]["sigma0"] == 0.4  # the space's
+    numbers = json.loads((searched / "archive.json").read_text())
+    assert (numbers["space"], numbers["space_sha256"]) == (ridges, archive.space_sha256)
+
+
+def test_what_is_printed_runs_as_it_stands(ridges, capsys):
+    assert search("--space", ridges, "--run-dir", "run", "--iterations", "1", *TINY) == 0
+    assert f"--space {ridges}" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_it_goes_on_as_if_it_had_never_stopped(ridges, searched, tmp_path, monkeypatch):
+    more = ["--iterations", "4", "--device", "cpu"]
+    there = move(ridges, tmp_path / "elsewhere")  # its hash says that it is the same
+    assert search("--resume", "run", "--space", there, *more) == 0
+    forget(monkeypatch)
+    write_ridges(tmp_path / "mine")
+    assert search("--space", ridges, "--run-dir", "whole", *TINY, *more) == 0
+    assert (tmp_path / "whole/archive.npz").read_bytes() == (searched / "archive.npz").read_bytes()
+
+
+def test_a_run_goes_on_with_no_other_space(ridges, searched, capsys, monkeypatch):
+    def refused(*words):
+        capsys.readouterr()
+        forget(monkeypatch)
+        assert search("--resume", "run", "--iterations", "3", "--device", "cpu", *words) == 2
+        return capsys.readouterr().err
+
+    assert "which is code: name it again (--space mine/space.py:Ridges)" in refused()
+    assert 'space ("mine/space.py:Ridges" there, "course" wanted)' in refused("--space", "course")
+    file = searched.parent / "mine/space.py"
+    file.write_text(file.read_text().replace("0.9", "0.8"))
+    assert "its code has changed since" in refused("--space", ridges)
+
+
+@pytest.mark.parametrize(
+    "look", [lambda: export(Export()), lambda: find_archive(None, None), lambda: reevaluate_run(Reevaluate())]
+)
+def test_a_run_alone_runs_nothing(searched, monkeypatch, look):
+    searched.rename(searched.parent / "moved")
+    (searched.parent / "runs").mkdir()
+    (searched.parent / "moved").rename(searched.parent / "runs/anymal-1")
+    with pytest.raises(ValueError, match=r"which is code: name it again \(--space mine/space.py:Ridges\)"):
+        look()
+    assert not spaces._named
+
+
+def test_fresh_episodes(ridges, searched):
+    archive = reevaluate_run(Reevaluate(run=searched, space=ridges, device="cpu"), open_evaluator=open_rasterising)
+    assert archive.fresh is not None and (archive.fresh.episodes == 40).all()
+    assert read_archive(searched).space_sha256 == controller_hash(ridges)
+
+
+def test_elites_as_files(ridges, searched):
+    export(Export(run=searched, elite="1", formats=("npz",), space=ridges))
+    found = find_archive(None, searched, space=ridges)
+    genes = found.archive.genes[1]
+    heightmap = read_heightmap(searched / "terrains/elite-1.npz")
+    np.testing.assert_array_equal(heightmap.heights, heights_of(genes[None], found.space)[0])
+    index = json.loads((searched / "terrains/index.json").read_text())
+    assert index["space"] == ridges and index["elites"][0]["terrain"] == found.space.describe(genes)
+
+
+def test_a_recording_is_read_without_the_code(ridges, searched, tmp_path, monkeypatch):
+    found = find_archive(None, searched, space=ridges)
+    wanted = on_elite(found.archive, 0, policy="shipped", replicas=2)
+    assert wanted.space == ridges
+    (made,) = stand_in_cross([])([wanted], lambda share: None)
+    heights = heights_of(wanted.terrain[None], found.space)
+    origin = {**made.origin, "space": ridges, "space_sha256": found.archive.space_sha256}
+    write_recording(tmp_path / "a.npz", replace(made, heights=heights, origin=origin))
+    forget(monkeypatch)
+    read = read_recording(tmp_path / "a.npz")
+    np.testing.assert_array_equal(read.heights, heights)
+    np.testing.assert_array_equal(read.genes, wanted.terrain[None])
+
+
+def test_a_page_about_it(ridges, searched, monkeypatch):
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(PICTURE))
+    monkeypatch.setattr(command, "check_policy", lambda policy, robot, device: None)
+    cfg = Report(run=searched, space=ridges, device="cpu", episodes=2, elites=1)
+    page = command.html_report(cfg, cross=stand_in_cross([])).read_text()
+    assert re.search(r"ridges of 0\.\d\d m", page)
