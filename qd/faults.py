@@ -268,13 +268,15 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
         "failing": None if archive.fresh is None else int(failing.sum()),
         "confirmed": None,
         "certified": int(archive.certified.sum()) if known else None,
-        "faults": int((archive.confirmed & archive.certified).sum()) if known else None,
+        "faults": None,
         "panel": list(faults.certifiers) if faults is not None else [],
     }
     if faults is None:
         return numbers
     resolved, in_c = faults.resolved_outcomes.any(axis=1), faults.mujoco_c_outcomes.any(axis=1) & failing
     numbers["confirmed"] = int(archive.confirmed.sum()) if resolved.any() else None
+    if known and resolved.any():
+        numbers["faults"] = int((archive.confirmed & archive.certified).sum())
     numbers["crossed_resolved"] = int((resolved & failing).sum())
     numbers["mujoco_c"] = {
         "crossed": int(in_c.sum()),
@@ -315,9 +317,12 @@ def fault_words(archive: Archive) -> list[str]:
         told.append(f"In plain MuJoCo C {there} of those crossed there fail.")
     if faults.certifiers:
         who, rest = any_of(faults.certifiers), int((archive.failing & ~archive.certified).sum())
-        one = numbers["faults"] == 1
-        what = "fault: a terrain" if one else "faults: terrains"
-        told.append(f"{numbers['faults']:,} {what} that {who} crosses and this controller does not.")
+        if numbers["faults"] is not None:
+            what = "fault: a terrain" if numbers["faults"] == 1 else "faults: terrains"
+            told.append(f"{numbers['faults']:,} {what} that {who} crosses and this controller does not.")
+        waiting = int((archive.certified & ~faults.resolved_outcomes.any(axis=1)).sum())
+        if waiting:
+            told.append(f"{waiting:,} that {who} crosses {'is' if waiting == 1 else 'are'} still to be confirmed.")
         told.append(f"{rest:,} failing elite{' is' if rest == 1 else 's are'} not known to be passable.")
     return told
 

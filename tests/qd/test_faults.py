@@ -177,6 +177,10 @@ def test_words_by_hand():
     assert faults == "1 fault: a terrain that C-G or S crosses and this controller does not."
     assert rest == "2 failing elites are not known to be passable."
     assert fault_words(dataclasses.replace(archive, faults=None)) == []
+    waits = dataclasses.replace(archive.faults, resolved_outcomes=0 * archive.faults.resolved_outcomes)
+    waits = dataclasses.replace(archive, faults=waits)
+    assert fault_numbers(waits)["faults"] is None
+    assert fault_words(waits)[1:] == ["2 that C-G or S crosses are still to be confirmed.", rest]
     assert [verdict_of(archive, number) for number in range(5)] == ["fault", "confirmed", "certified", "failing", ""]
     assert elite_words(archive, 0)[-1] == "It is a fault: a terrain that S crosses and this one not."
     assert elite_words(archive, 1)[-1] == "It is confirmed, and not known to be passable."

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from qd.archive import Archive
-from qd.faults import any_of, fault_words
+from qd.faults import any_of, fault_numbers, fault_words
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
@@ -68,10 +68,9 @@ def outcome_section(shown: Shown) -> list[Block]:
 
 def _faults_at_a_glance(archive: Archive) -> list[tuple[str, str]]:
     """The number of faults, where other controllers crossed what fails."""
-    faults = archive.faults
-    if faults is None or not faults.certifiers:
+    faults, count = archive.faults, fault_numbers(archive)["faults"]
+    if faults is None or count is None:
         return []
-    count = int((archive.confirmed & archive.certified).sum())
     return [(f"faults: terrains that {any_of(faults.certifiers)} crosses and this controller does not", f"{count:,}")]
 
 
