@@ -303,7 +303,7 @@ class Tab:
 
     def _show_elite(self) -> None:
         elite = self._selection.picked
-        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], self._show.found.space)[0])
+        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], self.common.show.found.space)[0])
         self._panel.show_elite(self.common.axes.details(elite))
         self._show_crossings()
 
