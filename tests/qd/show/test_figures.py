@@ -89,6 +89,7 @@ def test_summary_by_hand():
         "policy_sha256": None,
         "penalty_definition": "absolute",
         "space": "super_gaussian",
+        "space_sha256": None,
         "iterations": 7,
         "terrains_evaluated": 40,
         "episodes": 160,

@@ -107,7 +107,7 @@ def test_two_tabs_have_states_of_their_own(opened):
         see(page, "^Episode 1: out of time")
     one.bring_to_front()
     one.keyboard.press("m")
-    wait_until(one, lambda now: 3.0 < float(now["t"]) < 5.0)
+    wait_until(one, lambda now: 3.0 < float(now.get("t", 0)) < 5.0)
     one.keyboard.press("o")
     two.bring_to_front()
     two.wait_for_timeout(1500)
