@@ -92,6 +92,7 @@ def short_rollout(cfg, num_terrains):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [2, 3])
 def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go(tmp_path, groups, device, monkeypatch):
     """Robots go on with the terrains of other groups; three emitters make groups of one and two, or of one each."""
