@@ -19,7 +19,7 @@ from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import Open, elite_seeds
 from qd.run.directory import SUMMARY_FILE, RunDirectory
 from qd.run.progress import share_bar
-from qd.workers.evaluator import EvaluatorCfg, available_cores, origin_of, parse_workers, pipeline_of
+from qd.workers.evaluator import EvaluatorCfg, origin_of, parse_workers, pipeline_of
 from qd.workers.invalid import invalid_reasons, invalid_words
 from sim.files.atomic import to_json, write_atomically
 from sim.files.intervals import rate_words
@@ -80,11 +80,13 @@ class _Column(NamedTuple):
 
 def outcome_counts(result: "RolloutResult | Any") -> NDArray[np.int64]:
     """Episodes of each terrain by :data:`qd.archive.OUTCOMES`, shape (num_terrains, 4)."""
-    goal, collision, invalid = (
-        np.asarray(flags).sum(axis=1) for flags in (result.reached_goal, result.base_collision, result.invalid)
-    )
-    counts = {"goal": goal, "base_collision": collision, "invalid": invalid}
-    counts["other"] = result.invalid.shape[1] - goal - collision - invalid
+    return _counts(goal=result.reached_goal, base_collision=result.base_collision, invalid=result.invalid)
+
+
+def _counts(**flags: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Episodes by outcome, of flags of shape (num_terrains, num_episodes); where none is set, it is another."""
+    counts = {name: flag.sum(axis=1) for name, flag in flags.items()}
+    counts["other"] = (~np.any([*flags.values()], axis=0)).sum(axis=1)
     return np.stack([counts[name] for name in OUTCOMES], axis=1).astype(np.int64)
 
 
@@ -121,8 +123,7 @@ def confirm_in_mujoco_c(archive: Archive, chosen: Sequence[int], most: int, work
     order = elite_seeds(archive, work.seed, stream=_MUJOCO_C_STREAM)
     drawn = sorted(chosen, key=lambda number: (int(order[number]), number))[:most]
     missing = column.missing(archive, drawn)
-    workers = parse_workers(work.evaluator.workers)
-    processes = (None if workers.on_ray else workers.count) or available_cores()
+    processes = parse_workers(work.evaluator.workers).num_processes
     for first in range(0, len(missing), _MUJOCO_C_LOT * processes):
         part = missing[first : first + _MUJOCO_C_LOT * processes]
         archive = column.filled(archive, part, _counts_in_mujoco_c(archive, part, work, processes))
@@ -238,7 +239,7 @@ def _counts_in_mujoco_c(archive: Archive, numbers: NDArray[np.int64], work: Work
     """Outcomes of elites in plain MuJoCo C, shape (len(numbers), 4)."""
     from kernels.episode import Outcome
     from sim.bank import heights_of
-    from sim.mujoco_c.crossing import draw_starts, run_plain
+    from sim.mujoco_c.crossing import cross_plain
     from sim.robots.robot import get_robot
     from sim.simulation import resolved
     from sim.space import get_space
@@ -246,18 +247,17 @@ def _counts_in_mujoco_c(archive: Archive, numbers: NDArray[np.int64], work: Work
     robot, device = get_robot(work.evaluator.robot), work.evaluator.device
     heights = heights_of(archive.genes[numbers], get_space(archive.space, archive.space_sha256), device=device)
     seeds = elite_seeds(archive, work.seed, stream=_CONFIRM_STREAM)[numbers]
-    starts = [draw_starts(robot, grid, int(seed), EPISODES, device) for grid, seed in zip(heights, seeds, strict=True)]
     fine, solver = resolved(robot)
-    crossings = run_plain(
-        fine, work.evaluator.policy, heights, starts, processes=processes, time_constant_s=solver.time_constant_s
+    crossings = cross_plain(
+        fine, work.evaluator.policy, heights, seeds, num_episodes=EPISODES, device=device, processes=processes,
+        time_constant_s=solver.time_constant_s,
+    )  # fmt: skip
+    outcome = np.array([one.outcome for one in crossings])
+    return _counts(
+        goal=outcome == Outcome.GOAL,
+        base_collision=outcome == Outcome.BASE_COLLISION,
+        invalid=outcome == Outcome.INVALID,
     )
-    columns = {"goal": Outcome.GOAL, "base_collision": Outcome.BASE_COLLISION, "invalid": Outcome.INVALID}
-    rows = []
-    for one in crossings:
-        counts = {name: int((one.outcome == outcome).sum()) for name, outcome in columns.items()}
-        counts["other"] = len(one.outcome) - sum(counts.values())
-        rows.append([counts[name] for name in OUTCOMES])
-    return np.array(rows, np.int64)
 
 
 def fault_numbers(archive: Archive) -> dict[str, Any]:

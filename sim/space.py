@@ -150,6 +150,23 @@ def get_space(name: str, sha256: str | None = None, *, file: Path | None = None)
     )
 
 
+def recorded_space(name: str, sha256: str | None, *, named: str | None, file: Path | None) -> TerrainSpace:
+    """A space that a record names, once the one that the command line names, if any, is loaded.
+
+    Args:
+        name: What the record calls it.
+        sha256: Hash of its code that the record names.
+        named: What the command line names.
+        file: The record, for errors.
+
+    Raises:
+        ValueError: As of :func:`load_space` and :func:`get_space`.
+    """
+    if named is not None:
+        load_space(named)
+    return get_space(name, sha256, file=file)
+
+
 def _short(digest: str | None) -> str:
     return str(digest)[:12]
 

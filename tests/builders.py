@@ -1,6 +1,7 @@
 """Small things that tests of several rooms are made of: archives, terrains and controllers."""
 
 import hashlib
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,13 @@ from qd.archive import FRESH, Archive, FaultCounts, FreshValues
 SPACING = 0.05
 RNG_SEED = 5
 OBSERVATIONS, ACTIONS = 235, 12
+
+
+def free_port() -> int:
+    """A port of this host that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def small_archive(num_elites: int = 3) -> Archive:

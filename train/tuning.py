@@ -10,7 +10,7 @@ from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space, load_space, to_be_named
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, recorded_space, to_be_named
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, space_of, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import Start, read_start
@@ -206,11 +206,8 @@ def _check_space(flags: Finetune, there: dict[str, Any]) -> None:
     Raises:
         ValueError: If it is a user's own that the command line does not name, or another now.
     """
-    if there.get("space") is None:
-        return
-    if flags.space is not None:
-        load_space(flags.space)
-    get_space(there["space"], there.get("space_sha256"), file=flags.resume)
+    if there.get("space") is not None:
+        recorded_space(there["space"], there.get("space_sha256"), named=flags.space, file=flags.resume)
 
 
 def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, Any]) -> None:

@@ -89,14 +89,12 @@ class _Judged:
 def _config_of(args: Confirm | Certify) -> tuple[Path, SearchCfg, "RobotCfg"]:
     """Directory, search and robot of the run that a command line names."""
     from sim.robots.robot import get_robot, robot_of
-    from sim.space import get_space, load_space
+    from sim.space import recorded_space
 
     policy = args.policy if isinstance(args, Confirm) else None
     path = args.run or newest_run(get_robot(args.robot or "anymal"), policy)
     cfg = RunDirectory(path).read_cfg()
-    if args.space is not None:
-        load_space(args.space)
-    get_space(cfg.space, cfg.space_sha256, file=path)
+    recorded_space(cfg.space, cfg.space_sha256, named=args.space, file=path)
     return path, cfg, robot_of(as_settings(cfg), args.robot, path)
 
 

@@ -19,7 +19,6 @@ from qd.run.progress import share_bar
 from qd.studies.kept import Kept
 from qd.workers.evaluator import (
     EvaluatorCfg,
-    available_cores,
     check_policy,
     open_evaluator,
     origin_of,
@@ -367,7 +366,6 @@ class Crossings:
             self.outcome[name][left[terrain]] = crossings.outcome
             self._kept.write(**self.outcome)
 
-        on_ray, count = parse_workers(self._evaluator.workers)
         cross_plain(
             robot,
             drawn.policy,
@@ -375,7 +373,7 @@ class Crossings:
             drawn.seeds(name)[left],
             num_episodes=self._evaluator.num_replicas,
             device=host_device(),
-            processes=available_cores() if on_ray or count is None else count,
+            processes=parse_workers(self._evaluator.workers).num_processes,
             time_constant_s=solver.time_constant_s,
             crossed=crossed,
         )

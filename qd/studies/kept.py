@@ -33,9 +33,9 @@ class Kept:
     """
 
     def __init__(self, out: Path, robot: "RobotCfg", evaluator: "EvaluatorCfg", drawn: list[Any]) -> None:
-        self.file = out.with_name(f"{out.stem}.part.npz")
         from sim.space import space_identity  # which imports Warp: not for `--help`
 
+        self.file = out.with_name(f"{out.stem}.part.npz")
         controller = controller_hash(evaluator.policy)
         way = [robot_identity(robot), controller, space_identity(evaluator.space), evaluator.num_replicas, *drawn]
         way += [evaluator.device.startswith("cuda"), code_fingerprint(("kernels", "sim")), *robot.penalties]

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from qd.workers.evaluator import resolve_device
+from tests.builders import free_port
 from tests.qd import stand_in
 from tests.qd.cluster_run import GENES, SEEDS
 
@@ -22,12 +23,6 @@ pytest.importorskip("ray")
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 120.0
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def listens(port: int) -> bool:

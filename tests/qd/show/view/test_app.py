@@ -1,13 +1,10 @@
 import dataclasses
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
 import urllib.request
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,19 +17,13 @@ from qd.show.view.command import View, show_of
 from qd.show.view.recorder import Report
 from qd.show.view.scene import first_view_of
 from qd.show.view.tab import Tab
-from tests.qd.show.view.visitor import HEIGHT, WIDTH, Visitor
+from tests.builders import free_port
+from tests.qd.show.view.visitor import HEIGHT, ROOT, WIDTH, Visitor, serve, view_command
 
-ROOT = Path(__file__).parents[4]
 PICK_LIMIT_S = 1.0
 """From a click to the terrain on its way to the browser; it takes 0.15 s."""
 
 ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
@@ -374,18 +365,8 @@ def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
 
 def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
     port = free_port()
-    command = [sys.executable, "-m", "faultline", "view", "--run", str(ARCHIVE), "--port", str(port)]
-    command += ["--cache", str(tmp_path)]
-    process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell's background ignores it
-    )  # fmt: skip
-    assert process.stdout is not None
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if line.startswith("Open "):
-            break
+    command = view_command("--run", str(ARCHIVE), "--port", str(port), "--cache", str(tmp_path))
+    process, lines = serve(command)
     page = urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).read()
     assert b"<html" in page.lower()
     again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
@@ -397,7 +378,7 @@ def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
 
 
 def test_bad_input_is_one_line():
-    command = [sys.executable, "-m", "faultline", "view", "--run", "nowhere", "--port", str(free_port())]
+    command = view_command("--run", "nowhere", "--port", str(free_port()))
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert ended.returncode == 2
     assert [line for line in ended.stderr.splitlines() if "Warp" not in line] == [

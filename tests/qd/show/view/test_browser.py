@@ -3,15 +3,14 @@
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from functools import partial
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from tests.qd.show.view.test_app import ARCHIVE, ROOT, free_port
+from qd.run.directory import RESULTS
+from tests.builders import free_port
+from tests.qd.show.view.visitor import serve, view_command
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -19,6 +18,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None, reason="there is no browser: apt-get install chromium"),
 ]
+ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
 LIMIT_MS = 60_000
 """From a click to what it shows, on a busy machine that draws without a GPU."""
 WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -28,18 +28,9 @@ WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swift
 def address(tmp_path_factory):
     """Of a viewer of the published archive, with one controller under two names."""
     port = free_port()
-    command = [sys.executable, "-m", "faultline", "view", "--run", str(ARCHIVE), "--port", str(port)]
-    command += ["--cache", str(tmp_path_factory.mktemp("cache")), "--policies", "base=shipped", "C-G=shipped"]
-    process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell's background ignores it
-    )  # fmt: skip
-    assert process.stdout is not None
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if line.startswith("Open "):
-            break
+    cache = str(tmp_path_factory.mktemp("cache"))
+    flags = ["--run", str(ARCHIVE), "--port", str(port), "--cache", cache, "--policies", "base=shipped", "C-G=shipped"]
+    process, lines = serve(view_command(*flags))
     assert process.poll() is None, "".join(lines)
     yield f"http://127.0.0.1:{port}/"
     process.send_signal(signal.SIGINT)

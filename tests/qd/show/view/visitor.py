@@ -1,6 +1,11 @@
 """A browser's part of viser's protocol, as far as a tab needs it: it comes, answers, and looks somewhere."""
 
+import signal
+import subprocess
+import sys
 import threading
+from functools import partial
+from pathlib import Path
 
 import msgspec
 import viser
@@ -9,6 +14,26 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 WIDTH, HEIGHT = 1400, 900
+ROOT = Path(__file__).parents[4]
+
+
+def view_command(*flags: str) -> list[str]:
+    return [sys.executable, "-m", "faultline", "view", *flags]
+
+
+def serve(command: list[str]) -> tuple[subprocess.Popen[str], list[str]]:
+    """The process of a viewer that serves its page, and what it has printed until then."""
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell's background ignores it
+    )  # fmt: skip
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if line.startswith("Open "):
+            break
+    return process, lines
 
 
 class Visitor:
