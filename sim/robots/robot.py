@@ -259,9 +259,7 @@ ROBOTS = {
             steady_joints=tuple(f"hip_{joint}_{side}" for side in _SIDES for joint in ("abduction", "rotation")),
             start_joint_range=0.2,
         ),
-        learning=LearningCfg(
-            num_envs=2048, iterations=3400, init_noise_std=0.5, desired_kl=0.02, entropy=0.005, final_share=0.26
-        ),
+        learning=LearningCfg(num_envs=2048, iterations=3400, init_noise_std=0.5, desired_kl=0.02, entropy=0.005),
     ),
 }
 
