@@ -11,7 +11,7 @@ import warp as wp
 
 from kernels.state import base_ang_vel_b, base_lin_vel_b
 
-PENALTY_DEFINITION = "absolute"
+PENALTY_DEFINITION = "squared"
 """How yaw_rate, vel_x and vel_y measure an error; runs, scales and recordings name it, and none of another is read."""
 
 BASE = 1
@@ -138,27 +138,29 @@ def _penalty(function: Callable[..., Any]) -> Any:
 
 
 @wp.func
-def _velocity_error(step: PenaltyStep, env: int, axis: int) -> float:
+def _squared_velocity_error(step: PenaltyStep, env: int, axis: int) -> float:
     velocity = base_lin_vel_b(step.joint_q, step.joint_qd, step.base_com, env)
-    return wp.abs(velocity[axis] - step.command[env, axis])
+    error = velocity[axis] - step.command[env, axis]
+    return error * error
 
 
 @_penalty
 def yaw_rate(step: PenaltyStep, env: int) -> float:
-    """Absolute error of the yaw rate [rad/s], base frame."""
-    return wp.abs(base_ang_vel_b(step.joint_q, step.joint_qd, env)[2] - step.command[env, 2])
+    """Squared error of the yaw rate [(rad/s)^2], base frame."""
+    error = base_ang_vel_b(step.joint_q, step.joint_qd, env)[2] - step.command[env, 2]
+    return error * error
 
 
 @_penalty
 def vel_x(step: PenaltyStep, env: int) -> float:
-    """Absolute error of the forward velocity of the base link [m/s], base frame."""
-    return _velocity_error(step, env, 0)
+    """Squared error of the forward velocity of the base link [(m/s)^2], base frame."""
+    return _squared_velocity_error(step, env, 0)
 
 
 @_penalty
 def vel_y(step: PenaltyStep, env: int) -> float:
-    """Absolute error of the sideways velocity of the base link [m/s], base frame."""
-    return _velocity_error(step, env, 1)
+    """Squared error of the sideways velocity of the base link [(m/s)^2], base frame."""
+    return _squared_velocity_error(step, env, 1)
 
 
 @_penalty

@@ -37,7 +37,7 @@ SMALL: dict[str, dict[str, str]] = {
     "finetune": {**CPU, "--iterations": "2"},
     "export-policy": {},
     "stand": {**CPU, "--drops": "2"},
-    "calibrate": {**CPU, "--terrains": "20", "--replicas": "4", "--workers": "2"},
+    "calibrate": {**CPU, "--terrains": "20", "--most-terrains": "20", "--replicas": "4", "--workers": "2"},
     "compare": {**CPU, "--preset": "small", "--iterations": "1", "--seeds": "1", "--workers": "2"},
     "ablation": {**CPU, "--preset": "small", "--iterations": "2", "--workers": "2"},
     "beside": {},

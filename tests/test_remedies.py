@@ -17,7 +17,7 @@ CPU = ["--device", "cpu"]
 NET = ["--ppo.hidden-dims", "16", "8", "--ppo.steps-per-env", "4"]
 SMALL = {
     "archive": [*CPU, "--workers", "1", "--iterations", "2"],
-    "calibrate": [*CPU, "--workers", "1", "--terrains", "4", "--replicas", "2"],
+    "calibrate": [*CPU, "--workers", "1", "--terrains", "4", "--most-terrains", "4", "--replicas", "2"],
     "train": [*CPU, "--num-envs", "6", "--iterations", "2", *NET],
     "finetune": [*CPU, "--num-envs", "12", "--iterations", "2"],
     "evaluate": [*CPU, "--workers", "1", "--terrains", "2", "--episodes", "1"],

@@ -42,9 +42,9 @@ class PenaltyLook(NamedTuple):
 
 
 _PENALTY_LOOKS = {
-    "yaw_rate": PenaltyLook("yaw-rate error", "rad", "#cc79a7", "//"),
-    "vel_x": PenaltyLook("forward-\nvelocity error", "m", "#0072b2"),
-    "vel_y": PenaltyLook("sideways-\nvelocity error", "m", "#56b4e9", "\\\\"),
+    "yaw_rate": PenaltyLook("yaw-rate error", "(rad/s)^2 s", "#cc79a7", "//"),
+    "vel_x": PenaltyLook("forward-\nvelocity error", "(m/s)^2 s", "#0072b2"),
+    "vel_y": PenaltyLook("sideways-\nvelocity error", "(m/s)^2 s", "#56b4e9", "\\\\"),
     "contact_force": PenaltyLook("high contact\nforce", "N s", "#000000"),
     "stumble": PenaltyLook("stumble", "s", "#e69f00", ".."),
     "collision": PenaltyLook("collisions of\nbase and legs", "s", "#d55e00"),

@@ -1,7 +1,8 @@
-"""Penalty scales: what each raw penalty comes to on hard-random terrains, so that the six can be added and compared.
+"""Penalty scales: what each raw penalty comes to where a crossing fails, so that the six can be added and compared.
 
-The scale of a penalty is its mean over all valid episodes or, where it is 0 in over half of them, over the others.
-Scales are measured once with the shipped controller, before any search, and never tuned on an archive.
+The scale of a penalty is its mean over those episodes on hard-random terrains that did not reach the goal: one typical
+failure costs about 1 of each kind. Scales are measured once with the shipped controller, before any search, and never
+tuned on an archive.
 """
 
 import math
@@ -27,8 +28,10 @@ if TYPE_CHECKING:
 _CPU_TERRAINS = 16  # at once: enough to keep some cores busy, little enough memory
 _LOOK = (16, 5)
 """Terrains and episodes of the look at a few before the many; a GPU crosses all of them as quickly."""
+_ENOUGH = 200
+"""Failing episodes that scales are means over; with fewer, even of the most terrains, all episodes are."""
 _FEW = 30
-"""Episodes with a penalty that its scale should at least be a mean over."""
+"""Of those episodes, how many at least a penalty should occur in."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +42,10 @@ class Calibrate(Who, Where):
     every search reads them.
     """
 
-    terrains: int = setting(300, least=1)
-    """Hard-random terrains."""
+    terrains: int = setting(1_000, least=1)
+    """Hard-random terrains to begin with; as many again are drawn until 200 episodes did not reach the goal."""
+    most_terrains: int = setting(5_000, least=1)
+    """Terrains after which no more are drawn; a controller with fewer failing episodes is scaled by all episodes."""
     replicas: int = setting(20, least=1)
     """Episodes a terrain."""
     space: str = "super_gaussian"
@@ -86,27 +91,31 @@ class Calibrate(Who, Where):
             num_envs=self.num_envs,
             space=self.space,
         )
-        genes = load_space(self.space).hard_random(self.terrains, self.seed)
-        seeds = np.random.SeedSequence(self.seed).generate_state(self.terrains, np.uint32)
+        # Both are drawn row by row: of 5,000 the first 1,000 are those that 1,000 would be.
+        genes = load_space(self.space).hard_random(self._most, self.seed)
+        seeds = np.random.SeedSequence(self.seed).generate_state(self._most, np.uint32)
         out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
-        kept = Kept(out, robot, evaluator, [self.seed, self.terrains])
+        kept = Kept(out, robot, evaluator, [self.seed, self.terrains, self._most])
 
         def keep(crossed: Crossed) -> None:
-            kept.write(penalties=crossed.penalties, invalidity=crossed.invalidity)
+            arrays = {name: getattr(crossed, name) for name in _KEPT}
+            kept.write(**arrays)
 
         def measure() -> dict[str, Any]:
             crossed = _crossed_before(kept.read(), robot, self.replicas)
             if len(crossed):
                 print(f"{len(crossed)} terrains are kept from before in {kept.file}.", flush=True)
             elif device == "cpu" and math.prod(_LOOK) < self.terrains * self.replicas / 2:
-                _look(opened, evaluator, genes, seeds)
-            print(f"Crossing {self.terrains} hard-random terrains {self.replicas} times on {device}.", flush=True)
-            if len(crossed) < self.terrains:
+                _look(opened, evaluator, genes[: self.terrains], seeds)
+            if self._wanted(crossed) > len(crossed):
                 with (
                     naming_what_is_next(kept.state, lambda: "The same command goes on."),
                     opened(evaluator) as evaluate,
                 ):
-                    crossed = _cross(evaluate, evaluator.num_terrains, genes, seeds, crossed, keep)
+                    while (wanted := self._wanted(crossed)) > len(crossed):
+                        _tell_turn(crossed, wanted, self.replicas, device)
+                        at_once, part = evaluator.num_terrains, (genes[:wanted], seeds[:wanted])
+                        crossed = _cross(evaluate, at_once, *part, crossed, keep)
             tell_invalid(crossed, "hard-random terrains")
             return {
                 **workers.origin_of(device, self.seed, self.workers),
@@ -121,9 +130,20 @@ class Calibrate(Who, Where):
         absent = [name for name in robot.penalties if name not in report["scales"]]
         if absent:
             raise ValueError(
-                f"no scale for {', '.join(absent)}: 0 in all {_valid(report)} valid episodes. Leave it out of the "
-                f"robot's penalties, and the scales in {out} fit, or calibrate on more --terrains"
+                f"no scale for {', '.join(absent)}: 0 in all {_words(report)}. Leave it out of the robot's penalties, "
+                f"and the scales in {out} fit, or calibrate on more --terrains"
             )
+
+    @property
+    def _most(self) -> int:
+        return max(self.terrains, self.most_terrains)
+
+    def _wanted(self, crossed: "Crossed") -> int:
+        """Terrains to cross before it is asked again whether there are enough failing episodes."""
+        begun = -(-max(1, len(crossed)) // self.terrains) * self.terrains
+        few = not crossed.scaled_by_failing and not crossed.invalid.all()
+        more = self.terrains if few and len(crossed) == begun else 0
+        return min(begun + more, self._most)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +154,8 @@ class Crossed:
     """Raw sums, shape (T, R, P)."""
     invalidity: NDArray[np.uint8]
     """:class:`kernels.episode.Invalidity` of each episode, shape (T, R)."""
+    reached_goal: NDArray[np.bool_]
+    """Shape (T, R)."""
     penalty_names: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -144,19 +166,34 @@ class Crossed:
         """Shape (T, R)."""
         return self.invalidity != 0
 
+    @property
+    def failing(self) -> NDArray[np.bool_]:
+        """Valid, and did not reach the goal; shape (T, R)."""
+        return ~self.invalid & ~self.reached_goal
+
+    @property
+    def scaled_by_failing(self) -> bool:
+        """Whether enough episodes failed that scales are means over them alone."""
+        return int(self.failing.sum()) >= _ENOUGH
+
+
+_KEPT = ("penalties", "invalidity", "reached_goal")
+
 
 def _crossed_before(arrays: dict[str, NDArray[Any]], robot: "RobotCfg", num_replicas: int) -> Crossed:
     """What was crossed before; nothing if the arrays do not fit."""
     nothing = Crossed(
         penalties=np.zeros((0, num_replicas, len(robot.penalties))),
         invalidity=np.zeros((0, num_replicas), np.uint8),
+        reached_goal=np.zeros((0, num_replicas), bool),
         penalty_names=robot.penalties,
     )
-    if arrays.keys() != {"penalties", "invalidity"}:
+    if arrays.keys() != set(_KEPT):
         return nothing
     crossed = replace(nothing, **arrays)
-    fits = crossed.penalties.shape == (*crossed.invalidity.shape, len(robot.penalties))
-    return crossed if fits else nothing
+    shape = (len(crossed), num_replicas)
+    fits = crossed.penalties.shape == (*shape, len(robot.penalties))
+    return crossed if fits and crossed.invalidity.shape == crossed.reached_goal.shape == shape else nothing
 
 
 def _look(opened: "Open", evaluator: "EvaluatorCfg", genes: NDArray[Any], seeds: NDArray[Any]) -> None:
@@ -170,11 +207,11 @@ def _look(opened: "Open", evaluator: "EvaluatorCfg", genes: NDArray[Any], seeds:
     with opened(replace(evaluator, num_terrains=terrains, num_replicas=replicas)) as evaluate:
         crossed = _cross(evaluate, terrains, genes[:terrains], seeds[:terrains], None, lambda part: None)
     tell_invalid(crossed, "hard-random terrains")
-    scales, episodes = penalty_scales(crossed), int((~crossed.invalid).sum())
-    for name in crossed.penalty_names:
-        if name not in scales:
+    valid = ~crossed.invalid
+    for name, mean in _means(crossed, valid).items():
+        if not mean:
             print(
-                f"Penalty '{name}' is 0 in all {episodes} of them. If it cannot occur on this robot, stop here "
+                f"Penalty '{name}' is 0 in all {valid.sum()} of them. If it cannot occur on this robot, stop here "
                 "(Ctrl-C) and leave it out of the robot's penalties.",
                 flush=True,
             )
@@ -195,52 +232,90 @@ def _cross(
                 progress(min(1.0, (first + share * at_once) / len(genes)))
 
             result = evaluate(genes[turn], seeds[turn], show)
-            before = ([crossed.penalties], [crossed.invalidity]) if crossed is not None else ([], [])
-            crossed = Crossed(
-                penalties=np.concatenate([*before[0], np.asarray(result.penalties, np.float64)]),
-                invalidity=np.concatenate([*before[1], result.invalidity]),
+            part = Crossed(
+                penalties=np.asarray(result.penalties, np.float64),
+                invalidity=result.invalidity,
+                reached_goal=result.reached_goal,
                 penalty_names=tuple(result.penalty_names),
             )
+            crossed = part if crossed is None else _joined(crossed, part)
             keep(crossed)
     assert crossed is not None
     return crossed
 
 
-def penalty_scales(crossed: Any) -> dict[str, float]:
-    """Scale of each penalty over the valid episodes of crossings; a penalty that never occurred has none.
+def _joined(before: Crossed, part: Crossed) -> Crossed:
+    return replace(before, **{name: np.concatenate([getattr(before, name), getattr(part, name)]) for name in _KEPT})
 
-    Args:
-        crossed: :class:`Crossed`, or a rollout's result.
+
+def _tell_turn(crossed: Crossed, wanted: int, replicas: int, device: str) -> None:
+    """Says what is crossed next, and why more than was asked for."""
+    if len(crossed):
+        print(f"{crossed.failing.sum()} of {crossed.invalid.size} episodes did not reach the goal so far.", flush=True)
+    more = wanted - len(crossed)
+    print(
+        f"Crossing {more} {'more ' if len(crossed) else ''}hard-random terrains {replicas} times on {device}.",
+        flush=True,
+    )
+
+
+def penalty_scales(crossed: Crossed) -> dict[str, float]:
+    """Scale of each penalty; one that never occurred has none.
+
+    Returns:
+        By name the mean over the failing episodes, or over all valid ones if too few failed.
     """
-    rows: NDArray[np.float64] = np.asarray(crossed.penalties, dtype=np.float64)[~crossed.invalid]
-    scales = {}
-    for name, values in zip(crossed.penalty_names, rows.T, strict=True):
-        hit = values > 0.0
-        if hit.any():
-            scales[name] = float(values[hit].mean() if hit.mean() < 0.5 else values.mean())
-    return scales
+    means = _means(crossed, crossed.failing if crossed.scaled_by_failing else ~crossed.invalid)
+    return {name: mean for name, mean in means.items() if mean}
+
+
+def _means(crossed: Crossed, episodes: NDArray[np.bool_]) -> dict[str, float | None]:
+    """Mean of each penalty over some episodes, None where there are none."""
+    rows = crossed.penalties[episodes]
+    means = rows.mean(axis=0).tolist() if len(rows) else [None] * len(crossed.penalty_names)
+    return dict(zip(crossed.penalty_names, means, strict=True))
 
 
 def _measured(crossed: Crossed) -> dict[str, Any]:
     """The scales, and what they were measured on."""
-    rows = crossed.penalties[~crossed.invalid]
+    by_failing = crossed.scaled_by_failing
+    rows = crossed.penalties[crossed.failing if by_failing else ~crossed.invalid]
     shares = (rows > 0.0).mean(axis=0).tolist()
     return {
         "terrains": len(crossed),
         "episodes": int(crossed.invalid.size),
         "invalid_episodes": int(crossed.invalid.sum()),
+        "failing_episodes": int(crossed.failing.sum()),
+        "scaled_by": "failing" if by_failing else "all",
         "scales": penalty_scales(crossed),
         "share_of_episodes_with": dict(zip(crossed.penalty_names, shares, strict=True)),
+        "mean_failing": _means(crossed, crossed.failing),
+        "mean_reached": _means(crossed, ~crossed.invalid & crossed.reached_goal),
     }
 
 
-def _valid(report: dict[str, Any]) -> int:
+def _num_scaled_by(report: dict[str, Any]) -> int:
+    """Episodes that the scales are means over."""
+    if report["scaled_by"] == "failing":
+        return report["failing_episodes"]
     return report["episodes"] - report["invalid_episodes"]
 
 
+def _words(report: dict[str, Any]) -> str:
+    """The episodes that the scales are means over, in words."""
+    kind = "episodes that did not reach the goal" if report["scaled_by"] == "failing" else "valid episodes"
+    return f"{_num_scaled_by(report)} {kind}"
+
+
 def _show(report: dict[str, Any]) -> None:
+    if report["scaled_by"] == "all":
+        print(
+            f"Only {report['failing_episodes']} of {report['episodes']} episodes did not reach the goal, expected at "
+            f"least {_ENOUGH}: scales are means over all. Scales of failures need more --most-terrains."
+        )
+    print(f"Means over {_words(report)}, of {report['terrains']} terrains:")
     for name, scale in report["scales"].items():
         print(f"  {name:<14}{scale:12.4f}")
-        hits = round(report["share_of_episodes_with"][name] * _valid(report))
+        hits = round(report["share_of_episodes_with"][name] * _num_scaled_by(report))
         if hits < _FEW:
             print(f"  {'':<14}of {hits} episodes alone: too few for a scale to rely on; calibrate on more --terrains")

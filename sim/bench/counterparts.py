@@ -123,9 +123,9 @@ def penalties(
     sideways = force_of_foot[..., :2].norm(dim=2)
     step = torch.stack(
         [
-            (ang_vel[:, 2] - command[:, 2]).abs(),
-            (lin_vel[:, 0] - command[:, 0]).abs(),
-            (lin_vel[:, 1] - command[:, 1]).abs(),
+            (ang_vel[:, 2] - command[:, 2]).square(),
+            (lin_vel[:, 0] - command[:, 0]).square(),
+            (lin_vel[:, 1] - command[:, 1]).square(),
             (size[:, feet] - force_limit).clamp(min=0.0).sum(1),
             (sideways > STUMBLE_RATIO * force_of_foot[..., 2].abs()).any(1).float(),
             (size[:, base_and_limbs] > COLLISION_FORCE).sum(1).float(),

@@ -227,9 +227,9 @@ def step_penalties(
     size = np.linalg.norm(forces, axis=2)
     sideways = np.linalg.norm(forces[:, :, :2], axis=2)
     by_name = {
-        "yaw_rate": np.abs(qvel[:, 5] - command[:, 2]),
-        "vel_x": np.abs(velocity[:, 0] - command[:, 0]),
-        "vel_y": np.abs(velocity[:, 1] - command[:, 1]),
+        "yaw_rate": (qvel[:, 5] - command[:, 2]) ** 2,
+        "vel_x": (velocity[:, 0] - command[:, 0]) ** 2,
+        "vel_y": (velocity[:, 1] - command[:, 1]) ** 2,
         "contact_force": np.maximum(0.0, size[:, feet] - force_limit).sum(axis=1),
         "stumble": (sideways[:, feet] > 5.0 * np.abs(forces[:, feet, 2])).any(axis=1).astype(float),
         "collision": (size[:, ~feet] > 0.1).sum(axis=1).astype(float),

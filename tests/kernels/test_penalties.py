@@ -62,22 +62,22 @@ def test_permuting_environments(device):
 
 def test_velocity_errors_by_hand(device):
     # Level base turned by 90 degrees: it looks along world y. Its mass centre moving with (-0.2, 1, 0) m/s is
-    # (1, 0.2) in the base frame. Commanded (0.75, 0, 0.1), not turning: errors 0.25, 0.2, yaw rate 0.1.
-    # Two steps of 0.005 s: 0.0025, 0.002, 0.001.
+    # (1, 0.2) in the base frame. Commanded (0.75, 0, 0.1), not turning: errors 0.25, 0.2, yaw rate 0.1; squared
+    # 0.0625, 0.04, 0.01. Two steps of 0.005 s: 0.000625, 0.0004, 0.0001.
     q, qd = upright(1, 3)
     q[0, 3:7] = 0, 0, np.sqrt(0.5), np.sqrt(0.5)
     qd[0, :3] = -0.2, 1, 0
     sums = sums_after((q, qd), [[0.75, 0, 0.1]], np.zeros((1, 5, 3)), device, steps=2)
-    np.testing.assert_allclose(sums[0], [0.001, 0.0025, 0.002, 0, 0, 0], atol=1e-8)
+    np.testing.assert_allclose(sums[0], [0.0001, 0.000625, 0.0004, 0, 0, 0], atol=1e-9)
 
 
 def test_velocity_is_taken_at_the_base_origin(device):
     # Turning at 2 rad/s on the spot, the origin at rest: the mass centre at (0.05, -0.02) moves with w x r =
-    # 2 * (0.02, 0.05) = (0.04, 0.1) m/s. With command 0 only the yaw rate is an error: 2 * 0.005 = 0.01.
+    # 2 * (0.02, 0.05) = (0.04, 0.1) m/s. With command 0 only the yaw rate is an error: 2^2 * 0.005 = 0.02.
     q, qd = upright(1, 3)
     qd[0, :6] = 0.04, 0.1, 0, 0, 0, 2
     np.testing.assert_allclose(
-        sums_after((q, qd), [[0, 0, 0]], np.zeros((1, 5, 3)), device)[0], [0.01, 0, 0, 0, 0, 0], atol=1e-8
+        sums_after((q, qd), [[0, 0, 0]], np.zeros((1, 5, 3)), device)[0], [0.02, 0, 0, 0, 0, 0], atol=1e-8
     )
 
 

@@ -60,6 +60,7 @@ def calibrate_with(policy: Path) -> None:
     evaluator.open_evaluator = stand_in.open_stand_in
     out = str(policy.parent / "scales.json")
     argv = ["--policy", str(policy), "--out", out, "--device", "cpu", "--terrains", "8", "--replicas", "4"]
+    argv += ["--most-terrains", "8"]
     sys.exit(command.run_command(calibrate.Calibrate, argv, name="calibrate"))
 
 

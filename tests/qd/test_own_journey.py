@@ -100,7 +100,9 @@ def project():
 @pytest.fixture(scope="module")
 def calibrated(project, home, robot, trot):
     """Scales, measured by a Ray worker, which has none of the dog's files but those it is sent."""
-    return run("calibrate", *robot, *trot, "--terrains", "4", "--replicas", "2", "--workers", "ray:1")
+    return run(
+        "calibrate", *robot, *trot, "--terrains", "4", "--most-terrains", "4", "--replicas", "2", "--workers", "ray:1"
+    )
 
 
 @pytest.fixture(scope="module")

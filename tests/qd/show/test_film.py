@@ -232,7 +232,11 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     )
     numbers = numbers_of(crossed_of(made, NAMES, (1.0,) * 6))
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
-    assert numbers["duration_s"] == 10.0 and numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "m"}
+    assert numbers["duration_s"] == 10.0 and numbers["penalties"]["vel_x"] == {
+        "mean": 2.0,
+        "std": 1.0,
+        "unit": "(m/s)^2 s",
+    }
     assert numbers["invalid_episodes"] == 1 and numbers["outcomes"]["invalid"] == 1
     text = describe({"robot": "anymal", "policy": "mine.pt", "terrain": "hill.npz", **numbers})
     assert "1 of 2 (50%, 9 to 91%)" in text and "1 invalid episodes are left out: 1 too fast" in text

@@ -48,10 +48,10 @@ def done(tmp_path):
 
 def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
     text = describe(done)
-    row = next(line for line in text.splitlines() if "yaw_rate [rad]" in line)
-    assert " ".join(row.split()) == "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)"
-    row = next(line for line in text.splitlines() if "vel_x [m]" in line)
-    assert " ".join(row.split()) == "vel_x [m] 6.00 +- 1.00 (65% of all) 16.00 +- 0.00 (67% of all)"
+    row = next(line for line in text.splitlines() if "yaw_rate [(rad/s)^2 s]" in line)
+    assert " ".join(row.split()) == "yaw_rate [(rad/s)^2 s] 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)"
+    row = next(line for line in text.splitlines() if "vel_x [(m/s)^2 s]" in line)
+    assert " ".join(row.split()) == "vel_x [(m/s)^2 s] 6.00 +- 1.00 (65% of all) 16.00 +- 0.00 (67% of all)"
     row = next(line for line in text.splitlines() if "base collision" in line)
     assert " ".join(row.split()) == "base collision 1 of 4 (25%, 5 to 70%) 1 of 4 (25%, 5 to 70%)"
     # Wilson, z^2 = 3.8415, of 1 of 4: (.25 + .4802 +- 1.96 sqrt(.0469 + .0600)) / 1.9604 = .3725 +- .3269
@@ -68,7 +68,9 @@ def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
     corrected = dataclasses.replace(done, found=dataclasses.replace(done.found, archive=archive))
     lines = [" ".join(line.split()) for line in describe(corrected).splitlines()]
     assert lines[1:3] == ["found (4 episodes) corrected (40 episodes) now (4 episodes)", "fitness 3.25 1.62 10.50"]
-    assert "yaw_rate [rad] 1.00 +- 0.50 (35% of all) 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
+    assert (
+        "yaw_rate [(rad/s)^2 s] 1.00 +- 0.50 (35% of all) 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
+    )
     # 8 of the 40 are invalid
     assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) 1 of 4 (25%, 5 to 70%)" in lines
     title = draw(corrected).axes[0].get_title()
