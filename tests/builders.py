@@ -12,6 +12,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+from kernels.penalties import PENALTY_DEFINITION
 from qd.archive import FRESH, Archive, FaultCounts, FreshValues
 
 SPACING = 0.05
@@ -32,6 +33,7 @@ def small_archive(num_elites: int = 3) -> Archive:
     rows = rng.random(num_elites)
     return Archive(
         robot="anymal",
+        penalty_definition=PENALTY_DEFINITION,
         space="super_gaussian",
         penalties=("yaw_rate", "vel_x"),
         scales=(0.5, 2.0),

@@ -19,7 +19,7 @@ from qd.run.progress import clock
 from qd.run.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
 from sim.files.command import command_line
-from sim.robots.identity import check_robot
+from sim.robots.identity import check_identity
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
@@ -117,13 +117,13 @@ def read_archive_of(robot: "RobotCfg", run: Path, space: str | None = None) -> A
 
     Raises:
         FileNotFoundError: If there is none.
-        ValueError: If it is damaged, of the robot as it was before it changed, or of a space of a user's own that the
-            command line does not name or that has changed.
+        ValueError: If it is damaged, of the robot as it was before it changed, of penalties defined otherwise, or of a
+            space of a user's own that the command line does not name or that has changed.
     """
     archive = read_archive(run)
     check_space(archive, run, space)
     if archive.robot == robot.name:
-        check_robot(named_by(run, archive), robot, run, "put back what was there then, or give another archive")
+        check_identity(named_by(run, archive), robot, run, "search again, or give another archive")
     return archive
 
 

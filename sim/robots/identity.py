@@ -88,7 +88,7 @@ def check_robot(there: Mapping[str, Any], robot: "RobotCfg", file: Path, remedy:
         there: What the record names.
         robot: The robot of that name, as it is now.
         file: The record, for the message.
-        remedy: What to do about it.
+        remedy: What to do about it, other than putting back the robot.
 
     Raises:
         ValueError: If it is another robot.
@@ -99,7 +99,7 @@ def check_robot(there: Mapping[str, Any], robot: "RobotCfg", file: Path, remedy:
     elif expected != (now := robot_digest(robot)):
         raise ValueError(
             f"{file} is of robot '{robot.name}' as it was: its settings, model or meshes have changed since (expected "
-            f"SHA-256 {_short(expected)}, got {_short(now)} of {robot.spec}): {remedy}"
+            f"SHA-256 {_short(expected)}, got {_short(now)} of {robot.spec}): put back what was there then, or {remedy}"
         )
 
 
@@ -109,13 +109,13 @@ def check_identity(there: Mapping[str, Any], robot: "RobotCfg", file: Path, reme
     Raises:
         ValueError: If one of the two is another.
     """
-    check_robot(there, robot, file, remedy)
     definition, now = there.get("penalty_definition", FIRST_DEFINITION), penalty_definition()
     if definition != now:
         raise ValueError(
-            f"{file} has penalties of another definition than this version's, so that its numbers mean something else "
-            f"(expected '{definition}', got '{now}'): {remedy}"
+            f"{file} is of penalties by {definition} errors, expected {now} ones, which this version has: its numbers "
+            f"mean something else; {remedy}"
         )
+    check_robot(there, robot, file, remedy)
 
 
 def warn_if_trained_otherwise(policy: Path, robot: "RobotCfg") -> None:

@@ -313,5 +313,5 @@ def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Pat
             "since no code runs that the command line does not name"
         )
     robot = robot or ROBOTS[name]
-    check_identity(there, robot, file, "put back what was there then, or make it anew")
+    check_identity(there, robot, file, "make it anew")
     return robot

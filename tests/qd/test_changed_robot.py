@@ -28,7 +28,7 @@ from qd.workers.evaluator import EvaluatorCfg
 from sim.files.command import run_command
 from sim.recording.file import write_recording
 from sim.robots.identity import identity, robot_digest
-from sim.robots.robot import ROBOTS, get_robot
+from sim.robots.robot import ROBOTS, RobotCfg, get_robot
 from tests.builders import hashes, rsl_rl_actor, save_checkpoint
 from tests.qd import stand_in
 from tests.qd.show.view.made import make_recording
@@ -137,16 +137,29 @@ def test_no_command_takes_a_run_of_the_robot_before_it_changed(dog, capsys):
 
 
 def test_no_command_compares_numbers_of_another_definition(dog, capsys, monkeypatch):
-    assert read_archive("runs/dog").penalty_definition == "absolute"
-    monkeypatch.setattr(penalties, "PENALTY_DEFINITION", "squared")
-    for name in ("archive --resume", "reevaluate", "replay", "report", "export", "ablation"):
-        command, argv = READERS[name]
-        words = [*argv, trot(dog)] if argv[-1] == "--policy" else argv
-        line = refused(capsys, command, "--robot", str(dog), *words)
-        assert line.startswith("runs/dog has penalties of another definition"), (name, line)
-        assert "expected 'absolute', got 'squared'" in line
-    with pytest.raises(ValueError, match=r"dog\.scales\.json has penalties of another.*calibrate --robot"):
+    assert read_archive("runs/dog").penalty_definition == "squared"
+    Path("alone.npz").write_bytes(Path("runs/dog/archive.npz").read_bytes())
+    actor = rsl_rl_actor(12 + 24 + 15, 8).state_dict()
+    controller = save_checkpoint(dog.parent / "dog.pt", actor, critic_state_dict=None)
+    scales = get_robot(str(dog)).read_penalty_scales()
+    monkeypatch.setattr(penalties, "PENALTY_DEFINITION", "cubed")
+    with pytest.raises(ValueError, match=r"dog\.scales\.json is of penalties by squared errors.*calibrate --robot"):
         get_robot(str(dog)).read_penalty_scales()
+    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda *_: scales)  # or evaluate would stop at them
+    for name, (command, argv) in READERS.items():
+        given = controller if name == "finetune" else trot(dog)
+        words = [*argv, str(given)] if argv[-1] == "--policy" else argv
+        line = refused(capsys, command, "--robot", str(dog), *words)
+        assert line.startswith(f"{argv[1]} is of penalties by squared errors, expected cubed ones"), (name, line)
+        assert "; make it anew" in line or "; search again, or give another archive" in line, (name, line)
+
+
+def test_a_record_that_names_no_definition_is_of_absolute_errors(dog, capsys):
+    """As of versions before there was another; beside a missing hash of the robot that is the one line."""
+    older = dataclasses.replace(read_archive("runs/dog"), penalty_definition="absolute", robot_sha256=None)
+    write_archive(Path("older.npz"), older)
+    line = refused(capsys, Export, "--robot", str(dog), "--run", "older.npz")
+    assert line.startswith("older.npz is of penalties by absolute errors, expected squared ones, which this version")
 
 
 def test_scales_of_another_robot_are_refused_and_those_of_another_controller_told(dog, capsys):

@@ -182,7 +182,7 @@ def read_saved(run: Path, robot: RobotCfg, command: str) -> dict[str, Any]:
         )
     if command == "finetune":
         check_entries(extra, {"mix": (dict,)}, path)
-    check_robot(extra["settings"], robot, path, "put back what was there then, or begin a new run")
+    check_robot(extra["settings"], robot, path, "begin a new run")
     return saved
 
 

@@ -10,7 +10,7 @@ from qd.run.directory import check_space
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
-from sim.robots.identity import check_identity
+from sim.robots.identity import check_robot
 from sim.robots.robot import RobotCfg
 
 MEASURES = {"success": "success (no base collision)", "goal": "goal reached", "reward": "training reward"}
@@ -55,7 +55,7 @@ def read_tables(file: Path, robot: RobotCfg) -> dict[str, Any]:
         raise ValueError(
             f"{file} is of robot {tables['robot']}, got --robot {robot.name}: give that robot or other tables"
         )
-    check_identity(tables, robot, file, f"make them anew with {writer}")
+    check_robot(tables, robot, file, f"make them anew with {writer}")
     return tables
 
 
