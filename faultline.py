@@ -44,6 +44,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "ablation": Command("qd.studies.ablation:Ablation", "with and without standard deviations in the fitness"),
         "beside": Command("qd.studies.beside:Beside", "searches against different controllers side by side"),
         "agreement": Command("qd.studies.agreement:Agreement", "rates at finer contact and in MuJoCo C"),
+        "penalty-ratios": Command("qd.studies.penalty_ratios:PenaltyRatios", "how well penalties see failures"),
         "crosscheck": Command("sim.commands:Crosscheck", "the same crossings in plain MuJoCo C"),
         "distances": Command("train.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
         "tables": Command("train.evaluate.publish:Tables", "the published numbers beside the paper's"),

@@ -164,7 +164,9 @@ def summarise(
 
 
 def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
-    """Mean of ``|v_x - v_x,cmd|`` from 2 s to the end of each valid episode [m/s], base frame, every physics step.
+    """Error of v_x from 2 s to the end of each valid episode [m/s], base frame: the root of its mean square over time.
+
+    ``vx_error_mean`` is the mean of the episodes' errors.
 
     Args:
         result: Crossings whose penalties were summed from :data:`VELOCITY_FROM_S` on.
@@ -172,7 +174,7 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
     """
     counted_s = result.duration_s - VELOCITY_FROM_S
     usable = ~result.invalid & (counted_s > 0.0)
-    error = result.penalties[..., result.penalty_names.index("vel_x")] / np.where(usable, counted_s, 1.0)
+    error = np.sqrt(result.penalties[..., result.penalty_names.index("vel_x")] / np.where(usable, counted_s, 1.0))
     per_terrain = np.array([row[use].mean() for row, use in zip(error, usable, strict=True) if use.any()])
     return {
         "vx_error_mean": float(error[usable].mean()) if usable.any() else None,

@@ -47,7 +47,8 @@ def print_rates(report: dict[str, Any]) -> None:
             success, goal = (value_words(row[f"{key}_rate"], row.get(f"{key}_interval")) for key in ("success", "goal"))
             fallen = value_words(row["fallen_rate"], None)
             print(f"{label:<24}{success:>24}{goal:>24}{fallen:>8}{row['terrains']:>10}")
-    print(f"flat ground: mean |v_x - command| {value_words(report['flat']['vx_error_mean'], None)} m/s")
+    error = value_words(report["flat"]["vx_error_mean"], None)
+    print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
     for line in invalid_lines({name: report[name]["outcomes"] for name in ("hand_crafted", "hard_random")}):
         print(line)
 
@@ -94,7 +95,7 @@ def _row(label: str, cells: Iterable[str], wide: int, each: int) -> str:
 def _print_penalties(report: dict[str, Any], wide: int) -> None:
     rows = report["penalties"]
     names = list(next(iter(next(iter(rows.values())).values())))
-    print("\nscaled penalties: 1 is what a common one comes to with the shipped controller on hard-random terrain")
+    print("\nscaled penalties: 1 is the mean of crossings of hard-random terrain that the shipped controller fails")
     for name, row in rows.items():
         print(_row(name, names, wide, 15))
         for who, values in row.items():

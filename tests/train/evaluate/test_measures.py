@@ -93,12 +93,13 @@ def test_interval_is_that_of_the_mean():
 
 
 def test_velocity_error_is_a_mean_over_time():
-    # 1.2 m over 10 s counted is .12 m/s; .3 m over 6 s is .05; a fall before 2 s and an invalid one do not count.
+    # .9 (m/s)^2 s over 10 s counted is (.3 m/s)^2; .24 over 6 s is .2^2; a fall before 2 s and an invalid one do not
+    # count.
     result = result_of(
-        [[GOAL, GOAL], [HIT, BAD]], duration_s=[[12.0, 8.0], [1.5, 12.0]], vel_x=[[1.2, 0.3], [0.0, 9.0]]
+        [[GOAL, GOAL], [HIT, BAD]], duration_s=[[12.0, 8.0], [1.5, 12.0]], vel_x=[[0.9, 0.24], [0.0, 9.0]]
     )
     error = velocity_error(result, 0)
-    assert error["vx_error_mean"] == pytest.approx((0.12 + 0.05) / 2)
+    assert error["vx_error_mean"] == pytest.approx((0.3 + 0.2) / 2)
     assert error["episodes"] == 2
 
 
