@@ -1,6 +1,8 @@
 """Small things that tests of several rooms are made of: archives, terrains and controllers."""
 
 import hashlib
+import json
+import shutil
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,8 @@ from tensordict import TensorDict
 
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
 from kernels.penalties import PENALTY_DEFINITION
-from qd.archive import FRESH, Archive, FaultCounts, FreshValues
+from qd.archive import ARCHIVE_FILE, FRESH, Archive, FaultCounts, FreshValues, read_archive, write_archive
+from qd.run.directory import CONFIG_FILE
 
 SPACING = 0.05
 RNG_SEED = 5
@@ -53,6 +56,17 @@ def small_archive(num_elites: int = 3) -> Archive:
         episodes=np.full(num_elites, 4),
         iteration=np.arange(num_elites) + 1,
     )
+
+
+def as_of_now(run: Path, copy: Path) -> Path:
+    """A copy of a published run that says its penalties are defined as now, whichever version searched it."""
+    shutil.copytree(run, copy)
+    write_archive(copy / ARCHIVE_FILE, replace(read_archive(copy), penalty_definition=PENALTY_DEFINITION))
+    config = copy / CONFIG_FILE
+    content = json.loads(config.read_text())
+    content["settings"]["penalty_definition"] = PENALTY_DEFINITION
+    config.write_text(json.dumps(content))
+    return copy
 
 
 def fresh_values(archive: Archive) -> FreshValues:

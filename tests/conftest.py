@@ -13,11 +13,13 @@ import pytest
 import torch
 import warp as wp
 
+from qd.run.directory import RESULTS
 from sim.bank import TerrainBank
 from sim.files.command import publish
 from sim.files.provenance import provenance
 from sim.robots.robot import ROBOTS, get_robot
 from sim.simulation import Simulation, resolve_device
+from tests.builders import as_of_now
 from tests.sim.scenes import Stepper
 
 DEVICE = os.environ.get("FAULTLINE_DEVICE", "cpu")
@@ -82,6 +84,15 @@ def cassie():
 def robot(request):
     """Every robot in turn; ``tests.sim.scenes.ONLY_ANYMAL`` marks what is of one alone."""
     return get_robot(request.param)
+
+
+@pytest.fixture(scope="session")
+def published(tmp_path_factory) -> Path:
+    """A results/ folder with the published archives; their penalties count as defined now."""
+    results = tmp_path_factory.mktemp("published") / "results"
+    for name in ROBOTS:
+        as_of_now(RESULTS.resolve() / name / "archive", results / name / "archive")
+    return results
 
 
 @pytest.fixture(scope="session")

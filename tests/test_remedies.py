@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from faultline import main
-from tests.docs import ROOT
 from tests.run_docs import KICK
 from tests.sim.dogs import write_dog
 
@@ -52,14 +51,14 @@ MISTAKES = [
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory):
+def home(tmp_path_factory, published):
     """A folder with three dogs: one with a controller of its own code, and two with none."""
     home = tmp_path_factory.mktemp("home")
     for name in ("kicked", "bare", "lone"):
         write_dog(home / name)
     (home / "kicked" / "kick.py").write_text(KICK)
     (home / "walk.py").write_text("def act(observation):\n    return observation[:, -12:] * 0\n")
-    (home / "results").symlink_to(ROOT / "results")
+    (home / "results").symlink_to(published)
     return home
 
 

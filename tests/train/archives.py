@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from kernels.penalties import PENALTY_DEFINITION
 from qd.archive import Archive
 from sim.space import SUPER_GAUSSIAN
 
@@ -15,6 +16,7 @@ def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Ar
     counts = np.zeros(num_elites, np.int64)
     return Archive(
         robot=robot,
+        penalty_definition=PENALTY_DEFINITION,
         space="super_gaussian",
         penalties=PENALTIES,
         scales=(1.0,) * 6,

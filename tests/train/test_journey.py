@@ -26,10 +26,11 @@ def run(*words: str) -> str:
 
 
 @pytest.mark.slow
-def test_from_a_file_of_the_user_to_the_tables(tmp_path):
+def test_from_a_file_of_the_user_to_the_tables(tmp_path, published):
     mine, tuned = write_actor(tmp_path / "mine.pt", hidden=(24, 20, 16)), tmp_path / "tuned"
+    archive = ("--archive", str(published / "anymal" / "archive"))
     sizes = ("--num-envs", "8", "--terrains", "4", "--swap-every", "1", "--iterations", "2", "--critic-iterations", "1")
-    said = run("finetune", "--policy", str(mine), "--device", "cpu", "--run-dir", str(tuned), *sizes)
+    said = run("finetune", "--policy", str(mine), "--device", "cpu", "--run-dir", str(tuned), *archive, *sizes)
     assert "Fine-tuning 'anymal' on 4 terrains at a time (generated): 8 robots on cpu, 2 iterations" in said
     state = torch.load(tuned / "policy.pt", weights_only=True)["actor_state_dict"]
     assert [state[f"mlp.{k}.weight"].shape[0] for k in (0, 2, 4, 6)] == [24, 20, 16, 12]
@@ -39,7 +40,7 @@ def test_from_a_file_of_the_user_to_the_tables(tmp_path):
 
     controllers = (f"mine={mine}", f"C-G={tuned / 'policy.pt'}", f"C-G@onnx={tuned / 'policy.onnx'}")
     out = tmp_path / "tables.json"
-    where = ("--archive", "results/anymal/archive", "--out", str(out), "--run-dir", str(tmp_path / "kept"))
+    where = (*archive, "--out", str(out), "--run-dir", str(tmp_path / "kept"))
     said = run(
         "evaluate",
         "--policies",

@@ -124,10 +124,13 @@ def test_what_is_missing_is_crossed_in_batches_of_one_controller(anymal, tmp_pat
 
 
 def test_the_published_recording_is_that_of_the_published_archive(anymal, tmp_path):
+    from kernels.penalties import PENALTY_DEFINITION
     from qd.archive import read_archive
     from qd.run.directory import RESULTS
 
     archive = read_archive(RESULTS.resolve() / "anymal" / "archive")
+    if archive.penalty_definition != PENALTY_DEFINITION:
+        pytest.skip("the published archive is of an older definition of the penalties")
     recordings = Recordings(anymal, folder=tmp_path, published=RESULTS.resolve() / "anymal" / "view")
     found = recordings.read(on_elite(archive, 0, policy=str(anymal.policy_file), replicas=20))
     assert found is not None and found.num_episodes == 20

@@ -303,12 +303,10 @@ def test_a_fine_tuning_records_what_it_and_those_before_it_were_trained_on(tmp_p
     assert not expected & set(marks_of(second.genes[split_elites(second, "anymal").test]))
 
 
-PUBLISHED = Path("results/cassie/archive")
-
-
-def test_the_nearest_is_found_among_all_elites_trained_on():
-    report = distances(Distances(robot="cassie", terrains=3))
-    archive = read_archive(PUBLISHED)
+def test_the_nearest_is_found_among_all_elites_trained_on(published):
+    run = published / "cassie" / "archive"
+    report = distances(Distances(robot="cassie", archive=run, terrains=3))
+    archive = read_archive(run)
     split = split_elites(archive, "cassie")
     held, trained = (heights_of(archive.genes[rows]).astype(np.float64) for rows in (split.test[:3], split.train))
     by_hand = [min(np.sqrt(((mine - other) ** 2).mean()) for other in trained) for mine in held]
@@ -326,21 +324,24 @@ def test_the_nearest_is_found_among_all_elites_trained_on():
         ({"terrains": 0}, "terrains must be at least 1"),
         ({"seed": -1}, "seed must be at least 0"),
         ({"split_seed": -1}, "split_seed must be at least 0"),
-        ({"robot": "anymal", "archive": PUBLISHED}, "got one of 'cassie'"),
+        ({"robot": "anymal"}, "got one of 'cassie'"),
     ],
 )
-def test_what_makes_no_sense_is_refused(settings, message):
+def test_what_makes_no_sense_is_refused(settings, message, published):
     with pytest.raises(ValueError, match=message):
-        distances(Distances(**{"robot": "cassie", **settings}))
+        distances(Distances(**{"robot": "cassie", "archive": published / "cassie" / "archive", **settings}))
 
 
-def test_the_command_writes_what_it_prints(tmp_path):
+def test_the_command_writes_what_it_prints(tmp_path, published):
     def call(*flags):
         command = [sys.executable, "-m", "faultline", "distances", *flags]
         return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
     assert "--split-seed" in call("--help").stdout
-    done = call("--robot", "cassie", "--terrains", "2", "--out", str(tmp_path / "distances.json"))
+    done = call(
+        "--robot", "cassie", "--archive", str(published / "cassie" / "archive"), "--terrains", "2",
+        "--out", str(tmp_path / "distances.json"),
+    )  # fmt: skip
     assert done.returncode == 0 and "generated_far" in done.stdout
     assert json.loads((tmp_path / "distances.json").read_bytes())["nearest_m"]["generated"]["terrains"] == 2
     refused = call("--robot", "cassie", "--archive", str(tmp_path))

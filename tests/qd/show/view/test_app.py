@@ -9,27 +9,32 @@ import urllib.request
 import numpy as np
 import pytest
 
+from kernels.penalties import PENALTY_DEFINITION
 from qd.archive import read_archive
 from qd.run.directory import RESULTS
-from qd.show.recordings import Recordings
+from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
 from qd.show.view.command import View, show_of
 from qd.show.view.recorder import Report
 from qd.show.view.scene import first_view_of
 from qd.show.view.tab import Tab
+from sim.recording.file import read_recording
 from tests.builders import free_port
 from tests.qd.show.view.visitor import HEIGHT, ROOT, WIDTH, Visitor, serve, view_command
 
 PICK_LIMIT_S = 1.0
 """From a click to the terrain on its way to the browser; it takes 0.15 s."""
 
-ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
+
+@pytest.fixture(scope="module")
+def run(published):
+    return published / "anymal" / "archive"
 
 
 @pytest.fixture(scope="module")
-def show(anymal):
+def show(anymal, run):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return show_of(View(run=ARCHIVE, port=free_port(), policies=policies))
+    return show_of(View(run=run, port=free_port(), policies=policies))
 
 
 class Shown:
@@ -64,9 +69,21 @@ class Shown:
         self.app.close()
 
 
+@pytest.fixture(scope="module")
+def worst_crossed(show):
+    """What is asked for of the worst elite, and its published recording, whose penalties count as defined now."""
+    (file,) = (RESULTS.resolve() / "anymal" / "view").glob("*.npz")
+    recording = read_recording(file)
+    origin = recording.origin | {"penalty_definition": PENALTY_DEFINITION}
+    wanted = on_elite(show.found.archive, 0, policy=str(show.robot.policy_file), replicas=20)
+    return wanted, dataclasses.replace(recording, origin=origin)
+
+
 @pytest.fixture
-def shown(show, tmp_path):
-    shown = Shown(show, Recordings(show.robot, folder=tmp_path, published=show.published))
+def shown(show, worst_crossed, tmp_path):
+    recordings = Recordings(show.robot, folder=tmp_path)
+    recordings.keep(*worst_crossed)
+    shown = Shown(show, recordings)
     yield shown
     shown.close()
 
@@ -98,10 +115,10 @@ def test_the_worst_elite_is_there_with_its_crossing(tab):
     assert tab._clock.duration_s == pytest.approx(20.0)
 
 
-def test_a_folder_of_any_name_is_shown_as_text(show, tmp_path):
+def test_a_folder_of_any_name_is_shown_as_text(show, run, tmp_path):
     folder = tmp_path / "a`<img src=x onerror=alert(1)>"
     folder.mkdir()
-    (folder / "archive.npz").write_bytes((ARCHIVE / "archive.npz").read_bytes())
+    (folder / "archive.npz").write_bytes((run / "archive.npz").read_bytes())
     odd = show_of(dataclasses.replace(show.cfg, run=folder, port=free_port()))
     shown = Shown(odd, Recordings(odd.robot, folder=tmp_path / "cache"))
     try:
@@ -257,13 +274,13 @@ def test_penalties_are_called_alike_on_axes_curves_and_in_numbers(tab):
     assert "multiples of its scale" in tab._panel._numbers.content
 
 
-def test_opening_waits_for_no_simulation():
+def test_opening_waits_for_no_simulation(run):
     command = (
         "import sys, pathlib; from qd.show.view.command import View, show_of;"
         "show_of(View(run=pathlib.Path(sys.argv[1])));"
         "import qd.show.view.app; print('newton' in sys.modules)"
     )
-    archive = str(ARCHIVE)
+    archive = str(run)
     done = subprocess.run(
         [sys.executable, "-c", command, archive], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
@@ -363,9 +380,9 @@ def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
         shown.close()
 
 
-def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
+def test_the_command_serves_a_page_and_ends_on_ctrl_c(run, tmp_path):
     port = free_port()
-    command = view_command("--run", str(ARCHIVE), "--port", str(port), "--cache", str(tmp_path))
+    command = view_command("--run", str(run), "--port", str(port), "--cache", str(tmp_path))
     process, lines = serve(command)
     page = urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).read()
     assert b"<html" in page.lower()
@@ -374,7 +391,7 @@ def test_the_command_serves_a_page_and_ends_on_ctrl_c(tmp_path):
     process.send_signal(signal.SIGINT)
     rest = process.communicate(timeout=180)[0]
     assert process.returncode == 0 and "Stopped." in rest and "Traceback" not in rest
-    assert any(f"{len(read_archive(ARCHIVE))} elites of anymal, ready after" in line for line in lines)
+    assert any(f"{len(read_archive(run))} elites of anymal, ready after" in line for line in lines)
 
 
 def test_bad_input_is_one_line():

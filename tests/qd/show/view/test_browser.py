@@ -8,7 +8,6 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from qd.run.directory import RESULTS
 from tests.builders import free_port
 from tests.qd.show.view.visitor import serve, view_command
 
@@ -18,18 +17,18 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None, reason="there is no browser: apt-get install chromium"),
 ]
-ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
 LIMIT_MS = 60_000
 """From a click to what it shows, on a busy machine that draws without a GPU."""
 WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory):
+def address(tmp_path_factory, published):
     """Of a viewer of the published archive, with one controller under two names."""
     port = free_port()
     cache = str(tmp_path_factory.mktemp("cache"))
-    flags = ["--run", str(ARCHIVE), "--port", str(port), "--cache", cache, "--policies", "base=shipped", "C-G=shipped"]
+    run = published / "anymal" / "archive"
+    flags = ["--run", str(run), "--port", str(port), "--cache", cache, "--policies", "base=shipped", "C-G=shipped"]
     process, lines = serve(view_command(*flags))
     assert process.poll() is None, "".join(lines)
     yield f"http://127.0.0.1:{port}/"

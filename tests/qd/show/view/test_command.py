@@ -13,11 +13,14 @@ from qd.run.directory import RESULTS
 from qd.show.view.command import View, check_port, show_of
 from tests.builders import small_archive
 
-ARCHIVE = RESULTS.resolve() / "anymal" / "archive"
+
+@pytest.fixture(scope="module")
+def run(published):
+    return published / "anymal" / "archive"
 
 
-def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypatch, anymal):
-    (tmp_path / "results").symlink_to(RESULTS.resolve())
+def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypatch, anymal, published):
+    (tmp_path / "results").symlink_to(published)
     monkeypatch.chdir(tmp_path)
     show = show_of(View())
     assert show.found.run == RESULTS / "anymal" / "archive"
@@ -31,15 +34,15 @@ def make_folder(path):
     return path
 
 
-def test_controllers_are_named_and_tried(tmp_path, anymal):
-    cfg = View(run=ARCHIVE, policies=(f"base=shipped tuned={anymal.policy_file}",))
+def test_controllers_are_named_and_tried(tmp_path, anymal, run):
+    cfg = View(run=run, policies=(f"base=shipped tuned={anymal.policy_file}",))
     assert list(show_of(cfg).controllers) == ["base", "tuned"]
     with pytest.raises(ValueError, match="no such file"):
         show_of(dataclasses.replace(cfg, policies=("base=shipped", f"tuned={tmp_path / 'none.pt'}")))
 
 
-def test_terrains_are_shown_when_the_controller_of_the_search_is_lost(tmp_path):
-    shutil.copytree(ARCHIVE, tmp_path / "run")
+def test_terrains_are_shown_when_the_controller_of_the_search_is_lost(tmp_path, run):
+    shutil.copytree(run, tmp_path / "run")
     config = tmp_path / "run" / "config.json"
     config.write_text(config.read_text().replace('"policy": "shipped"', '"policy": "/gone/policy.pt"'))
     show = show_of(View(run=tmp_path / "run"))
@@ -51,8 +54,8 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_lost(tmp_path):
     [
         ({"robot": "spot"}, "unknown robot 'spot': expected one of anymal, cassie"),
         ({"run": Path("nowhere")}, r"no archive at nowhere/?.*: give a run directory"),
-        ({"robot": "cassie", "run": ARCHIVE}, "anymal"),
-        ({"elite": "5000"}, rf"has no elite 5000: expected .* 0 to {len(read_archive(ARCHIVE)) - 1}"),
+        ({"robot": "cassie"}, "anymal"),
+        ({"elite": "5000"}, r"has no elite 5000: expected .* 0 to {last}"),
         ({"elite": "-1"}, "has no elite -1"),
         ({"elite": "0 1"}, "one elite here, got '0 1'"),
         ({"cache": Path(__file__) / "cache"}, "cannot write to .*test_command"),
@@ -60,9 +63,10 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_lost(tmp_path):
         ({"policies": ("shipped",)}, "policies must be NAME=FILE each"),
     ],
 )
-def test_what_is_wrong_is_said_before_a_page_opens(changes, message):
+def test_what_is_wrong_is_said_before_a_page_opens(changes, message, run):
+    message = message.replace("{last}", str(len(read_archive(run)) - 1))
     with pytest.raises((ValueError, FileNotFoundError), match=message):
-        show_of(View(**{"run": ARCHIVE} | changes))
+        show_of(View(**{"run": run} | changes))
 
 
 def test_a_run_without_elites_is_refused(tmp_path):
@@ -71,8 +75,8 @@ def test_a_run_without_elites_is_refused(tmp_path):
         show_of(View(run=tmp_path))
 
 
-def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path):
-    shutil.copytree(ARCHIVE, tmp_path / "run")
+def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path, run):
+    shutil.copytree(run, tmp_path / "run")
     config = tmp_path / "run" / "config.json"
     settings = json.loads(config.read_text())
     settings["settings"] |= {"policy": "tests.sim.policies:stand", "policy_sha256": None}
@@ -86,8 +90,8 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["archive.npz", "config.json"])
-def test_a_half_written_run_is_refused(tmp_path, name):
-    shutil.copytree(ARCHIVE, tmp_path / "run")
+def test_a_half_written_run_is_refused(tmp_path, run, name):
+    shutil.copytree(run, tmp_path / "run")
     file = tmp_path / "run" / name
     file.write_bytes(file.read_bytes()[:300])
     with pytest.raises(ValueError, match=name):
