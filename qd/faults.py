@@ -23,7 +23,7 @@ from qd.workers.evaluator import EvaluatorCfg, origin_of, parse_workers, pipelin
 from qd.workers.invalid import invalid_reasons, invalid_words
 from sim.files.atomic import to_json, write_atomically
 from sim.files.intervals import rate_words
-from sim.policy.spec import controller_hash
+from sim.policy.spec import certifier_hash, controller_hash
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
@@ -179,11 +179,7 @@ def with_certifiers(faults: FaultCounts, certifiers: Mapping[str, str]) -> Fault
         ValueError: If one has no hash, or the counts of its name are of another controller.
     """
     for name, policy in certifiers.items():
-        digest = controller_hash(policy)
-        if digest is None:
-            raise ValueError(
-                f"certifier {name} must have a file, which its certificates name by hash, got {policy}: give a file"
-            )
+        digest = certifier_hash(name, policy)
         if digest in faults.certifier_sha256:
             continue
         if name in faults.certifiers:
@@ -327,6 +323,17 @@ def fault_words(archive: Archive) -> list[str]:
     return told
 
 
+def search_words(archive: Archive) -> list[str]:
+    """What certifiers did in a search for certified failures, in a sentence; nothing of any other search."""
+    own = archive.certificates
+    if own is None:
+        return []
+    return [
+        f"{int(own.certified.sum()):,} of {len(archive):,} elites were certified in the search: terrains that the "
+        f"controller did not cross then and {any_of(own.certifiers)} did. `faultline certify` lets them cross again."
+    ]
+
+
 VERDICTS = ("", "failing", "confirmed", "certified", "fault")
 """What an elite is, in a word."""
 
@@ -341,9 +348,9 @@ def verdict_of(archive: Archive, number: int) -> str:
 
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
-    faults = archive.faults
+    faults, told = archive.faults, _in_search(archive, number)
     if faults is None:
-        return []
+        return told
     kinds = {
         "with contact resolved": faults.resolved_outcomes[number],
         "in MuJoCo C": faults.mujoco_c_outcomes[number],
@@ -351,9 +358,10 @@ def elite_words(archive: Archive, number: int) -> list[str]:
     for place, name in enumerate(faults.certifiers):
         kinds[name] = faults.certifier_outcomes[number, place]
         kinds[f"{name} with contact resolved"] = faults.certifier_resolved_outcomes[number, place]
-    told = [f"{what}: {_goals(counts)} reach the goal." for what, counts in kinds.items() if counts.any()]
-    if not told:
-        return []
+    known = [f"{what}: {_goals(counts)} reach the goal." for what, counts in kinds.items() if counts.any()]
+    told += known
+    if not known:
+        return told
     by = [name for name, certifies in zip(faults.certifiers, faults.certificates()[number], strict=True) if certifies]
     if not archive.failing[number]:
         told.append("It does not fail by its fresh episodes.")
@@ -363,6 +371,17 @@ def elite_words(archive: Archive, number: int) -> list[str]:
     else:
         told.append(f"It is {'' if archive.confirmed[number] else 'not '}confirmed, and not known to be passable.")
     return told
+
+
+def _in_search(archive: Archive, number: int) -> list[str]:
+    """What certifiers did on an elite while it was searched for; nothing where none was asked."""
+    own = archive.certificates
+    if own is None or np.isnan(own.goal_rate[number]).all():
+        return []
+    rates = zip(own.certifiers, own.goal_rate[number], strict=True)
+    return [
+        f"In the search: {', '.join(f'{name} reached the goal in {rate:.0%} of its episodes' for name, rate in rates)}."
+    ]
 
 
 def _goals(counts: NDArray[np.int64]) -> str:

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
-from qd.fitness import FITNESS_FLOOR, Evaluation
+from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, gated_fitness
 from qd.run.settings import SchedulerCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, clipped, get_space
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
+_CERTIFIED_LEAD = 1e6  # more than fitnesses differ by: in a cell certified beats uncertified, then fitness decides
 
 
 class RandomEmitter:
@@ -66,6 +67,7 @@ class Scheduler:
         num_cells: Number of reachable cells.
         num_ratios: Number of ratio descriptors.
         seed: Seed of emitters and archives.
+        num_certifiers: Certifiers whose goal rates it is told.
     """
 
     def __init__(
@@ -76,17 +78,19 @@ class Scheduler:
         num_ratios: int,
         seed: int,
         space: TerrainSpace = SUPER_GAUSSIAN,
+        num_certifiers: int = 0,
     ) -> None:
         streams = np.random.SeedSequence(seed).spawn(cfg.emitters + 2)
         learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
-        self.result = _make_archive(space.num_genes, num_cells, num_ratios, streams[1], {})
+        shapes = space.num_genes, num_cells, num_ratios, num_certifiers
+        self.result = _make_archive(*shapes, streams[1], {})
         in_turn = list(zip(cycle(cfg.methods), streams[2:], strict=False))
         learns = any(name == "cma_mae" for name, _ in in_turn)
         self.archive = self.result
         if learns:
-            self.archive = _make_archive(space.num_genes, num_cells, num_ratios, streams[0], learning)
+            self.archive = _make_archive(*shapes, streams[0], learning)
         self.emitters: list[Emitter] = [self._emitter(cfg, name, space, stream) for name, stream in in_turn]
         self._asked: list[NDArray[np.float32] | None] = [None] * cfg.groups
 
@@ -143,13 +147,21 @@ class Scheduler:
             )
         return clipped(asked)
 
-    def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
+    def tell(
+        self,
+        evaluation: Evaluation,
+        iteration: int,
+        group: int = 0,
+        certifier_goal_rate: NDArray[np.float64] | None = None,
+    ) -> None:
         """What became of the terrains that a group last asked for.
 
         Args:
             evaluation: One row a terrain, in the order asked.
             iteration: Number of the iteration, from 1.
             group: Number of the group.
+            certifier_goal_rate: In a search for certified failures, of each certifier, shape (rows, num_certifiers);
+                NaN in rows that the controller crosses.
 
         Raises:
             RuntimeError: If it asked for nothing.
@@ -160,10 +172,15 @@ class Scheduler:
             raise RuntimeError("tell() must follow ask(), got no terrains asked for")
         if len(evaluation.fitness) != len(asked):
             raise ValueError(f"evaluation must have {len(asked)} rows, got {len(evaluation.fitness)}")
-        told = _rows(asked, evaluation, iteration)
+        told, ranked = _rows(asked, evaluation, iteration), evaluation.fitness
+        if certifier_goal_rate is not None:
+            best = certifier_goal_rate.max(axis=1)
+            told |= {"objective": gated_fitness(evaluation.fitness, best), "fitness": evaluation.fitness}
+            told["certifier_goal_rate"] = certifier_goal_rate
+            ranked = ranked + _CERTIFIED_LEAD * (best >= FAILING_GOAL_RATE)
         self._asked[group] = None
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
-        plain = self._add(told, accepted)
+        plain = self._add({**told, "objective": ranked}, accepted)
         learned = plain if self.archive is self.result else self.archive.add(**told)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
@@ -187,11 +204,15 @@ class Scheduler:
         return added
 
     def elites(self) -> dict[str, NDArray[Any]]:
-        """The elites in order of descending fitness, as the arrays of an :class:`qd.archive.Archive`."""
+        """The elites in order of descending fitness, as the arrays of an :class:`qd.archive.Archive`.
+
+        Of a search for certified failures with ``certifier_goal_rate``, shape (N, num_certifiers).
+        """
         data: Any = self.result.data()
-        order = np.lexsort((data["index"], -data["objective"]))
-        elites = {name: data[name][order] for name in _FIELDS}
-        return elites | {"fitness": data["objective"][order], "cell": data["index"][order].astype(np.int64)}
+        data["fitness"] = data.get("fitness", data["objective"])
+        order = np.lexsort((data["index"], -data["fitness"]))
+        names = (*_FIELDS, "fitness", *(("certifier_goal_rate",) if "certifier_goal_rate" in data else ()))
+        return {name: data[name][order] for name in names} | {"cell": data["index"][order].astype(np.int64)}
 
     def state(self) -> dict[str, Any]:
         """Everything a resumed search needs; what was asked for and not told stays asked for."""
@@ -229,11 +250,19 @@ _FIELDS = (
 
 
 def _make_archive(
-    num_genes: int, num_cells: int, num_ratios: int, stream: np.random.SeedSequence, learning: dict[str, Any]
+    num_genes: int,
+    num_cells: int,
+    num_ratios: int,
+    num_certifiers: int,
+    stream: np.random.SeedSequence,
+    learning: dict[str, Any],
 ) -> GridArchive:
     per_ratio = ((num_ratios,), np.float64)
     rate, count = ((), np.float64), ((), np.int64)
     shapes = ((num_genes,), np.float32), per_ratio, per_ratio, per_ratio, rate, rate, rate, count, count, count
+    own: dict[str, Any] = dict(zip(_FIELDS, shapes, strict=True))
+    if num_certifiers:
+        own |= {"fitness": rate, "certifier_goal_rate": ((num_certifiers,), np.float64)}
     return GridArchive(
         solution_dim=num_genes,
         dims=[num_cells],
@@ -242,7 +271,7 @@ def _make_archive(
         solution_dtype=np.float32,
         objective_dtype=np.float64,
         measures_dtype=np.float64,
-        extra_fields=dict(zip(_FIELDS, shapes, strict=True)),
+        extra_fields=own,
         **learning,
     )
 

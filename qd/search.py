@@ -1,19 +1,30 @@
 """The search: ask for terrains, let robots cross them, tell the emitters what became of them."""
 
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.faults import confirm_all, fault_words
-from qd.fitness import evaluation_of
+from qd.faults import confirm_all, fault_words, search_words
+from qd.fitness import Evaluation, evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
+from qd.gate import Gate, certifier_seeds, groups_behind, open_gate, rates_of
 from qd.run.arguments import Job
-from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, reached, write_results
+from qd.run.directory import (
+    CONFIG_FILE,
+    Metrics,
+    RunDirectory,
+    archive_of,
+    claimed,
+    episodes_in,
+    reached,
+    write_results,
+)
 from qd.run.progress import ProgressBar, plan
 from qd.run.settings import SearchCfg, code_of
 from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, pipeline_of, worker_status
@@ -29,8 +40,23 @@ MOST_DRAWN = 200
 """Elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)."""
 
 
+class _Crossed(NamedTuple):
+    """A group's terrains of one search that the controller has crossed."""
+
+    result: "RolloutResult"
+    evaluation: Evaluation
+    asked: NDArray[np.bool_] | None
+    """On which of them certifiers are asked, shape (terrains,); None in a search without."""
+
+
 def search_terrains(
-    cfg: SearchCfg, run: RunDirectory, search: "Scheduler", metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
+    cfg: SearchCfg,
+    run: RunDirectory,
+    search: "Scheduler",
+    metrics: Metrics,
+    evaluate: Evaluate,
+    bar: ProgressBar,
+    gate: Gate | None = None,
 ) -> None:
     """The loop: runs the iterations that are left, and saves each.
 
@@ -41,13 +67,14 @@ def search_terrains(
         metrics: Rows so far; one more an iteration.
         evaluate: Crosses terrains.
         bar: Shows progress.
+        gate: The certifiers of a search for certified failures.
 
     Raises:
         AllInvalidError: If no episode of a group is valid; the iterations before are saved.
     """
     left = range(len(metrics) + 1, cfg.iterations + 1)
     began = time.perf_counter()
-    for iteration, (result,) in crossed_iterations([(cfg, search)], left, evaluate, bar):
+    for iteration, (result,) in crossed_iterations([(cfg, search)], left, evaluate, bar, gate):
         found = archive_of(cfg, search, iteration)
         row = row_of(cfg, found, result, iteration)
         if looks_again(cfg, iteration):
@@ -56,14 +83,18 @@ def search_terrains(
         wall_s = ended - began  # from the end of the iteration before, so saving counts
         workers = worker_status(evaluate)
         counts = {"workers": workers.workers, "retries": workers.retries} if workers else {}
-        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **counts})
+        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": episodes_in(row) / wall_s, **counts})
         began = ended
         run.save(cfg, search, metrics, found)
         bar.show(metrics[-1], None if workers is None else str(workers))
 
 
 def crossed_iterations(
-    searches: "Sequence[tuple[SearchCfg, Scheduler]]", iterations: range, evaluate: Evaluate, bar: ProgressBar
+    searches: "Sequence[tuple[SearchCfg, Scheduler]]",
+    iterations: range,
+    evaluate: Evaluate,
+    bar: ProgressBar,
+    gate: Gate | None = None,
 ) -> "Iterator[tuple[int, list[RolloutResult]]]":
     """Lets the groups of some searches ask, have their terrains crossed, and tells them, in turn.
 
@@ -71,11 +102,15 @@ def crossed_iterations(
     are crossed. The order is fixed, and what a group has asked for is part of the saved state: a search that goes on
     where it was stopped is the same as one that was not.
 
+    In a search for certified failures a group is told when its certifiers have come back too, which is some groups
+    later: those are crossed by the controller meanwhile.
+
     Args:
         searches: Settings and states; all have as many groups and episodes a terrain. They are crossed together.
         iterations: Which to run.
         evaluate: Crosses terrains.
         bar: Shows progress.
+        gate: The certifiers, if one of the searches has some.
 
     Yields:
         Number of an iteration whose groups were all told, and its crossings, one result a search. Nothing is under way
@@ -83,7 +118,10 @@ def crossed_iterations(
     """
     cfg, pipeline = searches[0][0], pipeline_of(evaluate)
     groups, under_way = range(cfg.scheduler.groups), 0
+    behind = 0 if gate is None else groups_behind(len(groups))
     pipeline.clear()
+    if gate is not None:
+        gate.clear()
 
     def put(iteration: int, group: int) -> None:
         parts = [_group_terrains(own, search, iteration, group) for own, search in searches]
@@ -93,18 +131,21 @@ def crossed_iterations(
         for group in groups[under_way:]:
             put(iteration, group)
         ahead = iteration + 1 in iterations and not looks_again(cfg, iteration)
-        results: list[list[RolloutResult]] = [[] for _ in searches]
+        results: list[list[_Crossed]] = []
+        waiting: deque[int] = deque()
         for group in groups:
-            result, first = pipeline.take(bar.within(iteration, group, len(groups))), 0
-            for (own, search), told in zip(searches, results, strict=True):
-                places = search.places(group)
-                told.append(taken(result, places.stop - places.start, first=first))
-                first += places.stop - places.start
-                _tell(own, search, told[-1], iteration, group)
-            if ahead:
-                put(iteration + 1, group)
+            result = pipeline.take(bar.within(iteration, group, len(groups)))
+            results.append(_crossed(searches, result, group))
+            if gate is not None:
+                _ask_certifiers(gate, searches, results[group], iteration, group)
+            waiting.append(group)
+            while len(waiting) > (behind if group < groups[-1] else 0):
+                done = waiting.popleft()
+                _tell(searches, results[done], gate, iteration, done)
+                if ahead:
+                    put(iteration + 1, done)
         under_way = len(groups) if ahead else 0
-        yield iteration, [merged(told, join=1) for told in results]
+        yield iteration, [merged([one.result for one in own], join=1) for own in zip(*results, strict=True)]
 
 
 def _group_terrains(
@@ -115,10 +156,51 @@ def _group_terrains(
     return search.ask(group), seeds[search.places(group)]
 
 
-def _tell(cfg: SearchCfg, search: "Scheduler", result: "RolloutResult", iteration: int, group: int) -> None:
-    refuse_all_invalid(result)
-    search.tell(evaluation_of(result, cfg.cells, cfg.fitness), iteration, group)
-    search.ask(group)
+def _crossed(searches: "Sequence[tuple[SearchCfg, Scheduler]]", result: "RolloutResult", group: int) -> list[_Crossed]:
+    """What the controller made of a group's terrains, one a search."""
+    found, first = [], 0
+    for cfg, search in searches:
+        places = search.places(group)
+        own = taken(result, places.stop - places.start, first=first)
+        first += places.stop - places.start
+        refuse_all_invalid(own)
+        evaluation = evaluation_of(own, cfg.cells, cfg.fitness)
+        found.append(_Crossed(own, evaluation, evaluation.not_crossed if cfg.certified_by else None))
+    return found
+
+
+def _ask_certifiers(
+    gate: Gate,
+    searches: "Sequence[tuple[SearchCfg, Scheduler]]",
+    crossed: Sequence[_Crossed],
+    iteration: int,
+    group: int,
+) -> None:
+    """Lets certifiers cross what a group's terrains the controller did not, those of all searches together."""
+    parts = [
+        (search.ask(group)[one.asked], certifier_seeds(cfg, iteration, search.places(group))[one.asked])
+        for (cfg, search), one in zip(searches, crossed, strict=True)
+        if one.asked is not None
+    ]
+    gate.put(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _tell(
+    searches: "Sequence[tuple[SearchCfg, Scheduler]]",
+    crossed: Sequence[_Crossed],
+    gate: Gate | None,
+    iteration: int,
+    group: int,
+) -> None:
+    """Tells a group of emitters of each search what became of its terrains, and lets it ask again."""
+    counts, first = None if gate is None else gate.take(), 0
+    for (_, search), one in zip(searches, crossed, strict=True):
+        rates = None
+        if one.asked is not None and counts is not None:
+            last = first + int(one.asked.sum())
+            rates, first = rates_of(one.asked, counts[first:last]), last
+        search.tell(one.evaluation, iteration, group, rates)
+        search.ask(group)
 
 
 def looks_again(cfg: SearchCfg, iteration: int) -> bool:
@@ -135,10 +217,19 @@ def row_of(cfg: SearchCfg, found: Archive, result: "RolloutResult", iteration: i
         result: The iteration's crossings.
         iteration: Number of the iteration, from 1.
     """
+    evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
+    certified = {}
+    if found.certificates is not None:
+        asked = int(evaluation.not_crossed.sum()) * len(cfg.certified_by)
+        certified = {
+            "certifier_episodes": asked * cfg.certify_episodes,
+            "certified_elites": int(found.certificates.certified.sum()),
+        }
     return {
         "iteration": iteration,
         **found.scores(),
-        **evaluation_of(result, cfg.cells, cfg.fitness).means(),
+        **evaluation.means(),
+        **certified,
         "invalid_reasons": invalid_reasons(result),
         "physics_steps": int(result.physics_steps),
         "robot_steps": int(result.robot_steps),
@@ -166,6 +257,7 @@ def begin(cfg: SearchCfg) -> "Scheduler":
         num_cells=cfg.cells.num_cells,
         num_ratios=len(cfg.fitness.penalties),
         seed=cfg.seed,
+        num_certifiers=len(cfg.certified_by),
     )
 
 
@@ -198,12 +290,16 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
         own = [{**job.session, "iterations": cfg.iterations}] if done < cfg.iterations else []
         origin = {**job.origin, "sessions": [*reached(job.origin["sessions"], done), *own]}
         with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(job)):
-            with open_evaluator(job.evaluator) if done < cfg.iterations else nullcontext() as evaluate:
+            with ExitStack() as opened:
+                evaluate = gate = None
+                if done < cfg.iterations:
+                    evaluate = opened.enter_context(open_evaluator(job.evaluator))
+                    gate = opened.enter_context(open_gate(cfg, job.certifiers, job.evaluator, open_evaluator))
                 search, metrics = loaded or (begin(cfg), [])
                 run.write_config(cfg, origin)
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:
-                        search_terrains(cfg, run, search, metrics, evaluate, bar)
+                        search_terrains(cfg, run, search, metrics, evaluate, bar, gate)
             found = archive_of(cfg, search, len(metrics))
             archive = run.with_fresh_values(found)
             write_results(run, archive, metrics, origin)
@@ -218,7 +314,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
             later = f"Go on with:  {job.confirm_command}"
             with naming_what_is_next("what was crossed is kept", lambda: later):
                 archive = confirm_all(run, archive, job.evaluator, open_evaluator, cfg.seed)
-        for line in fault_words(archive):
+        for line in (*search_words(archive), *fault_words(archive)):
             print(line)
     invalid = invalid_iterations(metrics)
     if invalid is not None:

@@ -1,7 +1,8 @@
 """The search as a command: what its flags mean, for a new run or one that goes on."""
 
 import itertools
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,6 +13,7 @@ from qd.run.settings import (
     changed,
     code_of,
     differences,
+    is_searched,
     kept_penalties,
     measured_now,
     moved_policy,
@@ -21,9 +23,10 @@ from qd.run.settings import (
     refuse_unnamed_code,
     resumed,
 )
-from qd.workers.evaluator import EvaluatorCfg, check_policy, origin_of, resolve_device
+from qd.workers.evaluator import EvaluatorCfg, check_policy, origin_of, parse_workers, resolve_device
 from sim.files.atomic import is_leftover
 from sim.files.command import Where, Who, command_line
+from sim.policy.spec import ControllerSpec, certifier_hash, controller_hash, controllers_of, named_file
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -78,6 +81,11 @@ class Archive(Who, Where):
     """Weight of the standard deviations in the fitness."""
     lam: float | None = None
     """Weight in the fitness of u, the share of episodes without base collision; u is 0 if none collided."""
+    certified_by: tuple[str, ...] | None = None
+    """Search for failures that other controllers can cross: FILE or NAME=FILE of each, as --policy takes it. They cross
+    what the controller does not; terrains that none of them crosses are worth less."""
+    certify_episodes: int | None = None
+    """Episodes of each of them on such a terrain; 10."""
     reevaluate_every: int | None = None
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
@@ -92,6 +100,10 @@ class Archive(Who, Where):
         run_search(job_of(self))
 
 
+NOT_ON_RAY = (
+    "a search for certified failures runs in this process or in processes of this machine, not on Ray, whose workers "
+    "have one controller each"
+)
 _NOT_SETTINGS = ("device", "workers", "num_envs", "robot", "resume", "run_dir", "without", "reproduce", "confirm")
 _SESSION = ("command", "commit", "device")
 
@@ -114,6 +126,8 @@ class Job:
     """Provenance of the run's beginning, and the sessions before this one."""
     session: dict[str, Any]
     """Command, commit and device of this session."""
+    certifiers: dict[str, str] = field(default_factory=dict)
+    """Controllers of a search for certified failures, by name; none of any other."""
     resume_command: str
     """How to go on with it."""
     reevaluate_command: str
@@ -157,6 +171,8 @@ def job_of(args: Archive) -> Job:
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
     space, of_space = _space_of(args, there)
     changes |= of_space
+    certifiers, of_certifiers = _certifiers_of(args, there, robot)
+    changes |= of_certifiers
     if args.without is not None:
         changes["penalties"] = kept_penalties(robot, args.without)
     moved = None
@@ -171,6 +187,7 @@ def job_of(args: Archive) -> Job:
         path = _free_path(args, cfg, robot)
         if told := robot.scaled_by_another(policy_spec(cfg, robot)):
             print(told)
+    check_certifiers(certifiers, cfg, robot, device)
     now = origin_of(device, cfg.seed, args.workers)
     named = moved or code_of(cfg)
     at_end = {name: _at_end(getattr(args, name), cfg) for name in ("reproduce", "confirm")}
@@ -182,6 +199,7 @@ def job_of(args: Archive) -> Job:
         cfg=cfg,
         path=path,
         resumes=there is not None,
+        certifiers=certifiers,
         evaluator=evaluator_of(
             cfg, robot, moved or policy_spec(cfg, robot), device, args.workers, num_envs=args.num_envs
         ),
@@ -214,6 +232,71 @@ def _space_of(args: Archive, there: SearchCfg | None) -> "tuple[TerrainSpace, di
     return get_space(there.space, there.space_sha256, file=args.resume), {"space": None}
 
 
+def _certifiers_of(args: Archive, there: SearchCfg | None, robot: "RobotCfg") -> tuple[dict[str, str], dict[str, Any]]:
+    """The certifiers of a search by name, and what they change of the settings.
+
+    Raises:
+        ValueError: If one has no name, two have the same, the run's are code that the command line does not name, or
+            they are to work on Ray.
+    """
+    named = args.certified_by
+    if named is None and there is not None:
+        for text in there.certified_by:
+            refuse_unnamed_code(text.partition("=")[2], None, args.resume or Path(), flag="certified-by")
+        named = there.certified_by
+    if not named:
+        return {}, {"certified_by": None}
+    if parse_workers(args.workers).on_ray:
+        raise ValueError(f"{NOT_ON_RAY}, got --workers {args.workers}: leave out one of --workers and --certified-by")
+    certifiers = controllers_of([named_file(text) for text in named], robot, flag="certified-by")
+    settings = certifier_settings(certifiers)
+    same = there is not None and settings["certifier_sha256"] == there.certifier_sha256
+    if there is not None and same and [*certifiers] == [text.partition("=")[0] for text in there.certified_by]:
+        settings["certified_by"] = there.certified_by  # wherever their files are now
+    return certifiers, settings
+
+
+def certifier_settings(certifiers: Mapping[str, str]) -> dict[str, Any]:
+    """What certifiers are called in the settings of a search.
+
+    Raises:
+        ValueError: If one has no hash.
+    """
+    return {
+        "certified_by": tuple(f"{name}={policy}" for name, policy in certifiers.items()),
+        "certifier_sha256": tuple(certifier_hash(name, policy) for name, policy in certifiers.items()),
+    }
+
+
+def check_certifiers(certifiers: Mapping[str, str], cfg: SearchCfg, robot: "RobotCfg", device: str) -> None:
+    """Loads certifiers and tries them.
+
+    Args:
+        certifiers: Controllers by name.
+        cfg: The search whose controller they are to certify.
+        robot: Its robot.
+        device: Warp device name.
+
+    Raises:
+        ValueError: If one is the controller of the search, is there twice, cannot be loaded or does not fit the robot.
+    """
+    there: dict[str | None, str] = {}
+    for name, policy in certifiers.items():
+        if is_searched(cfg, policy, robot):
+            raise ValueError(
+                f"certifier {name} ({policy}) is the controller that is searched, expected another: a controller "
+                "cannot certify itself"
+            )
+        digest = controller_hash(policy)
+        if digest in there:
+            raise ValueError(f"certifiers {there[digest]} and {name} are the same controller: leave one of them out")
+        there |= {} if digest is None else {digest: name}
+        try:
+            check_policy(policy, robot, device)
+        except ValueError as error:
+            raise ValueError(f"certifier {name} does not fit {robot.name}: {error}") from error
+
+
 def _at_end(asked: str, cfg: SearchCfg) -> bool:
     return asked == "yes" or (asked == "auto" and cfg.preset != "small")
 
@@ -223,6 +306,12 @@ def own_file(robot: "RobotCfg") -> dict[str, Any]:
     return {} if robot.settings_file is None else {"robot_file": str(robot.settings_file)}
 
 
+def _code_among(certified_by: tuple[str, ...] | None) -> tuple[str, ...] | None:
+    """The certifiers, if one of them is code, which every command that goes on with the run must name."""
+    texts = [named_file(text) for text in certified_by or ()]
+    return certified_by if any(ControllerSpec.parse(text.partition("=")[2]).runs_code for text in texts) else None
+
+
 def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | None) -> str:
     from sim.space import to_be_named
 
@@ -230,6 +319,7 @@ def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | 
     return command_line(
         "archive", robot=robot.spec, resume=path, policy=policy, space=args.space and to_be_named(args.space),
         device=args.device, workers=args.workers, num_envs=args.num_envs, **at_end,
+        certified_by=_code_among(args.certified_by),
     )  # fmt: skip
 
 

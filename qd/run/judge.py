@@ -11,10 +11,10 @@ import numpy as np
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
 from qd.faults import Work, certify, confirm, confirm_in_mujoco_c, fault_words, known_names, saving
 from qd.fresh import Open
-from qd.run.arguments import evaluator_of
+from qd.run.arguments import check_certifiers, evaluator_of
 from qd.run.directory import CONFIG_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed, newest_run
 from qd.run.settings import SearchCfg, as_settings, code_of, is_searched, own_policy
-from qd.workers.evaluator import check_policy, open_evaluator, origin_of, resolve_device
+from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.command import InSpace, OfRobot, Where, Who, chosen_elites, command_line, naming_what_is_next
 from sim.files.intervals import rate_words
 from sim.files.settings import setting
@@ -205,15 +205,9 @@ def certify_run(args: Certify, *, open_evaluator: Open = open_evaluator, cross: 
         EvaluatorError: If a worker is lost; likewise.
     """
     path, cfg, robot = _config_of(args)
-    certifiers = controllers_of(args.by, robot, flag="by") if args.by else _panel_of(robot, cfg)
+    certifiers = controllers_of(args.by, robot, flag="by") if args.by else panel_of(robot, cfg)
     device = resolve_device(args.device, args.workers)
-    for name, policy in certifiers.items():
-        if is_searched(cfg, policy, robot):
-            raise ValueError(
-                f"certifier {name} ({policy}) is the controller that {path} was searched with, expected another: a "
-                "controller cannot certify itself"
-            )
-        _check_certifier(name, policy, robot, device)
+    check_certifiers(certifiers, cfg, robot, device)
     evaluator = evaluator_of(cfg, robot, next(iter(certifiers.values())), device, args.workers, num_envs=args.num_envs)
     with _judged(path, cfg, robot, args.elite) as judged:
         certifiers = known_names(judged.archive, certifiers)
@@ -245,25 +239,18 @@ def certify_run(args: Certify, *, open_evaluator: Open = open_evaluator, cross: 
     return archive
 
 
-def _check_certifier(name: str, policy: str, robot: "RobotCfg", device: str) -> None:
-    """Loads a certifier and tries it.
-
-    Raises:
-        ValueError: If it cannot be loaded or does not fit the robot.
-    """
-    try:
-        check_policy(policy, robot, device)
-    except ValueError as error:
-        raise ValueError(f"certifier {name} does not fit {robot.name}: {error}") from error
-
-
 def _panel_files(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:
     """The robot's fixed certifiers by name, without the controller that was searched."""
     files = sorted((RESULTS / robot.name / PANEL_FOLDER).glob("*.pt"))
     return {file.stem: str(file) for file in files if not is_searched(cfg, str(file), robot)}
 
 
-def _panel_of(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:
+def panel_of(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:
+    """The robot's fixed certifiers by name, without the controller that was searched.
+
+    Raises:
+        ValueError: If there is none.
+    """
     found = _panel_files(robot, cfg)
     if not found:
         folder = RESULTS / robot.name / PANEL_FOLDER

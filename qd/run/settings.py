@@ -119,6 +119,13 @@ class SearchCfg:
     """How the penalties are defined (:data:`kernels.penalties.PENALTY_DEFINITION`)."""
     reevaluate_every: int = setting(50, least=0)
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
+    certified_by: tuple[str, ...] = ()
+    """Certifiers of a search for certified failures, NAME=FILE each, as :func:`sim.policy.spec.controllers_of` takes
+    it; none in any other."""
+    certifier_sha256: tuple[str, ...] = ()
+    """Their hashes."""
+    certify_episodes: int = setting(10, least=1)
+    """Episodes of each certifier on a terrain that the controller does not cross."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -293,13 +300,14 @@ def code_of(cfg: SearchCfg) -> str | None:
     return cfg.policy if ControllerSpec.parse(cfg.policy).runs_code else None
 
 
-def refuse_unnamed_code(policy: str, given: str | None, path: Path) -> None:
+def refuse_unnamed_code(policy: str, given: str | None, path: Path, *, flag: str = "policy") -> None:
     """Refuses to run code that a run directory names and the command line does not.
 
     Args:
         policy: Controller of the run.
         given: That of the command line, if any.
         path: The run directory.
+        flag: The flag that names it.
 
     Raises:
         ValueError: If the run's is code and none is given.
@@ -307,7 +315,7 @@ def refuse_unnamed_code(policy: str, given: str | None, path: Path) -> None:
     if given is None and ControllerSpec.parse(policy).runs_code:
         raise ValueError(
             f"{path} was searched with the controller {policy}, which is code: name it again "
-            f"(--policy {shlex.quote(policy)}), since no code runs that the command line does not name"
+            f"(--{flag} {shlex.quote(policy)}), since no code runs that the command line does not name"
         )
 
 

@@ -4,23 +4,30 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qd.faults import fault_numbers
 from qd.fitness import FITNESS_FLOOR
-from qd.fresh import Open
-from qd.run.directory import Metrics
+from qd.fresh import Open, Reevaluate, reevaluate_run
+from qd.run.arguments import NOT_ON_RAY, certifier_settings, check_certifiers
+from qd.run.directory import Metrics, RunDirectory, episodes_in
+from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
 from qd.studies.study import StudyFlags, run_study, study_of
-from qd.workers.evaluator import open_evaluator, resolve_device
+from qd.workers.evaluator import open_evaluator, parse_workers, resolve_device
 from sim.files.command import publish
 from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
 from sim.files.settings import check, setting
+from sim.policy.spec import controllers_of, named_file
 from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from sim.robots.robot import RobotCfg
 
 METHODS: dict[str, dict[str, Any]] = {
     "uniform_random": {"method": "uniform_random"},
@@ -31,8 +38,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "cma_mae_sep": {"method": "cma_mae", "es": "sep_cma_es"},
     "cma_mae_narrow": {"method": "cma_mae", "es": "cma_es", "sigma0": 0.5},
     "mixed": {"method": "cma_mae+map_elites", "es": "cma_es"},
+    "gated": {"method": "cma_mae+map_elites", "es": "cma_es"},
 }
-"""What is compared: changes of the search's settings."""
+"""What is compared: changes of the search's settings. ``gated`` is ``mixed`` for certified failures."""
+GATED = "gated"
 LABELS = {
     "uniform_random": ("uniform random", "#999999", ":"),
     "hard_random": ("hard-random", "#000000", "--"),
@@ -42,6 +51,7 @@ LABELS = {
     "cma_mae_sep": ("CMA-MAE, sep-CMA", "#cc79a7", "--"),
     "cma_mae_narrow": ("CMA-MAE, first step .5", "#e69f00", ":"),
     "mixed": ("CMA-MAE and iso+line", "#d55e00", "-"),
+    "gated": ("... for certified failures", "#d55e00", "--"),
 }
 """Name, colour and line of each method in the figure."""
 _OTHER_LOOKS = [
@@ -57,6 +67,8 @@ AGAIN = (
     "mean_std",
 )
 """What a row of metrics has more where all elites crossed fresh episodes."""
+FAULTS = ("failing", "confirmed", "certified", "faults")
+"""What a method has more where its elites were judged."""
 _BATCH = ("batch_fitness", "batch_collision_rate", "batch_goal_rate")
 _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called, with a seed behind it
 
@@ -69,10 +81,19 @@ class Compare(StudyFlags):
     Ctrl-C whenever you like, and the same command goes on.
     """
 
-    methods: tuple[str, ...] = tuple(METHODS)
+    methods: tuple[str, ...] = tuple(name for name in METHODS if name != GATED)
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
-    size .5), mixed (cma_mae+map_elites); all. Settings of the search after a colon make another one of it:
-    cma_mae:restart-rule=20,learning-rate=0.3."""
+    size .5), mixed (cma_mae+map_elites), gated (mixed, for failures that others can cross); all but gated. Settings of
+    the search after a colon make another one of it: cma_mae:restart-rule=20,learning-rate=0.3."""
+    certified_by: tuple[str, ...] = ()
+    """Certifiers of the method gated, FILE or NAME=FILE. It ends with as many episodes as the others have, those of the
+    certifiers included, and so after fewer iterations."""
+    certify_episodes: int = setting(10, least=1)
+    """Episodes of each of them on a terrain that the controller does not cross."""
+    certify: bool = False
+    """Confirm and certify the elites of every run afterwards, and count the faults."""
+    by: tuple[str, ...] = ()
+    """Who certifies them then, NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt."""
     seeds: int = setting(3, least=1, most=MAX_T_VALUES)
     """Runs of each method, with seeds from --seed on."""
     seed: int = 0
@@ -101,14 +122,23 @@ class Compare(StudyFlags):
         size = self.preset or ("paper" if device.startswith("cuda") else "small")
         asked = {name: getattr(self, name) for name in ("seed", "iterations", "reevaluate_every", "policy")}
         shared = measured_now(changed(preset(size, robot, self.policy), asked), robot)
-        methods = self._methods(shared)
+        certifiers = controllers_of([named_file(text) for text in self.certified_by], robot, flag="certified-by")
+        certifiers = certifiers if self.certified_by else {}
+        methods = self._methods(shared, certifiers)
+        check_certifiers(certifiers, shared, robot, device)
+        judges = judges_of(self.by, shared, robot, device) if self.certify else {}
         seeds = range(self.seed, self.seed + self.seeds)
         runs = {f"{name}-{seed}": replace(cfg, seed=seed) for name, cfg in methods.items() for seed in seeds}
-        study = study_of(self, "compare", runs, robot, device, sampled=False)
+        study = study_of(self, "compare", runs, robot, device, sampled=False, certifiers=certifiers)
 
         def measure() -> dict[str, Any]:
             found = run_study(study, open_evaluator)
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds] for name in methods}
+            report = report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()})
+            for name in methods if self.certify else ():
+                folders = [study.path / f"{name}-{seed}" for seed in seeds]
+                counts = [self._judged(folder, robot.spec, judges, open_evaluator) for folder in folders]
+                report["methods"][name] |= {key: _over_seeds([one[key] for one in counts]) for key in FAULTS}
             return {
                 **study.origin,
                 **identity(robot, study.evaluator.policy),
@@ -116,13 +146,28 @@ class Compare(StudyFlags):
                 "seeds": list(seeds),
                 "reachable_cells": shared.cells.num_cells,
                 "qd_score_offset": -FITNESS_FLOOR,
-                **report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()}),
+                "certified_by": dict(zip(certifiers, certifier_settings(certifiers)["certifier_sha256"], strict=True)),
+                "panel": list(judges),
+                **report,
             }
 
         return publish(study.out, measure, _show, draw=lambda report: as_png(draw_comparison(report)))
 
-    def _methods(self, shared: SearchCfg) -> dict[str, SearchCfg]:
-        """Settings of each method: different searches on the same number of terrains.
+    def _judged(self, run: Path, robot: str, judges: dict[str, str], open_evaluator: Open) -> dict[str, Any]:
+        """What a run's elites are in fresh episodes, with contact resolved and to the judges; what is there is kept."""
+        where = {"robot": robot, "run": run, "device": self.device, "workers": self.workers, "num_envs": self.num_envs}
+        if RunDirectory(run).fresh_archive() is None:
+            reevaluate_run(Reevaluate(policy=self.policy, **where), open_evaluator=open_evaluator)
+        confirm_run(Confirm(policy=self.policy, **where), open_evaluator=open_evaluator)
+        by = tuple(f"{name}={policy}" for name, policy in judges.items())
+        return fault_numbers(certify_run(Certify(by=by, **where), open_evaluator=open_evaluator))
+
+    def _methods(self, shared: SearchCfg, certifiers: dict[str, str]) -> dict[str, SearchCfg]:
+        """Settings of each method: different searches on the same number of terrains, or of episodes.
+
+        Args:
+            shared: What they have in common.
+            certifiers: Those of the method gated.
 
         Raises:
             ValueError: If they are not, or a name cannot be that of a folder.
@@ -130,6 +175,14 @@ class Compare(StudyFlags):
         unknown = [name for name in self.methods if name.split(":")[0] not in METHODS]
         if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
             raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(self.methods)}")
+        gated = [name for name in self.methods if name.split(":")[0] == GATED]
+        if bool(gated) != bool(certifiers):
+            raise ValueError(
+                f"methods: {GATED} and --certified-by need each other, got {', '.join(self.methods)} with "
+                f"{', '.join(certifiers) or 'no certifier'}"
+            )
+        if gated and parse_workers(self.workers).on_ray:
+            raise ValueError(f"methods: {NOT_ON_RAY}, got --workers {self.workers}")
         names: dict[SearchCfg, str] = {}
         for name in self.methods:
             if not _NAME.fullmatch(name):
@@ -137,6 +190,8 @@ class Compare(StudyFlags):
                     f"methods: a name must be up to 200 letters, digits and _+-.,:= without spaces, got {name!r}"
                 )
             cfg = changed(shared, changes_of(name))
+            if name in gated:
+                cfg = replace(cfg, **certifier_settings(certifiers), certify_episodes=self.certify_episodes)
             if cfg in names:
                 raise ValueError(f"methods: {names[cfg]} and {name} are the same search: leave one of them out")
             if cfg.scheduler.num_terrains != shared.scheduler.num_terrains:
@@ -172,11 +227,24 @@ def changes_of(method: str) -> dict[str, Any]:
     return found
 
 
+def judges_of(by: Sequence[str], cfg: SearchCfg, robot: "RobotCfg", device: str) -> dict[str, str]:
+    """Controllers that certify afterwards, by name: those given, or the robot's panel.
+
+    Raises:
+        ValueError: If there is none, or one cannot be used (:func:`qd.run.arguments.check_certifiers`).
+    """
+    found = controllers_of(by, robot, flag="by") if by else panel_of(robot, cfg)
+    check_certifiers(found, cfg, robot, device)
+    certifier_settings(found)
+    return found
+
+
 def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[str, Any]:
     """The numbers of a comparison.
 
     Args:
-        runs: Metrics of every seed, by method; equally many rows.
+        runs: Metrics of every seed, by method; equally many rows but for searches that have spent their episodes, whose
+            curves stay where they ended.
         settings: Settings of each method's scheduler.
 
     Returns:
@@ -184,7 +252,9 @@ def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[
         the curves found (``CURVES``, every iteration) and corrected (``AGAIN``, at ``corrected_at`` terrains) as mean
         and 95 % t interval over seeds, what its terrains did to the robots on average, and its episodes.
     """
-    first = next(iter(runs.values()))[0]
+    ended = runs
+    first = max((rows for seeds in runs.values() for rows in seeds), key=len)
+    runs = {name: [rows + rows[-1:] * (len(first) - len(rows)) for rows in seeds] for name, seeds in runs.items()}
     terrains = np.cumsum([row["terrains"] for row in first])
     every = [rows for seeds in runs.values() for rows in seeds]
     # The last iteration of a comparison that was stopped in it and then extended has them in some runs only.
@@ -195,10 +265,15 @@ def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[
             "settings": settings[name],
             **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in range(len(first))] for key in CURVES},
             **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in at] for key in AGAIN},
-            **{key: _over_seeds([float(np.mean([row[key] for row in rows])) for rows in seeds]) for key in _BATCH},
-            "episodes": sum(row["episodes"] for rows in seeds for row in rows),
-            "invalid_episodes": sum(row["invalid_episodes"] for rows in seeds for row in rows),
-            "wall_s": sum(row["wall_s"] for rows in seeds for row in rows),
+            **{
+                key: _over_seeds([float(np.mean([row[key] for row in rows])) for rows in ended[name]]) for key in _BATCH
+            },
+            "iterations": [len(rows) for rows in ended[name]],
+            "episodes": sum(episodes_in(row) for rows in ended[name] for row in rows),
+            **{
+                key: sum(row.get(key, 0) for rows in ended[name] for row in rows)
+                for key in ("certifier_episodes", "invalid_episodes", "wall_s")
+            },
         }
     return {
         "iterations": len(first),
@@ -263,3 +338,6 @@ def _show(report: dict[str, Any]) -> None:
     for name, method in report["methods"].items():
         last = method["corrected_qd_score"][-1]
         print(f"  {name}: {value_words(last['mean'], last['interval'], '.0f')}")
+        if "faults" in method:
+            found = method["faults"]
+            print(f"    faults: {value_words(found['mean'], found['interval'], '.0f')}")

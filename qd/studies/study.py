@@ -6,15 +6,26 @@ The same command goes on where it was stopped.
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import Archive
 from qd.fresh import Open, drawn_elites, numbers_of, reevaluate
+from qd.gate import Gate, open_gate
 from qd.run.arguments import evaluator_of, own_file
-from qd.run.directory import CONFIG_FILE, RUNS, Metrics, RunDirectory, archive_of, claimed, origin_in, write_results
+from qd.run.directory import (
+    CONFIG_FILE,
+    RUNS,
+    Metrics,
+    RunDirectory,
+    archive_of,
+    claimed,
+    episodes_in,
+    origin_in,
+    write_results,
+)
 from qd.run.progress import ProgressBar
 from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, refuse_changes
 from qd.search import MOST_DRAWN, begin, crossed_iterations, looks_again, row_of
@@ -59,6 +70,8 @@ class Study:
     """Provenance."""
     sampled: bool
     """Whether up to 200 drawn elites cross fresh episodes every so many iterations; else all do, and at the end too."""
+    certifiers: dict[str, str] = field(default_factory=dict)
+    """Controllers by name, the same in all searches for certified failures among them."""
 
 
 def study_of(
@@ -70,6 +83,7 @@ def study_of(
     *,
     sampled: bool,
     moved: str | None = None,
+    certifiers: dict[str, str] | None = None,
 ) -> Study:
     """A study whose controller was tried.
 
@@ -81,6 +95,7 @@ def study_of(
         device: Warp device name.
         sampled: As of the field.
         moved: Where the controller is, if not where the settings say.
+        certifiers: As of the field.
 
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot.
@@ -97,6 +112,7 @@ def study_of(
         evaluator=evaluator_of(cfg, robot, controller, device, flags.workers, num_envs=flags.num_envs, runs=len(runs)),
         origin={**origin_of(device, cfg.seed, flags.workers), **own_file(robot)},
         sampled=sampled,
+        certifiers=certifiers or {},
     )
 
 
@@ -115,6 +131,17 @@ class _Search:
     def done(self) -> int:
         """Iterations done."""
         return len(self.metrics)
+
+    def episodes_left(self, iterations: int, *rows: dict[str, Any]) -> int:
+        """Episodes to be spent; none once it has made so many iterations, or spent as many as they have of a plain one.
+
+        Args:
+            iterations: Of the study.
+            rows: Of iterations that are not among its metrics yet.
+        """
+        metrics, each = [*self.metrics, *rows], self.cfg.episodes_per_iteration
+        left = iterations * each - sum(map(episodes_in, metrics))
+        return left if len(metrics) < iterations and left >= each else 0
 
 
 def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
@@ -135,14 +162,22 @@ def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
     with ExitStack() as claims:
         claims.enter_context(claimed(study.path))
         searches = {name: _opened(study, name, claims) for name in study.runs}
-        left = sum((one.cfg.iterations - one.done) * one.cfg.episodes_per_iteration for one in searches.values())
+        iterations = min(one.cfg.iterations for one in searches.values())
+        left = sum(one.episodes_left(iterations) for one in searches.values())
         print(f"{len(searches)} searches in {study.path}: {left:,} episodes, and those of elites again", flush=True)
         with naming_what_is_next("finished iterations are saved", lambda: "The same command goes on"):
-            with open_evaluator(study.evaluator) if left else nullcontext() as evaluate:
+            gated = [one.cfg for one in searches.values() if one.cfg.certified_by]
+            with ExitStack() as opened:
+                evaluate = gate = None
+                if left:
+                    evaluate = opened.enter_context(open_evaluator(study.evaluator))
+                if left and gated:
+                    own = open_gate(gated[0], study.certifiers, study.evaluator, open_evaluator, runs=len(gated))
+                    gate = opened.enter_context(own)
                 for one in searches.values():
                     one.run.write_config(one.cfg, one.origin)
                 if evaluate is not None:
-                    _lock_step(list(searches.values()), evaluate, sampled=study.sampled)
+                    _lock_step(list(searches.values()), evaluate, gate, sampled=study.sampled)
             for one in searches.values():
                 found = one.run.with_fresh_values(archive_of(one.cfg, one.search, one.done))
                 write_results(one.run, found, one.metrics, one.origin)
@@ -168,40 +203,60 @@ def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
     return _Search(cfg=cfg, run=run, origin=origin, search=search, metrics=metrics)
 
 
-def _lock_step(searches: Sequence[_Search], evaluate: Evaluate, *, sampled: bool) -> None:
-    """Runs the iterations that are left; searches behind the others, as after a kill, catch up first."""
+def _lock_step(searches: Sequence[_Search], evaluate: Evaluate, gate: Gate | None, *, sampled: bool) -> None:
+    """Runs the iterations that are left; searches behind the others, as after a kill, catch up first.
+
+    Searches with certifiers end earlier than the others, with as many episodes.
+    """
     iterations = min(one.cfg.iterations for one in searches)
     with ProgressBar(iterations, min(one.done for one in searches)) as bar:
-        while (done := min(one.done for one in searches)) < iterations:
-            active = [one for one in searches if one.done == done]
-            caught_up = min((one.done for one in searches if one.done > done), default=iterations)
-            _iterate(active, evaluate, range(done + 1, min(caught_up, iterations) + 1), bar, sampled=sampled)
+        while going := [one for one in searches if one.episodes_left(iterations)]:
+            done = min(one.done for one in going)
+            active = [one for one in going if one.done == done]
+            caught_up = min((one.done for one in going if one.done > done), default=iterations)
+            left = range(done + 1, caught_up + 1)
+            gated = any(one.cfg.certified_by for one in active)
+            _iterate(active, evaluate, gate if gated else None, left, bar, iterations=iterations, sampled=sampled)
 
 
 def _iterate(
-    active: Sequence[_Search], evaluate: Evaluate, iterations: range, bar: ProgressBar, *, sampled: bool
+    active: Sequence[_Search],
+    evaluate: Evaluate,
+    gate: Gate | None,
+    left: range,
+    bar: ProgressBar,
+    *,
+    iterations: int,
+    sampled: bool,
 ) -> None:
-    """Some iterations of some searches, each saved."""
+    """Some iterations of some searches, each saved, until one of them has spent its episodes."""
     began = time.perf_counter()
     states = [(one.cfg, one.search) for one in active]
-    for iteration, results in crossed_iterations(states, iterations, evaluate, bar):
+    for iteration, results in crossed_iterations(states, left, evaluate, bar, gate):
         rows = []
         for one, result in zip(active, results, strict=True):
             one.found = archive_of(one.cfg, one.search, iteration)
             rows.append(row_of(one.cfg, one.found, result, iteration))
-        if looks_again(active[0].cfg, iteration) or (iteration == active[0].cfg.iterations and not sampled):
-            rows = [row | again for row, again in zip(rows, _elites_again(active, evaluate, sampled), strict=True)]
+        ending = [not one.episodes_left(iterations, row) for one, row in zip(active, rows, strict=True)]
+        every = looks_again(active[0].cfg, iteration) or iteration == active[0].cfg.iterations
+        chosen = [k for k, ends in enumerate(ending) if every or ends]
+        if chosen and not (sampled and not looks_again(active[0].cfg, iteration)):
+            again = _elites_again([active[k] for k in chosen], evaluate, sampled)
+            for k, numbers in zip(chosen, again, strict=True):
+                rows[k] |= numbers
         ended = time.perf_counter()
         wall_s, began = ended - began, ended
         for one, row in zip(active, rows, strict=True):
-            one.metrics.append({**row, "wall_s": wall_s / len(active), "episodes_per_s": row["episodes"] / wall_s})
+            one.metrics.append({**row, "wall_s": wall_s / len(active), "episodes_per_s": episodes_in(row) / wall_s})
             assert one.found is not None
             one.run.save(one.cfg, one.search, one.metrics, one.found)
         best = max((one.metrics[-1] for one in active), key=lambda row: row["elites"])
-        episodes = sum(row["episodes"] for row in rows)
+        episodes = sum(map(episodes_in, rows))
         status = worker_status(evaluate)
         shown = {**best, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
         bar.show(shown, None if status is None else str(status))
+        if any(ending):
+            return
 
 
 def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) -> list[dict[str, Any]]:

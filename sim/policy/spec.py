@@ -248,6 +248,27 @@ def controllers_of(policies: Sequence[str], robot: "RobotCfg", *, flag: str = "p
     return found
 
 
+def named_file(text: str) -> str:
+    """``NAME=FILE`` of a controller that is named so, or by its file alone, whose name it then has."""
+    if re.match(r"[\w.+@-]+=", text):
+        return text
+    return f"{Path(ControllerSpec.parse(text).label).stem}={text}"
+
+
+def certifier_hash(name: str, policy: str) -> str:
+    """SHA-256 of a certifier, which its certificates name.
+
+    Raises:
+        ValueError: If it has none.
+    """
+    digest = controller_hash(policy)
+    if digest is None:
+        raise ValueError(
+            f"certifier {name} must have a file, which its certificates name by hash, got {policy}: give a file"
+        )
+    return digest
+
+
 def label_suffix(policy: str) -> str:
     """The ending of the names of files about a controller that is not the usual one, for example ``-C-G``."""
     label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")

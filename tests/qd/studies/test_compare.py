@@ -368,3 +368,52 @@ def test_figure_of_one_seed_has_lines_without_bands(tmp_path):
 def test_every_method_has_a_look_of_its_own():
     assert LABELS.keys() == METHODS.keys()
     assert len({look[1:] for look in LABELS.values()}) == len(METHODS)
+
+
+CERTIFIER = "me=tests.qd.run.test_arguments:fine_policy"
+
+
+@contextmanager
+def crossed_by_certifiers(cfg):
+    """The stand-in; a certifier crosses everything."""
+
+    def evaluate(genes, seeds, progress=None):
+        result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
+        if cfg.policy == CERTIFIER.partition("=")[2]:
+            never = np.zeros(result.invalid.shape, bool)
+            return stand_in.make_result(result.penalties, base_collision=never)
+        return result
+
+    yield evaluate
+
+
+def test_a_search_for_certified_failures_ends_with_as_many_episodes(capsys):
+    changes = {"methods": ("mixed", "gated"), "certified_by": (CERTIFIER,), "iterations": 6, "seeds": 1}
+    changes |= {"certify": True, "by": (CERTIFIER,), "open_evaluator": crossed_by_certifiers}
+    path = run("a", **changes)
+    report = numbers_of(path)
+    mixed, gated = (report["methods"][name] for name in ("mixed", "gated"))
+    # 4 emitters x 8 terrains x 4 episodes an iteration, and 10 a terrain that is not crossed
+    assert mixed["iterations"] == [6] and mixed["episodes"] == 6 * 128 and mixed["certifier_episodes"] == 0
+    done = gated["iterations"][0]
+    assert done < 6 and gated["certifier_episodes"] > 0
+    assert gated["episodes"] == done * 128 + gated["certifier_episodes"] > 5 * 128
+    last = rows_of(path / "gated-5")[-1]
+    assert gated["episodes"] - last["episodes"] - last["certifier_episodes"] <= 5 * 128
+    assert len(gated["elites"]) == 6 and gated["elites"][done - 1 :] == gated["elites"][-1:] * (7 - done)
+    assert report["corrected_at"][-1] == 6 * 32
+    for method in (mixed, gated):  # the judge crosses all that fails
+        assert method["faults"]["mean"] == method["certified"]["mean"] == method["confirmed"]["mean"]
+        assert 0 < method["faults"]["mean"] <= method["failing"]["mean"]
+    assert report["panel"] == ["me"] and [*report["certified_by"]] == ["me"]
+    assert "faults: " in capsys.readouterr().out
+    again = run("a", **{**changes, "open_evaluator": never})  # all of it is kept
+    assert numbers_of(again) == report
+    assert_same(path, run("b", **changes))
+
+
+def test_gated_and_its_certifiers_need_each_other():
+    for changes in ({"methods": ("gated",)}, {"certified_by": (CERTIFIER,)}):
+        with pytest.raises(ValueError, match="gated and --certified-by need each other"):
+            run("a", open_evaluator=never, **changes)
+    assert not Path("a").exists()
