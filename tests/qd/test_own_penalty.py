@@ -31,6 +31,7 @@ def project(tmp_path):
     return tmp_path, name
 
 
+@pytest.mark.slow  # the kernels are compiled anew
 def test_an_added_penalty_is_one_function(project):
     folder, name = project
     dog = write_dog(folder / "mine")
