@@ -41,6 +41,7 @@ SMALL: dict[str, dict[str, str]] = {
     "compare": {**CPU, "--preset": "small", "--iterations": "1", "--seeds": "1", "--workers": "2"},
     "ablation": {**CPU, "--preset": "small", "--iterations": "2", "--workers": "2"},
     "beside": {},
+    "penalty-ratios": {**CPU, "--terrains": "2", "--replicas": "4"},
     "agreement": {**CPU, "--terrains": "2", "--elites": "1", "--episodes": "2", "--mujoco-c": "1", "--workers": "1"},
     "crosscheck": {**CPU, "--terrains": "1", "--episodes": "2", "--plain-episodes": "2"},
     "distances": {},

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+from kernels.penalties import PENALTY_DEFINITION
 from qd.fitness import FitnessCfg
 from qd.run.arguments import Job
 from qd.run.directory import RunDirectory, origin_in
@@ -15,6 +16,7 @@ from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 
 CFG = SearchCfg(
+    penalty_definition=PENALTY_DEFINITION,
     robot="anymal",
     preset="small",
     policy="shipped",

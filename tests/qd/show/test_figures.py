@@ -87,7 +87,7 @@ def test_summary_by_hand():
         "robot": "anymal",
         "robot_sha256": None,
         "policy_sha256": None,
-        "penalty_definition": "absolute",
+        "penalty_definition": "squared",
         "space": "super_gaussian",
         "space_sha256": None,
         "iterations": 7,

@@ -196,8 +196,8 @@ def test_rates_of_ones_own_terrain_with_their_intervals(capsys):
     assert report["outcomes"] == {"goal": 0, "base_collision": 0, "time_out": 4, "out": 0, "invalid": 0}
     assert report["heights_m"] == [0.0, 2.0] and report["map"] == "161 x 81 nodes over 16 x 8 m, heights 0.00 to 2.00 m"
     assert report["duration_s"] == 20.0
-    # 20 s at rest against 0.75 m/s
-    assert report["penalties"]["vel_x"]["mean"] == pytest.approx(15.0, rel=0.1)
+    # 20 s at rest against 0.75 m/s: 20 * 0.75^2
+    assert report["penalties"]["vel_x"]["mean"] == pytest.approx(11.25, rel=0.1)
     assert {
         "command",
         "commit",

@@ -89,7 +89,7 @@ def test_flat_ground_is_crossed_alike_in_both(anymal):
     np.testing.assert_array_equal(ours.outcome[0], plain.outcome)
     np.testing.assert_array_equal(plain.duration_s, 4.0)
     velocities = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y")]
-    np.testing.assert_allclose(ours.penalties[0][:, velocities], plain.penalties[:, velocities], rtol=0.05)
+    np.testing.assert_allclose(ours.penalties[0][:, velocities], plain.penalties[:, velocities], rtol=0.1)
 
 
 def test_cassie_goes_over_alike_in_both(cassie):
