@@ -19,6 +19,8 @@ class StartRanges:
     position: wp.vec2
     """Nominal start, world-local x, y [m]."""
     position_range: float
+    ahead: float
+    """Starts lie up to this further along x, uniform [m]; 0 for none."""
     yaw_range: float
     joint_scale_range: float
     """Joint angles are the default pose times 1 +- this."""
@@ -51,6 +53,8 @@ def _place_robot(
 ):  # fmt: skip
     """Write the joint coordinates and velocities of a start drawn from ``rng`` (base velocity: at the link origin)."""
     x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    if ranges.ahead > 0.0:  # else no number is drawn, and starts are those of a crossing
+        x += ranges.ahead * wp.randf(rng)
     y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
     half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
     rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))

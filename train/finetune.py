@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from sim.files.settings import setting
 from sim.robots.training import RewardCfg
 from train.ppo.cfg import PpoCfg, TrainingFlags
+from train.task.cfg import MOST_SPREAD
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -44,10 +45,19 @@ class Finetune(TrainingFlags):
     a space of one's own, and a resumed training on it, need it named here."""
     split_seed: int = setting(0, least=0)
     """Which elites are held out for the evaluation."""
-    draw: Literal["uniform", "failing"] = "uniform"
-    """How elites are drawn at each exchange: uniform; or failing, the likelier the less often they were crossed."""
+    only: Literal["all", "failing", "certified", "uncertified"] = "all"
+    """Which elites: all; those that fail by their fresh episodes; of these those that a certifier crosses, or those
+    that none is known to cross."""
+    held_out: bool = True
+    """Whether elites are held out for the evaluation; a specialist, which is to certify, may train on all."""
+    draw: Literal["uniform", "failing", "learnable"] = "uniform"
+    """How elites are drawn at each exchange: uniform; failing, the likelier the less often they were crossed; or
+    learnable, the likelier the nearer to half of the time, so that harder ones come later."""
     task: Literal["crossing", "commands"] = "crossing"
     """What robots are told: to cross, as in a search; or random velocities, as in the base's training."""
+    start_spread: float = setting(0.0, least=0.0, most=MOST_SPREAD)
+    """Robots start up to so far along the way, uniformly [m], with the goal where it is; task crossing. Where a terrain
+    is hard at its beginning, robots so learn what lies behind."""
     rewards: RewardCfg
     """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel.
     The rewards of an evaluation keep the robot's own."""
@@ -75,6 +85,9 @@ class Finetune(TrainingFlags):
             "archive": None if archive is None else Path(archive["path"]),
             "space": shipped_space(settings),
             "task": "crossing" if task["crosses"] else "commands",
+            "start_spread": task.get("start_spread", 0.0),
+            "only": (archive or {}).get("only", "all"),
+            "held_out": (archive or {}).get("held_out", True),
             "rewards": task["rewards"],
         }
 

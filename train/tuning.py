@@ -1,11 +1,13 @@
 """A fine-tuning: what it begins with, checked, and how it exchanges terrains under the learner."""
 
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from qd.run.directory import published_or_newest, read_archive_of
+from qd.archive import Archive
+from qd.run.directory import directory_of, published_or_newest, read_archive_of
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
@@ -96,8 +98,14 @@ class FineTuning(Training):
         print(f"The same as ONNX: {path.with_suffix('.onnx')}")
 
     def next_command(self) -> str:
-        """The command that holds the controller against the shipped one, on elites held out of its training too."""
+        """The command that holds the controller against the shipped one, on elites held out of its training too.
+
+        Of one that was trained on all elites, none held out: the command that lets it certify.
+        """
         archive = self.job.settings["archive"]
+        if archive and not archive.get("held_out", True):
+            by, run = f"S={self.job.run_dir / POLICY}", directory_of(Path(archive["path"]))
+            return command_line("certify", robot=self.job.robot.spec, run=run, by=[by])
         return command_line(
             "evaluate",
             robot=self.job.robot.spec,
@@ -127,14 +135,16 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     else:  # all of it is in the checkpoint: the file it began with may be gone
         start, ppo, before = None, flags.ppo, saved["extra"]["settings"].get("trained_before", [])
     crosses = flags.task == "crossing"
-    task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards)
+    if flags.start_spread and not crosses:
+        raise ValueError(f"start_spread needs task crossing, got task {flags.task} with {flags.start_spread:g} m")
+    task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards, start_spread=flags.start_spread)
     common = settings_of(flags, robot, size, task, ppo)
     mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
     if size["num_envs"] < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
     if saved is not None:
         _check_space(flags, saved["extra"]["settings"])
-    genes, space, archive = _elites(flags, robot)
+    genes, space, goal_rate, archive = _elites(flags, robot)
     settings = {
         **common,
         "policy": str(flags.policy or "shipped"),
@@ -151,7 +161,11 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         flags=flags, robot=robot, device=device, num_envs=size["num_envs"], iterations=size["iterations"], task=task,
         ppo=ppo, settings=settings, saved=saved, began=began,
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
-        start=start, mix=Mix(cfg=mix_cfg, genes=genes, space=space, crosses=crosses, seed=flags.seed, device=device),
+        start=start,
+        mix=Mix(
+            cfg=mix_cfg, genes=genes, space=space, crosses=crosses, seed=flags.seed, device=device,
+            goal_rate=goal_rate if flags.draw == "learnable" else None,
+        ),
     )  # fmt: skip
 
 
@@ -170,13 +184,17 @@ def paper_sizes(robot: str) -> dict[str, int]:
     return _PAPER.get(robot, _PAPER_OTHERS)
 
 
-def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace, dict[str, Any] | None]:
-    """Genes of the elites to train on, shape (E, num_genes), what they mean, and where they are from."""
+def _elites(
+    flags: Finetune, robot: RobotCfg
+) -> tuple[np.ndarray, TerrainSpace, np.ndarray | None, dict[str, Any] | None]:
+    """Genes of the elites to train on, shape (E, num_genes), what they mean, their goal rates, where they are from."""
     if flags.mix != "generated":
         if flags.archive is not None:
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
+        if flags.only != "all" or not flags.held_out:
+            raise ValueError(f"mix {flags.mix} has no elites: leave --only and --no-held-out out, or use mix generated")
         space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
-        return np.zeros((0, space.num_genes), np.float32), space, None
+        return np.zeros((0, space.num_genes), np.float32), space, None, None
     named = None if flags.policy is None else str(flags.policy)
     path = flags.archive or published_or_newest(robot, named, flag="archive")
     try:
@@ -184,11 +202,56 @@ def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace,
     except FileNotFoundError as error:
         make = command_line("archive", robot=robot.spec, policy=named)
         raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error
-    rows = split_elites(archive, robot.name, flags.split_seed, spec=robot.spec, run=path).train
-    return archive.genes[rows], space_of(archive), {
+    split = split_elites(archive, robot.name, flags.split_seed, spec=robot.spec, run=path)
+    rows = split.train if flags.held_out else np.concatenate([split.train, split.test])
+    rows = rows[chosen_elites(archive, flags.only, path)[rows]]
+    if len(rows) == 0:
+        raise ValueError(
+            f"{path} must have elites to train on that are {flags.only}, got none: choose others by --only"
+        )
+    goal_rate = (archive.fresh or archive).goal_rate[rows]
+    # The defaults are not named, so that a run of before there were others goes on.
+    chosen = {"only": flags.only} if flags.only != "all" else {}
+    chosen |= {} if flags.held_out else {"held_out": False}
+    return archive.genes[rows], space_of(archive), goal_rate, {
         "path": str(path), "archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows),
-        "elites_sha256": elites_sha256(archive),
+        "elites_sha256": elites_sha256(archive), **chosen,
     }  # fmt: skip
+
+
+def chosen_elites(archive: Archive, only: str, path: Path) -> np.ndarray:
+    """Which elites of an archive are of a kind: ``all``, ``failing``, ``certified`` or ``uncertified``.
+
+    Args:
+        archive: The N elites.
+        only: The kind.
+        path: Where the archive lies, for errors.
+
+    Returns:
+        Bool, shape (N,).
+
+    Raises:
+        ValueError: If nobody has looked: there are no fresh episodes, or no certifier was asked about them all.
+    """
+    if only == "all":
+        return np.ones(len(archive), bool)
+    if archive.fresh is None:
+        raise ValueError(
+            f"{path} must have fresh episodes of its elites, which say what fails, got none: run `faultline "
+            "reevaluate` first, or use --only all"
+        )
+    if only == "failing":
+        return archive.failing
+    asked = (
+        np.zeros(len(archive), bool) if archive.faults is None else archive.faults.certifier_outcomes.any(axis=(1, 2))
+    )
+    missing = int((archive.failing & ~asked).sum())
+    if missing:
+        raise ValueError(
+            f"{path} must have all its failing elites crossed by certifiers, got {missing} of "
+            f"{int(archive.failing.sum())} that were not: run `faultline certify` first, or use --only failing"
+        )
+    return archive.certified if only == "certified" else archive.failing & ~archive.certified
 
 
 def _named(space: TerrainSpace, saved: dict[str, Any] | None) -> dict[str, Any]:

@@ -9,20 +9,22 @@ import numpy as np
 import pytest
 import torch
 
-from qd.archive import write_archive
+from qd.archive import FaultCounts, write_archive
 from sim import space as spaces
 from sim.files.atomic import locked
 from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
+from tests.builders import fresh_values
 from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
 from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
+from train.evaluate.sets import split_elites
 from train.finetune import Finetune
 from train.ppo.learner import read_checkpoint
 from train.ppo.ppo import CapturedPPO
-from train.ppo.run import CommandTask, read_saved, sizes_of
+from train.ppo.run import CommandTask, check_resumed, read_saved, sizes_of
 
 ROBOT = get_robot("anymal")
 
@@ -293,6 +295,14 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
         (["--archive", "{dir}/empty.npz"], "needs at least 5 elites, got 0"),
         (["--mix", "hand-crafted", "--archive", "{dir}/archive"], "takes no terrains from an archive"),
         (["--mix", "hard-random", "--draw", "failing"], "draw failing chooses among elites"),
+        (["--mix", "hard-random", "--only", "failing"], "mix hard-random has no elites: leave --only"),
+        (["--only", "failing"], "must have fresh episodes of its elites, which say what fails, got none"),
+        (
+            ["--only", "uncertified", "--archive", "{dir}/fresh.npz"],
+            "crossed by certifiers, got 10 of 10 that were not",
+        ),
+        (["--task", "commands", "--start-spread", "2"], "start_spread needs task crossing, got task commands with 2 m"),
+        (["--start-spread", "11"], "start_spread must be at least 0 and at most 10, got 11.0"),
         (["--policy", "{dir}/nowhere.pt"], "no such file"),
         (["--policy", "{dir}/narrow.pt"], "maps 100 observations to 12 actions"),
         (["--policy", "{dir}/script.pt"], "a fine-tuning starts from an rsl_rl checkpoint"),
@@ -326,6 +336,7 @@ def test_numbers_that_are_not_finite_stop_it_and_keep_the_last_checkpoint(places
 def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeypatch, capsys):
     write_archive(places / "cassie.npz", make_archive(10, robot="cassie"))
     write_archive(places / "empty.npz", make_archive(0))
+    write_archive(places / "fresh.npz", replace(make_archive(10), fresh=fresh_values(make_archive(10))))
     state = torch.load(places / "start.pt", weights_only=True)["actor_state_dict"]
     state["mlp.0.weight"] = state["mlp.0.weight"][:, :100]
     torch.save({"actor_state_dict": state}, places / "narrow.pt")
@@ -340,6 +351,58 @@ def test_errors_come_before_any_work_in_one_line(flags, message, places, monkeyp
     lines = capsys.readouterr().err.splitlines()
     (error,) = [line for line in lines if "names no hash" not in line]  # a warning of archives made by hand
     assert message in error and error.startswith("error: ")
+
+
+@pytest.fixture(scope="module")
+def judged(places):
+    """Ten elites: 2 are crossed in fresh episodes; of the other 8 a certifier crosses the first 3."""
+    archive = make_archive(10)
+    fresh = replace(fresh_values(archive), goal_rate=np.array([0.1] * 8 + [0.9] * 2))
+    outcomes = np.array([[[20, 0, 0, 0]]] * 3 + [[[0, 20, 0, 0]]] * 5 + [[[0, 0, 0, 0]]] * 2)
+    counts = replace(
+        FaultCounts.none_of(10), certifiers=("C-G",), certifier_sha256=("a" * 64,), certifier_outcomes=outcomes,
+        certifier_resolved_outcomes=outcomes * (outcomes[:, :, :1] > 0),
+    )  # fmt: skip
+    write_archive(places / "judged.npz", replace(archive, fresh=fresh, faults=counts))
+    return places / "judged.npz", archive
+
+
+def test_which_elites_are_trained_on(places, judged):
+    path, archive = judged
+    kinds = {"all": range(10), "failing": range(8), "certified": range(3), "uncertified": range(3, 8)}
+    for only, expected in kinds.items():
+        job = job_of(config(places, archive=path, only=only, held_out=False, run_dir=places / "none"))
+        rows = [int(np.flatnonzero((archive.genes == genes).all(axis=1))[0]) for genes in job.mix.genes]
+        assert sorted(rows) == list(expected), only
+        held = job_of(config(places, archive=path, only=only, run_dir=places / "none"))
+        kept = {genes.tobytes() for genes in held.mix.genes}
+        train = {archive.genes[row].tobytes() for row in split_elites(archive, "anymal").train}
+        assert kept == train & {genes.tobytes() for genes in job.mix.genes}
+    assert job.settings["archive"]["only"] == "uncertified" and job.settings["archive"]["held_out"] is False
+    learnable = job_of(config(places, archive=path, only="failing", draw="learnable", run_dir=places / "none"))
+    assert learnable.mix.success().tolist() == [0.1] * len(learnable.mix.genes)
+
+
+def test_a_specialist_trains_on_what_nobody_crosses_from_along_the_way_and_goes_on(places, judged, capsys):
+    run, (path, _) = places / "specialist", judged
+    own = {"only": "uncertified", "held_out": False, "start_spread": 8.0, "draw": "learnable", "iterations": 2}
+    assert finetune(config(places, archive=path, run_dir=run, **own)) == 0
+    assert f"certify --robot anymal --run {places} --by S={run / 'policy.pt'}" in capsys.readouterr().out
+    settings = json.loads((run / "policy.train.json").read_text())["settings"]
+    assert settings["task"]["start_spread"] == 8.0 and settings["archive"]["trained_on"] == 5
+    flags = resumed(run, iterations=3)
+    assert (flags.only, flags.held_out, flags.start_spread, flags.draw) == ("uncertified", False, 8.0, "learnable")
+    assert finetune(flags) == 0
+    with pytest.raises(ValueError, match=r"begun with other settings .*start_spread \(8.0 there, 2.0 wanted\)"):
+        job_of(resumed(run, iterations=3, start_spread=2.0))
+
+
+def test_a_run_of_before_starts_were_spread_goes_on(places, finished):
+    saved = read_saved(finished, ROBOT, "finetune")
+    settings = saved["extra"]["settings"]
+    older = {**settings, "task": {key: value for key, value in settings["task"].items() if key != "start_spread"}}
+    old = {**saved, "extra": {**saved["extra"], "settings": older}}
+    assert check_resumed(config(places), old, settings) == []
 
 
 def test_a_training_in_a_space_of_ones_own_goes_on_only_with_it(places, tmp_path, monkeypatch):

@@ -194,7 +194,8 @@ def check_resumed(flags: TrainingFlags, saved: dict[str, Any], settings: dict[st
     """
     if saved["iter"] > settings["iterations"]:
         raise ValueError(f"{flags.resume} has done {saved['iter']} iterations already: give at least as many in all")
-    return differences(saved["extra"]["settings"], settings)
+    there = saved["extra"]["settings"]
+    return differences({**there, "task": {"start_spread": 0.0, **there["task"]}}, settings)  # older ones have no spread
 
 
 # The training itself ---------------------------------------------------------------------------------------------

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
 
+MOST_SPREAD = 10.0
+"""A start further along than this lies within 2 m of the goal [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class NoiseCfg:
     """Half widths of the uniform observation noise, in the units of the measured quantity."""
@@ -49,6 +53,8 @@ class TaskCfg(TrainingCfg):
     crosses: bool = False
     """Robots start at one side of a terrain and are told to go to the other, as in a search, instead of random
     velocities and headings from its middle."""
+    start_spread: float = setting(0.0, least=0.0, most=MOST_SPREAD)
+    """Where robots cross, they start up to so far along the way, uniformly [m]; the goal stays where it is."""
     episode_s: float = setting(20.0, above=0)
     command_interval_s: float = setting(10.0, above=0)
     """A new command every so often."""

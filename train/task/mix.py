@@ -22,7 +22,7 @@ from sim.terrain import (
 from train.task.curriculum import Tiles
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
-_LEAST_WEIGHT = 0.1  # of a terrain that is always crossed, beside 1 more for one that never is
+_LEAST_WEIGHT = 0.1  # of a terrain that is drawn least, beside 1 more for one that is drawn most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,13 +36,16 @@ class MixCfg:
     """Terrains trained on at a time."""
     swap_every: int = setting(400, least=1)
     """They are exchanged for others every so many iterations."""
-    draw: Literal["uniform", "failing"] = "uniform"
-    """How elites are drawn: uniform, or failing: the likelier, the less often they were crossed the last time."""
+    draw: Literal["uniform", "failing", "learnable"] = "uniform"
+    """How elites are drawn: uniform; failing: the likelier, the less often they were crossed the last time; or
+    learnable: the likelier, the nearer to half of the time (goal rate times its rest: Rutherford et al. 2024)."""
 
     def __post_init__(self) -> None:
         check(self)
-        if self.draw == "failing" and self.mix != "generated":
-            raise ValueError(f"draw failing chooses among elites, of which mix {self.mix} has none: use mix generated")
+        if self.draw != "uniform" and self.mix != "generated":
+            raise ValueError(
+                f"draw {self.draw} chooses among elites, of which mix {self.mix} has none: use mix generated"
+            )
         if self.terrains < 2 and self.mix != "hand-crafted":
             raise ValueError(f"terrains must be at least 2 for mix {self.mix}, half of each kind, got {self.terrains}")
 
@@ -69,6 +72,8 @@ class Mix:
     device: str
     space: TerrainSpace = SUPER_GAUSSIAN
     """What the genes mean."""
+    goal_rate: NDArray[np.float64] | None = None
+    """Goal rate of each elite as its archive has it, shape (E,), which stands in until it is trained on; None: 0."""
     swap: int = -1
     """Number of the present exchange, from 0."""
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -144,8 +149,9 @@ class Mix:
         return self.terrains()
 
     def success(self) -> NDArray[np.float64]:
-        """Share of the episodes on each elite that crossed it; 0 where there was none, shape (E,)."""
-        return self.crossed / np.maximum(self.episodes, 1)
+        """Share of the episodes on each elite that crossed it, shape (E,); without any what its archive says, or 0."""
+        before = 0.0 if self.goal_rate is None else self.goal_rate
+        return np.where(self.episodes > 0, self.crossed / np.maximum(self.episodes, 1), before)
 
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([_MIX_KEY, self.seed, self.swap, stream])
@@ -172,7 +178,12 @@ class Mix:
             return np.zeros(0, np.int64)
         rng, count, wanted = self._rng(1), len(self.genes), self.cfg.terrains - self.cfg.hand_crafted
         whole = np.tile(np.arange(count), wanted // count)
-        weights = np.ones(count) if self.cfg.draw == "uniform" else 1.0 - self.success() + _LEAST_WEIGHT
+        rate = self.success()
+        weights = {
+            "uniform": np.ones(count),
+            "failing": 1.0 - rate + _LEAST_WEIGHT,
+            "learnable": 4.0 * rate * (1.0 - rate) + _LEAST_WEIGHT,
+        }[self.cfg.draw]
         rest = rng.choice(count, size=wanted - len(whole), replace=False, p=weights / weights.sum())
         return np.concatenate([whole, rest])
 

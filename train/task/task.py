@@ -276,7 +276,7 @@ def _make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int
 def _make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
     """The randomised start of an episode as a kernel argument."""
     if cfg.crosses:
-        return crossing.make_start_ranges(crossing.CrossingCfg(), robot)
+        return _fill(crossing.make_start_ranges(crossing.CrossingCfg(), robot), ahead=cfg.start_spread)
     return _fill(
         StartRanges(),
         position=_TILE_CENTRE,

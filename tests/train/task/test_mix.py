@@ -143,6 +143,23 @@ def test_failing_elites_are_drawn_more_often():
     assert drawn[:5].mean() / 300 == pytest.approx((2 - 2 * 0.77) / 5, abs=0.05)
 
 
+def test_learnable_elites_are_drawn_more_often_and_harder_ones_later():
+    drawn = np.zeros((2, 7))
+    for seed in range(300):
+        mix = make_mix(draw="learnable", terrains=4, seed=seed)
+        mix.goal_rate = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.5])
+        mix.swap = 0
+        drawn[0, mix._draw_rows()] += 1
+        # trained on, the last two are always crossed and the third in half of the episodes
+        mix.episodes[:], mix.crossed[:] = [0, 0, 10, 0, 0, 10, 10], [0, 0, 5, 0, 0, 10, 10]
+        drawn[1, mix._draw_rows()] += 1
+    # The weights of the test above: .1 and 4 * .5 * .5 + .1. Then one of seven has 1.1: it comes first with 1.1/1.7,
+    # second with .6/1.7 * 1.1/1.6: .89 in all.
+    assert drawn[0, 5:].mean() / 300 == pytest.approx(0.77, abs=0.06)
+    assert drawn[1, 2] / 300 == pytest.approx(0.89, abs=0.06)
+    assert drawn[1, [0, 1, 3, 4, 5, 6]].mean() / 300 == pytest.approx((2 - 0.89) / 6, abs=0.05)
+
+
 def test_it_goes_on_from_its_state():
     straight, cut = make_mix(draw="failing"), make_mix(draw="failing")
     known = counts([1, 2, 3, 3, 0, 1], [4] * 6)
@@ -169,7 +186,7 @@ def test_a_state_of_something_else_is_refused(damage):
     ("changes", "message"),
     [
         ({"mix": "easy"}, "mix must be one of generated, hard-random, hand-crafted, got 'easy'"),
-        ({"draw": "lucky"}, "draw must be one of uniform, failing, got 'lucky'"),
+        ({"draw": "lucky"}, "draw must be one of uniform, failing, learnable, got 'lucky'"),
         ({"draw": "failing", "mix": "hard-random"}, "draw failing chooses among elites, of which"),
         ({"swap_every": 0}, "swap_every must be at least 1, got 0"),
         ({"terrains": 1}, "terrains must be at least 2 for mix generated, .* got 1"),

@@ -156,6 +156,19 @@ def test_observations_are_noisy_within_their_widths(shared_task):
         assert 0.97 * width <= found <= width + 1e-5, columns
 
 
+def test_crossings_begin_along_the_way_with_the_goal_where_it_is(make_task):
+    task = make_task(num_envs=12, crosses=True, start_spread=8.0)
+    x, y = joint_q(task)[:, 0], joint_q(task)[:, 1]
+    assert (x >= 1.9).all() and (x <= 10.1).all() and x.min() < 4.0 and x.max() > 7.0
+    assert ((y - 4.0).abs() <= 0.1).all()
+    step = torch.zeros(12, 12, device=task.device)
+    task.step(step)
+    joint_q(task)[0, :2] = torch.tensor([13.6, 4.0], device=task.device)
+    task.step(step)
+    assert task.end[0] == int(Outcome.GOAL) and (task.end[1:] == 0).all()
+    assert joint_q(task)[0, 0] <= 10.1  # it began anew, along the way
+
+
 def test_bad_input_is_refused(shared_task, make_task):
     with pytest.raises(ValueError, match=r"action must have shape \(6, 12\), got \(6, 11\)"):
         shared_task.step(torch.zeros(6, 11, device=shared_task.device))
