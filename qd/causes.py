@@ -44,7 +44,7 @@ class Shape:
     oblique_deg: float
     """Angle between the way and the direction in which the ground rises or falls most, 0 to 90 [degrees]."""
     length_m: float
-    """Length of the way on which the part has at least half of that height [m]."""
+    """Length over which it has at least half of that height, along the way through that place [m]."""
     left_m: float
     """How far it has so to the left of the way, where it is highest [m]."""
     right_m: float
@@ -89,7 +89,7 @@ def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:
         "along_deg": _degrees(float(along[place])),
         "across_deg": _degrees(float(across[place])),
         "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[place]), abs(along[place])))),
-        "length_m": SPACING * int((np.abs(ground).max(axis=1) >= abs(height) / 2).sum()) if height else 0.0,
+        "length_m": SPACING * int((np.abs(ground[:, row]) >= abs(height) / 2).sum()) if height else 0.0,
         "left_m": left,
         "right_m": right,
     }
@@ -108,15 +108,15 @@ def _kind_of(shape: dict[str, float]) -> str:
         return "beside the way"
     if shape["slope_deg"] < GENTLE:
         return "gentle hill" if raised else "gentle hollow"
+    oblique = HEAD_ON < shape["oblique_deg"] <= SIDEWAYS
+    if shape["length_m"] <= SHORT:
+        name, ends = "ridge" if raised else "ditch", sum(shape[side] < NARROW for side in ("left_m", "right_m"))
+        if oblique:
+            return f"oblique {name}"
+        return (name, f"{name} end", "knob" if raised else "hole")[ends]
     if shape["oblique_deg"] > SIDEWAYS:
         return "side slope"
-    if shape["oblique_deg"] > HEAD_ON:
-        return "oblique rise" if rises else "oblique drop"
-    ends = sum(shape[side] < NARROW for side in ("left_m", "right_m"))
-    if shape["length_m"] <= SHORT:
-        return (("ridge", "ridge end", "knob") if raised else ("ditch", "ditch end", "hole"))[ends]
-    name = "rise" if rises else "drop"
-    return name if not ends else f"{name} at an edge"
+    return f"{'oblique ' * oblique}{'rise' if rises else 'drop'}"
 
 
 def _under(values: NDArray[Any], half_width: float) -> NDArray[Any]:

@@ -112,7 +112,11 @@ class Case:
             without={part: self._best_known(rest) for part, rest in removed.items()},
             scale=scale if self.scalable and parts else None,
             passing_scale=passing,
-            scales={trial.scale: self.counts[trial] for trial in self.counts if trial == Trial(parts, trial.scale)},
+            scales={
+                trial.scale: counts
+                for trial, counts in self.counts.items()
+                if trial.scale != 1.0 and trial.parts == parts
+            },
             subsets=len({trial.parts for trial in self.counts if trial.scale == 1.0 and trial.parts != self.whole}),
         )
 

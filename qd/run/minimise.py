@@ -82,7 +82,7 @@ class MinimalTerrains:
     """By number of the elite; their counts grow."""
 
     @cached_property
-    def _shapes(self) -> dict[tuple[int, Parts, float], tuple[dict[int, "Shape"], float]]:
+    def _shapes(self) -> dict[tuple[int, Parts], dict[int, "Shape"]]:
         return {}
 
     def minima(self) -> dict[int, Minimal]:
@@ -115,16 +115,25 @@ class MinimalTerrains:
         genes = np.array(genes, np.float32).reshape(len(minima), self.archive.genes.shape[1])
         return replace(rows, genes=genes, fresh=fresh, faults=None if known is None else known.faults_of(genes))
 
-    def shape_of_parts(self, number: int, minimal: Minimal, scale: float = 1.0) -> tuple[dict[int, "Shape"], float]:
-        """Shapes of the parts of a minimal terrain by their numbers, and the height or depth of the highest [m]."""
-        key = (number, minimal.parts, scale)
+    def shapes(self, number: int, minimal: Minimal) -> dict[int, "Shape"]:
+        """Shapes of the parts of a minimal terrain, by their numbers."""
+        key = (number, minimal.parts)
         if key not in self._shapes:
             from qd.causes import fields_of, shape_of  # with Warp: not for `--help`
 
-            fields = fields_of(self.genes(number, minimal, scale), minimal.parts, self.space)
-            shapes = {part: shape_of(field, self.half_width) for part, field in zip(minimal.parts, fields, strict=True)}
-            self._shapes[key] = (shapes, float(np.abs(fields).max(initial=0.0)))
+            fields = fields_of(self.genes(number, minimal), minimal.parts, self.space)
+            shapes = (shape_of(field, self.half_width) for field in fields)
+            self._shapes[key] = dict(zip(minimal.parts, shapes, strict=True))
         return self._shapes[key]
+
+    def margin(self, number: int, minimal: Minimal) -> tuple[float, float | None]:
+        """Largest height or depth of a minimal terrain, and how far it moves to the least scale that fails [m]."""
+        from sim.bank import heights_of  # with Warp: not for `--help`
+
+        genes = [self.genes(number, minimal, scale) for scale in (1.0, minimal.scale or 1.0)]
+        whole, scaled = heights_of(np.array(genes), self.space)
+        moved = None if minimal.scale is None else round(float(np.abs(whole - scaled).max()), 4)
+        return round(float(np.abs(whole).max()), 4), moved
 
     def entry(self, number: int, minimal: Minimal, judged: Archive, place: int) -> dict[str, Any]:
         """A minimal terrain as ``minimal.json`` has it.
@@ -136,9 +145,8 @@ class MinimalTerrains:
             place: The terrain's among them.
         """
         words, case = self.space.parts(self.archive.genes[number]), self.cases[number]
-        shapes, height = self.shape_of_parts(number, minimal)
+        shapes, (height, margin) = self.shapes(number, minimal), self.margin(number, minimal)
         cause = minimal.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
-        scaled = None if minimal.scale is None else self.shape_of_parts(number, minimal, minimal.scale)[1]
         return {
             "elite": number,
             "cell": int(self.archive.cell[number]),
@@ -156,8 +164,8 @@ class MinimalTerrains:
             "cause": None if cause is None else {"bump": cause, **asdict(shapes[cause])},
             "scale": minimal.scale,
             "passing_scale": minimal.passing_scale,
-            "height_m": round(height, 4),
-            "margin_m": None if scaled is None else round(height - scaled, 4),
+            "height_m": height,
+            "margin_m": margin,
             "scales": [{"scale": scale, **_rate(counts)} for scale, counts in sorted(minimal.scales.items())],
             "verdict": verdict_of(judged, place),
             **_judged(judged, place),
@@ -347,8 +355,8 @@ def minimal_words(numbers: dict[str, Any], judged: Archive) -> list[str]:
     if numbers["margin_m_median"] is not None:
         margins = [100 * entry["margin_m"] for entry in entries if entry["margin_m"] is not None]
         told.append(
-            f"Margin, by which heights can shrink while it still fails: {100 * numbers['margin_m_median']:.1f} cm "
-            f"(median), {min(margins):.1f} to {max(margins):.1f} cm."
+            "Margin, how far the ground can move toward flat ground and still fails: "
+            f"{100 * numbers['margin_m_median']:.1f} cm (median), {min(margins):.1f} to {max(margins):.1f} cm."
         )
     if numbers["causes"]:
         told.append(f"Causes: {', '.join(f'{kind} {many}' for kind, many in numbers['causes'].items())}.")

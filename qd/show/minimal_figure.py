@@ -80,6 +80,7 @@ def _draw_histogram(axes: "Axes", numbers: dict[str, Any]) -> None:
     axes.set_ylabel("terrains")
     locator: Any = axes.yaxis.get_major_locator()
     locator.set_params(integer=True)
-    axes.legend(title="cause", frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.set_xlim(-0.6, 1.3 * len(sizes))  # with room for the legend
+    axes.legend(title="cause", frameon=False, loc="center right")
     axes.grid(axis="y", alpha=0.3)
     axes.set_axisbelow(True)
