@@ -24,6 +24,7 @@ SHORT = 1.0
 NARROW = 0.5
 """A part that falls to half of its height nearer than this beside the way ends there [m]."""
 
+_NEAR = 1.0  # an oblique ridge goes on before and behind the place where it is highest under the robot [m]
 _FIRST_MET = 0.9  # of places nearly as steep as the steepest the one that is met first counts
 
 
@@ -46,7 +47,7 @@ class Shape:
     length_m: float
     """Length over which it has at least half of that height, along the way through that place [m]."""
     left_m: float
-    """How far it has so to the left of the way, where it is highest [m]."""
+    """How far it has so to the left of the way, within 1 m along the way of that place [m]."""
     right_m: float
     """How far to the right [m]; negative where it lies to the left alone."""
 
@@ -108,15 +109,15 @@ def _kind_of(shape: dict[str, float]) -> str:
         return "beside the way"
     if shape["slope_deg"] < GENTLE:
         return "gentle hill" if raised else "gentle hollow"
-    oblique = HEAD_ON < shape["oblique_deg"] <= SIDEWAYS
     if shape["length_m"] <= SHORT:
         name, ends = "ridge" if raised else "ditch", sum(shape[side] < NARROW for side in ("left_m", "right_m"))
-        if oblique:
-            return f"oblique {name}"
-        return (name, f"{name} end", "knob" if raised else "hole")[ends]
+        if ends:
+            return f"{name} end" if ends == 1 else "knob" if raised else "hole"
+        return name if shape["oblique_deg"] <= HEAD_ON else f"oblique {name}"
     if shape["oblique_deg"] > SIDEWAYS:
         return "side slope"
-    return f"{'oblique ' * oblique}{'rise' if rises else 'drop'}"
+    name = "rise" if rises else "drop"
+    return name if shape["oblique_deg"] <= HEAD_ON else f"oblique {name}"
 
 
 def _under(values: NDArray[Any], half_width: float) -> NDArray[Any]:
@@ -127,14 +128,16 @@ def _under(values: NDArray[Any], half_width: float) -> NDArray[Any]:
 
 
 def _reach(field: NDArray[np.float64], column: np.intp, row: np.intp, half_width: float) -> tuple[float, float]:
-    """How far a part has half of its height to the left and to the right of the way, where it is highest on it [m]."""
+    """How far a part has half of its height to the left and to the right of the way, near where it is highest [m]."""
     centre, beside = round(CrossingCfg.start[1] / SPACING), round(half_width / SPACING)
-    across = field[:, round(CrossingCfg.start[0] / SPACING) + int(column)]
-    highest = centre - beside + int(row)
-    low = across * np.sign(across[highest]) < abs(across[highest]) / 2
-    above, below = np.flatnonzero(low[highest:]), np.flatnonzero(low[highest::-1])
-    left = highest + int(above[0]) if len(above) else len(across)
-    right = highest - int(below[0]) if len(below) else -1
+    first, near = round(CrossingCfg.start[0] / SPACING) + int(column), round(_NEAR / SPACING)
+    highest = field[centre - beside + int(row), first]
+    window = field[:, max(first - near, 0) : first + near + 1]
+    low = (window * np.sign(highest) < abs(highest) / 2).all(axis=1)
+    place = centre - beside + int(row)
+    above, below = np.flatnonzero(low[place:]), np.flatnonzero(low[place::-1])
+    left = place + int(above[0]) if len(above) else len(low)
+    right = place - int(below[0]) if len(below) else -1
     return SPACING * (left - centre), SPACING * (centre - right)
 
 
