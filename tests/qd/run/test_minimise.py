@@ -186,7 +186,7 @@ def test_what_cannot_be_minimised_is_refused_before_anything_is_crossed(path, ma
 
 def test_more_parts_than_subsets_can_be_crossed_of(path, elites, monkeypatch):
     monkeypatch.setattr("qd.run.minimise.MOST_PARTS", 7)
-    with pytest.raises(ValueError, match="must have at most 7 parts .*, got 8: give --how greedy"):
+    with pytest.raises(ValueError, match=r"must have at most 7 parts .*, got 8: give --how greedy"):
         minimised(path, elite=elites, how="exhaustive", opened=judges(stop_after=0))
 
 
