@@ -54,8 +54,8 @@ class Minimise(Who, InSpace, Where):
     the CPU: faults first, then confirmed and certified ones, then others that fail."""
     how: Literal["exhaustive", "greedy"] | None = None
     """exhaustive: all subsets are crossed, from the smallest on, until one fails. greedy: parts are taken away one at a
-    time as long as what is left fails, about a tenth of the work. If left out, exhaustive on a GPU, greedy on the CPU
-    and for terrains of more than 10 parts."""
+    time as long as what is left fails, which takes far fewer crossings where many parts are needed. If left out,
+    exhaustive on a GPU, greedy on the CPU and for terrains of more than 10 parts."""
     confirm: bool = False
     """Cross the minimal terrains with contact resolved too, as `faultline confirm` does with elites."""
     certify: bool = False
