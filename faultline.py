@@ -20,6 +20,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "reevaluate": Command("qd.fresh:Reevaluate", "cross every elite of an archive again in fresh episodes"),
         "confirm": Command("qd.run.judge:Confirm", "cross the failing elites again with contact resolved"),
         "certify": Command("qd.run.judge:Certify", "which failing elites other controllers cross: faults"),
+        "minimise": Command("qd.run.minimise:Minimise", "which parts of a failing terrain it takes to fail"),
         "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
         "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
     },

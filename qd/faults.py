@@ -46,7 +46,7 @@ class Work:
     """Opens what crosses terrains."""
     seed: int
     """The search's; the episodes are drawn apart from the search's own and from the fresh ones."""
-    save: Callable[[Archive], None]
+    save: Callable[[Archive], object]
     """Writes what is known so far; called after each lot."""
 
 

@@ -62,6 +62,12 @@ class SuperGaussian(TerrainSpace):
         found[:, np.asarray(parts, dtype=int) * GENES_PER_BUMP + _HEIGHT] = 0.0  # the middle of -0.25 m to 0.25 m
         return found
 
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32]:
+        """Genes with the height of every bump times ``scale``."""
+        found = clipped(self.validate(genes))
+        found[:, _HEIGHT::GENES_PER_BUMP] *= scale  # 0 is the height in the middle of its range
+        return found
+
 
 def _in_words(bump: NDArray[np.float64]) -> str:
     x, y, sigma_x, sigma_y, _, _, theta, height = bump

@@ -62,6 +62,7 @@ LEFT_OUT = {
     "faultline compare --robot anymal$": "eight searches take long; the one that names its methods runs",
     "faultline confirm": "crosses for a quarter of an hour on a CPU; tests/qd/run/test_judge.py runs it small",
     "faultline certify": "likewise",
+    "faultline minimise": "likewise; tests/qd/run/test_minimise.py runs it small",
     "faultline replay .* --certificate": "shows what certify recorded",
     "faultline bench": "compiles torch kernels for minutes; tests/sim/bench runs it small",
     "faultline speed": "measures a GPU",

@@ -74,7 +74,7 @@ class Certify(OfRobot, InSpace, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Judged:
+class Judged:
     """A run whose failing elites are to be crossed."""
 
     run: RunDirectory
@@ -86,20 +86,20 @@ class _Judged:
     """Numbers of the failing elites that were named."""
 
 
-def _config_of(args: Confirm | Certify) -> tuple[Path, SearchCfg, "RobotCfg"]:
-    """Directory, search and robot of the run that a command line names."""
+def config_of(args: OfRobot, run: Path | None, space: str | None) -> tuple[Path, SearchCfg, "RobotCfg"]:
+    """Directory, search and robot of the run that a command line names, and its terrain space at hand."""
     from sim.robots.robot import get_robot, robot_of
     from sim.space import recorded_space
 
-    policy = args.policy if isinstance(args, Confirm) else None
-    path = args.run or newest_run(get_robot(args.robot or "anymal"), policy)
+    policy = args.policy if isinstance(args, Who) else None
+    path = run or newest_run(get_robot(args.robot or "anymal"), policy)
     cfg = RunDirectory(path).read_cfg()
-    recorded_space(cfg.space, cfg.space_sha256, named=args.space, file=path)
+    recorded_space(cfg.space, cfg.space_sha256, named=space, file=path)
     return path, cfg, robot_of(as_settings(cfg), args.robot, path)
 
 
 @contextmanager
-def _judged(path: Path, cfg: SearchCfg, robot: "RobotCfg", elite: str) -> Iterator[_Judged]:
+def judged_run(path: Path, cfg: SearchCfg, robot: "RobotCfg", elite: str) -> Iterator[Judged]:
     """The run, kept from other commands.
 
     Raises:
@@ -119,7 +119,7 @@ def _judged(path: Path, cfg: SearchCfg, robot: "RobotCfg", elite: str) -> Iterat
             raise ValueError(
                 f"{path} must have fresh episodes of its elites, which say what fails, got none: run `{remedy}` first"
             )
-        yield _Judged(
+        yield Judged(
             run=RunDirectory(path), cfg=cfg, robot=robot, archive=archive, chosen=_failing(archive, elite, path)
         )
 
@@ -146,6 +146,28 @@ def _failing(archive: Archive, elite: str, path: Path) -> list[int]:
     return numbers
 
 
+def searched_policy(path: Path, cfg: SearchCfg, robot: "RobotCfg", given: str | None, what: str) -> str:
+    """The controller that was searched, as :func:`sim.policy.loaders.load_policy` takes it.
+
+    Args:
+        path: The run.
+        cfg: Its search.
+        robot: Its robot.
+        given: Controller that the command line names.
+        what: What is to be done with the run, for the error.
+
+    Raises:
+        ValueError: If another one is named, or it is code that is not named again.
+    """
+    policy = own_policy(path, cfg, robot) if given is None else spec_of(given, robot)
+    if not is_searched(cfg, policy, robot):
+        raise ValueError(
+            f"{path} must be {what} with the controller that was searched, {cfg.policy}, got {policy}: leave out "
+            "--policy, or use `faultline certify` to see which elites another controller crosses"
+        )
+    return policy
+
+
 def confirm_run(args: Confirm, *, open_evaluator: Open = open_evaluator) -> Archive:
     """Crosses failing elites of a run with contact resolved, writes what came of it, and says it.
 
@@ -163,16 +185,11 @@ def confirm_run(args: Confirm, *, open_evaluator: Open = open_evaluator) -> Arch
         Interrupted: On Ctrl-C; lots that ended are kept.
         EvaluatorError: If a worker is lost; likewise.
     """
-    path, cfg, robot = _config_of(args)
-    policy = own_policy(path, cfg, robot) if args.policy is None else spec_of(args.policy, robot)
-    if not is_searched(cfg, policy, robot):
-        raise ValueError(
-            f"{path} must be confirmed with the controller that was searched, {cfg.policy}, got {policy}: leave out "
-            "--policy, or use `faultline certify` to see which elites another controller crosses"
-        )
+    path, cfg, robot = config_of(args, args.run, args.space)
+    policy = searched_policy(path, cfg, robot, args.policy, "confirmed")
     device = resolve_device(args.device, args.workers)
     evaluator = evaluator_of(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
-    with _judged(path, cfg, robot, args.elite) as judged:
+    with judged_run(path, cfg, robot, args.elite) as judged:
         by = {"confirmed_by": {**origin_of(device, cfg.seed, args.workers), **identity(robot, policy)}}
         save = saving(judged.run, by)
         work = Work(evaluator=evaluator, open_evaluator=open_evaluator, seed=cfg.seed, save=save)
@@ -204,12 +221,11 @@ def certify_run(args: Certify, *, open_evaluator: Open = open_evaluator, cross: 
         Interrupted: On Ctrl-C; lots that ended are kept.
         EvaluatorError: If a worker is lost; likewise.
     """
-    path, cfg, robot = _config_of(args)
-    certifiers = controllers_of(args.by, robot, flag="by") if args.by else panel_of(robot, cfg)
+    path, cfg, robot = config_of(args, args.run, args.space)
     device = resolve_device(args.device, args.workers)
-    check_certifiers(certifiers, cfg, robot, device)
+    certifiers = certifiers_of(args.by, cfg, robot, device)
     evaluator = evaluator_of(cfg, robot, next(iter(certifiers.values())), device, args.workers, num_envs=args.num_envs)
-    with _judged(path, cfg, robot, args.elite) as judged:
+    with judged_run(path, cfg, robot, args.elite) as judged:
         certifiers = known_names(judged.archive, certifiers)
         origin = origin_of(device, cfg.seed, args.workers)
         there = judged.run.read_summary().get("certified_by") or {}
@@ -237,6 +253,23 @@ def certify_run(args: Certify, *, open_evaluator: Open = open_evaluator, cross: 
     elif archive.certified.any():
         print(f"Next, confirm them:  {command_line('confirm', robot=robot.spec, run=path)}")
     return archive
+
+
+def certifiers_of(by: tuple[str, ...], cfg: SearchCfg, robot: "RobotCfg", device: str) -> dict[str, str]:
+    """Certifiers by name, each tried on the robot.
+
+    Args:
+        by: As the command line names them; the robot's panel if empty.
+        cfg: The search whose controller they are to certify.
+        robot: Its robot.
+        device: Warp device name.
+
+    Raises:
+        ValueError: If there is none; as of :func:`qd.run.arguments.check_certifiers`.
+    """
+    certifiers = controllers_of(by, robot, flag="by") if by else panel_of(robot, cfg)
+    check_certifiers(certifiers, cfg, robot, device)
+    return certifiers
 
 
 def _panel_files(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:

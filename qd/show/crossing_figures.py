@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qd.show.crossed import ENDINGS, Crossed, penalties_by_place
 from qd.show.figures import look_of, new_figure
@@ -71,14 +72,7 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
         crossed: The crossings.
         limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
     """
-    from matplotlib.colors import LinearSegmentedColormap
-
-    heights = crossed.recording.heights[0]
-    low, high = limits or (float(heights.min()), float(heights.max()))
-    greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
-    image = axes.imshow(
-        heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
-    )
+    image = draw_heights(axes, crossed.recording.heights[0], limits)
     for outcome, end in ENDINGS.items():
         chosen = np.flatnonzero(crossed.outcome == outcome)
         for k in chosen:
@@ -86,6 +80,24 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
         if len(chosen):
             places = crossed.ends[chosen]
             axes.scatter(*places[:, :2].T, color=end.color, marker=end.marker, s=55, edgecolors="white", zorder=3)
+    return image
+
+
+def draw_heights(axes: "Axes", heights: NDArray[np.float32], limits: tuple[float, float] | None = None) -> Any:
+    """A height map from above with start and goal; returns the image.
+
+    Args:
+        axes: Where.
+        heights: Of a terrain [m], shape (nrow, ncol).
+        limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
+    """
+    from matplotlib.colors import LinearSegmentedColormap
+
+    low, high = limits or (float(heights.min()), float(heights.max()))
+    greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
+    image = axes.imshow(
+        heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
+    )
     for place, look in ((CrossingCfg.start, _START), (CrossingCfg.goal, _GOAL)):
         axes.plot(*place, **look)
     axes.set_ylabel("y [m]")

@@ -14,7 +14,7 @@ from qd.fitness import FITNESS_FLOOR
 from qd.fresh import Open, Reevaluate, reevaluate_run
 from qd.run.arguments import NOT_ON_RAY, certifier_settings, check_certifiers
 from qd.run.directory import Metrics, RunDirectory, episodes_in
-from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
+from qd.run.judge import Certify, Confirm, certifiers_of, certify_run, confirm_run
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
 from qd.studies.study import StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, parse_workers, resolve_device
@@ -233,8 +233,7 @@ def judges_of(by: Sequence[str], cfg: SearchCfg, robot: "RobotCfg", device: str)
     Raises:
         ValueError: If there is none, or one cannot be used (:func:`qd.run.arguments.check_certifiers`).
     """
-    found = controllers_of(by, robot, flag="by") if by else panel_of(robot, cfg)
-    check_certifiers(found, cfg, robot, device)
+    found = certifiers_of(tuple(by), cfg, robot, device)
     certifier_settings(found)
     return found
 

@@ -66,6 +66,15 @@ class TerrainSpace(Protocol):
         """
         ...
 
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """Genes of the same terrains with all their heights scaled down together; None where the space cannot.
+
+        Args:
+            genes: Shape (num_terrains, num_genes).
+            scale: In (0, 1]; of 1 the terrains stay as they are.
+        """
+        return None
+
     def describe(self, genes: ArrayLike) -> str:
         """A terrain in words, one part a line.
 

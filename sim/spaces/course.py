@@ -13,7 +13,7 @@ from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, PARAMETERS, S
 from sim.spaces.base import Seed, TerrainSpace, clipped
 
 _KIND, _LENGTH = GENES.index("kind"), GENES.index("length")
-_FIRST_PARAMETER = GENES.index("size")
+_SIZE = _FIRST_PARAMETER = GENES.index("size")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +104,19 @@ class Course(TerrainSpace):
             rows[:, part, _KIND] = _middle_of(Kind.FLAT, len(Kind))
             rows[:, part, _LENGTH] = _middle_of(cells[:, part] - flat.low, flat.high - flat.low + 1)
         return clipped(found)
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32]:
+        """Genes with the size of every element times ``scale``, or the least that its kind has."""
+        found = clipped(self.validate(genes))
+        kinds = self.elements(found)["kind"]
+        rows = found.reshape(len(found), MAX_ELEMENTS, GENES_PER_ELEMENT)
+        for kind, (size, *_) in PARAMETERS.items():
+            of_kind = kinds == kind
+            if size.high > size.low:
+                metres = size.low + (rows[of_kind, _SIZE] + 1.0) / 2.0 * (size.high - size.low)
+                share = (np.maximum(metres * scale, size.low) - size.low) / (size.high - size.low)
+                rows[of_kind, _SIZE] = 2.0 * share - 1.0
+        return found
 
     def describe(self, genes: ArrayLike) -> str:
         """The elements in words, in the order of the way, without flat ground."""

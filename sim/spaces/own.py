@@ -23,7 +23,8 @@ class OwnSpace(TerrainSpace):
     Args:
         spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
         own: What is found there. It has ``num_genes`` and ``rasterise(genes, x, y)``, and may have ``hard_random(count,
-            rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``, and ``sigma0``.
+            rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``, ``scaled(genes,
+            scale)``, and ``sigma0``.
 
     Raises:
         ValueError: If it lacks something, or what it has is not as it must be.
@@ -139,6 +140,16 @@ class OwnSpace(TerrainSpace):
             raise self._wrong("parts", "is missing: terrains of this space have no parts to take away")
         return self._rows("without", self._call("without", clipped(rows), list(parts)))
 
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """What the user's method makes of genes; None if there is none.
+
+        Raises:
+            ValueError: If it does not return genes.
+        """
+        if not hasattr(self._own, "scaled"):
+            return None
+        return self._rows("scaled", self._call("scaled", clipped(self.validate(genes)), scale))
+
     def _rows(self, method: str, found: Any) -> NDArray[np.float32]:
         try:
             return clipped(self.validate(found))
@@ -178,5 +189,6 @@ def load_own(spec: str) -> OwnSpace:
     hard = space.hard_random(_TRIED, 0)
     heights_of(np.concatenate([np.zeros((1, space.num_genes), np.float32), hard]), space)
     space.without(hard, range(len(space.parts(hard[0]))))
+    space.scaled(hard, 0.5)
     space.describe(hard[0])
     return space

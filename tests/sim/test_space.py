@@ -105,3 +105,9 @@ def test_a_pool_that_is_no_file_is_refused(tmp_path):
     for name in ("missing.npz", "text.npz", "."):
         with pytest.raises(ValueError, match="--genes"):
             read_pool(tmp_path / name)
+
+
+def test_scaled_bumps_are_lower_everywhere():
+    genes = 2 * SUPER_GAUSSIAN.hard_random(2, 5)  # beyond the limits, which are clipped
+    np.testing.assert_allclose(heights_of(SUPER_GAUSSIAN.scaled(genes, 0.3)), 0.3 * heights_of(genes), atol=1e-6)
+    np.testing.assert_array_equal(SUPER_GAUSSIAN.scaled(genes, 1.0), clipped(genes))

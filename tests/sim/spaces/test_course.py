@@ -93,3 +93,19 @@ def test_flat_ground_can_be_as_long_as_any_element():
     longest = max(ranges[1].high for kind, ranges in PARAMETERS.items() if kind is not Kind.STAIRS)
     stairs = 7 * 0.35 / 0.05 + 1
     assert PARAMETERS[Kind.FLAT][1].high >= max(longest, stairs)
+
+
+def test_scaled_elements_are_lower_and_stay_in_their_ranges():
+    genes = course(
+        element("kerb", size=0.2, turn=1),
+        element("flat", length=10),
+        element("ditch", size=0.4, length=6),
+        element("stairs", size=0.2, length=0.28, detail=3, turn=-1),
+    )
+    before, half = COURSE.elements(genes)[0], COURSE.elements(COURSE.scaled(genes, 0.5))[0]
+    # Half of .2 m stairs is below the lowest stairs, .12 m.
+    np.testing.assert_allclose(half["size"][:4], [0.1, 0.0, 0.2, PARAMETERS[Kind.STAIRS][0].low], atol=1e-6)
+    for name in ("kind", "first", "cells", "detail"):
+        np.testing.assert_array_equal(half[name], before[name])
+    np.testing.assert_allclose(COURSE.scaled(genes, 1.0), genes, atol=1e-6)
+    np.testing.assert_allclose(heights_of(COURSE.scaled(genes, 0.9), COURSE).max(), 0.18, atol=1e-6)

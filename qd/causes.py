@@ -1,0 +1,145 @@
+"""The shape of a part of a terrain, as a robot that walks straight to the goal meets it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.crossing import CrossingCfg
+from sim.terrain import SPACING
+
+if TYPE_CHECKING:
+    from sim.space import TerrainSpace
+
+LEAST_HEIGHT = 0.03
+"""A part that is nowhere so high or deep under the robot lies beside its way [m]."""
+GENTLE = 10.0
+"""Slopes below are gentle [degrees]."""
+HEAD_ON, SIDEWAYS = 30.0, 60.0
+"""A slope that rises or falls at a smaller angle to the way is met head on, at a larger one from the side [degrees]."""
+SHORT = 1.0
+"""A part that is at least half as high as at its highest over no more of the way is a ridge or a ditch [m]."""
+NARROW = 0.5
+"""A part that falls to half of its height nearer than this beside the way ends there [m]."""
+
+_NEAR = 1.0  # an oblique ridge goes on before and behind the place where it is highest under the robot [m]
+_FIRST_MET = 0.9  # of places nearly as steep as the steepest the one that is met first counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """How a robot meets a part that lies alone on flat ground."""
+
+    kind: str
+    """In a word or two: rise, drop, ridge, ditch and so on; docs/faults.md has all."""
+    height_m: float
+    """Height under the robot where it is largest, negative of a hollow [m]."""
+    slope_deg: float
+    """Steepest slope under the robot [degrees]."""
+    along_deg: float
+    """Its part along the way, negative where the ground falls [degrees]."""
+    across_deg: float
+    """Its part across the way [degrees]."""
+    oblique_deg: float
+    """Angle between the way and the direction in which the ground rises or falls most, 0 to 90 [degrees]."""
+    length_m: float
+    """Length over which it has at least half of that height, along the way through that place [m]."""
+    left_m: float
+    """How far it has so to the left of the way, within 1 m along the way of that place [m]."""
+    right_m: float
+    """How far to the right [m]; negative where it lies to the left alone."""
+
+
+def fields_of(genes: NDArray[np.float32], parts: Sequence[int], space: "TerrainSpace") -> NDArray[np.float32]:
+    """Heights [m] that parts of a terrain add to the others, shape (len(parts), nrow, ncol).
+
+    Args:
+        genes: Of one terrain, shape (num_genes,).
+        parts: Their numbers.
+        space: What the genes mean.
+    """
+    from sim.bank import heights_of  # with Warp: not for `--help`
+
+    rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
+    heights = heights_of(np.concatenate(rows), space)
+    return heights[0] - heights[1:]
+
+
+def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:
+    """The shape of a part under a robot on the straight way from start to goal.
+
+    Args:
+        field: Heights that it adds [m], shape (nrow, ncol).
+        half_width: Half the width of the robot's stance [m].
+    """
+    heights = field.astype(np.float64)
+    by_y, by_x = (np.gradient(heights, SPACING, axis=axis) for axis in (0, 1))
+    ground, along, across = (_under(np.asarray(values), half_width) for values in (heights, by_x, by_y))
+    column, row = np.unravel_index(np.abs(ground).argmax(), ground.shape)
+    height = float(ground[column, row])
+    steepness = np.hypot(along, across)
+    met = np.argwhere(steepness >= _FIRST_MET * steepness.max())
+    met = met[met[:, 0] == met[0, 0]]
+    place = (int(met[0, 0]), int(met[np.argmax(steepness[*met.T]), 1]))
+    left, right = _reach(heights, column, row, half_width)
+    numbers = {
+        "height_m": height,
+        "slope_deg": _degrees(float(steepness[place])),
+        "along_deg": _degrees(float(along[place])),
+        "across_deg": _degrees(float(across[place])),
+        "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[place]), abs(along[place])))),
+        "length_m": SPACING * int((np.abs(ground[:, row]) >= abs(height) / 2).sum()) if height else 0.0,
+        "left_m": left,
+        "right_m": right,
+    }
+    return Shape(kind=_kind_of(numbers), **{name: round(value, 3) for name, value in numbers.items()})
+
+
+def on_the_way(field: NDArray[np.float32], half_width: float) -> float:
+    """Largest height or depth [m] of a part under a robot on the straight way from start to goal."""
+    return float(np.abs(_under(field, half_width)).max())
+
+
+def _kind_of(shape: dict[str, float]) -> str:
+    """The kind of a shape by the limits above; docs/faults.md has them as a table."""
+    raised, rises = shape["height_m"] > 0.0, shape["along_deg"] > 0.0
+    if abs(shape["height_m"]) < LEAST_HEIGHT:
+        return "beside the way"
+    if shape["slope_deg"] < GENTLE:
+        return "gentle hill" if raised else "gentle hollow"
+    if shape["length_m"] <= SHORT:
+        name, ends = "ridge" if raised else "ditch", sum(shape[side] < NARROW for side in ("left_m", "right_m"))
+        if ends:
+            return f"{name} end" if ends == 1 else "knob" if raised else "hole"
+        return name if shape["oblique_deg"] <= HEAD_ON else f"oblique {name}"
+    if shape["oblique_deg"] > SIDEWAYS:
+        return "side slope"
+    name = "rise" if rises else "drop"
+    return name if shape["oblique_deg"] <= HEAD_ON else f"oblique {name}"
+
+
+def _under(values: NDArray[Any], half_width: float) -> NDArray[Any]:
+    """Values of the nodes under the robot, shape (along the way, across it)."""
+    centre, beside = round(CrossingCfg.start[1] / SPACING), round(half_width / SPACING)
+    first, last = (round(place[0] / SPACING) for place in (CrossingCfg.start, CrossingCfg.goal))
+    return values[centre - beside : centre + beside + 1, first : last + 1].T
+
+
+def _reach(field: NDArray[np.float64], column: np.intp, row: np.intp, half_width: float) -> tuple[float, float]:
+    """How far a part has half of its height to the left and to the right of the way, near where it is highest [m]."""
+    centre, beside = round(CrossingCfg.start[1] / SPACING), round(half_width / SPACING)
+    first, near = round(CrossingCfg.start[0] / SPACING) + int(column), round(_NEAR / SPACING)
+    highest = field[centre - beside + int(row), first]
+    window = field[:, max(first - near, 0) : first + near + 1]
+    low = (window * np.sign(highest) < abs(highest) / 2).all(axis=1)
+    place = centre - beside + int(row)
+    above, below = np.flatnonzero(low[place:]), np.flatnonzero(low[place::-1])
+    left = place + int(above[0]) if len(above) else len(low)
+    right = place - int(below[0]) if len(below) else -1
+    return SPACING * (left - centre), SPACING * (centre - right)
+
+
+def _degrees(slope: float) -> float:
+    return float(np.rad2deg(np.arctan(slope)))

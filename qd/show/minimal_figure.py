@@ -1,0 +1,86 @@
+"""The figure of minimal terrains: how many parts a failure takes, and a gallery."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qd.show.crossing_figures import draw_heights
+from qd.show.figures import new_figure
+from sim.bank import heights_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from qd.run.minimise import MinimalTerrains
+
+_SHOWN = 12  # terrains of the gallery
+_COLUMNS = 3
+_COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#999999")
+
+
+def draw_minimal(terrains: "MinimalTerrains", numbers: dict[str, Any]) -> "Figure":
+    """How many parts failures take, by the kind of the cause, and some minimal terrains from above.
+
+    Of every kind of cause the gallery has one terrain before it has a second of another.
+
+    Args:
+        terrains: At least one that is minimal.
+        numbers: The same as ``minimal.json`` has them.
+    """
+    entries, minima = numbers["elites"], terrains.minima()
+    shown = _gallery(entries)
+    rows = -(-len(shown) // _COLUMNS)
+    figure = new_figure(13.0, 3.2 + 2.3 * rows)
+    figure.suptitle(f"{terrains.archive.robot}: {len(entries):,} minimal terrains")
+    grid = figure.add_gridspec(rows + 1, _COLUMNS, height_ratios=(1.3, *[1.0] * rows))
+    _draw_histogram(figure.add_subplot(grid[0, :]), numbers)
+    genes = [terrains.genes(entry["elite"], minima[entry["elite"]]) for entry in shown]
+    heights = heights_of(np.array(genes), terrains.space)
+    limits = (float(heights.min()), float(heights.max()))
+    panels = [figure.add_subplot(grid[1 + place // _COLUMNS, place % _COLUMNS]) for place in range(len(shown))]
+    for axes, entry, ground in zip(panels, shown, heights, strict=True):
+        image = draw_heights(axes, ground, limits)
+        kind = entry["cause"]["kind"] if entry["cause"] else "no part"
+        parts = f"{len(entry['bumps'])} of {entry['of']} parts"
+        axes.set_title(f"elite {entry['elite']}: {parts}, {kind}, {entry['goal_rate']:.0%} arrive", fontsize=9)
+    figure.colorbar(image, ax=panels, label="height [m]", shrink=0.8, pad=0.01)
+    return figure
+
+
+def _gallery(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Some entries, the first of each kind of cause first."""
+    seen: dict[str, int] = {}
+    order = []
+    for place, entry in enumerate(entries):
+        kind = entry["cause"]["kind"] if entry["cause"] else ""
+        seen[kind] = seen.get(kind, 0) + 1
+        order.append((seen[kind], place))
+    return [entries[place] for _, place in sorted(order)[:_SHOWN]]
+
+
+def _draw_histogram(axes: "Axes", numbers: dict[str, Any]) -> None:
+    """Terrains by the number of their parts, stacked by the kind of the cause."""
+    entries = numbers["elites"]
+    sizes = np.arange(max(len(entry["bumps"]) for entry in entries) + 1)
+    bottom = np.zeros(len(sizes))
+    kinds = [*numbers["causes"], *[None] * any(entry["cause"] is None for entry in entries)]
+    for place, kind in enumerate(kinds):
+        own = [len(entry["bumps"]) for entry in entries if (entry["cause"] or {}).get("kind") == kind]
+        counts = np.bincount(own, minlength=len(sizes))
+        look: dict[str, Any] = {
+            "color": _COLORS[place % len(_COLORS)],
+            "hatch": "//" * (place // len(_COLORS)),
+            "edgecolor": "white",
+        }
+        axes.bar(sizes, counts, bottom=bottom, label=f"{kind or 'no part'} ({len(own)})", **look)
+        bottom += counts
+    axes.set_xticks(sizes)
+    axes.set_xlabel("parts that a failure takes")
+    axes.set_ylabel("terrains")
+    locator: Any = axes.yaxis.get_major_locator()
+    locator.set_params(integer=True)
+    axes.set_xlim(-0.6, 1.3 * len(sizes))  # with room for the legend
+    axes.legend(title="cause", frameon=False, loc="center right")
+    axes.grid(axis="y", alpha=0.3)
+    axes.set_axisbelow(True)
