@@ -1,10 +1,12 @@
 """A fine-tuning: what it begins with, checked, and how it exchanges terrains under the learner."""
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from qd.archive import Archive
 from qd.run.directory import published_or_newest, read_archive_of
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
@@ -12,7 +14,7 @@ from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, recorded_space, to_be_named
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, space_of, split_elites
-from train.finetune import Finetune
+from train.finetune import Finetune, archive_paths
 from train.ppo.learner import Start, read_start
 from train.ppo.run import (
     POLICY,
@@ -97,14 +99,15 @@ class FineTuning(Training):
 
     def next_command(self) -> str:
         """The command that holds the controller against the shipped one, on elites held out of its training too."""
-        archive = self.job.settings["archive"]
+        settings = self.job.settings
+        newest = (archive_paths(settings) or [None])[-1]
         return command_line(
             "evaluate",
             robot=self.job.robot.spec,
-            policies=[f"base={self.job.settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
-            archive=archive and archive["path"],
+            policies=[f"base={settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
+            archive=newest,
             space=to_be_named(self.mix.space.name),
-            split_seed=(self.job.settings["split_seed"] or None) if archive else None,
+            split_seed=(settings["split_seed"] or None) if newest else None,
         )
 
 
@@ -134,16 +137,17 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
     if saved is not None:
         _check_space(flags, saved["extra"]["settings"])
-    genes, space, archive = _elites(flags, robot)
+    elites = _elites(flags, robot)
     settings = {
         **common,
         "policy": str(flags.policy or "shipped"),
         "mix": asdict(mix_cfg),
-        "archive": archive,
+        "archive": elites.about,
+        **({"shares": flags.shares} if len(flags.archive) > 1 else {}),
         "split_seed": flags.split_seed,
         "critic_iterations": alone,
         **({"trained_before": before} if before else {}),
-        **_named(space, saved),
+        **_named(elites.space, saved),
     }
     if saved is not None:
         _refuse_changes(flags, saved, settings)
@@ -151,7 +155,11 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         flags=flags, robot=robot, device=device, num_envs=size["num_envs"], iterations=size["iterations"], task=task,
         ppo=ppo, settings=settings, saved=saved, began=began,
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
-        start=start, mix=Mix(cfg=mix_cfg, genes=genes, space=space, crosses=crosses, seed=flags.seed, device=device),
+        start=start,
+        mix=Mix(
+            cfg=mix_cfg, genes=elites.genes, space=elites.space, weights=elites.weights, crosses=crosses,
+            seed=flags.seed, device=device,
+        ),
     )  # fmt: skip
 
 
@@ -170,25 +178,71 @@ def paper_sizes(robot: str) -> dict[str, int]:
     return _PAPER.get(robot, _PAPER_OTHERS)
 
 
-def _elites(flags: Finetune, robot: RobotCfg) -> tuple[np.ndarray, TerrainSpace, dict[str, Any] | None]:
-    """Genes of the elites to train on, shape (E, num_genes), what they mean, and where they are from."""
+class _Elites(NamedTuple):
+    """Elites to train on."""
+
+    genes: np.ndarray
+    """Shape (E, num_genes)."""
+    space: TerrainSpace
+    weights: np.ndarray | None = None
+    """How likely each is drawn, shape (E,); all alike if None."""
+    about: dict[str, Any] | None = None
+    """Where they are from, as settings have it: of several archives each value is a list."""
+
+
+def _elites(flags: Finetune, robot: RobotCfg) -> _Elites:
+    """The elites that a command line asks to train on.
+
+    Raises:
+        ValueError: If there are none, or archives are of different terrain spaces.
+    """
     if flags.mix != "generated":
-        if flags.archive is not None:
+        if flags.archive:
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
         space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
-        return np.zeros((0, space.num_genes), np.float32), space, None
+        return _Elites(np.zeros((0, space.num_genes), np.float32), space)
+    paths = flags.archive or (_usual_archive(flags, robot),)
+    archives = [_read_archive(flags, robot, path) for path in paths]
+    spaces = {(one.space, one.space_sha256): path for one, path in zip(archives, paths, strict=True)}
+    if len(spaces) > 1:
+        told = ", ".join(f"{path} of {name}" for (name, _), path in spaces.items())
+        raise ValueError(f"all archives must be of one terrain space, got {told}: leave those of another out")
+    splits = [
+        split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path)
+        for one, path in zip(archives, paths, strict=True)
+    ]
+    held_out = {mark for one, split in zip(archives, splits, strict=True) for mark in marks_of(one.genes[split.test])}
+    parts = []
+    for one, split in zip(archives, splits, strict=True):  # searches that begin alike may share an elite
+        genes = one.genes[split.train]
+        parts.append(genes[[mark not in held_out for mark in marks_of(genes)]])
+    about = [
+        {
+            "path": str(path), "archive_iterations": one.iterations, "elites": len(one), "trained_on": len(part),
+            "elites_sha256": elites_sha256(one),
+        }
+        for path, one, part in zip(paths, archives, parts, strict=True)
+    ]  # fmt: skip
+    equal = len(parts) > 1 and flags.shares == "equal"
+    return _Elites(
+        np.concatenate(parts),
+        space_of(archives[0]),
+        np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts]) if equal else None,
+        about[0] if len(about) == 1 else {key: [one[key] for one in about] for key in about[0]},
+    )
+
+
+def _usual_archive(flags: Finetune, robot: RobotCfg) -> Path:
     named = None if flags.policy is None else str(flags.policy)
-    path = flags.archive or published_or_newest(robot, named, flag="archive")
+    return published_or_newest(robot, named, flag="archive")
+
+
+def _read_archive(flags: Finetune, robot: RobotCfg, path: Path) -> Archive:
     try:
-        archive = read_archive_of(robot, path, flags.space)
+        return read_archive_of(robot, path, flags.space)
     except FileNotFoundError as error:
-        make = command_line("archive", robot=robot.spec, policy=named)
+        make = command_line("archive", robot=robot.spec, policy=None if flags.policy is None else str(flags.policy))
         raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error
-    rows = split_elites(archive, robot.name, flags.split_seed, spec=robot.spec, run=path).train
-    return archive.genes[rows], space_of(archive), {
-        "path": str(path), "archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows),
-        "elites_sha256": elites_sha256(archive),
-    }  # fmt: skip
 
 
 def _named(space: TerrainSpace, saved: dict[str, Any] | None) -> dict[str, Any]:

@@ -69,6 +69,8 @@ class Mix:
     device: str
     space: TerrainSpace = SUPER_GAUSSIAN
     """What the genes mean."""
+    weights: NDArray[np.float64] | None = None
+    """How likely each elite is drawn beside the others, shape (E,), before ``draw`` is; all alike if None."""
     swap: int = -1
     """Number of the present exchange, from 0."""
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -172,7 +174,9 @@ class Mix:
             return np.zeros(0, np.int64)
         rng, count, wanted = self._rng(1), len(self.genes), self.cfg.terrains - self.cfg.hand_crafted
         whole = np.tile(np.arange(count), wanted // count)
-        weights = np.ones(count) if self.cfg.draw == "uniform" else 1.0 - self.success() + _LEAST_WEIGHT
+        weights = np.ones(count) if self.weights is None else self.weights
+        if self.cfg.draw == "failing":
+            weights = weights * (1.0 - self.success() + _LEAST_WEIGHT)
         rest = rng.choice(count, size=wanted - len(whole), replace=False, p=weights / weights.sum())
         return np.concatenate([whole, rest])
 
