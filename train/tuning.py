@@ -119,7 +119,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     """
     robot, device = get_robot(flags.robot), device_of(flags)
     saved = read_saved(flags.resume, robot, flags.command) if flags.resume else None
-    size = sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
+    size = tuning_sizes(flags, robot, device)
     alone = flags.critic_iterations
     alone = min(_CRITIC_ITERATIONS, size["iterations"] // 2) if alone is None else alone
     if saved is None:
@@ -171,6 +171,11 @@ def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
         return "Rewards: the robot's own"
     given = ", ".join(f"{name}={weight:g}" for name, weight in other.items())
     return f"Rewards: {given} (the robot's own: {', '.join(f'{usual[name]:g}' for name in other)})"
+
+
+def tuning_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int]:
+    """Robots, terrains, iterations and how often terrains are exchanged: what flags say, else what suits the device."""
+    return sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
 
 
 def paper_sizes(robot: str) -> dict[str, int]:

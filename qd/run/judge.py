@@ -1,6 +1,6 @@
 """The commands that judge the failing elites of a run: confirm and certify."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -181,7 +181,7 @@ def confirm_run(args: Confirm, *, open_evaluator: Open = open_evaluator) -> Arch
             archive = confirm_in_mujoco_c(archive, judged.chosen, args.mujoco_c, work)
             saving(judged.run)(archive)
     _tell(archive, path)
-    if archive.confirmed.any() and _panel_files(robot, cfg):
+    if archive.confirmed.any() and panel_files(robot, lambda file: is_searched(cfg, file, robot)):
         print(f"Next, see which of them other controllers cross:  {_certify_command(robot, path, args)}")
     return archive
 
@@ -205,7 +205,10 @@ def certify_run(args: Certify, *, open_evaluator: Open = open_evaluator, cross: 
         EvaluatorError: If a worker is lost; likewise.
     """
     path, cfg, robot = _config_of(args)
-    certifiers = controllers_of(args.by, robot, flag="by") if args.by else _panel_of(robot, cfg)
+    if args.by:
+        certifiers = controllers_of(args.by, robot, flag="by")
+    else:
+        certifiers = panel_of(robot, lambda file: is_searched(cfg, file, robot))
     device = resolve_device(args.device, args.workers)
     for name, policy in certifiers.items():
         if is_searched(cfg, policy, robot):
@@ -257,14 +260,24 @@ def _check_certifier(name: str, policy: str, robot: "RobotCfg", device: str) -> 
         raise ValueError(f"certifier {name} does not fit {robot.name}: {error}") from error
 
 
-def _panel_files(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:
-    """The robot's fixed certifiers by name, without the controller that was searched."""
+def panel_files(robot: "RobotCfg", is_measured: Callable[[str], bool]) -> dict[str, str]:
+    """The robot's fixed certifiers by name, without the controller that is measured.
+
+    Args:
+        robot: The robot.
+        is_measured: Whether a file is of that controller.
+    """
     files = sorted((RESULTS / robot.name / PANEL_FOLDER).glob("*.pt"))
-    return {file.stem: str(file) for file in files if not is_searched(cfg, str(file), robot)}
+    return {file.stem: str(file) for file in files if not is_measured(str(file))}
 
 
-def _panel_of(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:
-    found = _panel_files(robot, cfg)
+def panel_of(robot: "RobotCfg", is_measured: Callable[[str], bool]) -> dict[str, str]:
+    """:func:`panel_files`, of which there must be one.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    found = panel_files(robot, is_measured)
     if not found:
         folder = RESULTS / robot.name / PANEL_FOLDER
         raise ValueError(
