@@ -1,6 +1,6 @@
 # The doors of the project. Every target works in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive train finetune evaluate report view bench test test-all test-gpu lint
+.PHONY: help setup archive train finetune harden evaluate report view bench test test-all test-gpu lint
 
 PYTHON ?= python3
 ROBOT ?=
@@ -57,6 +57,9 @@ train: setup ## Train a base controller from scratch
 
 finetune: setup ## Train a controller further on terrains that broke it
 	$(call faultline,finetune)
+
+harden: setup ## Rounds of search and training, until a search finds little that breaks the controller
+	$(call faultline,harden)
 
 evaluate: setup ## Measure rates of one controller, or make the tables of several
 	$(call faultline,evaluate)

@@ -163,6 +163,28 @@ def certify(archive: Archive, chosen: Sequence[int], certifiers: Mapping[str, st
     return archive
 
 
+def is_judged(archive: Archive, certifiers: Mapping[str, str]) -> bool:
+    """Whether nothing is left of all failing elites to be crossed for :func:`confirm` and :func:`certify`.
+
+    Args:
+        archive: With fresh values.
+        certifiers: Controllers by name.
+
+    Raises:
+        ValueError: As of :func:`with_certifiers`.
+    """
+    faults = with_certifiers(archive.faults or FaultCounts.none_of(len(archive)), certifiers)
+    archive, failing = replace(archive, faults=faults), np.flatnonzero(archive.failing).tolist()
+    left = [_Column("resolved_outcomes").missing(archive, failing)]
+    for policy in certifiers.values():
+        place = faults.certifier_sha256.index(str(controller_hash(policy)))
+        searched, resolved = (_Column(kind, place) for kind in ("certifier_outcomes", "certifier_resolved_outcomes"))
+        crosses = goal_rates(searched.of(archive)) >= FAILING_GOAL_RATE
+        left += [searched.missing(archive, failing)]
+        left += [resolved.missing(archive, [number for number in failing if crosses[number]])]
+    return not any(map(len, left))
+
+
 def certificate_seeds(archive: Archive, seed: int) -> NDArray[np.uint32]:
     """Seeds of the episodes at the search's settings that certificates are of, shape (N,)."""
     return elite_seeds(archive, seed, stream=_CERTIFY_STREAM)

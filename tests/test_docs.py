@@ -246,7 +246,7 @@ def test_the_space_of_a_page_makes_ridges(tmp_path):
     assert space.describe(genes) == "ridges of 0.30 m, 0.90 m apart"
 
 
-COMMANDS = ["archive", "train", "finetune", "evaluate", "report", "view", "bench"]
+COMMANDS = ["archive", "train", "finetune", "harden", "evaluate", "report", "view", "bench"]
 TARGETS = ["help", "setup", *COMMANDS, "test", "test-all", "test-gpu", "lint"]
 
 

@@ -22,6 +22,12 @@ def shipped_space(settings: dict[str, Any]) -> str | None:
     return None if settings.get("space_sha256") else settings.get("space")
 
 
+def archive_paths(settings: dict[str, Any]) -> list[str]:
+    """Where the archives lie that a training's settings name; a single one stands there by itself."""
+    paths = (settings.get("archive") or {"path": []})["path"]
+    return [paths] if isinstance(paths, str) else paths
+
+
 @dataclass(frozen=True, kw_only=True)
 class Finetune(TrainingFlags):
     """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
@@ -37,9 +43,12 @@ class Finetune(TrainingFlags):
     mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
     """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G) or hard-random ones (C-HR), or
     nothing else (C-HC)."""
-    archive: Path | None = None
-    """Run of a search, or its archive.npz, for mix generated; results/<robot>/archive, or of a robot without one
+    archive: tuple[Path, ...] = ()
+    """Runs of searches, or their archive.npz, for mix generated; results/<robot>/archive, or of a robot without one
     its newest run under runs/."""
+    shares: Literal["equal", "size"] = "equal"
+    """Of several archives: elites of each are drawn equally often (equal), so that a small archive counts as much as a
+    large one; or every elite is (size)."""
     space: str | None = None
     """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Elites of
     a space of one's own, and a resumed training on it, need it named here."""
@@ -77,17 +86,18 @@ class Finetune(TrainingFlags):
         if settings is None:
             return {"rewards": replace(robot.training.rewards, **_REWARDS)}
         same = ("seed", "num_envs", "iterations", "critic_iterations", "split_seed", "ppo")
-        policy, archive, task = settings["policy"], settings.get("archive"), settings["task"]
+        policy, task = settings["policy"], settings["task"]
         return {
             **{name: settings[name] for name in same},
             **settings["mix"],
             "policy": None if policy == "shipped" else Path(policy),
-            "archive": None if archive is None else Path(archive["path"]),
+            "archive": tuple(map(Path, archive_paths(settings))),
+            "shares": settings.get("shares", "equal"),
             "space": shipped_space(settings),
             "task": "crossing" if task["crosses"] else "commands",
             "start_spread": task.get("start_spread", 0.0),
-            "only": (archive or {}).get("only", "all"),
-            "held_out": (archive or {}).get("held_out", True),
+            "only": (settings["archive"] or {}).get("only", "all"),
+            "held_out": (settings["archive"] or {}).get("held_out", True),
             "rewards": task["rewards"],
         }
 

@@ -1,8 +1,9 @@
 """A fine-tuning: what it begins with, checked, and how it exchanges terrains under the learner."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, recorded_space, to_be_named
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, space_of, split_elites
-from train.finetune import Finetune
+from train.finetune import Finetune, archive_paths
 from train.ppo.learner import Start, read_start
 from train.ppo.run import (
     POLICY,
@@ -102,17 +103,18 @@ class FineTuning(Training):
 
         Of one that was trained on all elites, none held out: the command that lets it certify.
         """
-        archive = self.job.settings["archive"]
-        if archive and not archive.get("held_out", True):
-            by, run = f"S={self.job.run_dir / POLICY}", directory_of(Path(archive["path"]))
+        settings = self.job.settings
+        newest = (archive_paths(settings) or [None])[-1]
+        if newest is not None and not settings["archive"].get("held_out", True):
+            by, run = f"S={self.job.run_dir / POLICY}", directory_of(Path(newest))
             return command_line("certify", robot=self.job.robot.spec, run=run, by=[by])
         return command_line(
             "evaluate",
             robot=self.job.robot.spec,
-            policies=[f"base={self.job.settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
-            archive=archive and archive["path"],
+            policies=[f"base={settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
+            archive=newest,
             space=to_be_named(self.mix.space.name),
-            split_seed=(self.job.settings["split_seed"] or None) if archive else None,
+            split_seed=(settings["split_seed"] or None) if newest else None,
         )
 
 
@@ -124,7 +126,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     """
     robot, device = get_robot(flags.robot), device_of(flags)
     saved = read_saved(flags.resume, robot, flags.command) if flags.resume else None
-    size = sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
+    size = tuning_sizes(flags, robot, device)
     alone = flags.critic_iterations
     alone = min(_CRITIC_ITERATIONS, size["iterations"] // 2) if alone is None else alone
     if saved is None:
@@ -144,16 +146,17 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
     if saved is not None:
         _check_space(flags, saved["extra"]["settings"])
-    genes, space, goal_rate, archive = _elites(flags, robot)
+    elites = _elites(flags, robot)
     settings = {
         **common,
         "policy": str(flags.policy or "shipped"),
         "mix": asdict(mix_cfg),
-        "archive": archive,
+        "archive": elites.about,
+        **({"shares": flags.shares} if len(flags.archive) > 1 else {}),
         "split_seed": flags.split_seed,
         "critic_iterations": alone,
         **({"trained_before": before} if before else {}),
-        **_named(space, saved),
+        **_named(elites.space, saved),
     }
     if saved is not None:
         _refuse_changes(flags, saved, settings)
@@ -163,8 +166,8 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
         start=start,
         mix=Mix(
-            cfg=mix_cfg, genes=genes, space=space, crosses=crosses, seed=flags.seed, device=device,
-            goal_rate=goal_rate if flags.draw == "learnable" else None,
+            cfg=mix_cfg, genes=elites.genes, space=elites.space, weights=elites.weights, crosses=crosses,
+            seed=flags.seed, device=device, goal_rate=elites.goal_rate if flags.draw == "learnable" else None,
         ),
     )  # fmt: skip
 
@@ -179,44 +182,114 @@ def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
     return f"Rewards: {given} (the robot's own: {', '.join(f'{usual[name]:g}' for name in other)})"
 
 
+def tuning_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int]:
+    """Robots, terrains, iterations and how often terrains are exchanged: what flags say, else what suits the device."""
+    return sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
+
+
 def paper_sizes(robot: str) -> dict[str, int]:
     """Sizes of the paper's fine-tuning; of a robot that it does not have, those of its ANYmal."""
     return _PAPER.get(robot, _PAPER_OTHERS)
 
 
-def _elites(
-    flags: Finetune, robot: RobotCfg
-) -> tuple[np.ndarray, TerrainSpace, np.ndarray | None, dict[str, Any] | None]:
-    """Genes of the elites to train on, shape (E, num_genes), what they mean, their goal rates, where they are from."""
+class _Elites(NamedTuple):
+    """Elites to train on."""
+
+    genes: np.ndarray
+    """Shape (E, num_genes)."""
+    space: TerrainSpace
+    weights: np.ndarray | None = None
+    """How likely each is drawn, shape (E,); all alike if None."""
+    goal_rate: np.ndarray | None = None
+    """Of each, as its archive has it, shape (E,)."""
+    about: dict[str, Any] | None = None
+    """Where they are from, as settings have it: of several archives each value is a list."""
+
+
+def _elites(flags: Finetune, robot: RobotCfg) -> _Elites:
+    """The elites that a command line asks to train on.
+
+    Raises:
+        ValueError: If there are none, or archives are of different terrain spaces.
+    """
     if flags.mix != "generated":
-        if flags.archive is not None:
+        if flags.archive:
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
         if flags.only != "all" or not flags.held_out:
             raise ValueError(f"mix {flags.mix} has no elites: leave --only and --no-held-out out, or use mix generated")
         space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
-        return np.zeros((0, space.num_genes), np.float32), space, None, None
-    named = None if flags.policy is None else str(flags.policy)
-    path = flags.archive or published_or_newest(robot, named, flag="archive")
-    try:
-        archive = read_archive_of(robot, path, flags.space)
-    except FileNotFoundError as error:
-        make = command_line("archive", robot=robot.spec, policy=named)
-        raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error
-    split = split_elites(archive, robot.name, flags.split_seed, spec=robot.spec, run=path)
-    rows = split.train if flags.held_out else np.concatenate([split.train, split.test])
-    rows = rows[chosen_elites(archive, flags.only, path)[rows]]
-    if len(rows) == 0:
-        raise ValueError(
-            f"{path} must have elites to train on that are {flags.only}, got none: choose others by --only"
-        )
-    goal_rate = (archive.fresh or archive).goal_rate[rows]
+        return _Elites(np.zeros((0, space.num_genes), np.float32), space)
+    paths = flags.archive or (_usual_archive(flags, robot),)
+    archives = [_read_archive(flags, robot, path) for path in paths]
+    spaces = {(one.space, one.space_sha256): path for one, path in zip(archives, paths, strict=True)}
+    if len(spaces) > 1:
+        told = ", ".join(f"{path} of {name}" for (name, _), path in spaces.items())
+        raise ValueError(f"all archives must be of one terrain space, got {told}: leave those of another out")
+    rows = _rows_to_train_on(flags, robot, paths, archives)
+    parts = [one.genes[chosen] for one, chosen in zip(archives, rows, strict=True)]
+    rates = [(one.fresh or one).goal_rate[chosen] for one, chosen in zip(archives, rows, strict=True)]
+    about = [
+        {
+            "path": str(path), "archive_iterations": one.iterations, "elites": len(one), "trained_on": len(part),
+            "elites_sha256": elites_sha256(one),
+        }
+        for path, one, part in zip(paths, archives, parts, strict=True)
+    ]  # fmt: skip
     # The defaults are not named, so that a run of before there were others goes on.
     chosen = {"only": flags.only} if flags.only != "all" else {}
     chosen |= {} if flags.held_out else {"held_out": False}
-    return archive.genes[rows], space_of(archive), goal_rate, {
-        "path": str(path), "archive_iterations": archive.iterations, "elites": len(archive), "trained_on": len(rows),
-        "elites_sha256": elites_sha256(archive), **chosen,
-    }  # fmt: skip
+    equal = len(parts) > 1 and flags.shares == "equal"
+    return _Elites(
+        genes=np.concatenate(parts),
+        space=space_of(archives[0]),
+        weights=np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts]) if equal else None,
+        goal_rate=np.concatenate(rates),
+        about=(about[0] if len(about) == 1 else {key: [one[key] for one in about] for key in about[0]}) | chosen,
+    )
+
+
+def _rows_to_train_on(
+    flags: Finetune, robot: RobotCfg, paths: Sequence[Path], archives: Sequence[Archive]
+) -> list[np.ndarray]:
+    """Which elites of each archive: those asked for, without what any archive holds out.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    splits = [
+        split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path)
+        for one, path in zip(archives, paths, strict=True)
+    ]
+    if flags.held_out:  # searches that begin alike may share an elite
+        held_out = {
+            mark for one, split in zip(archives, splits, strict=True) for mark in marks_of(one.genes[split.test])
+        }
+    else:
+        held_out = set()
+    found = []
+    for path, one, split in zip(paths, archives, splits, strict=True):
+        rows = split.train if flags.held_out else np.concatenate([split.train, split.test])
+        rows = rows[chosen_elites(one, flags.only, path)[rows]]
+        found.append(rows[[mark not in held_out for mark in marks_of(one.genes[rows])]] if len(rows) else rows)
+    if not any(map(len, found)):
+        told = ", ".join(map(str, paths))
+        raise ValueError(
+            f"{told} must have elites to train on that are {flags.only}, got none: choose others by --only"
+        )
+    return found
+
+
+def _usual_archive(flags: Finetune, robot: RobotCfg) -> Path:
+    named = None if flags.policy is None else str(flags.policy)
+    return published_or_newest(robot, named, flag="archive")
+
+
+def _read_archive(flags: Finetune, robot: RobotCfg, path: Path) -> Archive:
+    try:
+        return read_archive_of(robot, path, flags.space)
+    except FileNotFoundError as error:
+        make = command_line("archive", robot=robot.spec, policy=None if flags.policy is None else str(flags.policy))
+        raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error
 
 
 def chosen_elites(archive: Archive, only: str, path: Path) -> np.ndarray:

@@ -32,6 +32,8 @@ CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"
 SUMMARY_FILE = "archive.json"
+ROUNDS_FILE = "rounds.json"
+"""Rounds of search and training, in the directory that holds the runs of both."""
 JUDGED_BY = ("confirmed_by", "certified_by")
 """Keys of the summary that say where fault counts come from."""
 _REMEDY = "put a copy of it back, or start a new run"

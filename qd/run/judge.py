@@ -1,6 +1,6 @@
 """The commands that judge the failing elites of a run: confirm and certify."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -198,7 +198,7 @@ def confirm_run(args: Confirm, *, open_evaluator: Open = open_evaluator) -> Arch
             archive = confirm_in_mujoco_c(archive, judged.chosen, args.mujoco_c, work)
             saving(judged.run)(archive)
     _tell(archive, path)
-    if archive.confirmed.any() and _panel_files(robot, cfg):
+    if archive.confirmed.any() and panel_files(robot, lambda file: is_searched(cfg, file, robot)):
         print(f"Next, see which of them other controllers cross:  {_certify_command(robot, path, args)}")
     return archive
 
@@ -267,24 +267,32 @@ def certifiers_of(by: tuple[str, ...], cfg: SearchCfg, robot: "RobotCfg", device
     Raises:
         ValueError: If there is none; as of :func:`qd.run.arguments.check_certifiers`.
     """
-    certifiers = controllers_of(by, robot, flag="by") if by else panel_of(robot, cfg)
+    if by:
+        certifiers = controllers_of(by, robot, flag="by")
+    else:
+        certifiers = panel_of(robot, lambda file: is_searched(cfg, file, robot))
     check_certifiers(certifiers, cfg, robot, device)
     return certifiers
 
 
-def _panel_files(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:
-    """The robot's fixed certifiers by name, without the controller that was searched."""
+def panel_files(robot: "RobotCfg", is_measured: Callable[[str], bool]) -> dict[str, str]:
+    """The robot's fixed certifiers by name, without the controller that is measured.
+
+    Args:
+        robot: The robot.
+        is_measured: Whether a file is of that controller.
+    """
     files = sorted((RESULTS / robot.name / PANEL_FOLDER).glob("*.pt"))
-    return {file.stem: str(file) for file in files if not is_searched(cfg, str(file), robot)}
+    return {file.stem: str(file) for file in files if not is_measured(str(file))}
 
 
-def panel_of(robot: "RobotCfg", cfg: SearchCfg) -> dict[str, str]:
-    """The robot's fixed certifiers by name, without the controller that was searched.
+def panel_of(robot: "RobotCfg", is_measured: Callable[[str], bool]) -> dict[str, str]:
+    """:func:`panel_files`, of which there must be one.
 
     Raises:
         ValueError: If there is none.
     """
-    found = _panel_files(robot, cfg)
+    found = panel_files(robot, is_measured)
     if not found:
         folder = RESULTS / robot.name / PANEL_FOLDER
         raise ValueError(

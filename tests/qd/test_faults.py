@@ -17,6 +17,7 @@ from qd.faults import (
     elite_words,
     fault_numbers,
     fault_words,
+    is_judged,
     outcome_counts,
     verdict_of,
     with_certifiers,
@@ -188,3 +189,21 @@ def test_words_by_hand():
     assert elite_words(archive, 3)[-1] == "It is not confirmed, and not known to be passable."
     assert elite_words(archive, 4)[-1] == "It does not fail by its fresh episodes."
     assert "with contact resolved: 9 of 20 (45%, 26 to 66%) reach the goal." in elite_words(archive, 0)
+
+
+def test_judged_is_an_archive_of_which_nothing_is_left_to_be_crossed(failing, certifier):
+    panel, everyone = {"C": certifier}, list(range(6))
+    half = work(lambda cfg, genes: [0 if cfg.policy == "p" else 10] * len(genes))
+    assert not is_judged(failing, panel)
+    confirmed = confirm(failing, everyone, half)
+    assert not is_judged(confirmed, panel) and is_judged(confirmed, {})
+    assert not is_judged(certify(confirmed, everyone[:5], panel, half), panel)
+    judged = certify(confirmed, everyone, panel, half)
+    assert is_judged(judged, panel)
+    # A certifier that does not cross at the search's settings is not asked with contact resolved.
+    assert is_judged(certify(confirmed, everyone, panel, work(lambda cfg, genes: [0] * len(genes))), panel)
+
+
+def test_where_nothing_fails_nothing_is_left(failing, certifier):
+    fine = dataclasses.replace(failing, fresh=dataclasses.replace(failing.fresh, goal_rate=np.ones(6)))
+    assert is_judged(fine, {"C": certifier})

@@ -20,7 +20,7 @@ from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
 from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
-from train.evaluate.sets import split_elites
+from train.evaluate.sets import marks_of, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import read_checkpoint
 from train.ppo.ppo import CapturedPPO
@@ -36,7 +36,7 @@ def places(tmp_path_factory):
 
 def config(places, **changes):
     values = {
-        "policy": places / "start.pt", "archive": places / "archive" / "archive.npz", "device": "cpu", "num_envs": 6,
+        "policy": places / "start.pt", "archive": (places / "archive" / "archive.npz",), "device": "cpu", "num_envs": 6,
         "terrains": 4, "swap_every": 2, "iterations": 3, "critic_iterations": 1, "rows": 3, "ppo": PPO, **changes,
     }  # fmt: skip
     return Finetune(**{"rewards": Finetune.defaults([]).rewards, **values})
@@ -224,16 +224,64 @@ def test_resume_needs_the_directory_alone_and_goes_on_with_the_same_terrains(fin
     assert later["extra"]["settings"] == {**before, "iterations": 4}
 
 
+def rows_of_swap(mix, number):
+    """Elites of an exchange, without their terrains."""
+    mix.swap = number
+    return mix._draw_rows()
+
+
+def test_several_archives_are_trained_on_together(places):
+    for name, count, seed in (("one", 10, 0), ("two", 30, 1)):
+        write_archive(places / f"{name}.npz", make_archive(count, seed=seed))
+    both = (places / "one.npz", places / "two.npz")
+    job = job_of(config(places, archive=both, run_dir=places / "none"))
+    assert len(job.mix.genes) == 8 + 24 and job.mix.weights.reshape(4, 8).sum(axis=1).tolist() == [1.0, *[1 / 3] * 3]
+    drawn = np.concatenate([rows_of_swap(job.mix, k) for k in range(400)])
+    assert 0.4 < (drawn < 8).mean() < 0.6  # in equal shares, though the second has three times as many
+    assert job.settings["shares"] == "equal" and job.settings["archive"]["path"] == [str(path) for path in both]
+    assert job.settings["archive"]["trained_on"] == [8, 24]
+    by_size = job_of(config(places, archive=both, shares="size", run_dir=places / "none"))
+    assert by_size.mix.weights is None
+
+
+def test_what_one_archive_holds_out_is_not_trained_on_from_another(places):
+    write_archive(places / "same.npz", make_archive(30, seed=1))
+    write_archive(places / "part.npz", (whole := make_archive(30, seed=1)).rows(np.arange(20)))
+    held_out = whole.genes[split_elites(whole, "anymal").test]
+    job = job_of(config(places, archive=(places / "same.npz", places / "part.npz"), run_dir=places / "none"))
+    assert not set(marks_of(held_out)) & set(job.trained_on)
+
+
+def test_archives_of_two_terrain_spaces_are_refused(places):
+    courses = np.zeros((10, spaces.COURSE.num_genes), np.float32)
+    write_archive(places / "course.npz", replace(make_archive(10), space="course", genes=courses))
+    both = (places / "archive" / "archive.npz", places / "course.npz")
+    with pytest.raises(ValueError, match=r"all archives must be of one terrain space, got .*of course"):
+        job_of(config(places, archive=both, run_dir=places / "none"))
+
+
+def test_a_training_on_several_archives_goes_on(places):
+    write_archive(places / "second.npz", make_archive(12, seed=2))
+    both = (places / "archive" / "archive.npz", places / "second.npz")
+    run = places / "several"
+    assert finetune(config(places, archive=both, run_dir=run, iterations=1)) == 0
+    assert resumed(run).archive == both
+    assert finetune(resumed(run, iterations=2)) == 0
+    write_archive(places / "second.npz", make_archive(12, seed=3))
+    with pytest.raises(ValueError, match=r"archive.elites_sha256 \(.*put an archive that has changed back"):
+        finetune(resumed(run, iterations=3))
+
+
 def test_resume_needs_neither_the_first_controller_nor_the_archives_place(places):
     start, archive, moved, run = (places / name for name in ("gone.pt", "gone.npz", "moved.npz", "moving"))
     start.write_bytes((places / "start.pt").read_bytes())
     write_archive(archive, make_archive(10))
-    finetune(config(places, policy=start, archive=archive, run_dir=run, iterations=1))
+    finetune(config(places, policy=start, archive=(archive,), run_dir=run, iterations=1))
     start.unlink()
     archive.rename(moved)
     with pytest.raises(ValueError, match=r"no archive at .*gone.npz.*name it with --archive"):
         finetune(resumed(run, iterations=2))
-    assert finetune(resumed(run, iterations=2, archive=moved)) == 0
+    assert finetune(resumed(run, iterations=2, archive=(moved,))) == 0
     assert finetune(resumed(run, iterations=3)) == 0  # it remembers where they lie now
     write_archive(moved, make_archive(10, seed=1))  # as many others
     with pytest.raises(ValueError, match=r"archive.elites_sha256 \(.*put an archive that has changed back"):
@@ -407,7 +455,7 @@ def test_a_run_of_before_starts_were_spread_goes_on(places, finished):
 
 def test_a_training_in_a_space_of_ones_own_goes_on_only_with_it(places, tmp_path, monkeypatch):
     ridges = write_ridges(tmp_path / "mine")
-    own = {"mix": "hard-random", "archive": None, "space": ridges, "iterations": 1, "run_dir": tmp_path / "run"}
+    own = {"mix": "hard-random", "archive": (), "space": ridges, "iterations": 1, "run_dir": tmp_path / "run"}
     assert finetune(config(places, **own)) == 0
     monkeypatch.setattr(spaces, "_named", [])  # as in a program that has just begun
     with pytest.raises(ValueError, match=r"which is code: name it again \(--space .*space.py:Ridges\)"):

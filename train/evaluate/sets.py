@@ -36,7 +36,8 @@ PAPER_TRAINING_ELITES = 750
 """Elites that the paper trains on."""
 _OTHER_TERRAINS = 300  # of a robot that the paper does not have
 _HELD_OUT_SHARE = 0.2
-_MIN_ELITES = 5  # of which a fifth is one
+MIN_ELITES = 5
+"""Fewest elites that can be split: a fifth of them is one."""
 
 _TEST_KEY = 20250604  # with the set's number and the seed, the entropy of a test set
 _SPLIT_KEY = 20250605
@@ -110,10 +111,10 @@ def split_elites(
             f"the archive must be of robot '{robot}', got one of '{archive.robot}': its terrains were found to break "
             f"another body; give an archive of '{robot}', which `{command_line('archive', robot=spec or robot)}` makes"
         )
-    if len(archive) < _MIN_ELITES:
+    if len(archive) < MIN_ELITES:
         more = {"resume": directory_of(run) if run else "RUN", "iterations": 2 * archive.iterations}
         raise ValueError(
-            f"an archive to be split into training and test terrains needs at least {_MIN_ELITES} elites, got "
+            f"an archive to be split into training and test terrains needs at least {MIN_ELITES} elites, got "
             f"{len(archive)}: let its search go on with `{command_line('archive', robot=spec or robot, **more)}`"
         )
     num_train, num_test = PAPER_TRAINING_ELITES, paper_terrains(robot)

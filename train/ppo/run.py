@@ -325,4 +325,10 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
 
 def _given(flags: list[tuple[str, Any]]) -> dict[str, Any]:
     """Flags as JSON has them: those that were left out are absent, paths are text."""
-    return {name: str(value) if isinstance(value, Path) else value for name, value in flags if value is not None}
+    return {name: _as_text(value) for name, value in flags if value is not None}
+
+
+def _as_text(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_as_text(item) for item in value]
+    return str(value) if isinstance(value, Path) else value

@@ -74,6 +74,8 @@ class Mix:
     """What the genes mean."""
     goal_rate: NDArray[np.float64] | None = None
     """Goal rate of each elite as its archive has it, shape (E,), which stands in until it is trained on; None: 0."""
+    weights: NDArray[np.float64] | None = None
+    """How likely each elite is drawn beside the others, shape (E,), before ``draw`` is; all alike if None."""
     swap: int = -1
     """Number of the present exchange, from 0."""
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -179,11 +181,12 @@ class Mix:
         rng, count, wanted = self._rng(1), len(self.genes), self.cfg.terrains - self.cfg.hand_crafted
         whole = np.tile(np.arange(count), wanted // count)
         rate = self.success()
-        weights = {
+        preferred = {
             "uniform": np.ones(count),
             "failing": 1.0 - rate + _LEAST_WEIGHT,
             "learnable": 4.0 * rate * (1.0 - rate) + _LEAST_WEIGHT,
         }[self.cfg.draw]
+        weights = preferred if self.weights is None else preferred * self.weights
         rest = rng.choice(count, size=wanted - len(whole), replace=False, p=weights / weights.sum())
         return np.concatenate([whole, rest])
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from qd.run.directory import ROUNDS_FILE
 from qd.run.settings import own_policy
 from qd.workers.evaluator import check_policy, resolve_device
-from sim.files.atomic import write_atomically
 from sim.files.command import InSpace, OnDevice, Who, naming_what_is_next
 from sim.files.settings import check, setting
 from sim.policy.spec import spec_of
@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from qd.show.report.material import Material, Shown
     from qd.show.report.tables import Change, Changes
 
-MAX_BYTES = 15_000_000
-"""Most that a page may weigh."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Who, OnDevice, InSpace):
@@ -32,7 +29,8 @@ class Report(Who, OnDevice, InSpace):
     """
 
     run: Path | None = None
-    """Run directory; the newest of this robot under runs/, else its published archive."""
+    """Run directory; the newest of this robot under runs/, else its published archive. Of a `faultline harden` the page
+    is about its rounds, and nothing is crossed."""
     tables: Path | None = None
     """File of the evaluation tables; results/<robot>/tables.json if it is there."""
     out: Path | None = None
@@ -63,8 +61,11 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
     from qd.show.elites import Found, elites_of
     from qd.show.report.material import Shown, gather
     from qd.show.report.modes import find_modes
+    from qd.show.report.rounds import rounds_report
 
     check(cfg)
+    if cfg.run is not None and (cfg.run / ROUNDS_FILE).exists():
+        return rounds_report(cfg.run, cfg.robot, cfg.out)
     material = gather(cfg)
     elites = elites_of(material.archive, judged=True)
     if not len(elites):
@@ -162,9 +163,9 @@ def _lead(material: "Material") -> str:
 
 
 def _write(shown: "Shown") -> Path:
-    """Writes figures and page, the page last: it is whole or as it was."""
+    """Writes figures and page."""
     from qd.show.report import elites, evaluation, search
-    from qd.show.report.page import Section, counted, pictures_of, render
+    from qd.show.report.page import Section, publish_page
 
     material = shown.material
     chapters = {
@@ -180,17 +181,5 @@ def _write(shown: "Shown") -> Path:
         ("Where this comes from", "origin"): search.origin_section,
     }
     sections = [Section(*name, blocks) for name, make in chapters.items() if (blocks := make(shown))]
-    page = render(f"How {material.archive.robot} breaks: a search's report", _lead(material), sections)
-    if len(page) > MAX_BYTES:
-        raise ValueError(
-            f"the page would have {len(page):,} bytes, at most {MAX_BYTES:,} are allowed: show fewer --elites"
-        )
-    figures = material.out.with_name(f"{material.out.stem}-figures")
-    figures.mkdir(exist_ok=True)
-    pictures = pictures_of(sections)
-    for picture in pictures:
-        write_atomically(figures / picture.name, picture.png)
-    write_atomically(material.out, page)
-    print(f"{counted(len(pictures), 'figure')} under {figures}")
-    print(f"Report: {material.out} ({len(page) / 1e6:.1f} MB; opens in a browser, without a network)")
-    return material.out
+    title = f"How {material.archive.robot} breaks: a search's report"
+    return publish_page(material.out, title, _lead(material), sections, remedy="show fewer --elites")

@@ -30,8 +30,8 @@ def tables_section(shown: Shown) -> list[Block]:
         paragraph(_told(tables, kinds)),
         *([paragraph(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
         *_drawn(shown.material.tables_file.with_suffix(".png")),
-        *(_measure_table(kinds, measure) for measure in MEASURES),
-        *_changes_tables(tables),
+        *(measure_table(kinds, measure) for measure in MEASURES),
+        *changes_tables(tables),
     ]
 
 
@@ -133,13 +133,19 @@ def _value(tables: dict[str, Any], measure: str, name: str, who: str) -> str:
     return percent(value) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
 
 
-def _measure_table(tables: dict[str, Any], measure: str) -> str:
+def measure_table(tables: dict[str, Any], measure: str) -> str:
+    """A measure of every controller on every set, with intervals.
+
+    Args:
+        tables: By kind of controller (:func:`qd.show.report.tables.by_kind`).
+        measure: One of :data:`qd.show.report.tables.MEASURES`.
+    """
     controllers = list(tables["controllers"])
     rows = [[_label(name), *(_value(tables, measure, name, who) for who in controllers)] for name in tables[measure]]
     return table([MEASURES[measure], *controllers], rows)
 
 
-def _changes_tables(tables: dict[str, Any]) -> list[Block]:
+def changes_tables(tables: dict[str, Any]) -> list[Block]:
     """What became of the terrains from the first controller to every other, and folded between the others."""
     first = next(iter(tables["controllers"]))
     from_first, others = [], []

@@ -2,17 +2,20 @@
 
 import base64
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qd.run.progress import clock
 from qd.show.figures import as_png
+from sim.files.atomic import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+MAX_BYTES = 15_000_000
+"""Most that a page may weigh."""
 _FOLDER = Path(__file__).parent
 # Nothing may be fetched, whatever else the page says.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -153,6 +156,48 @@ def counted(number: int, one: str, many: str = "") -> str:
 def pictures_of(sections: Sequence[Section]) -> list[Picture]:
     """All figures of a page, in order."""
     return [block for section in sections for block in section.blocks if isinstance(block, Picture)]
+
+
+def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section], *, remedy: str) -> Path:
+    """Writes figures and page, the page last: it is whole or as it was.
+
+    Args:
+        out: File of the page; its figures go to a folder beside it.
+        title: Of the page.
+        lead: What stands under it.
+        sections: In order.
+        remedy: What makes a page smaller.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: If the page is too large.
+    """
+    page, pictures = render(title, lead, sections), pictures_of(sections)
+    if len(page) > MAX_BYTES:
+        raise ValueError(f"the page would have {len(page):,} bytes, at most {MAX_BYTES:,} are allowed: {remedy}")
+    figures = out.with_name(f"{out.stem}-figures")
+    figures.mkdir(exist_ok=True)
+    for one in pictures:
+        write_atomically(figures / one.name, one.png)
+    write_atomically(out, page)
+    print(f"{counted(len(pictures), 'figure')} under {figures}")
+    print(f"Report: {out} ({len(page) / 1e6:.1f} MB; opens in a browser, without a network)")
+    return out
+
+
+def origin_table(origin: Mapping[str, Any]) -> list[list[str]]:
+    """Rows of a table that says where numbers come from.
+
+    Args:
+        origin: Some of command, commit, device, versions, seed and date.
+    """
+    rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]
+    versions = origin.get("versions")
+    if isinstance(versions, dict):
+        rows.append(["versions", ", ".join(f"{name} {version}" for name, version in versions.items())])
+    return rows
 
 
 def _html(block: Block) -> str:

@@ -14,7 +14,18 @@ from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, sp
 from qd.show.report.evaluation import most_mended
 from qd.show.report.figures import draw_pairs
 from qd.show.report.material import Shown
-from qd.show.report.page import Block, absent, at_a_glance, counted, hours, paragraph, percent, picture, table
+from qd.show.report.page import (
+    Block,
+    absent,
+    at_a_glance,
+    counted,
+    hours,
+    origin_table,
+    paragraph,
+    percent,
+    picture,
+    table,
+)
 from sim.files.command import plain_command
 from sim.files.intervals import bootstrap_interval
 from sim.policy.spec import SHIPPED, ControllerSpec
@@ -213,10 +224,7 @@ def origin_section(shown: Shown) -> list[Block]:
     if not origin:
         lost = "The search is not on record: there is no config.json beside the archive. A search writes one:"
         return [absent(lost, plain_command("archive", robot=shown.material.robot.spec))]
-    rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]
-    versions = origin.get("versions")
-    if isinstance(versions, dict):
-        rows.append(["versions", ", ".join(f"{name} {version}" for name, version in versions.items())])
+    rows = origin_table(origin)
     again = shown.material.reproduced_by
     rows += [[f"fresh episodes: {name}", str(again[name])] for name in _AGAIN if name in again]
     text = f"The archive read is {shown.material.run}. Its search began with:"

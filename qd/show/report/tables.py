@@ -1,5 +1,6 @@
 """The evaluation's ``tables.json``, read as data, and the terrains in it that are worth showing before and after."""
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,9 +49,8 @@ def read_tables(file: Path, robot: RobotCfg) -> dict[str, Any]:
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: {writer} writes them")
     tables = read_json(file)
-    for key, shape in _shapes(tables):
-        if not _fits(shape, tables.get(key)):
-            raise ValueError(f"{file} must hold the tables of {writer}, but its {key} cannot be read: give that file")
+    if damaged := unreadable(tables, {"robot": str}):
+        raise ValueError(f"{file} must hold the tables of {writer}, but its {damaged} cannot be read: give that file")
     if tables["robot"] != robot.name:
         raise ValueError(
             f"{file} is of robot {tables['robot']}, got --robot {robot.name}: give that robot or other tables"
@@ -59,10 +59,20 @@ def read_tables(file: Path, robot: RobotCfg) -> dict[str, Any]:
     return tables
 
 
+def unreadable(tables: dict[str, Any], more: dict[str, Any]) -> str | None:
+    """The first key of tables whose value cannot be read; None if all can.
+
+    Args:
+        tables: What a file has.
+        more: Shapes of other keys that must be there.
+    """
+    shapes = itertools.chain(more.items(), _shapes(tables))
+    return next((key for key, shape in shapes if not _fits(shape, tables.get(key))), None)
+
+
 def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Every key of the tables that is read, with its shape for :func:`_fits`; later shapes need earlier keys to fit."""
     terrains = {"count": int, "terrains": [int]}
-    yield "robot", str
     yield "episodes", int
     yield "controllers", {...: {"policy": str, "sha256": str | None}}
     yield "terrains", {...: int}

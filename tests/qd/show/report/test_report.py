@@ -15,9 +15,10 @@ from qd.run.settings import as_settings, preset
 from qd.show.elites import elites_of
 from qd.show.figures import as_png, new_figure, summary
 from qd.show.report import command
+from qd.show.report import page as page_module
 from qd.show.report.command import Report
 from qd.show.report.material import gather
-from qd.show.report.page import Section, absent, at_a_glance, heading, paragraph, render, table
+from qd.show.report.page import MAX_BYTES, Section, absent, at_a_glance, heading, paragraph, render, table
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
@@ -114,7 +115,7 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
     assert out.name == "report.html" and run.name == "run"
     content = out.read_bytes()
     page = Page(content)
-    assert page.open == [] and len(content) < command.MAX_BYTES
+    assert page.open == [] and len(content) < MAX_BYTES
     assert page.resources and all(resource.startswith("data:image/png;base64,") for resource in page.resources)
     assert all(link.startswith("#") and link[1:] in page.ids for link in page.links)
     assert len(page.ids) == len(set(page.ids))
@@ -317,7 +318,7 @@ def test_a_page_is_whole_or_as_it_was(reported, run, monkeypatch):
     def full(path, data):
         raise OSError("no space left")
 
-    monkeypatch.setattr(command, "write_atomically", full)
+    monkeypatch.setattr(page_module, "write_atomically", full)
     with pytest.raises(OSError, match="no space left"):
         reported(elites=1)
     assert out.read_bytes() == before

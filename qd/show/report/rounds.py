@@ -1,0 +1,233 @@
+"""The page of a hardening: faults by round, rates by round, and what became of terrains."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qd.run.directory import ROUNDS_FILE
+from qd.show.figures import new_figure
+from qd.show.report.evaluation import changes_tables, measure_table
+from qd.show.report.page import (
+    Block,
+    Section,
+    absent,
+    at_a_glance,
+    counted,
+    origin_table,
+    paragraph,
+    picture,
+    publish_page,
+    table,
+)
+from qd.show.report.tables import LABELS, MEASURES, by_kind, unreadable
+from sim.files.atomic import prepare_output, read_json
+from sim.files.command import plain_command
+from sim.robots.robot import get_robot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COUNTS = ("elites", "failing", "confirmed", "certified", "faults")
+_BARS = {"failing": ("#56b4e9", ""), "confirmed": ("#0072b2", "//"), "faults": ("#d55e00", "..")}
+_LINES = (("#0072b2", "o"), ("#d55e00", "X"), ("#009e73", "s"), ("#cc79a7", "^"), ("#e69f00", "D"), ("#56b4e9", "v"),
+          ("#000000", "P"))  # fmt: skip
+_COUNT = int | None
+_ROW = {"controller": str, "search": str, "episodes": _COUNT, "panel": [str], **dict.fromkeys(_COUNTS, _COUNT)}
+_SHAPES = {"robot": str, "rounds": [_ROW], "comparisons": {...: _ROW}, "tables": dict, "sessions": list}
+
+
+def rounds_report(run: Path, robot: str | None, out: Path | None) -> Path:
+    """Writes the page; returns its file.
+
+    Args:
+        run: Directory of the hardening.
+        robot: The robot that the command line names.
+        out: File to write; report.html in the directory.
+
+    Raises:
+        ValueError: If the file is damaged, of another robot or of no finished search yet, or OUT cannot be written.
+    """
+    content = _read(run, robot)
+    out = out or run / "report.html"
+    if out.suffix != ".html":
+        raise ValueError(f"out must be a file named *.html, got {out}: name for example {out / 'report.html'}")
+    prepare_output(out)
+    sections = [
+        Section("Faults by round", "faults", _faults(content)),
+        Section("Rates by round", "rates", _rates(content)),
+        Section("What became of terrains", "changes", _changes(content)),
+        Section("Where this comes from", "origin", _origin(content, run)),
+    ]
+    lead = f"Made from {run} by faultline: a search for what breaks a controller, a training on it, and again."
+    title = f"{content['robot']} hardened: {counted(len(content['rounds']) - 1, 'round')} of search and training"
+    return publish_page(out, title, lead, sections, remedy=f"move files out of {run}")
+
+
+def _read(run: Path, robot: str | None) -> dict[str, Any]:
+    file = run / ROUNDS_FILE
+    content = read_json(file)
+    if not content.get("rounds"):
+        go_on = "let it go on with the command that began it"
+        raise ValueError(f"{file} must have a search that is over, got none: {go_on}")
+    damaged = unreadable({**content, **content.get("tables", {})}, _SHAPES)
+    if damaged:
+        raise ValueError(f"{file} must be of `faultline harden`, but its {damaged} cannot be read: put a copy back")
+    if robot is not None and get_robot(robot).name != content["robot"]:
+        raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
+    return content
+
+
+def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rounds, and after them what they are compared with."""
+    return [*content["rounds"], *content["comparisons"].values()]
+
+
+def _faults(content: dict[str, Any]) -> list[Block]:
+    """What each search found."""
+    first, last = content["rounds"][0], content["rounds"][-1]
+    glance = [
+        (f"faults of {row['controller']}, in {row['episodes']:,} episodes of a search", _number(row["faults"]))
+        for row in ([first] if first is last else [first, last])
+    ]
+    text = (
+        f"Each search is against one controller. A terrain is failing if under half of the robots reach the goal in 40 "
+        "fresh episodes, confirmed if they do not with contact resolved either, and a fault if a controller of the "
+        f"panel ({', '.join(first['panel']) or 'nobody'}) crosses it. {_told(first, last)}"
+    )
+    head = ["controller", "search", "episodes", *_COUNTS, "panel"]
+    rows = [
+        [row["controller"], row["search"], *(_number(row[key]) for key in ("episodes", *_COUNTS)),
+         ", ".join(row["panel"])] for row in _rows(content)
+    ]  # fmt: skip
+    shows = "Failing elites, those confirmed, and faults of the search against every controller"
+    compared = [paragraph(_compared(content))] if content["comparisons"] else []
+    return [at_a_glance(glance), paragraph(text), picture("faults", draw_faults(content), shows), *compared,
+            table(head, rows)]  # fmt: skip
+
+
+def _number(count: int | None) -> str:
+    return "-" if count is None else f"{count:,}"
+
+
+def _told(first: dict[str, Any], last: dict[str, Any]) -> str:
+    """What the rounds brought, in a sentence; empty where there is one search alone, or faults were not counted."""
+    if first is last or first["faults"] is None or last["faults"] is None:
+        return ""
+    share = f", {last['faults'] / first['faults']:.2f} times as many" if first["faults"] and last["faults"] else ""
+    same = "" if first["episodes"] == last["episodes"] else " The searches had different budgets."
+    return (
+        f"The search against {first['controller']} found {counted(first['faults'], 'fault')}, that against "
+        f"{last['controller']} {counted(last['faults'], 'fault')}{share}.{same}"
+    )
+
+
+def _compared(content: dict[str, Any]) -> str:
+    """What the rounds are compared with."""
+    words = {"hard_random": "hard-random terrains", "first_archive": "the first archive alone"}
+    told = [
+        f"{row['controller']} had as many trainings of the same length as {row['rounds']} rounds on "
+        f"{words.get(kind, kind)}"
+        for kind, row in content["comparisons"].items()
+    ]
+    return f"For comparison, {'; '.join(told)}, and then one search against it."
+
+
+def draw_faults(content: dict[str, Any]) -> "Figure":
+    """What the search against every controller found, as bars.
+
+    Args:
+        content: Of ``rounds.json``.
+    """
+    rows = _rows(content)
+    figure = new_figure(max(6.0, 1.5 * len(rows) + 2.0), 4.0)
+    axes = figure.subplots()
+    places, width = np.arange(len(rows)), 0.26
+    for shift, (name, (colour, hatch)) in enumerate(_BARS.items(), start=-1):
+        counts = [row[name] or 0 for row in rows]
+        bars = axes.bar(places + width * shift, counts, width, color=colour, hatch=hatch, edgecolor="white", label=name)
+        axes.bar_label(bars, [_number(row[name]) for row in rows], fontsize=8)
+    axes.set_xticks(places, [row["controller"] for row in rows])
+    axes.set_ylabel("terrains of the search's archive")
+    axes.set_xlabel("controller that was searched")
+    axes.grid(axis="y", alpha=0.3)
+    axes.set_axisbelow(True)
+    axes.legend(frameon=False, ncols=len(_BARS), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
+def _rates(content: dict[str, Any]) -> list[Block]:
+    """Every controller on the fixed sets and on the archives."""
+    tables = by_kind(content["tables"])
+    text = (
+        "Every controller on the same terrains from the same starts: hand-crafted and hard-random ones, and of each "
+        "search elites that no training drew, though they may lie close to some that were. "
+        f"{content['tables']['episodes']} episodes a terrain; intervals are 95 %, bootstrap over terrains. Elites were "
+        "chosen because the controller of their own search struggled there: against that one another looks better "
+        "by chance too."
+    )
+    shows = "Goal rate and success of every controller on every set with intervals"
+    drawn = picture("rates", draw_rates(content), shows)
+    return [paragraph(text), drawn, *(measure_table(tables, measure) for measure in MEASURES)]
+
+
+def draw_rates(content: dict[str, Any]) -> "Figure":
+    """Goal rate and success of every controller: a line a set over the rounds, points of what they are compared with.
+
+    Args:
+        content: Of ``rounds.json``.
+    """
+    tables = content["tables"]
+    compared = [row["controller"] for row in content["comparisons"].values()]
+    figure = new_figure(12.0, 4.6)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, measure in zip(panels, ("goal", "success"), strict=True):
+        _draw_lines(axes, tables, measure, [who not in compared for who in tables["controllers"]])
+        axes.set_ylabel(f"{MEASURES[measure]} [%]")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _draw_lines(axes: "Axes", tables: dict[str, Any], measure: str, joined: list[bool]) -> None:
+    """Each set's rates; controllers that are ``joined`` have a line through them."""
+    controllers = list(tables["controllers"])
+    count = len(tables[measure])
+    for k, (name, row) in enumerate(tables[measure].items()):
+        colour, marker = _LINES[k % len(_LINES)]
+        there = [place for place, who in enumerate(controllers) if row[who] is not None]
+        values = np.array([100.0 * row[controllers[place]] for place in there])
+        limits = 100.0 * np.array([tables["intervals"][measure][name][controllers[place]] for place in there])
+        limits = limits.reshape(-1, 2)
+        lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)  # equal limits are off by rounding
+        places = np.array(there) + 0.06 * (k - (count - 1) / 2)
+        label = LABELS.get(name, f"{name}, held out")
+        axes.errorbar(places, values, lengths, color=colour, marker=marker, capsize=3, label=label, linestyle="")
+        rounds = [joined[place] for place in there]
+        axes.plot(places[rounds], values[rounds], color=colour, linewidth=1.2)
+    axes.set_xticks(range(len(controllers)), controllers, rotation=20 if len(controllers) > 5 else 0)
+    axes.set_ylim(-3, 103)
+    axes.grid(alpha=0.3)
+
+
+def _changes(content: dict[str, Any]) -> list[Block]:
+    """What is mended, newly broken and still failing."""
+    blocks = changes_tables(content["tables"])
+    return blocks or [absent("Nothing is trained yet: there are no two controllers to compare.")]
+
+
+def _origin(content: dict[str, Any], run: Path) -> list[Block]:
+    """Where the numbers come from, and how to look closer."""
+    sessions = [
+        [f"{number}", *(str(one.get(key, "")) for key in ("command", "commit", "device", "date"))]
+        for number, one in enumerate(content["sessions"], start=1)
+    ]
+    closer = [plain_command("report", run=run / row["search"]) for row in _rows(content)]
+    return [
+        paragraph(f"The numbers are those of {run / ROUNDS_FILE}. It was begun with:"),
+        table(["", ""], origin_table(content), words=True),
+        paragraph(f"It was worked on in {counted(len(sessions), 'session')}:"),
+        table(["session", "command", "commit", "device", "date"], sessions, words=True),
+        paragraph(f"Each search has a page of its own: {', '.join(f'`{command}`' for command in closer)}."),
+    ]

@@ -1,0 +1,292 @@
+"""Hardening: its steps in order, what goes on after a stop anywhere, what is written, comparisons, errors."""
+
+import json
+import os
+import signal
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from kernels.episode import Outcome
+from qd.archive import read_archive
+from sim.files.atomic import read_json, to_json
+from sim.files.command import Interrupted, run_command
+from sim.robots.robot import get_robot
+from sim.rollout import RolloutResult
+from tests.train.results import result_of
+from tests.train.starts import write_actor
+from train import hardening, tuning
+from train.evaluate.sets import marks_of, recorded_marks, split_elites
+from train.harden import Harden
+from train.hardening import harden, hardening_of
+
+ROBOT = get_robot("anymal")
+ITERATIONS = 3
+
+
+class Crossings:
+    """Crossings at once: nobody arrives under the base, everybody under the certifier, half under what was trained.
+
+    Args:
+        die_after: Crossings after which Ctrl-C is pressed.
+    """
+
+    def __init__(self, die_after: int = 10_000) -> None:
+        self.left, self.made = die_after, []
+
+    @contextmanager
+    def open(self, cfg):
+        def evaluate(terrains, seeds, progress=None):
+            if not self.left:
+                raise KeyboardInterrupt
+            self.left -= 1
+            self.made.append((cfg.policy, cfg.resolved, len(seeds)))
+            return crossed(cfg, seeds)
+
+        yield evaluate
+
+
+def crossed(cfg, seeds) -> RolloutResult:
+    shape = (len(seeds), cfg.num_replicas)
+    share = 1.0 if "certifier" in cfg.policy else 0.0 if "start" in cfg.policy else 0.5
+    arrived = np.arange(shape[1]) < share * shape[1] * np.ones((shape[0], 1))
+    outcomes = np.where(arrived, Outcome.GOAL, Outcome.BASE_COLLISION)
+    rows = [np.random.default_rng(int(seed)).dirichlet(np.full(6, 0.3)) for seed in seeds]
+    reward = np.ones(shape) if cfg.reward else None
+    result = result_of(outcomes, names=ROBOT.penalties, reward=reward)
+    penalties = 50.0 * np.array(rows)[:, None] * np.array(ROBOT.read_penalty_scales()) * np.ones((*shape, 1))
+    return replace(result, penalties=penalties)
+
+
+def stub_tune(job, tune):
+    """A training that changes one weight; its record names what it trained on."""
+    tune.run.mkdir()
+    content = torch.load(tune.start, weights_only=True)
+    state = content["actor_state_dict"]
+    state["mlp.0.bias"] = state["mlp.0.bias"] + 1.0 + len(tune.archives)
+    torch.save(content, tune.run / "policy.pt")
+    torch.save(content, tune.run / "checkpoint.pt")
+    record = {"iterations": job.tune_iterations, "archives": [str(run) for run in tune.archives]}
+    (tune.run / "policy.train.json").write_bytes(to_json(record))
+
+
+@pytest.fixture
+def places(tmp_path):
+    write_actor(tmp_path / "start.pt")
+    content = torch.load(tmp_path / "start.pt", weights_only=True)
+    content["actor_state_dict"]["mlp.0.bias"] -= 1.0
+    torch.save(content, tmp_path / "certifier.pt")
+    return tmp_path
+
+
+def config(places, **changes):
+    values = {
+        "policy": places / "start.pt", "run_dir": places / "run", "rounds": 2, "device": "cpu", "workers": "1",
+        "emitters": 1, "batch_size": 12, "replicas": 2, "search_episodes": 20, "tune_iterations": ITERATIONS,
+        "terrains": 3, "episodes": 2, "by": (f"C={places / 'certifier.pt'}",),
+    }  # fmt: skip
+    return Harden(**values | changes)
+
+
+def rounds_of(places):
+    return read_json(places / "run" / "rounds.json")
+
+
+def numbers(content):
+    """What a hardening found, without when and how."""
+    return {name: content[name] for name in ("settings", "rounds", "comparisons", "tables", "robot")}
+
+
+@pytest.fixture(autouse=True)
+def _no_figures(monkeypatch):
+    """Searches draw theirs otherwise, which takes longer than all the rest here."""
+    monkeypatch.setattr("qd.show.figures.write_figures", lambda *_: [])
+
+
+@pytest.fixture
+def stubbed(monkeypatch):
+    monkeypatch.setattr(hardening, "_tune", stub_tune)
+
+
+def test_rounds_from_end_to_end(places, stubbed, capsys):
+    crossings = Crossings()
+    assert harden(config(places), open_evaluator=crossings.open) == 0
+    content = rounds_of(places)
+    assert [row["controller"] for row in content["rounds"]] == ["base", "round-1", "round-2"]
+    assert [row["tuned"] for row in content["rounds"]] == [[], ["tune-1"], ["tune-2"]]
+    for number, row in enumerate(content["rounds"]):
+        archive = read_archive(places / "run" / f"search-{number}")
+        assert row["search"] == f"search-{number}" and row["episodes"] == 24 and row["panel"] == ["C"]
+        assert row["elites"] == len(archive) >= 5 and row["failing"] == int(archive.failing.sum())
+        assert row["policy_sha256"] == archive.policy_sha256
+    base, *later = content["rounds"]
+    assert base["faults"] == base["failing"] == base["elites"]  # nobody arrives, and the certifier always does
+    assert all(row["failing"] == row["confirmed"] == row["certified"] == row["faults"] == 0 for row in later)
+    assert len({row["policy_sha256"] for row in content["rounds"]}) == 3
+    records = [read_json(places / "run" / f"tune-{number}" / "policy.train.json") for number in (1, 2)]
+    assert [len(record["archives"]) for record in records] == [1, 2]
+    assert content["settings"]["search"]["episodes"] == 24  # 20 are rounded up
+    for key in ("command", "commit", "device", "versions", "seed", "date", "robot_sha256"):
+        assert key in content, key
+    said = capsys.readouterr().out
+    assert f"report --robot anymal --run {places / 'run'}" in said and "round-2     " in said
+    before = len(crossings.made)
+    assert harden(config(places), open_evaluator=crossings.open) == 0  # nothing is left to be done
+    assert len(crossings.made) == before and len(rounds_of(places)["sessions"]) == 2
+    assert numbers(rounds_of(places)) == numbers(content)
+
+
+def test_every_controller_is_evaluated_on_the_fixed_sets_and_every_archive(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    tables = rounds_of(places)["tables"]
+    assert list(tables["goal"]) == ["hand_crafted", "hard_random", "search-0", "search-1"]
+    assert all(row == {"base": 0.0, "round-1": 0.5} for row in tables["goal"].values())
+    fates = tables["differences"]["search-0"]["base -> round-1"]
+    assert fates["mended"]["count"] == fates["compared"] == tables["terrains"]["search-0"] >= 1
+    archive = read_archive(places / "run" / "search-0")
+    held_out = split_elites(archive, "anymal").test
+    assert set(fates["mended"]["terrains"]) <= set(held_out.tolist())
+
+
+def test_stopped_after_every_crossing_it_comes_to_the_same(places, stubbed):
+    whole = config(places, rounds=1, run_dir=places / "whole")
+    harden(whole, open_evaluator=Crossings().open)
+    expected = numbers(read_json(places / "whole" / "rounds.json"))
+    made = []
+    for _session in range(60):
+        crossings = Crossings(die_after=1)
+        try:
+            assert harden(config(places, rounds=1), open_evaluator=crossings.open) == 0
+            break
+        except Interrupted as stop:
+            assert "Go on with:" in str(stop) and f"--run-dir {places / 'run'}" in str(stop)
+            assert len(crossings.made) == 1  # each session gets further
+        finally:
+            made += crossings.made
+    got = numbers(rounds_of(places))
+    assert json.dumps(got).replace("/run/", "/whole/") == json.dumps(expected)
+    assert len(set(made)) > 5
+
+
+def test_stopped_in_a_training_it_goes_on_with_it(places, monkeypatch):
+    begun = []
+
+    def stopped(job, tune):
+        begun.append(tune.run.name)
+        if len(begun) == 1:
+            raise KeyboardInterrupt
+        stub_tune(job, tune)
+
+    monkeypatch.setattr(hardening, "_tune", stopped)
+    with pytest.raises(Interrupted, match=r"what is finished is kept\. Go on with:"):
+        harden(config(places), open_evaluator=Crossings().open)
+    assert [row["controller"] for row in rounds_of(places)["rounds"]] == ["base"]
+    assert harden(config(places), open_evaluator=Crossings().open) == 0
+    assert begun == ["tune-1", "tune-1", "tune-2"]
+
+
+def test_a_training_that_is_cut_short_is_not_taken_for_whole(places, stubbed):
+    job = hardening_of(config(places), open_evaluator=Crossings().open)
+    tune = replace(job.stages[1].tunes[0], start=places / "start.pt")
+    assert not job.is_tuned(tune)
+    (places / "run").mkdir()
+    stub_tune(replace(job, tune_iterations=ITERATIONS - 1), tune)
+    assert not job.is_tuned(tune)
+    (tune.run / "policy.train.json").write_bytes(to_json({"iterations": ITERATIONS}))
+    assert job.is_tuned(tune)
+
+
+def test_more_rounds_continue_a_finished_run(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    first = rounds_of(places)["rounds"]
+    crossings = Crossings()
+    harden(config(places, rounds=2), open_evaluator=crossings.open)
+    assert rounds_of(places)["rounds"][:2] == first and len(rounds_of(places)["rounds"]) == 3
+    assert (str(places / "start.pt"), False, 12) not in crossings.made  # the first search is not made again
+
+
+def test_comparisons_spend_as_many_trainings_otherwise(places, stubbed):
+    harden(config(places, rounds=2, against=("hard_random", "first_archive")), open_evaluator=Crossings().open)
+    content = rounds_of(places)
+    assert list(content["comparisons"]) == ["hard_random", "first_archive"]
+    for kind, archives in (("hard_random", []), ("first_archive", [str(places / "run" / "search-0")])):
+        row = content["comparisons"][kind]
+        assert (row["controller"], row["rounds"], row["episodes"]) == (kind, 2, 24)
+        assert row["tuned"] == [f"tune-{kind}-1", f"tune-{kind}-2"]
+        records = [read_json(places / "run" / name / "policy.train.json") for name in row["tuned"]]
+        assert [record["archives"] for record in records] == [archives, archives]
+    assert list(content["tables"]["controllers"]) == ["base", "round-1", "round-2", "hard_random", "first_archive"]
+    assert "search-hard_random-2" not in content["tables"]["goal"]
+    harden(config(places, rounds=2), open_evaluator=Crossings().open)  # what was compared stays in the tables
+    assert numbers(rounds_of(places)) == numbers(content)
+
+
+def test_a_real_training_draws_from_all_archives_and_brings_its_critic_along(places, monkeypatch):
+    small = {"num_envs": 6, "terrains": 4, "swap_every": 2, "iterations": 1}
+    monkeypatch.setattr(tuning, "_SMALL", small)
+    assert harden(config(places, tune_iterations=1), open_evaluator=Crossings().open) == 0
+    run = places / "run"
+    record = read_json(run / "tune-2" / "policy.train.json")
+    assert record["settings"]["policy"] == str(run / "tune-1" / "checkpoint.pt")
+    assert record["settings"]["critic_iterations"] == 0
+    assert record["settings"]["archive"]["path"] == [str(run / "search-0"), str(run / "search-1")]
+    marks = recorded_marks(str(run / "tune-2" / "policy.pt"))
+    for name in ("search-0", "search-1"):
+        archive = read_archive(run / name)
+        split = split_elites(archive, "anymal")
+        assert set(marks_of(archive.genes[split.train])) <= marks
+        assert not set(marks_of(archive.genes[split.test])) & marks
+
+
+def test_the_time_limit_stops_it_as_ctrl_c_does(places, monkeypatch, capsys):
+    def endless(job, tune):
+        time.sleep(60)
+
+    monkeypatch.setattr(hardening, "_tune", endless)
+    harden_once = config(places, rounds=1)
+    before = signal.getsignal(signal.SIGALRM)
+    assert harden(replace(harden_once, max_seconds=3.0), open_evaluator=Crossings().open) == 0
+    assert "The time is up. Stopped; what is finished is kept. Go on with:" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGALRM) == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rounds": 0}, "rounds must be at least 1, got 0"),
+        ({"policy": "nowhere.pt"}, "no such file"),
+        ({"policy": "script.pt"}, "a fine-tuning starts from an rsl_rl checkpoint"),
+        ({"by": ("C=start.pt",)}, "by must name a certifier other than start.pt, got C"),
+        ({"by": ()}, "panel must hold certifiers of anymal"),
+        ({"preset": "huge"}, "unknown preset 'huge'"),
+        ({"run_dir": "full"}, "is not empty and holds no rounds.json"),
+        ({"run_dir": "other"}, "holds a hardening of other settings: "),
+    ],
+)
+def test_errors_come_before_any_work_in_one_line(places, changes, message, monkeypatch, capsys):
+    monkeypatch.chdir(places)
+    torch.jit.script(torch.nn.Linear(235, 12)).save("script.pt")
+    for name, content in (("full/file", b""), ("other/rounds.json", to_json({"settings": {"seed": 5}}))):
+        (places / name).parent.mkdir()
+        (places / name).write_bytes(content)
+    flags = {"policy": "start.pt", "by": ("C=certifier.pt",), "run_dir": "run", "device": "cpu"} | changes
+    given = [word for name, value in flags.items() for word in words_of(name, value)]
+    before = sorted(os.listdir(places))
+    assert run_command(Harden, given, name="harden") == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert message in error and error.startswith("error: ")
+    assert sorted(os.listdir(places)) == before
+
+
+def words_of(name, value):
+    values = [str(item) for item in value] if isinstance(value, tuple) else [str(value)]
+    return [f"--{name.replace('_', '-')}", *values] if values else []
+
+
+def test_too_few_elites_to_train_on_are_said(places, stubbed):
+    with pytest.raises(ValueError, match=r"must have found at least 5 elites to train on, got [0-4]: give more"):
+        harden(config(places, batch_size=2, search_episodes=4), open_evaluator=Crossings().open)

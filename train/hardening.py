@@ -1,0 +1,485 @@
+"""A hardening at work: which steps there are, which of them are done, and what they say together.
+
+Every step is a run of its own: a search with its verdicts, or a training. What is done is read off these runs, so that
+a hardening that was killed anywhere goes on where it was. ``rounds.json`` follows from them.
+"""
+
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from qd.archive import read_archive
+from qd.faults import is_judged
+from qd.fresh import Open
+from qd.run.arguments import Archive, job_of
+from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, RunDirectory, claimed, read_archive_of
+from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
+from qd.run.settings import changed, differences, preset
+from qd.search import run_search
+from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
+from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
+from sim.files.command import Interrupted, command_line, naming_what_is_next
+from sim.files.intervals import value_words
+from sim.files.settings import check
+from sim.policy.spec import controller_hash, controllers_of, is_same
+from sim.robots.identity import identity
+from sim.robots.robot import RobotCfg, get_robot
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, to_be_named
+from train.evaluate.crossings import cross_all
+from train.evaluate.evaluate import Evaluate, evaluator_of
+from train.evaluate.measures import measure
+from train.evaluate.sets import MIN_ELITES, TerrainSet, generated_set, make_sets, split_elites
+from train.evaluate.tables import make_tables
+from train.finetune import Finetune
+from train.harden import Harden
+from train.ppo.learner import read_start
+from train.ppo.run import CHECKPOINT, POLICY
+from train.tuning import tuning_sizes
+
+BASE = "base"
+"""Name of the controller that a hardening begins with."""
+_GPU_EPISODES = 400_000
+_FIXED_SETS = ("hand_crafted", "hard_random")
+_SEEDS = 100  # of searches and trainings, apart between hardenings of one seed and the next
+_COUNTS = (
+    "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "failing", "confirmed",
+    "certified", "faults", "panel",
+)  # fmt: skip
+_VERDICTS = ("confirmed", "certified", "faults")
+_SESSION = ("command", "commit", "device", "date")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tune:
+    """One fine-tuning."""
+
+    run: Path
+    """Its directory."""
+    start: Path | None
+    """What it begins with: a controller, or the checkpoint of the training before, whose critic comes along; the
+    shipped controller if None."""
+    archives: tuple[Path, ...]
+    """Runs of the searches whose elites it trains on; of none: on hard-random terrains."""
+    seed: int
+
+    @property
+    def policy(self) -> str:
+        """The controller that it makes."""
+        return str(self.run / POLICY)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A controller: the trainings that lead to it, and the search against it."""
+
+    controller: str
+    """Its name in ``rounds.json``."""
+    policy: str
+    """Its file."""
+    tunes: tuple[Tune, ...]
+    """The trainings since the stage before; none of the base."""
+    search: Path
+    """Run of the search."""
+    seed: int
+    """Of the search."""
+    compared: str = ""
+    """Key in ``comparisons``; empty for a round."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hardening:
+    """A hardening that can begin or go on: what a user may have got wrong is checked."""
+
+    flags: Harden
+    robot: RobotCfg
+    path: Path
+    device: str
+    space: TerrainSpace
+    evaluator: EvaluatorCfg
+    """What crosses the sets of the evaluation."""
+    search_iterations: int
+    tune_iterations: int
+    settings: dict[str, Any]
+    """What makes it what it is, as JSON values."""
+    open_evaluator: Open
+
+    @property
+    def stages(self) -> list[Stage]:
+        """All controllers in order: the base, one a round, and those to compare with."""
+        rounds, shipped = self.flags.rounds, self.flags.policy
+        found = [
+            Stage(
+                controller=BASE, policy=str(shipped or self.robot.policy_file), tunes=(), search=self.search_run(0),
+                seed=self.seed(0),
+            )
+        ]  # fmt: skip
+        archives = [self.search_run(number) for number in range(rounds)]
+        chain = self._chain("tune", [tuple(archives[:number]) for number in range(1, rounds + 1)])
+        for number, tune in enumerate(chain, start=1):
+            found.append(
+                Stage(
+                    controller=f"round-{number}", policy=tune.policy, tunes=(tune,), search=self.search_run(number),
+                    seed=self.seed(number),
+                )
+            )  # fmt: skip
+        for kind in self.flags.against:
+            chain = self._chain(f"tune-{kind}", [() if kind == "hard_random" else (archives[0],)] * rounds)
+            search = self.path / f"search-{kind}-{rounds}"
+            stage = Stage(
+                controller=kind, policy=chain[-1].policy, tunes=chain, search=search, seed=self.seed(rounds),
+                compared=kind,
+            )  # fmt: skip
+            found.append(stage)
+        return found
+
+    def _chain(self, name: str, archives: list[tuple[Path, ...]]) -> tuple[Tune, ...]:
+        """Trainings of which each begins where the one before it ended, by what they train on."""
+        found, start = [], self.flags.policy
+        for number, trained_on in enumerate(archives, start=1):
+            run = self.path / f"{name}-{number}"
+            found.append(Tune(run=run, start=start, archives=trained_on, seed=self.seed(number)))
+            start = run / CHECKPOINT
+        return tuple(found)
+
+    def search_run(self, number: int) -> Path:
+        """Run of the search against the controller of a round; 0: of the base."""
+        return self.path / f"search-{number}"
+
+    def seed(self, number: int) -> int:
+        """Seed of a round: searches of one seed would begin with the same terrains, some of which are held out."""
+        return _SEEDS * self.flags.seed + number
+
+    def certifiers(self, policy: str) -> dict[str, str]:
+        """Who certifies the faults of a controller, by name: the panel, or those named, without itself.
+
+        Raises:
+            ValueError: If nobody is left.
+        """
+        if not self.flags.by:
+            return panel_of(self.robot, lambda file: is_same(file, policy))
+        named = controllers_of(self.flags.by, self.robot, flag="by")
+        found = {name: file for name, file in named.items() if not is_same(file, policy)}
+        if not found:
+            raise ValueError(f"by must name a certifier other than {policy}, got {', '.join(named)}: name another one")
+        return found
+
+    def is_searched(self, stage: Stage) -> bool:
+        """Whether the search against a controller is over, its fresh episodes included."""
+        archive = RunDirectory(stage.search).fresh_archive()
+        return archive is not None and archive.iterations >= self.search_iterations
+
+    def is_judged(self, stage: Stage) -> bool:
+        """Whether its faults are counted too."""
+        return self.is_searched(stage) and is_judged(read_archive(stage.search), self.certifiers(stage.policy))
+
+    def is_tuned(self, tune: Tune) -> bool:
+        """Whether a training is over."""
+        try:
+            done = read_json(Path(tune.policy).with_suffix(".train.json")).get("iterations")
+        except (OSError, ValueError):
+            return False
+        return Path(tune.policy).exists() and isinstance(done, int) and done >= self.tune_iterations
+
+    @property
+    def command(self) -> str:
+        """The command that goes on with it."""
+        given = {one.name: getattr(self.flags, one.name) for one in fields(self.flags)}
+        changed_ = {one.name: given[one.name] for one in fields(self.flags) if given[one.name] != one.default}
+        kept = {name: value for name, value in changed_.items() if value != ()}
+        return command_line("harden", **{**kept, "run_dir": self.path})
+
+
+def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Hardening:
+    """What a command line asks for, checked.
+
+    Raises:
+        ValueError: If robot, controller, certifiers, device, a size or the directory is not as it must be.
+    """
+    check(flags)
+    flags = _with_known_comparisons(flags)
+    robot, device = get_robot(flags.robot), resolve_device(flags.device, flags.workers)
+    policy = flags.policy or robot.policy_file
+    read_start(policy, robot)
+    check_policy(str(policy), robot, device)
+    space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
+    on_cuda = device.startswith("cuda")
+    sizes = {name: getattr(flags, name) for name in ("emitters", "batch_size", "replicas")}
+    search = changed(preset(flags.preset or ("wide" if on_cuda else "small"), robot, str(policy)), sizes)
+    an_iteration = search.episodes_per_iteration
+    wanted = flags.search_episodes or (_GPU_EPISODES if on_cuda else search.iterations * an_iteration)
+    tuning = replace(Finetune.defaults(["--robot", robot.spec]), iterations=flags.tune_iterations)
+    names = ("terrains", "episodes", "device", "workers", "num_envs", "space")
+    evaluation = Evaluate(robot=robot.spec, sets=_FIXED_SETS, **{name: getattr(flags, name) for name in names})
+    found = Hardening(
+        flags=flags,
+        robot=robot,
+        path=_path_of(flags),
+        device=device,
+        space=space,
+        evaluator=replace(evaluator_of(evaluation, robot), reward=True),
+        search_iterations=-(-wanted // an_iteration),
+        tune_iterations=tuning_sizes(tuning, robot, device)["iterations"],
+        settings={},
+        open_evaluator=open_evaluator,
+    )
+    found = replace(found, settings=_settings_of(found, search.preset, sizes, an_iteration))
+    for certifier in found.certifiers(str(policy)).values():
+        check_policy(certifier, robot, device)
+    _refuse_another(found)
+    return found
+
+
+def _path_of(flags: Harden) -> Path:
+    return flags.run_dir or Path("runs") / f"{get_robot(flags.robot).name}-harden-{flags.seed}"
+
+
+def _with_known_comparisons(flags: Harden) -> Harden:
+    """The flags with what the rounds were compared with before: it stays in the tables."""
+    file = _path_of(flags) / ROUNDS_FILE
+    known = read_json(file).get("comparisons", {}) if file.exists() else {}
+    there = (kind for kind, row in known.items() if row["rounds"] == flags.rounds)
+    return replace(flags, against=tuple(dict.fromkeys([*there, *flags.against])))
+
+
+def _settings_of(job: Hardening, size: str, sizes: dict[str, Any], an_iteration: int) -> dict[str, Any]:
+    flags = job.flags
+    searched = {"preset": size, **sizes, "episodes": an_iteration * job.search_iterations}
+    return {
+        **identity(job.robot, flags.policy or job.robot.policy_file),
+        "seed": flags.seed,
+        "space": job.space.name,
+        "search": searched,
+        "tune": {"iterations": job.tune_iterations, "draw": flags.draw, "shares": flags.shares},
+        "evaluation": {"terrains": job.evaluator.num_terrains, "episodes": job.evaluator.num_replicas},
+    }
+
+
+def _refuse_another(job: Hardening) -> None:
+    """Refuses a directory that holds something else, or a hardening of other settings.
+
+    Raises:
+        ValueError: If it does.
+    """
+    path = job.path
+    if (path / ROUNDS_FILE).exists():
+        there = read_json(path / ROUNDS_FILE).get("settings")
+        different = differences(there if isinstance(there, dict) else {}, job.settings)
+        if different:
+            raise ValueError(
+                f"{path} holds a hardening of other settings: {', '.join(different)}: give those, or another --run-dir"
+            )
+    elif path.is_dir() and not all(map(is_leftover, path.iterdir())):
+        raise ValueError(f"{path} is not empty and holds no {ROUNDS_FILE}: give another --run-dir")
+
+
+def harden(flags: Harden, *, open_evaluator: Open = open_evaluator) -> int:
+    """Runs what is left of a hardening; returns the exit status 0, also where the time is up.
+
+    Args:
+        flags: What is asked for.
+        open_evaluator: Opens what crosses terrains.
+
+    Raises:
+        As :meth:`train.harden.Harden.execute`.
+    """
+    job = hardening_of(flags, open_evaluator=open_evaluator)
+    go_on = f"Go on with:  {job.command}"
+    with _time_limit(flags.max_seconds) as is_up:
+        try:
+            with claimed(job.path), naming_what_is_next("what is finished is kept", lambda: go_on):
+                _begin(job)
+                for stage in job.stages:
+                    _run(job, stage)
+        except Interrupted as stop:
+            if not is_up():
+                raise
+            print(f"The time is up. {stop}")
+            return 0
+    _tell(read_json(job.path / ROUNDS_FILE))
+    print(f"Next, see it on one page:  {command_line('report', robot=job.robot.spec, run=job.path)}")
+    return 0
+
+
+@contextmanager
+def _time_limit(seconds: float | None) -> Iterator[Callable[[], bool]]:
+    """Interrupts as Ctrl-C does after so many seconds; gives what says whether it did."""
+    rung: list[int] = []
+
+    def ring(kind: int, _frame: object) -> None:
+        rung.append(kind)
+        signal.raise_signal(signal.SIGINT)
+
+    if seconds is None:
+        yield lambda: False
+        return
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield lambda: bool(rung)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _run(job: Hardening, stage: Stage) -> None:
+    """All that is left to be done for a controller."""
+    for tune in stage.tunes:
+        if not job.is_tuned(tune):
+            print(f"\n=== {stage.controller}: training, in {tune.run}", flush=True)
+            _tune(job, tune)
+    if stage.tunes and not job.is_searched(stage):
+        _record(job)
+    if not job.is_judged(stage):
+        print(f"\n=== {stage.controller}: search, in {stage.search}", flush=True)
+        _search(job, stage)
+        _judge(job, stage)
+    _record(job)
+
+
+def _tune(job: Hardening, tune: Tune) -> None:
+    """Trains, or goes on; raises KeyboardInterrupt where it was asked to stop."""
+    flags, robot = job.flags, job.robot.spec
+    own = {"device": flags.device, "iterations": job.tune_iterations, "archive": _divisible(tune.archives)}
+    if (tune.run / CHECKPOINT).exists():
+        training = Finetune.defaults(["--robot", robot, "--resume", str(tune.run)])
+    else:
+        training = Finetune.defaults(["--robot", robot])
+        own |= {"run_dir": tune.run, "policy": tune.start, "seed": tune.seed, "shares": flags.shares}
+        own |= {"draw": flags.draw} if tune.archives else {"mix": "hard-random"}
+    own["space"] = to_be_named(job.space.name) if tune.archives else job.space.name
+    if replace(training, **own).execute():
+        raise KeyboardInterrupt
+
+
+def _divisible(runs: Sequence[Path]) -> tuple[Path, ...]:
+    """The searches that found enough elites to train on some and hold out others; the first must have."""
+    enough = tuple(run for run in runs if len(read_archive(run)) >= MIN_ELITES)
+    if runs and runs[0] not in enough:
+        raise ValueError(
+            f"{runs[0]} must have found at least {MIN_ELITES} elites to train on, got {len(read_archive(runs[0]))}: "
+            "give more --search-episodes and another --run-dir"
+        )
+    return enough
+
+
+def _search(job: Hardening, stage: Stage) -> None:
+    """Searches against a controller, or goes on; ends with fresh episodes, and with contact resolved."""
+    if job.is_searched(stage):
+        return
+    if (stage.search / CONFIG_FILE).exists():
+        own: dict[str, Any] = {"resume": stage.search}
+    else:
+        sizes = ("preset", "emitters", "batch_size", "replicas")
+        own = {name: getattr(job.flags, name) for name in sizes}
+        own |= {"run_dir": stage.search, "seed": stage.seed}
+    args = Archive(
+        **_where(job), **own, policy=_named(job, stage), iterations=job.search_iterations, reproduce="yes",
+        confirm="yes",
+    )  # fmt: skip
+    run_search(job_of(args), open_evaluator=job.open_evaluator)
+
+
+def _judge(job: Hardening, stage: Stage) -> None:
+    """Counts the faults of a controller among the elites of its search."""
+    who = tuple(f"{name}={file}" for name, file in job.certifiers(stage.policy).items())
+    confirm = Confirm(**_where(job), run=stage.search, policy=_named(job, stage))
+    confirm_run(confirm, open_evaluator=job.open_evaluator)
+    certify_run(Certify(**_where(job), run=stage.search, by=who), open_evaluator=job.open_evaluator)
+
+
+def _where(job: Hardening) -> dict[str, Any]:
+    """The flags that every command about a search takes."""
+    names = ("device", "workers", "num_envs", "space")
+    return {"robot": job.robot.spec, **{name: getattr(job.flags, name) for name in names}}
+
+
+def _named(job: Hardening, stage: Stage) -> str | None:
+    """What a search calls its controller; None for the shipped one."""
+    return None if job.flags.policy is None and not stage.tunes else stage.policy
+
+
+def _begin(job: Hardening) -> None:
+    """Writes what is to be done, with this session after those before."""
+    file = job.path / ROUNDS_FILE
+    now = origin_of(job.device, job.flags.seed, job.flags.workers)
+    content = read_json(file) if file.exists() else {**now, "settings": job.settings, "sessions": []}
+    sessions = [*content.pop("sessions"), {name: now[name] for name in _SESSION}]
+    write_atomically(file, to_json({**content, "sessions": sessions}))
+    started = time.strftime("%H:%M")
+    print(f"Hardening '{job.robot.name}' for {job.flags.rounds} rounds in {job.path}, from {started}", flush=True)
+
+
+def _record(job: Hardening) -> None:
+    """Writes ``rounds.json``: the counts of all searches that are over, and the tables of all controllers there are."""
+    file = job.path / ROUNDS_FILE
+    content = read_json(file)
+    rows = {stage.controller: (stage, _row(job, stage)) for stage in job.stages if job.is_judged(stage)}
+    known = dict(content.get("comparisons") or {})  # those of this session and of sessions before
+    known |= {stage.compared: {"rounds": job.flags.rounds, **row} for stage, row in rows.values() if stage.compared}
+    written = {
+        **content,
+        **{name: job.settings[name] for name in ("robot", "robot_sha256", "penalty_definition")},
+        "rounds": [row for stage, row in rows.values() if not stage.compared],
+        "comparisons": known,
+        "tables": _tables(job),
+    }
+    write_atomically(file, to_json(written))
+
+
+def _row(job: Hardening, stage: Stage) -> dict[str, Any]:
+    """What the search against a controller found."""
+    summary = RunDirectory(stage.search).read_summary()
+    counts = {name: summary.get(name) for name in _COUNTS}
+    if counts["failing"] == 0:  # nobody had to cross anything
+        counts |= dict.fromkeys(_VERDICTS, 0)
+    who = {name: value for name, value in identity(job.robot, stage.policy).items() if name.startswith("policy")}
+    return {
+        "controller": stage.controller,
+        **who,
+        "tuned": [tune.run.name for tune in stage.tunes],
+        "search": stage.search.name,
+        **counts,
+    }
+
+
+def _tables(job: Hardening) -> dict[str, Any]:
+    """Every controller there is on the fixed sets and on the held-out elites of every archive.
+
+    The same keys as of ``tables.json``; what was crossed before is not crossed again.
+    """
+    there = [stage for stage in job.stages if all(map(job.is_tuned, stage.tunes))]
+    controllers = {stage.controller: stage.policy for stage in there}
+    sets = dict(make_sets(_FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space))
+    searched = [stage.search for stage in there if not stage.compared and job.is_searched(stage)]
+    sets |= {run.name: _held_out(job, run) for run in _divisible(searched)}
+    results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
+    scales = job.robot.read_penalty_scales(None if job.flags.policy is None else str(job.flags.policy))
+    crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
+    about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()}
+    return {
+        "episodes": job.evaluator.num_replicas,
+        "controllers": about,
+        **make_tables(crossed, sets, job.robot, 0),
+    }
+
+
+def _held_out(job: Hardening, run: Path) -> TerrainSet:
+    """Elites of an archive that no training draws."""
+    archive = read_archive_of(job.robot, run, job.flags.space)
+    split = split_elites(archive, job.robot.name, spec=job.robot.spec, run=run)
+    return replace(generated_set(archive, split, job.evaluator.num_terrains, 0), name=run.name)
+
+
+def _tell(content: Mapping[str, Any]) -> None:
+    """The rounds in a few lines."""
+    goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
+    print("\n" + "".join(f"{title:<12}" for title in ("controller", "elites", "failing", "faults")) + "goal on")
+    for row in [*content["rounds"], *content["comparisons"].values()]:
+        who = row["controller"]
+        counts = ("-" if row[key] is None else row[key] for key in ("elites", "failing", "faults"))
+        rates = (f"{name} {value_words(goal[name].get(who), limits[name].get(who))}" for name in _FIXED_SETS)
+        print("".join(f"{cell:<12}" for cell in (who, *counts)) + ", ".join(rates))
