@@ -192,6 +192,7 @@ def numbers_of(again: FreshValues, cells: Cells, *, sampled: bool = False) -> di
         return numbers
     kept = again.corrected_elites()
     return numbers | {
+        "failing": int(again.failing.sum()),
         "corrected_elites": len(kept),
         "corrected_coverage": len(kept) / cells.num_cells,
         "corrected_qd_score": float((again.fitness[kept] - FITNESS_FLOOR).sum()),

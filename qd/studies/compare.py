@@ -64,10 +64,11 @@ AGAIN = (
     "corrected_elites",
     "corrected_mean_fitness",
     "reproduced",
+    "failing",
     "mean_std",
 )
 """What a row of metrics has more where all elites crossed fresh episodes."""
-FAULTS = ("failing", "confirmed", "certified", "faults")
+FAULTS = ("confirmed", "certified", "faults")
 """What a method has more where its elites were judged."""
 _BATCH = ("batch_fitness", "batch_collision_rate", "batch_goal_rate")
 _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called, with a seed behind it
@@ -75,16 +76,18 @@ _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called,
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(StudyFlags):
-    """Compare ways to search on the same number of terrains, several seeds each, all in lock-step.
+    """Compare ways to search on the same number of terrains, several seeds each, crossed together.
 
     Every search is an ordinary run in its own folder METHOD-SEED. State is saved after every iteration: stop with
-    Ctrl-C whenever you like, and the same command goes on.
+    Ctrl-C whenever you like, and the same command goes on. Searches of other widths are compared by
+    mixed:emitters=80,groups=8: eight times the terrains an iteration, in an eighth of the iterations.
     """
 
     methods: tuple[str, ...] = tuple(name for name in METHODS if name != GATED)
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
     size .5), mixed (cma_mae+map_elites), gated (mixed, for failures that others can cross); all but gated. Settings of
-    the search after a colon make another one of it: cma_mae:restart-rule=20,learning-rate=0.3."""
+    the search after a colon make another one of it: cma_mae:restart-rule=20,learning-rate=0.3. Of NAME@1 only the
+    first seed is run."""
     certified_by: tuple[str, ...] = ()
     """Certifiers of the method gated, FILE or NAME=FILE. It ends with as many episodes as the others have, those of the
     certifiers included, and so after fewer iterations."""
@@ -99,7 +102,8 @@ class Compare(StudyFlags):
     seed: int = 0
     """The first seed."""
     iterations: int = 33
-    """Iterations of every run; more than before extend a comparison that is there."""
+    """Iterations of a run of the preset's size, and so the terrains of every run; more than before extend a comparison
+    that is there."""
     reevaluate_every: int = setting(11, least=1)
     """Every so many iterations, and at the end, all elites cross 40 fresh episodes."""
 
@@ -127,23 +131,24 @@ class Compare(StudyFlags):
         methods = self._methods(shared, certifiers)
         check_certifiers(certifiers, shared, robot, device)
         judges = judges_of(self.by, shared, robot, device) if self.certify else {}
-        seeds = range(self.seed, self.seed + self.seeds)
-        runs = {f"{name}-{seed}": replace(cfg, seed=seed) for name, cfg in methods.items() for seed in seeds}
+        seeds = {name: range(self.seed, self.seed + count) for name, count in self._asked().items()}
+        runs = {f"{name}-{seed}": replace(methods[name], seed=seed) for name in methods for seed in seeds[name]}
         study = study_of(self, "compare", runs, robot, device, sampled=False, certifiers=certifiers)
 
         def measure() -> dict[str, Any]:
             found = run_study(study, open_evaluator)
-            metrics = {name: [found[f"{name}-{seed}"] for seed in seeds] for name in methods}
+            metrics = {name: [found[f"{name}-{seed}"] for seed in seeds[name]] for name in methods}
             report = report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()})
             for name in methods if self.certify else ():
-                folders = [study.path / f"{name}-{seed}" for seed in seeds]
+                folders = [study.path / f"{name}-{seed}" for seed in seeds[name]]
                 counts = [self._judged(folder, robot.spec, judges, open_evaluator) for folder in folders]
                 report["methods"][name] |= {key: _over_seeds([one[key] for one in counts]) for key in FAULTS}
             return {
                 **study.origin,
                 **identity(robot, study.evaluator.policy),
                 "preset": size,
-                "seeds": list(seeds),
+                "seeds": list(range(self.seed, self.seed + self.seeds)),
+                "iterations": self.iterations,
                 "reachable_cells": shared.cells.num_cells,
                 "qd_score_offset": -FITNESS_FLOOR,
                 "certified_by": dict(zip(certifiers, certifier_settings(certifiers)["certifier_sha256"], strict=True)),
@@ -172,10 +177,11 @@ class Compare(StudyFlags):
         Raises:
             ValueError: If they are not, or a name cannot be that of a folder.
         """
-        unknown = [name for name in self.methods if name.split(":")[0] not in METHODS]
-        if unknown or not self.methods or len(set(self.methods)) < len(self.methods):
+        asked = self._asked()
+        unknown = [name for name in asked if name.split(":")[0] not in METHODS]
+        if unknown or not asked or len(asked) < len(self.methods):
             raise ValueError(f"methods must be some of {', '.join(METHODS)}, each once, got {', '.join(self.methods)}")
-        gated = [name for name in self.methods if name.split(":")[0] == GATED]
+        gated = [name for name in asked if name.split(":")[0] == GATED]
         if bool(gated) != bool(certifiers):
             raise ValueError(
                 f"methods: {GATED} and --certified-by need each other, got {', '.join(self.methods)} with "
@@ -184,23 +190,50 @@ class Compare(StudyFlags):
         if gated and parse_workers(self.workers).on_ray:
             raise ValueError(f"methods: {NOT_ON_RAY}, got --workers {self.workers}")
         names: dict[SearchCfg, str] = {}
-        for name in self.methods:
+        for name in asked:
             if not _NAME.fullmatch(name):
                 raise ValueError(
                     f"methods: a name must be up to 200 letters, digits and _+-.,:= without spaces, got {name!r}"
                 )
-            cfg = changed(shared, changes_of(name))
+            cfg = _resized(changed(shared, changes_of(name)), shared, name)
             if name in gated:
                 cfg = replace(cfg, **certifier_settings(certifiers), certify_episodes=self.certify_episodes)
             if cfg in names:
                 raise ValueError(f"methods: {names[cfg]} and {name} are the same search: leave one of them out")
-            if cfg.scheduler.num_terrains != shared.scheduler.num_terrains:
-                raise ValueError(
-                    f"methods: emitters times batch_size must be {shared.scheduler.num_terrains} as in all runs of the "
-                    f"comparison, got {cfg.scheduler.num_terrains} in {name}"
-                )
             names[cfg] = name
         return {name: cfg for cfg, name in names.items()}
+
+    def _asked(self) -> dict[str, int]:
+        """How many seeds of each method.
+
+        Raises:
+            ValueError: If a number behind an @ is none.
+        """
+        found = {}
+        for text in self.methods:
+            name, at, count = text.partition("@")
+            if at and not (count.isdecimal() and 1 <= int(count) <= self.seeds):
+                raise ValueError(
+                    f"methods: behind @ there must be a number of seeds from 1 to {self.seeds}, got {text}"
+                )
+            found[name] = int(count) if at else self.seeds
+        return found
+
+
+def _resized(cfg: SearchCfg, shared: SearchCfg, name: str) -> SearchCfg:
+    """A search with as many iterations as make the same number of terrains as the others have.
+
+    Raises:
+        ValueError: If no whole number of them does.
+    """
+    terrains, own = shared.iterations * shared.scheduler.num_terrains, cfg.scheduler.num_terrains
+    if terrains % own:
+        raise ValueError(
+            f"methods: iterations of {name} must make up the {terrains:,} terrains of the others, got {own:,} terrains "
+            "an iteration: change emitters, batch-size or --iterations"
+        )
+    every = max(1, shared.reevaluate_every * shared.scheduler.num_terrains // own)
+    return replace(cfg, iterations=terrains // own, reevaluate_every=every)
 
 
 def changes_of(method: str) -> dict[str, Any]:
@@ -242,43 +275,35 @@ def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[
     """The numbers of a comparison.
 
     Args:
-        runs: Metrics of every seed, by method; equally many rows but for searches that have spent their episodes, whose
-            curves stay where they ended.
+        runs: Metrics of every seed, by method. Searches that have spent their episodes earlier than other seeds stay
+            where they ended.
         settings: Settings of each method's scheduler.
 
     Returns:
-        ``iterations``, ``terrains_evaluated`` (cumulative, one an iteration), and ``methods``: of each its settings,
-        the curves found (``CURVES``, every iteration) and corrected (``AGAIN``, at ``corrected_at`` terrains) as mean
-        and 95 % t interval over seeds, what its terrains did to the robots on average, and its episodes.
+        ``methods``: of each its settings, the curves found (``CURVES``, at ``terrains_evaluated``, cumulative) and
+        corrected (``AGAIN``, at ``corrected_at`` terrains) as mean and 95 % t interval over seeds, what its terrains
+        did to the robots on average, its iterations and episodes.
     """
-    ended = runs
-    first = max((rows for seeds in runs.values() for rows in seeds), key=len)
-    runs = {name: [rows + rows[-1:] * (len(first) - len(rows)) for rows in seeds] for name, seeds in runs.items()}
-    terrains = np.cumsum([row["terrains"] for row in first])
-    every = [rows for seeds in runs.values() for rows in seeds]
+    return {"methods": {name: _numbers_of_method(seeds, settings[name]) for name, seeds in runs.items()}}
+
+
+def _numbers_of_method(ended: list[Metrics], settings: Any) -> dict[str, Any]:
+    longest = max(ended, key=len)
+    seeds = [rows + rows[-1:] * (len(longest) - len(rows)) for rows in ended]
+    terrains = np.cumsum([row["terrains"] for row in longest])
     # The last iteration of a comparison that was stopped in it and then extended has them in some runs only.
-    at = [k for k in range(len(first)) if all("corrected_qd_score" in rows[k] for rows in every)]
-    methods = {}
-    for name, seeds in runs.items():
-        methods[name] = {
-            "settings": settings[name],
-            **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in range(len(first))] for key in CURVES},
-            **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in at] for key in AGAIN},
-            **{
-                key: _over_seeds([float(np.mean([row[key] for row in rows])) for rows in ended[name]]) for key in _BATCH
-            },
-            "iterations": [len(rows) for rows in ended[name]],
-            "episodes": sum(episodes_in(row) for rows in ended[name] for row in rows),
-            **{
-                key: sum(row.get(key, 0) for rows in ended[name] for row in rows)
-                for key in ("certifier_episodes", "invalid_episodes", "wall_s")
-            },
-        }
+    at = [k for k in range(len(longest)) if all("corrected_qd_score" in rows[k] for rows in seeds)]
+    every = [row for rows in ended for row in rows]
     return {
-        "iterations": len(first),
+        "settings": settings,
         "terrains_evaluated": terrains.tolist(),
         "corrected_at": terrains[at].tolist(),
-        "methods": methods,
+        **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in range(len(longest))] for key in CURVES},
+        **{key: [_over_seeds([rows[k].get(key) for rows in seeds]) for k in at] for key in AGAIN},
+        **{key: _over_seeds([float(np.mean([row[key] for row in rows])) for rows in ended]) for key in _BATCH},
+        "iterations": [len(rows) for rows in ended],
+        "episodes": sum(map(episodes_in, every)),
+        **{key: sum(row.get(key, 0) for row in every) for key in ("certifier_episodes", "invalid_episodes", "wall_s")},
     }
 
 
@@ -299,8 +324,9 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     from qd.show.figures import new_figure
 
     figure, seeds = new_figure(12.0, 4.6), len(report["seeds"])
+    most = max(method["terrains_evaluated"][-1] for method in report["methods"].values())
     figure.suptitle(
-        f"{report['robot']}: {report['terrains_evaluated'][-1]:,} terrains a run, "
+        f"{report['robot']}: {most:,} terrains a run, "
         + (f"{seeds} seeds a method, mean and 95 % interval over them" if seeds > 1 else "one seed")
     )
     panels = (
@@ -313,7 +339,7 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
         others = iter(_OTHER_LOOKS * len(report["methods"]))
         for name, method in report["methods"].items():
             title, color, style = LABELS.get(name) or (name.replace(":", ": "), *next(others))
-            points = [point for point in zip(report[along], method[key], strict=True) if point[1]["mean"] is not None]
+            points = [point for point in zip(method[along], method[key], strict=True) if point[1]["mean"] is not None]
             x = [terrains for terrains, _ in points]
             mean = [factor * point["mean"] for _, point in points]
             marker = "o" if along == "corrected_at" else ""
@@ -330,13 +356,19 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
 
 
 def _show(report: dict[str, Any]) -> None:
-    """Prints the last corrected QD score of each method."""
-    if not report["corrected_at"]:
-        return  # some runs were extended alone, with fresh episodes of some elites only
-    print(f"\ncorrected QD score after {report['corrected_at'][-1]:,} terrains, 95 % interval over seeds")
+    """Prints what each method has found, by the last fresh episodes of all elites."""
+    width = max(map(len, report["methods"]))
+    print(
+        f"\nby fresh episodes, 95 % interval over seeds\n  {'':<{width}}  {'elites':>22}{'failing':>22}{'QD score':>24}"
+    )
     for name, method in report["methods"].items():
-        last = method["corrected_qd_score"][-1]
-        print(f"  {name}: {value_words(last['mean'], last['interval'], '.0f')}")
+        if not method["corrected_at"]:
+            continue  # some runs were extended alone, with fresh episodes of some elites only
+        cells = [
+            value_words(method[key][-1]["mean"], method[key][-1]["interval"], ".0f")
+            for key in ("corrected_elites", "failing", "corrected_qd_score")
+        ]
+        print(f"  {name:<{width}}  {cells[0]:>22}{cells[1]:>22}{cells[2]:>24}")
         if "faults" in method:
             found = method["faults"]
             print(f"    faults: {value_words(found['mean'], found['interval'], '.0f')}")

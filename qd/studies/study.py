@@ -105,11 +105,16 @@ def study_of(
     controller = moved or policy_spec(cfg, robot)
     if told := robot.scaled_by_another(controller):
         print(told)
+    evaluator = evaluator_of(cfg, robot, controller, device, flags.workers, num_envs=flags.num_envs, runs=len(runs))
+    by_groups: dict[int, int] = {}  # terrains under way in each lock-step
+    for one in (own.scheduler for own in runs.values()):
+        by_groups[one.groups] = by_groups.get(one.groups, 0) + one.num_terrains
+    groups, terrains = max(by_groups.items(), key=lambda one: one[1])
     return Study(
         path=path,
         out=flags.out or path / f"{name}.json",
         runs=runs,
-        evaluator=evaluator_of(cfg, robot, controller, device, flags.workers, num_envs=flags.num_envs, runs=len(runs)),
+        evaluator=replace(evaluator, num_terrains=terrains, lots=groups),
         origin={**origin_of(device, cfg.seed, flags.workers), **own_file(robot)},
         sampled=sampled,
         certifiers=certifiers or {},
@@ -121,6 +126,8 @@ class _Search:
     """One of the searches, as far as it is."""
 
     cfg: SearchCfg
+    iterations: int
+    """Of the study; the run may have more."""
     run: RunDirectory
     origin: dict[str, Any]
     search: "Scheduler"
@@ -132,16 +139,20 @@ class _Search:
         """Iterations done."""
         return len(self.metrics)
 
-    def episodes_left(self, iterations: int, *rows: dict[str, Any]) -> int:
-        """Episodes to be spent; none once it has made so many iterations, or spent as many as they have of a plain one.
+    @property
+    def step(self) -> tuple[int, int]:
+        """What searches must agree in to be crossed in lock-step: groups, and when elites cross fresh episodes."""
+        return self.cfg.scheduler.groups, self.cfg.reevaluate_every
+
+    def episodes_left(self, *rows: dict[str, Any]) -> int:
+        """Episodes to be spent; none once it has made its iterations, or spent as many as they have of a plain one.
 
         Args:
-            iterations: Of the study.
             rows: Of iterations that are not among its metrics yet.
         """
         metrics, each = [*self.metrics, *rows], self.cfg.episodes_per_iteration
-        left = iterations * each - sum(map(episodes_in, metrics))
-        return left if len(metrics) < iterations and left >= each else 0
+        left = self.iterations * each - sum(map(episodes_in, metrics))
+        return left if len(metrics) < self.iterations and left >= each else 0
 
 
 def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
@@ -162,8 +173,7 @@ def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
     with ExitStack() as claims:
         claims.enter_context(claimed(study.path))
         searches = {name: _opened(study, name, claims) for name in study.runs}
-        iterations = min(one.cfg.iterations for one in searches.values())
-        left = sum(one.episodes_left(iterations) for one in searches.values())
+        left = sum(one.episodes_left() for one in searches.values())
         print(f"{len(searches)} searches in {study.path}: {left:,} episodes, and those of elites again", flush=True)
         with naming_what_is_next("finished iterations are saved", lambda: "The same command goes on"):
             gated = [one.cfg for one in searches.values() if one.cfg.certified_by]
@@ -200,23 +210,28 @@ def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
         raise ValueError(f"{run.path} is not empty and holds no run: give another --run-dir")
     search, metrics = loaded or (begin(cfg), [])
     cfg = replace(cfg, iterations=max(cfg.iterations, len(metrics)))  # one that was extended alone is not shortened
-    return _Search(cfg=cfg, run=run, origin=origin, search=search, metrics=metrics)
+    return _Search(
+        cfg=cfg, iterations=study.runs[name].iterations, run=run, origin=origin, search=search, metrics=metrics
+    )
 
 
 def _lock_step(searches: Sequence[_Search], evaluate: Evaluate, gate: Gate | None, *, sampled: bool) -> None:
     """Runs the iterations that are left; searches behind the others, as after a kill, catch up first.
 
-    Searches with certifiers end earlier than the others, with as many episodes.
+    Searches with certifiers end earlier than the others, with as many episodes. Those that cannot go in lock-step with
+    the first ones come after them.
     """
-    iterations = min(one.cfg.iterations for one in searches)
+    iterations = max(one.iterations for one in searches)
     with ProgressBar(iterations, min(one.done for one in searches)) as bar:
-        while going := [one for one in searches if one.episodes_left(iterations)]:
+        while going := [one for one in searches if one.episodes_left()]:
+            going = [one for one in going if one.step == going[0].step]
             done = min(one.done for one in going)
             active = [one for one in going if one.done == done]
-            caught_up = min((one.done for one in going if one.done > done), default=iterations)
-            left = range(done + 1, caught_up + 1)
+            last = min(one.iterations for one in active)
+            caught_up = min((one.done for one in going if one.done > done), default=last)
+            left = range(done + 1, min(last, caught_up) + 1)
             gated = any(one.cfg.certified_by for one in active)
-            _iterate(active, evaluate, gate if gated else None, left, bar, iterations=iterations, sampled=sampled)
+            _iterate(active, evaluate, gate if gated else None, left, bar, sampled=sampled)
 
 
 def _iterate(
@@ -226,7 +241,6 @@ def _iterate(
     left: range,
     bar: ProgressBar,
     *,
-    iterations: int,
     sampled: bool,
 ) -> None:
     """Some iterations of some searches, each saved, until one of them has spent its episodes."""
@@ -237,10 +251,10 @@ def _iterate(
         for one, result in zip(active, results, strict=True):
             one.found = archive_of(one.cfg, one.search, iteration)
             rows.append(row_of(one.cfg, one.found, result, iteration))
-        ending = [not one.episodes_left(iterations, row) for one, row in zip(active, rows, strict=True)]
-        every = looks_again(active[0].cfg, iteration) or iteration == active[0].cfg.iterations
-        chosen = [k for k, ends in enumerate(ending) if every or ends]
-        if chosen and not (sampled and not looks_again(active[0].cfg, iteration)):
+        ending = [not one.episodes_left(row) for one, row in zip(active, rows, strict=True)]
+        every = looks_again(active[0].cfg, iteration)
+        chosen = [k for k, ends in enumerate(ending) if every or (ends and not sampled)]
+        if chosen:
             again = _elites_again([active[k] for k in chosen], evaluate, sampled)
             for k, numbers in zip(chosen, again, strict=True):
                 rows[k] |= numbers

@@ -419,22 +419,22 @@ def test_which_elites_are_trained_on(places, judged):
     path, archive = judged
     kinds = {"all": range(10), "failing": range(8), "certified": range(3), "uncertified": range(3, 8)}
     for only, expected in kinds.items():
-        job = job_of(config(places, archive=path, only=only, held_out=False, run_dir=places / "none"))
+        job = job_of(config(places, archive=(path,), only=only, held_out=False, run_dir=places / "none"))
         rows = [int(np.flatnonzero((archive.genes == genes).all(axis=1))[0]) for genes in job.mix.genes]
         assert sorted(rows) == list(expected), only
-        held = job_of(config(places, archive=path, only=only, run_dir=places / "none"))
+        held = job_of(config(places, archive=(path,), only=only, run_dir=places / "none"))
         kept = {genes.tobytes() for genes in held.mix.genes}
         train = {archive.genes[row].tobytes() for row in split_elites(archive, "anymal").train}
         assert kept == train & {genes.tobytes() for genes in job.mix.genes}
     assert job.settings["archive"]["only"] == "uncertified" and job.settings["archive"]["held_out"] is False
-    learnable = job_of(config(places, archive=path, only="failing", draw="learnable", run_dir=places / "none"))
+    learnable = job_of(config(places, archive=(path,), only="failing", draw="learnable", run_dir=places / "none"))
     assert learnable.mix.success().tolist() == [0.1] * len(learnable.mix.genes)
 
 
 def test_a_specialist_trains_on_what_nobody_crosses_from_along_the_way_and_goes_on(places, judged, capsys):
     run, (path, _) = places / "specialist", judged
     own = {"only": "uncertified", "held_out": False, "start_spread": 8.0, "draw": "learnable", "iterations": 2}
-    assert finetune(config(places, archive=path, run_dir=run, **own)) == 0
+    assert finetune(config(places, archive=(path,), run_dir=run, **own)) == 0
     assert f"certify --robot anymal --run {places} --by S={run / 'policy.pt'}" in capsys.readouterr().out
     settings = json.loads((run / "policy.train.json").read_text())["settings"]
     assert settings["task"]["start_spread"] == 8.0 and settings["archive"]["trained_on"] == 5

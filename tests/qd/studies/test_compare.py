@@ -60,6 +60,11 @@ def numbers_of(path: Path) -> dict:
     return {name: value for name, value in report.items() if name not in ("date", "command")}
 
 
+def corrected_at(path: Path) -> list[int]:
+    """Terrains after which the elites of every method crossed fresh episodes."""
+    return sorted(set.intersection(*(set(method["corrected_at"]) for method in numbers_of(path)["methods"].values())))
+
+
 def rows_of(run: Path) -> list[dict]:
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     return [{name: value for name, value in row.items() if name not in ("wall_s", "episodes_per_s")} for row in rows]
@@ -100,8 +105,9 @@ def test_corrected_rows_are_at_the_iterations_asked_for():
         corrected = [row["iteration"] for row in rows_of(path / name) if "corrected_qd_score" in row]
         assert corrected == [2, 4, 5]
     # 4 emitters x 8 terrains an iteration.
-    assert numbers_of(path)["terrains_evaluated"] == [32, 64, 96, 128, 160]
-    assert numbers_of(path)["corrected_at"] == [64, 128, 160]
+    for method in numbers_of(path)["methods"].values():
+        assert method["terrains_evaluated"] == [32, 64, 96, 128, 160]
+    assert corrected_at(path) == [64, 128, 160]
 
 
 def test_interrupted_and_resumed_it_finds_the_same():
@@ -122,6 +128,28 @@ def test_interrupted_and_resumed_it_finds_the_same():
     assert calls == [4 * 2 * 16] * 2  # both groups of four searches together
     assert [len(rows_of(Path("a", name))) for name in runs_of(Path("a"))] == [1] * 4
     assert_same(run("a"), whole)
+
+
+def test_searches_of_other_widths_have_as_many_terrains_and_are_those_of_a_search_alone():
+    wide = "mixed:emitters=16,groups=4"
+    path = run("a", methods=("mixed@1", wide), iterations=4, seeds=2)
+    assert runs_of(path) == ["mixed-5", f"{wide}-5", f"{wide}-6"]
+    narrow, broad = (numbers_of(path)["methods"][name] for name in ("mixed", wide))
+    assert narrow["terrains_evaluated"] == [32, 64, 96, 128] and broad["terrains_evaluated"] == [128]
+    assert narrow["corrected_at"] == [64, 128] and broad["corrected_at"] == [128]
+    assert (narrow["iterations"], broad["iterations"], broad["episodes"]) == ([4], [1, 1], 2 * 128 * 4)
+    assert len(broad["failing"][-1]["seeds"]) == 2
+    asked = Archive(
+        preset="small", device="cpu", policy=POLICY, iterations=1, seed=6, reevaluate_every=1, emitters=16, groups=4,
+        run_dir=Path("alone"),
+    )  # fmt: skip
+    alone, together = (
+        vars(run_search(job_of(asked), open_evaluator=open_stand_in)),
+        vars(read_archive(path / f"{wide}-6")),
+    )
+    for key in ("genes", "fitness", "ratios", "cell"):
+        assert np.array_equal(together[key], alone[key]), key
+    assert_same(run("a", methods=("mixed@1", wide), iterations=4, seeds=2, open_evaluator=never), path)
 
 
 def interrupt_at_save(monkeypatch, number: int) -> None:
@@ -152,8 +180,8 @@ def test_runs_behind_the_others_catch_up(monkeypatch, number):
 def test_it_is_extended_and_keeps_its_corrected_rows():
     path, whole = run("a"), run("whole", iterations=4)
     assert run("a", iterations=4) == path
-    assert numbers_of(path)["corrected_at"] == [64, 96, 128]  # 3 was the last iteration once
-    assert numbers_of(whole)["corrected_at"] == [64, 128]
+    assert corrected_at(path) == [64, 96, 128]  # 3 was the last iteration once
+    assert corrected_at(whole) == [64, 128]
     for name in runs_of(path):
         assert (path / name / "archive.npz").read_bytes() == (whole / name / "archive.npz").read_bytes()
         assert json.loads((path / name / "config.json").read_text())["iterations"] == 4
@@ -163,7 +191,7 @@ def test_stopped_in_its_last_iteration_and_extended_only_what_all_runs_have_is_c
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
         interrupt_at_save(patch, 11)
         run("a")
-    assert numbers_of(run("a", iterations=4))["corrected_at"] == [64, 128]
+    assert corrected_at(run("a", iterations=4)) == [64, 128]
 
 
 def test_resuming_a_finished_one_evaluates_nothing_and_writes_its_numbers_again():
@@ -187,7 +215,7 @@ def test_a_run_is_extended_alone_and_the_others_follow():
     for name in runs_of(path):
         assert (path / name / "archive.npz").read_bytes() == (whole / name / "archive.npz").read_bytes()
     # Alone it had some of its elites looked at, not all: the common looks are those at iterations 2 and 3.
-    assert numbers_of(path)["corrected_at"] == [64, 96]
+    assert corrected_at(path) == [64, 96]
 
 
 def test_a_search_and_a_comparison_do_not_share_a_run():
@@ -249,9 +277,12 @@ def test_numbers_go_where_they_are_asked_for():
         ({"methods": ("cma_mae", "cma_mae_sep:es=cma_es")}, "cma_mae and cma_mae_sep:es=cma_es are the same search"),
         (
             {"methods": ("cma_mae", "cma_mae:emitters=8")},
-            "emitters times batch_size must be 32 as in all runs of the comparison, got 64 in cma_mae:emitters=8",
+            "iterations of cma_mae:emitters=8 must make up the 96 terrains of the others, got 64 terrains an iteration",
         ),
         ({"methods": ("mixed", "mixed")}, "each once, got mixed, mixed"),
+        ({"methods": ("mixed", "mixed@1")}, "each once, got mixed, mixed@1"),
+        ({"methods": ("mixed@3",)}, "behind @ there must be a number of seeds from 1 to 2, got mixed@3"),
+        ({"methods": ("mixed@one",)}, "behind @ there must be a number of seeds from 1 to 2, got mixed@one"),
         ({"methods": ()}, "methods must be some of"),
         ({"seeds": 0}, "seeds must be at least 1 and at most 10, got 0"),
         ({"seeds": 11}, "seeds must be at least 1 and at most 10, got 11"),
@@ -318,8 +349,8 @@ def reported(runs: dict) -> dict:
 
 def test_report_by_hand():
     report = reported(RUNS)
-    assert (report["iterations"], report["terrains_evaluated"], report["corrected_at"]) == (2, [10, 20], [20])
     found = report["methods"]["cma_mae"]
+    assert (found["iterations"], found["terrains_evaluated"], found["corrected_at"]) == ([2] * 3, [10, 20], [20])
     assert found["settings"] == {"method": "cma_mae"}
     assert [point["mean"] for point in found["qd_score"]] == [2.0, 20.0]
     assert found["qd_score"][0]["interval"] == pytest.approx([2.0 - HALF, 2.0 + HALF])
@@ -340,7 +371,7 @@ def test_a_seed_without_a_value_leaves_the_mean_out():
 def test_corrected_rows_that_some_runs_lack_are_left_out():
     runs = {"mixed": [[row(1.0, corrected=1.0), row(2.0, corrected=2.0)], [row(1.0), row(2.0, corrected=2.0)]]}
     report = reported(runs)
-    assert report["corrected_at"] == [20]
+    assert report["methods"]["mixed"]["corrected_at"] == [20]
     assert [point["mean"] for point in report["methods"]["mixed"]["corrected_qd_score"]] == [2.0]
 
 
@@ -400,11 +431,10 @@ def test_a_search_for_certified_failures_ends_with_as_many_episodes(capsys):
     assert gated["episodes"] == done * 128 + gated["certifier_episodes"] > 5 * 128
     last = rows_of(path / "gated-5")[-1]
     assert gated["episodes"] - last["episodes"] - last["certifier_episodes"] <= 5 * 128
-    assert len(gated["elites"]) == 6 and gated["elites"][done - 1 :] == gated["elites"][-1:] * (7 - done)
-    assert report["corrected_at"][-1] == 6 * 32
+    assert len(gated["elites"]) == done and gated["terrains_evaluated"][-1] == gated["corrected_at"][-1] == done * 32
     for method in (mixed, gated):  # the judge crosses all that fails
         assert method["faults"]["mean"] == method["certified"]["mean"] == method["confirmed"]["mean"]
-        assert 0 < method["faults"]["mean"] <= method["failing"]["mean"]
+        assert 0 < method["faults"]["mean"] <= method["failing"][-1]["mean"]
     assert report["panel"] == ["me"] and [*report["certified_by"]] == ["me"]
     assert "faults: " in capsys.readouterr().out
     again = run("a", **{**changes, "open_evaluator": never})  # all of it is kept

@@ -171,7 +171,7 @@ def test_command_line(tmp_path, device, capsys):
     assert collision["solver_failure"] is None
     assert min(collision["physics_steps_per_s"], collision["physics_steps_per_s_solver_collision"]) > 100
     # After 0.2 s of the same motion on the two grounds the bases are where they would be on one.
-    assert collision["height_difference_m"] < 0.01
+    assert collision["height_difference_m"] < 0.015
     assert (collision["solver_invalid_envs"], collision["solver_overflows"]) == (0, 0)
     printed = capsys.readouterr().out
     assert all(name in printed for name in (*CASES, "whole_step", "bare physics", str(out)))

@@ -267,7 +267,7 @@ def test_a_file_of_another_kind_has_no_marks(tmp_path):
 def test_what_a_fine_tuning_leaves_says_what_it_was_trained_on(name, tmp_path):
     write_archive(tmp_path / "archive.npz", ARCHIVE)
     cfg = replace(Finetune.defaults([]),
-        policy=write_actor(tmp_path / "start.pt"), archive=tmp_path / "archive.npz", device="cpu", ppo=PPO,
+        policy=write_actor(tmp_path / "start.pt"), archive=(tmp_path / "archive.npz",), device="cpu", ppo=PPO,
         run_dir=tmp_path / "run", num_envs=6, terrains=4, swap_every=2, iterations=1,
     )  # fmt: skip
     assert cfg.execute() == 0
@@ -280,7 +280,7 @@ def test_what_a_fine_tuning_leaves_says_what_it_was_trained_on(name, tmp_path):
     with pytest.raises(ValueError, match=r"C-G was trained on . of the 4 elites that split seed 1 holds out"):
         evaluate_tables(tables, open_evaluator=None)  # pyright: ignore[reportArgumentType] - nothing is crossed
     write_archive(tmp_path / "other.npz", make_archive(10, seed=2))
-    later = job_of(replace(cfg, policy=left, archive=tmp_path / "other.npz", run_dir=tmp_path / "later"), 0.0)
+    later = job_of(replace(cfg, policy=left, archive=(tmp_path / "other.npz",), run_dir=tmp_path / "later"), 0.0)
     assert later.settings["trained_before"] == sorted(trained)
     assert set(trained) < set(later.trained_on)
 
@@ -292,7 +292,7 @@ def test_a_fine_tuning_records_what_it_and_those_before_it_were_trained_on(tmp_p
     cfg = replace(
         Finetune.defaults([]),
         policy=policy,
-        archive=tmp_path / "second.npz",
+        archive=(tmp_path / "second.npz",),
         device="cpu",
         run_dir=tmp_path / "run",
         num_envs=12,

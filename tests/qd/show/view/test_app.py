@@ -9,7 +9,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from kernels.penalties import PENALTY_DEFINITION
+from kernels.episode import Outcome
 from qd.archive import read_archive
 from qd.run.directory import RESULTS
 from qd.show.recordings import Recordings, on_elite
@@ -71,12 +71,14 @@ class Shown:
 
 @pytest.fixture(scope="module")
 def worst_crossed(show):
-    """What is asked for of the worst elite, and its published recording, whose penalties count as defined now."""
+    """What is asked for of the worst elite, and its published recording, in which one episode ended otherwise."""
     (file,) = (RESULTS.resolve() / "anymal" / "view").glob("*.npz")
     recording = read_recording(file)
-    origin = recording.origin | {"penalty_definition": PENALTY_DEFINITION}
+    outcome, frames = np.full_like(recording.outcome, Outcome.TIME_OUT), recording.num_frames.copy()
+    outcome[0, 16], frames[0, 16] = Outcome.BASE_COLLISION, frames[0, 16] // 2
+    duration_s = np.where(outcome == Outcome.TIME_OUT, recording.duration_s, 10.0).astype(np.float32)
     wanted = on_elite(show.found.archive, 0, policy=str(show.robot.policy_file), replicas=20)
-    return wanted, dataclasses.replace(recording, origin=origin)
+    return wanted, dataclasses.replace(recording, outcome=outcome, num_frames=frames, duration_s=duration_s)
 
 
 @pytest.fixture
@@ -186,10 +188,10 @@ def test_a_camera_in_the_address_is_left_where_it_is(shown):
 
 
 def test_what_is_not_there_is_refused_in_words(shown):
-    shown.come("?elite=480&controller=C-HR&episode=21&t=soon")
+    shown.come("?elite=9999&controller=C-HR&episode=21&t=soon")
     assert notes(shown, 4, visitor=1) == [
         "t=soon in the address is no time in seconds: it is left out.",
-        "There is no elite 480 here: there are 0 to 479.",
+        f"There is no elite 9999 here: there are 0 to {len(shown.tab._archive) - 1}.",
         "There is no controller 'C-HR' here: there are base, other.",
         "There is no episode 21 here: there are 1 to 20.",
     ]
