@@ -215,6 +215,8 @@ def step_penalties(
 ) -> Array:
     """Raw penalties of one physics step, before times dt, in the order of :data:`PENALTIES`; shape (num, 6).
 
+    An added penalty that has no formula here is NaN: how episodes end can be compared without it.
+
     Args:
         qpos: Shape (num, 7 + num_joints).
         qvel: Shape (num, 6 + num_joints).
@@ -234,4 +236,5 @@ def step_penalties(
         "stumble": (sideways[:, feet] > 5.0 * np.abs(forces[:, feet, 2])).any(axis=1).astype(float),
         "collision": (size[:, ~feet] > 0.1).sum(axis=1).astype(float),
     }
-    return np.stack([by_name[name] for name in PENALTIES], axis=1)
+    unknown = np.full(len(qpos), np.nan)
+    return np.stack([by_name.get(name, unknown) for name in PENALTIES], axis=1)

@@ -262,3 +262,11 @@ def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
     expected = cross(anymal, stand, flat, starts, cfg)
     np.testing.assert_array_equal(found.outcome, expected.outcome)
     np.testing.assert_array_equal(found.penalties, expected.penalties)
+
+
+def test_an_added_penalty_without_a_formula_is_nan(monkeypatch):
+    monkeypatch.setattr("sim.mujoco_c.model.PENALTIES", ("vel_y", "roll_rate"))
+    state = (np.zeros((2, 7)), np.zeros((2, 6)), np.array([[0.0, 0.5, 0.0]] * 2), np.zeros((2, 1, 3)))
+    state[0][:, 3] = 1.0
+    found = step_penalties(*state, feet=np.array([True]), force_limit=1.0)
+    np.testing.assert_array_equal(found, [[0.25, np.nan]] * 2)
