@@ -16,7 +16,7 @@ SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4")
 
 
 def make_search(cfg: SchedulerCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> Scheduler:
-    return Scheduler(cfg, num_cells=cells.num_cells, num_ratios=6, seed=seed)
+    return Scheduler(cfg, cells=cells, seed=seed)
 
 
 def advance(search: Scheduler, first: int, last: int, cells: Cells = CELLS) -> None:
@@ -62,7 +62,7 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
 
 
 def test_in_a_cell_certified_beats_uncertified_then_fitness_decides(tmp_path):
-    search = Scheduler(SMALL, num_cells=CELLS.num_cells, num_ratios=6, seed=0, num_certifiers=2)
+    search = Scheduler(SMALL, cells=CELLS, seed=0, num_certifiers=2)
     nobody, no, yes = [np.nan, np.nan], [0.4, 0.0], [0.2, 0.5]
     genes = search.ask()
     rows = [(7, 9.0, no), (7, 1.0, yes), (8, 9.0, nobody), (8, -1.0, yes), (8, 1.0, yes), (9, 2.0, no), (9, 3.0, no)]
