@@ -56,26 +56,49 @@ class Prediction(NamedTuple):
     """Whether at least one robot has a base collision, shape (MEMBERS, N)."""
 
 
-class _Networks(nn.Sequential):
+class _Networks(nn.ModuleList):
     """Small convolutional networks side by side, as groups of channels.
 
     Heights of shape (batch, MEMBERS, *SHAPE), in which each network sees its own, become (batch, MEMBERS, num_out).
     """
 
     def __init__(self, num_out: int) -> None:
-        layers, rows, cols = [], *SHAPE
-        for size, channels_in, channels_out in ((5, 1, 12), (3, 12, 24), (3, 24, 32), (3, 32, 32)):
-            layers += [_beside(channels_in, channels_out, size, stride=2, padding=size // 2), nn.ReLU()]
-            rows, cols = (rows + 1) // 2, (cols + 1) // 2
-        super().__init__(*layers, _beside(32, 64, (rows, cols)), nn.ReLU(), _beside(64, num_out, 1))
+        super().__init__()
+        rows, cols = SHAPE
+        for size, stride, channels_in, channels_out in ((5, 3, 1, 12), (3, 2, 12, 24), (3, 2, 24, 32)):
+            self.append(_beside(channels_in, channels_out, size, stride=stride, padding=size // 2))
+            rows, cols = -(-rows // stride), -(-cols // stride)
+        self.append(_beside(32, 64, (rows, cols)))
+        self.append(_beside(64, num_out, 1))
 
-    def forward(self, input: Tensor) -> Tensor:
-        return super().forward(input).reshape(len(input), MEMBERS, -1)
+    def forward(self, heights: Tensor) -> Tensor:
+        if heights.is_cuda:
+            return self._through(heights, slice(None)).reshape(len(heights), MEMBERS, -1)
+        # One by one, since groups are slow on the CPU.
+        members = (slice(member, member + 1) for member in range(MEMBERS))
+        return torch.stack([self._through(heights[:, own], own).flatten(1) for own in members], dim=1)
+
+    def _through(self, rows: Tensor, members: slice) -> Tensor:
+        """What some of the networks make of the heights that each sees."""
+        for index, layer in enumerate(self):
+            assert isinstance(layer, nn.Conv2d)
+            weight, bias = (
+                part.unflatten(0, (MEMBERS, -1))[members].flatten(0, 1) for part in (layer.weight, _bias_of(layer))
+            )
+            rows = nn.functional.relu(rows) if index else rows
+            together = rows.shape[1] // weight.shape[1]
+            rows = nn.functional.conv2d(rows, weight, bias, layer.stride, layer.padding, groups=together)
+        return rows
 
 
 def _beside(channels_in: int, channels_out: int, size: Any, stride: int = 1, padding: int = 0) -> nn.Conv2d:
     channels = MEMBERS * channels_in, MEMBERS * channels_out
     return nn.Conv2d(*channels, size, groups=MEMBERS, stride=stride, padding=padding)
+
+
+def _bias_of(layer: nn.Conv2d) -> Tensor:
+    assert layer.bias is not None
+    return layer.bias
 
 
 class Surrogate:

@@ -68,9 +68,9 @@ class SchedulerCfg:
     of a half."""
     mirror_share: float = setting(0.0, **_SHARE)
     """Iso+line: share of the children that are mirrored left to right."""
-    candidates: int = setting(25, least=1, most=10_000)
+    candidates: int = setting(20, least=1, most=10_000)
     """Surrogate: terrains that the networks judge in each generation for one that robots cross."""
-    generations: int = setting(4, least=1, most=1_000)
+    generations: int = setting(3, least=1, most=1_000)
     """Surrogate: generations that the networks judge before robots cross the best."""
     explore_share: float = setting(0.25, **_SHARE)
     """Surrogate: share of its terrains that are elites varied once, whatever the networks say."""
