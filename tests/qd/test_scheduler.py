@@ -11,8 +11,9 @@ from tests.qd import stand_in
 
 CELLS = Cells(6)
 FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
-JOINED = ("cma_me+cma_mae", "map_elites+hard_random")
-SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4")
+JOINED = ("cma_me+cma_mae", "map_elites+hard_random", "surrogate+cma_mae")
+BRIEF = {"training_steps": 2, "candidates": 2, "generations": 2}  # networks learn little in it
+SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4", **BRIEF)
 
 
 def make_search(cfg: SchedulerCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> Scheduler:
@@ -116,11 +117,16 @@ def test_cell_of_an_elite_is_the_cell_of_its_ratios():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"es": kind} for kind in ES_KINDS] + [{"method": name} for name in (*METHODS, *JOINED)]
+    "changes",
+    [
+        *({"es": kind} for kind in ES_KINDS),
+        *({"method": name} for name in (*METHODS, *JOINED)),
+        {"method": "map_elites", "crossover_share": 0.5, "mirror_share": 0.2},
+    ],
 )
 def test_a_saved_search_goes_on_bit_for_bit(changes, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut
-    cfg = SchedulerCfg(emitters=2, batch_size=6, restart_rule="5", **changes)
+    cfg = SchedulerCfg(emitters=2, batch_size=6, restart_rule="5", **BRIEF, **changes)
     straight, cut = make_search(cfg), make_search(cfg)
     advance(straight, 1, 16)
     advance(cut, 1, 7)
@@ -148,7 +154,7 @@ def test_tell_answers_ask():
 
 @pytest.mark.parametrize("method", [*METHODS, *JOINED])
 def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_valid_terrain(method):
-    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1", method=method))
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1", method=method, **BRIEF))
     for iteration in (1, 2):
         genes = search.ask()
         assert genes.shape == (12, 64)
@@ -215,6 +221,7 @@ def test_a_state_of_something_else_is_refused(state):
         ("emitters", 0), ("batch_size", 1), ("method", "cma_me+"), ("method", "cma_me+cma_me"),
         ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
         ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")),
+        ("crossover_share", 1.5), ("mirror_share", -0.1), ("disagree_share", 0.9), ("training_steps", 0),
         ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
 )  # fmt: skip
