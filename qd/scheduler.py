@@ -148,7 +148,7 @@ class Scheduler:
         self.archive = self.result
         if learns:
             self.archive = _make_archive(*shapes, streams[0], learning)
-        self.surrogate: "Surrogate | None" = None
+        self.surrogate: Surrogate | None = None
         if any(name == "surrogate" for name, _ in in_turn):
             from qd import surrogate  # with torch
 

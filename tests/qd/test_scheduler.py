@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
-from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
+from ribs.emitters import EvolutionStrategyEmitter
 
+from qd import surrogate
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.settings import ES_KINDS, METHODS, SchedulerCfg
-from qd.scheduler import RandomEmitter, Scheduler
+from qd.scheduler import RandomEmitter, Scheduler, VariationEmitter
 from tests.qd import stand_in
 
 CELLS = Cells(6)
@@ -14,6 +15,12 @@ FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
 JOINED = ("cma_me+cma_mae", "map_elites+hard_random", "surrogate+cma_mae")
 BRIEF = {"training_steps": 2, "candidates": 2, "generations": 2}  # networks learn little in it
 SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4", **BRIEF)
+
+
+@pytest.fixture(autouse=True)
+def small_steps(monkeypatch):
+    """Training of a surrogate that takes next to no time."""
+    monkeypatch.setattr(surrogate, "BATCH", 2)
 
 
 def make_search(cfg: SchedulerCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> Scheduler:
@@ -205,7 +212,7 @@ def test_joined_methods_take_turns_each_judged_by_its_own_archive():
 
 def test_of_fewer_emitters_than_methods_the_first_ones_count():
     search = make_search(SchedulerCfg(emitters=1, batch_size=2, method="map_elites+cma_mae"))
-    assert [type(emitter) for emitter in search.emitters] == [IsoLineEmitter]
+    assert [type(emitter) for emitter in search.emitters] == [VariationEmitter]
     assert search.archive is search.result  # nobody goes by CMA-MAE's
 
 

@@ -28,13 +28,16 @@ def crossed(genes, seed: int, space=SUPER_GAUSSIAN) -> Evaluation:
     steep = np.stack([np.abs(np.diff(part, axis=2)).mean(axis=(1, 2)) for part in parts], axis=1)
     high = np.stack([np.abs(part).mean(axis=(1, 2)) for part in parts], axis=1)
     noise = np.random.default_rng(seed).uniform(0.9, 1.1, (len(genes), 4, 6))
-    result = stand_in.make_result((0.02 + 4.0 * (30.0 * steep + 4.0 * high) ** 2)[:, None] * noise * stand_in.SCALES)
+    result = stand_in.make_result((0.0005 + 0.1 * (30.0 * steep + 4.0 * high) ** 2)[:, None] * noise * stand_in.SCALES)
     return evaluation_of(result, CELLS, FITNESS)
 
 
-def advance(search: Scheduler, first: int, last: int, space=SUPER_GAUSSIAN) -> None:
-    for iteration in range(first, last + 1):
-        search.tell(crossed(search.ask(), iteration, space), iteration)
+@pytest.fixture(autouse=True, scope="module")
+def small_steps():
+    """Steps of training that take a quarter of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "BATCH", 16)
+        yield
 
 
 def make_surrogate(cfg: SchedulerCfg = CFG, seed: int = 0) -> Surrogate:
@@ -104,7 +107,10 @@ def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
     np.maximum.at(best, at, there.fitness.mean(axis=0))
     assert (learned._gain(found, best) > 0.0).all()
     # By hand for the first: each network's fitness less that of the cell where it puts the terrain.
-    gains = [max(0.0, f - best[CELLS.cell_of(r[None])[0]]) for f, r in zip(found.fitness[:, 0], found.ratios[:, 0])]
+    gains = [
+        max(0.0, f - best[CELLS.cell_of(r[None])[0]])
+        for f, r in zip(found.fitness[:, 0], found.ratios[:, 0], strict=True)
+    ]
     assert learned._gain(found, best)[0] == pytest.approx(np.mean(gains))
     chance = learned._gain(expected(learned._varied(elites, 60))[0], best)
     assert learned._gain(found, best).mean() > chance.mean()
@@ -147,7 +153,7 @@ def test_the_newest_are_kept(monkeypatch):
 @pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE], ids=lambda space: space.name)
 def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
     cfg = SchedulerCfg(
-        emitters=5, batch_size=8, groups=2, method="surrogate+cma_mae", training_steps=4, candidates=3, generations=2,
+        emitters=5, batch_size=8, groups=2, method="surrogate+cma_mae", training_steps=3, candidates=2, generations=2,
         crossover_share=0.3,
     )  # fmt: skip
 
@@ -159,7 +165,7 @@ def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
                 search.ask(group)
 
     straight, cut = (Scheduler(cfg, cells=CELLS, seed=1, space=space) for _ in range(2))
-    advance_groups(straight, 1, 5)
+    advance_groups(straight, 1, 4)
     advance_groups(cut, 1, 3)
     save_checkpoint(tmp_path / "saved", cut.state())
     cut = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
@@ -167,7 +173,7 @@ def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
     assert (
         sum(emitter.batch_size for emitter in cut.emitters if getattr(emitter, "surrogate", 0) is cut.surrogate) == 24
     )
-    advance_groups(cut, 4, 5)
+    advance_groups(cut, 4, 4)
     for name, rows in straight.elites().items():
         assert np.array_equal(rows, cut.elites()[name]), name
     for group in range(2):
