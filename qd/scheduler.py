@@ -5,17 +5,23 @@ middle of its cell. Evolution strategies search unbounded; archives hold the unc
 clipped genes as data.
 """
 
+from collections.abc import Iterator
 from itertools import cycle
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
+from qd.descriptors import Cells
 from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, gated_fitness
 from qd.run.settings import SchedulerCfg
+from qd.variation import check_variation, recombined
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, clipped, get_space
+
+if TYPE_CHECKING:
+    from qd.surrogate import Surrogate
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
 _CERTIFIED_LEAD = 1e6  # more than fitnesses differ by: in a cell certified beats uncertified, then fitness decides
@@ -51,7 +57,56 @@ class RandomEmitter:
         """Learns nothing."""
 
 
-Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter
+class VariationEmitter(IsoLineEmitter):
+    """Iso+line, of whose children some take parts of a further elite, and some are mirrored.
+
+    Args:
+        archive: The elites.
+        cfg: The shares.
+        space: What genes mean.
+        stream: Seed of these changes.
+        iso_line: Arguments of pyribs' emitter.
+    """
+
+    def __init__(
+        self,
+        archive: GridArchive,
+        cfg: SchedulerCfg,
+        space: TerrainSpace,
+        stream: np.random.SeedSequence,
+        **iso_line: Any,
+    ) -> None:
+        super().__init__(archive, **iso_line)
+        self._shares = cfg.crossover_share, cfg.mirror_share
+        self._space = space.name, space.sha256  # a checkpoint holds no code
+        self._further = np.random.default_rng(stream)
+
+    def ask(self) -> NDArray[np.float32]:
+        """Genes, shape (batch_size, num_genes)."""
+        children = super().ask()
+        if self.archive.empty:
+            return children
+        others: Any = self.archive.sample_elites(len(children))
+        return recombined(children, others["solution"], *self._shares, get_space(*self._space), self._further)
+
+
+class SurrogateEmitter:
+    """Asks for what a surrogate proposes, which all such emitters of a search share.
+
+    Args:
+        archive: The elites.
+        surrogate: Proposes terrains, for all emitters of a group at once.
+        batch_size: Terrains asked for at once.
+    """
+
+    def __init__(self, archive: GridArchive, surrogate: "Surrogate", batch_size: int) -> None:
+        self.archive, self.surrogate, self.batch_size = archive, surrogate, batch_size
+
+    def tell(self, **told: Any) -> None:
+        """Learns nothing by itself: the surrogate learns from the terrains of all emitters."""
+
+
+Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter | SurrogateEmitter
 
 
 class Scheduler:
@@ -64,43 +119,56 @@ class Scheduler:
     Args:
         cfg: Settings.
         space: What genes mean.
-        num_cells: Number of reachable cells.
-        num_ratios: Number of ratio descriptors.
+        cells: The reachable cells.
         seed: Seed of emitters and archives.
         num_certifiers: Certifiers whose goal rates it is told.
+
+    Raises:
+        ValueError: If elites are to be varied as the space cannot.
     """
 
     def __init__(
         self,
         cfg: SchedulerCfg,
         *,
-        num_cells: int,
-        num_ratios: int,
+        cells: Cells,
         seed: int,
         space: TerrainSpace = SUPER_GAUSSIAN,
         num_certifiers: int = 0,
     ) -> None:
-        streams = np.random.SeedSequence(seed).spawn(cfg.emitters + 2)
+        check_variation(cfg, space)
+        *streams, shared = np.random.SeedSequence(seed).spawn(cfg.emitters + 3)
         learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
-        shapes = space.num_genes, num_cells, num_ratios, num_certifiers
+        shapes = space.num_genes, cells.num_cells, cells.num_ratios, num_certifiers
         self.result = _make_archive(*shapes, streams[1], {})
         in_turn = list(zip(cycle(cfg.methods), streams[2:], strict=False))
         learns = any(name == "cma_mae" for name, _ in in_turn)
         self.archive = self.result
         if learns:
             self.archive = _make_archive(*shapes, streams[0], learning)
+        self.surrogate: Surrogate | None = None
+        if any(name == "surrogate" for name, _ in in_turn):
+            from qd import surrogate  # with torch
+
+            self.surrogate = surrogate.Surrogate(cfg, cells, space, shared)
         self.emitters: list[Emitter] = [self._emitter(cfg, name, space, stream) for name, stream in in_turn]
         self._asked: list[NDArray[np.float32] | None] = [None] * cfg.groups
 
     def _emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
         if method.endswith("random"):
             return RandomEmitter(self.result, space, method, cfg.batch_size, stream)
+        if method == "surrogate":
+            assert self.surrogate is not None
+            return SurrogateEmitter(self.result, self.surrogate, cfg.batch_size)
         if method == "map_elites":
-            first, later = stream.spawn(2)
-            return IsoLineEmitter(
+            first, later, further = stream.spawn(3)
+            return VariationEmitter(
                 self.result,
+                cfg,
+                space,
+                further,
                 iso_sigma=cfg.iso_sigma,
                 line_sigma=cfg.line_sigma,
                 initial_solutions=space.hard_random(cfg.batch_size, np.random.default_rng(first)),
@@ -142,10 +210,32 @@ class Scheduler:
         """
         asked = self._asked[group]
         if asked is None:
+            emitters = self.emitters[self._group(group)]
+            proposed = self._proposed([emitter for emitter in emitters if isinstance(emitter, SurrogateEmitter)])
             asked = self._asked[group] = np.concatenate(
-                [emitter.ask() for emitter in self.emitters[self._group(group)]]
+                [next(proposed) if isinstance(emitter, SurrogateEmitter) else emitter.ask() for emitter in emitters]
             )
         return clipped(asked)
+
+    def _proposed(self, emitters: list[SurrogateEmitter]) -> Iterator[NDArray[np.float32]]:
+        """What the surrogate proposes for some emitters: one search for all, so that no two ask for the same."""
+        if self.surrogate is None or not emitters:
+            return iter(())
+        data: Any = self.result.data()
+        best = data["objective"]
+        if "certifier_goal_rate" in data:
+            best = gated_fitness(data["fitness"], data["certifier_goal_rate"].max(axis=1))
+        under_way = [clipped(genes) for genes in self._asked if genes is not None]
+        sizes = [emitter.batch_size for emitter in emitters]
+        genes = self.surrogate.propose(
+            sum(sizes), data["genes"], data["index"], best, np.concatenate([data["genes"][:0], *under_way])
+        )
+        return iter(np.split(genes, np.cumsum(sizes)[:-1]))
+
+    def compute_on(self, device: str) -> None:
+        """Lets a surrogate work on a Warp device; all else works on the host."""
+        if self.surrogate is not None:
+            self.surrogate.compute_on(device)
 
     def tell(
         self,
@@ -179,6 +269,8 @@ class Scheduler:
             told["certifier_goal_rate"] = certifier_goal_rate
             ranked = ranked + _CERTIFIED_LEAD * (best >= FAILING_GOAL_RATE)
         self._asked[group] = None
+        if self.surrogate is not None:
+            self.surrogate.learn(asked, evaluation, told["objective"])
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
         plain = self._add({**told, "objective": ranked}, accepted)
         learned = plain if self.archive is self.result else self.archive.add(**told)
@@ -186,7 +278,7 @@ class Scheduler:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
         for emitter in self.emitters[self._group(group)]:
-            own = slice(first, first + emitter.batch_size)
+            own = slice(first, first + int(emitter.batch_size))
             added = plain if emitter.archive is self.result else learned
             emitter.tell(
                 **{name: rows[own] for name, rows in told.items()},
@@ -240,6 +332,8 @@ class Scheduler:
             raise ValueError("a search has two archives, emitters, and what they asked for, got something else")
         search = cls.__new__(cls)
         search.archive, search.result, search.emitters, search._asked = archive, result, emitters, asked
+        shared = [emitter.surrogate for emitter in emitters if isinstance(emitter, SurrogateEmitter)]
+        search.surrogate = shared[0] if shared else None
         return search
 
 

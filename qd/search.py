@@ -246,16 +246,32 @@ def _look_again(cfg: SearchCfg, found: Archive, evaluate: Evaluate) -> dict[str,
     return numbers_of(again, cfg.cells, sampled=True)
 
 
-def begin(cfg: SearchCfg) -> "Scheduler":
-    """A search that has asked for nothing yet."""
+def begin(
+    cfg: SearchCfg, device: str, loaded: "tuple[Scheduler, Metrics] | None" = None
+) -> "tuple[Scheduler, Metrics]":
+    """A search and its metrics: one that goes on, or one that has asked for nothing yet.
+
+    Args:
+        cfg: The search.
+        device: Warp device of what it computes beside the simulation.
+        loaded: One that goes on.
+
+    Raises:
+        ValueError: If elites are to be varied as the space cannot.
+    """
+    search, metrics = loaded or (_new(cfg), [])
+    search.compute_on(device)
+    return search, metrics
+
+
+def _new(cfg: SearchCfg) -> "Scheduler":
     from qd.scheduler import Scheduler  # pyribs takes two seconds to import
     from sim.space import get_space
 
     return Scheduler(
         cfg.scheduler,
         space=get_space(cfg.space, cfg.space_sha256),
-        num_cells=cfg.cells.num_cells,
-        num_ratios=len(cfg.fitness.penalties),
+        cells=cfg.cells,
         seed=cfg.seed,
         num_certifiers=len(cfg.certified_by),
     )
@@ -285,6 +301,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
             raise ValueError(
                 f"iterations must be at least {done}, as many as {job.path} has done, got {cfg.iterations}"
             )
+        search, metrics = begin(cfg, job.device, loaded)
         print(plan(cfg, job.path, done, job.device, job.evaluator.num_workers), flush=True)
         _mention_fresh_values(job, run, done)
         own = [{**job.session, "iterations": cfg.iterations}] if done < cfg.iterations else []
@@ -295,7 +312,6 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
                 if done < cfg.iterations:
                     evaluate = opened.enter_context(open_evaluator(job.evaluator))
                     gate = opened.enter_context(open_gate(cfg, job.certifiers, job.evaluator, open_evaluator))
-                search, metrics = loaded or (begin(cfg), [])
                 run.write_config(cfg, origin)
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:

@@ -18,6 +18,7 @@ from sim.spaces.base import clipped as clipped
 from sim.spaces.course import COURSE
 
 _HEIGHT = PARAMETERS.index("w")
+_SIDED = [PARAMETERS.index(name) for name in ("mu_y", "theta")]  # their ranges are as wide to the left as to the right
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +40,16 @@ class SuperGaussian(TerrainSpace):
     def num_genes(self) -> int:
         """Eight genes a bump, in the order of :data:`kernels.super_gaussian.PARAMETERS`, bump after bump."""
         return self.num_bumps * GENES_PER_BUMP
+
+    @property
+    def any_spacing(self) -> bool:
+        """A bump has a height everywhere."""
+        return True
+
+    @property
+    def genes_per_part(self) -> int:
+        """A part is a bump."""
+        return GENES_PER_BUMP
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.super_gaussian.rasterise`)."""
@@ -66,6 +77,12 @@ class SuperGaussian(TerrainSpace):
         """Genes with the height of every bump times ``scale``."""
         found = clipped(self.validate(genes))
         found[:, _HEIGHT::GENES_PER_BUMP] *= scale  # 0 is the height in the middle of its range
+        return found
+
+    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Genes with every bump on the other side of the way, turned the other way."""
+        found = self.validate(genes).copy()
+        found.reshape(len(found), self.num_bumps, GENES_PER_BUMP)[:, :, _SIDED] *= -1.0
         return found
 
 

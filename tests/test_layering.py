@@ -18,7 +18,7 @@ LIBRARY_DOORS = {  # a room, or a folder of one
     "rsl_rl": ("train",),
     "PIL": ("sim", "qd"),
     "imageio_ffmpeg": ("qd",),
-    "torch": ("sim", "train"),
+    "torch": ("sim", "train", "qd/surrogate.py"),
     "onnx": ("sim", "train"),
     "onnxruntime": ("sim",),
     "viser": ("qd/show/view",),

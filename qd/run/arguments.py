@@ -58,7 +58,8 @@ class Archive(Who, Where):
     replicas: int | None = None
     """Episodes a terrain."""
     method: str | None = None
-    """Where terrains come from: cma_mae, cma_me, map_elites, hard_random, uniform_random; several joined by +."""
+    """Where terrains come from: cma_mae, cma_me, map_elites, surrogate, hard_random, uniform_random; several joined by
+    +."""
     emitters: int | None = None
     """Emitters."""
     batch_size: int | None = None
@@ -73,6 +74,10 @@ class Archive(Who, Where):
     """When emitters restart: a number of iterations, basic or no_improvement."""
     es: str | None = None
     """Evolution strategy: cma_es or sep_cma_es."""
+    crossover_share: float | None = None
+    """Share of the children of map_elites and surrogate that take parts, such as bumps, from a further elite; 0."""
+    mirror_share: float | None = None
+    """Share of these children that are mirrored left to right; 0."""
     intervals: int | None = None
     """Intervals of each ratio."""
     without: tuple[str, ...] | None = None

@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 Settings = dict[str, Any]
 """The settings that make a run what it is, as JSON values."""
 
-METHODS = ("cma_mae", "cma_me", "map_elites", "hard_random", "uniform_random")
+METHODS = ("cma_mae", "cma_me", "map_elites", "surrogate", "hard_random", "uniform_random")
 ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
+_SHARE = {"least": 0.0, "most": 1.0}
 _STEPS = {"least": 1e-6, "most": 1e3}  # what evolution strategies can reckon with; genes are float32 in [-1, 1]
 
 
@@ -35,9 +36,10 @@ class SchedulerCfg:
 
     method: str = "cma_mae+map_elites"
     """Where new terrains come from: `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
-    `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `hard_random`, the paper's, every height at
-    its limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn,
-    and where there are fewer emitters, the first methods count. After 75 iterations of the paper preset the default's
+    `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `surrogate`, elites varied likewise for some
+    generations that networks judge (after DSAGE, Bhatt et al. 2022); `hard_random`, the paper's, every height at its
+    limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn, and
+    where there are fewer emitters, the first methods count. After 75 iterations of the paper preset the default's
     corrected QD score was 6,103, that of CMA-MAE alone 5,675 (one seed each; `results/anymal/compare_long.json`)."""
     emitters: int = setting(10, least=1)
     """Emitters, each with an evolution strategy or a stream of its own."""
@@ -61,6 +63,22 @@ class SchedulerCfg:
     line_sigma: float = setting(0.2, least=0.0, most=_STEPS["most"])
     """Iso+line: standard deviation of the step along the line to another elite, in its length (published: .2)."""
 
+    crossover_share: float = setting(0.0, **_SHARE)
+    """Iso+line: share of the children that take each of their parts, such as bumps, from a further elite with a chance
+    of a half."""
+    mirror_share: float = setting(0.0, **_SHARE)
+    """Iso+line: share of the children that are mirrored left to right."""
+    candidates: int = setting(20, least=1, most=10_000)
+    """Surrogate: terrains that the networks judge in each generation for one that robots cross."""
+    generations: int = setting(3, least=1, most=1_000)
+    """Surrogate: generations that the networks judge before robots cross the best."""
+    explore_share: float = setting(0.25, **_SHARE)
+    """Surrogate: share of its terrains that are elites varied once, whatever the networks say."""
+    disagree_share: float = setting(0.1, **_SHARE)
+    """Surrogate: share of its terrains that the networks disagree most about."""
+    training_steps: int = setting(100, least=1, most=100_000)
+    """Surrogate: steps of training an iteration, each on 64 terrains a network."""
+
     def __post_init__(self) -> None:
         check(self)
         if not set(self.methods) <= set(METHODS) or len(set(self.methods)) < len(self.methods):
@@ -72,7 +90,11 @@ class SchedulerCfg:
                 f"restart_rule must be a positive number of iterations or one of {', '.join(RESTART_RULES)}, "
                 f"got {self.restart_rule}"
             )
-
+        if self.explore_share + self.disagree_share > 1.0:
+            raise ValueError(
+                f"explore_share and disagree_share must be at most 1 together, got {self.explore_share} and "
+                f"{self.disagree_share}"
+            )
         if self.groups > self.emitters:
             raise ValueError(f"groups must be at most as many as emitters, {self.emitters}, got {self.groups}")
 

@@ -38,6 +38,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "cma_mae_sep": {"method": "cma_mae", "es": "sep_cma_es"},
     "cma_mae_narrow": {"method": "cma_mae", "es": "cma_es", "sigma0": 0.5},
     "mixed": {"method": "cma_mae+map_elites", "es": "cma_es"},
+    "surrogate": {"method": "surrogate"},
     "gated": {"method": "cma_mae+map_elites", "es": "cma_es"},
 }
 """What is compared: changes of the search's settings. ``gated`` is ``mixed`` for certified failures."""
@@ -51,6 +52,7 @@ LABELS = {
     "cma_mae_sep": ("CMA-MAE, sep-CMA", "#cc79a7", "--"),
     "cma_mae_narrow": ("CMA-MAE, first step .5", "#e69f00", ":"),
     "mixed": ("CMA-MAE and iso+line", "#d55e00", "-"),
+    "surrogate": ("surrogate", "#882255", "-"),
     "gated": ("... for certified failures", "#d55e00", "--"),
 }
 """Name, colour and line of each method in the figure."""
@@ -83,11 +85,11 @@ class Compare(StudyFlags):
     mixed:emitters=80,groups=8: eight times the terrains an iteration, in an eighth of the iterations.
     """
 
-    methods: tuple[str, ...] = tuple(name for name in METHODS if name != GATED)
+    methods: tuple[str, ...] = tuple(name for name in METHODS if name not in (GATED, "surrogate"))
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
-    size .5), mixed (cma_mae+map_elites), gated (mixed, for failures that others can cross); all but gated. Settings of
-    the search after a colon make another one of it: cma_mae:restart-rule=20,learning-rate=0.3. Of NAME@1 only the
-    first seed is run."""
+    size .5), mixed (cma_mae+map_elites), surrogate (elites varied as networks advise), gated (mixed, for failures that
+    others can cross); all but the last two. Settings of the search after a colon make another one of it:
+    cma_mae:restart-rule=20,learning-rate=0.3. Of NAME@1 only the first seed is run."""
     certified_by: tuple[str, ...] = ()
     """Certifiers of the method gated, FILE or NAME=FILE. It ends with as many episodes as the others have, those of the
     certifiers included, and so after fewer iterations."""

@@ -77,7 +77,7 @@ class Speed(OfRobot, OnDevice):
 
 def time_iterations(cfg: SearchCfg, evaluator: EvaluatorCfg) -> tuple[Metrics, NDArray[Any]]:
     """Runs a search from the start; its metrics rows, and the terrains it would ask for next."""
-    search, metrics = begin(cfg), list[dict[str, Any]]()
+    search, metrics = begin(cfg, evaluator.device)
     with (
         tempfile.TemporaryDirectory() as folder,
         open_evaluator(evaluator) as evaluate,

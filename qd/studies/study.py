@@ -208,7 +208,7 @@ def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
         origin, loaded = {**study.origin, "seed": cfg.seed, "sessions": []}, None
     else:
         raise ValueError(f"{run.path} is not empty and holds no run: give another --run-dir")
-    search, metrics = loaded or (begin(cfg), [])
+    search, metrics = begin(cfg, study.evaluator.device, loaded)
     cfg = replace(cfg, iterations=max(cfg.iterations, len(metrics)))  # one that was extended alone is not shortened
     return _Search(
         cfg=cfg, iterations=study.runs[name].iterations, run=run, origin=origin, search=search, metrics=metrics

@@ -35,6 +35,16 @@ class TerrainSpace(Protocol):
         """First step size of a search whose command line names none."""
         return DEFAULT_SIGMA0
 
+    @property
+    def any_spacing(self) -> bool:
+        """Whether it can be rasterised on nodes of any distance and number, and not only on those of a simulation."""
+        return False
+
+    @property
+    def genes_per_part(self) -> int | None:
+        """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
+        return None
+
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device.
 
@@ -72,6 +82,14 @@ class TerrainSpace(Protocol):
         Args:
             genes: Shape (num_terrains, num_genes).
             scale: In (0, 1]; of 1 the terrains stay as they are.
+        """
+        return None
+
+    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32] | None:
+        """Genes of the same terrains with left and right exchanged, at y = 4 m; None where the space cannot.
+
+        Args:
+            genes: Shape (num_terrains, num_genes).
         """
         return None
 

@@ -57,6 +57,11 @@ class Course(TerrainSpace):
         """A quarter of the genes' range: a wider start asks for the first and the last kind alone."""
         return 0.5
 
+    @property
+    def genes_per_part(self) -> int:
+        """A part is an element."""
+        return GENES_PER_ELEMENT
+
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.course.rasterise`)."""
         course.rasterise(genes, spacing, heights_out)

@@ -24,7 +24,7 @@ class OwnSpace(TerrainSpace):
         spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
         own: What is found there. It has ``num_genes`` and ``rasterise(genes, x, y)``, and may have ``hard_random(count,
             rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``, ``scaled(genes,
-            scale)``, and ``sigma0``.
+            scale)``, ``mirrored(genes)``, ``genes_per_part``, and ``sigma0``.
 
     Raises:
         ValueError: If it lacks something, or what it has is not as it must be.
@@ -45,6 +45,12 @@ class OwnSpace(TerrainSpace):
         if not isinstance(sigma0, int | float) or not 0.0 < sigma0 < np.inf:
             raise self._wrong("sigma0", f"must be a positive number, got {sigma0!r}")
         self._sigma0 = float(sigma0)
+        per_part = getattr(own, "genes_per_part", None)
+        if per_part is not None and (
+            isinstance(per_part, bool) or not isinstance(per_part, int) or per_part < 1 or number % per_part
+        ):
+            raise self._wrong("genes_per_part", f"must divide num_genes, {number}, got {per_part!r}")
+        self._genes_per_part: int | None = per_part
 
     @property
     def name(self) -> str:
@@ -65,6 +71,11 @@ class OwnSpace(TerrainSpace):
     def sigma0(self) -> float:
         """First step size of a search whose command line names none."""
         return self._sigma0
+
+    @property
+    def genes_per_part(self) -> int | None:
+        """Genes of a part that can be exchanged for that of another terrain; None if it names no number."""
+        return self._genes_per_part
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights, as tensors on the device that the arrays are on.
@@ -150,6 +161,16 @@ class OwnSpace(TerrainSpace):
             return None
         return self._rows("scaled", self._call("scaled", clipped(self.validate(genes)), scale))
 
+    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32] | None:
+        """What the user's method makes of genes; None if there is none.
+
+        Raises:
+            ValueError: If it does not return genes.
+        """
+        if not hasattr(self._own, "mirrored"):
+            return None
+        return self._rows("mirrored", self._call("mirrored", clipped(self.validate(genes))))
+
     def _rows(self, method: str, found: Any) -> NDArray[np.float32]:
         try:
             return clipped(self.validate(found))
@@ -190,5 +211,6 @@ def load_own(spec: str) -> OwnSpace:
     heights_of(np.concatenate([np.zeros((1, space.num_genes), np.float32), hard]), space)
     space.without(hard, range(len(space.parts(hard[0]))))
     space.scaled(hard, 0.5)
+    space.mirrored(hard)
     space.describe(hard[0])
     return space

@@ -1,22 +1,30 @@
 import numpy as np
 import pytest
-from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
+from ribs.emitters import EvolutionStrategyEmitter
 
+from qd import surrogate
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.settings import ES_KINDS, METHODS, SchedulerCfg
-from qd.scheduler import RandomEmitter, Scheduler
+from qd.scheduler import RandomEmitter, Scheduler, VariationEmitter
 from tests.qd import stand_in
 
 CELLS = Cells(6)
 FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
-JOINED = ("cma_me+cma_mae", "map_elites+hard_random")
-SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4")
+JOINED = ("cma_me+cma_mae", "map_elites+hard_random", "surrogate+cma_mae")
+BRIEF = {"training_steps": 2, "candidates": 2, "generations": 2}  # networks learn little in it
+SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4", **BRIEF)
+
+
+@pytest.fixture(autouse=True)
+def small_steps(monkeypatch):
+    """Training of a surrogate that takes next to no time."""
+    monkeypatch.setattr(surrogate, "BATCH", 2)
 
 
 def make_search(cfg: SchedulerCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> Scheduler:
-    return Scheduler(cfg, num_cells=cells.num_cells, num_ratios=6, seed=seed)
+    return Scheduler(cfg, cells=cells, seed=seed)
 
 
 def advance(search: Scheduler, first: int, last: int, cells: Cells = CELLS) -> None:
@@ -62,7 +70,7 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
 
 
 def test_in_a_cell_certified_beats_uncertified_then_fitness_decides(tmp_path):
-    search = Scheduler(SMALL, num_cells=CELLS.num_cells, num_ratios=6, seed=0, num_certifiers=2)
+    search = Scheduler(SMALL, cells=CELLS, seed=0, num_certifiers=2)
     nobody, no, yes = [np.nan, np.nan], [0.4, 0.0], [0.2, 0.5]
     genes = search.ask()
     rows = [(7, 9.0, no), (7, 1.0, yes), (8, 9.0, nobody), (8, -1.0, yes), (8, 1.0, yes), (9, 2.0, no), (9, 3.0, no)]
@@ -116,11 +124,16 @@ def test_cell_of_an_elite_is_the_cell_of_its_ratios():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"es": kind} for kind in ES_KINDS] + [{"method": name} for name in (*METHODS, *JOINED)]
+    "changes",
+    [
+        *({"es": kind} for kind in ES_KINDS),
+        *({"method": name} for name in (*METHODS, *JOINED)),
+        {"method": "map_elites", "crossover_share": 0.5, "mirror_share": 0.2},
+    ],
 )
 def test_a_saved_search_goes_on_bit_for_bit(changes, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut
-    cfg = SchedulerCfg(emitters=2, batch_size=6, restart_rule="5", **changes)
+    cfg = SchedulerCfg(emitters=2, batch_size=6, restart_rule="5", **BRIEF, **changes)
     straight, cut = make_search(cfg), make_search(cfg)
     advance(straight, 1, 16)
     advance(cut, 1, 7)
@@ -148,7 +161,7 @@ def test_tell_answers_ask():
 
 @pytest.mark.parametrize("method", [*METHODS, *JOINED])
 def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_valid_terrain(method):
-    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1", method=method))
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1", method=method, **BRIEF))
     for iteration in (1, 2):
         genes = search.ask()
         assert genes.shape == (12, 64)
@@ -199,7 +212,7 @@ def test_joined_methods_take_turns_each_judged_by_its_own_archive():
 
 def test_of_fewer_emitters_than_methods_the_first_ones_count():
     search = make_search(SchedulerCfg(emitters=1, batch_size=2, method="map_elites+cma_mae"))
-    assert [type(emitter) for emitter in search.emitters] == [IsoLineEmitter]
+    assert [type(emitter) for emitter in search.emitters] == [VariationEmitter]
     assert search.archive is search.result  # nobody goes by CMA-MAE's
 
 
@@ -215,6 +228,7 @@ def test_a_state_of_something_else_is_refused(state):
         ("emitters", 0), ("batch_size", 1), ("method", "cma_me+"), ("method", "cma_me+cma_me"),
         ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
         ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")),
+        ("crossover_share", 1.5), ("mirror_share", -0.1), ("disagree_share", 0.9), ("training_steps", 0),
         ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
 )  # fmt: skip

@@ -99,6 +99,20 @@ def test_every_run_is_the_searchs_own():
             assert np.array_equal(together[key], alone[key]), key
 
 
+def test_a_surrogate_and_exchange_of_parts_are_compared_and_stopped_as_all_others_are():
+    few = "training-steps=1,candidates=1,generations=1"
+    methods = (f"surrogate:{few}", f"surrogate:method=surrogate+map_elites,{few}", "map_elites:crossover-share=0.3")
+    changes = {"methods": methods, "seeds": 1}
+    whole = run("whole", **changes)
+    assert numbers_of(whole)["methods"][methods[2]]["settings"]["crossover_share"] == 0.3
+    run("a", **changes, iterations=2)
+    again = run("a", **changes)
+    assert runs_of(again) == runs_of(whole)
+    for name in runs_of(whole):
+        assert (again / name / "archive.npz").read_bytes() == (whole / name / "archive.npz").read_bytes()
+        assert len(rows_of(again / name)) == 3
+
+
 def test_corrected_rows_are_at_the_iterations_asked_for():
     path = run("a", iterations=5)
     for name in runs_of(path):

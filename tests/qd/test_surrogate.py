@@ -1,0 +1,201 @@
+"""The surrogate over a stand-in whose penalties follow from heights, as a robot's do."""
+
+import numpy as np
+import pytest
+import torch
+
+from qd import surrogate as module
+from qd.descriptors import Cells
+from qd.fitness import Evaluation, FitnessCfg, evaluation_of
+from qd.run.checkpoint import load_checkpoint, save_checkpoint
+from qd.run.settings import SchedulerCfg
+from qd.scheduler import Scheduler
+from qd.surrogate import Surrogate
+from sim.corridor import corridor_heights
+from sim.space import SUPER_GAUSSIAN
+from sim.spaces.course import COURSE
+from tests.qd import stand_in
+
+CELLS = Cells(6, 5)
+FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
+CFG = SchedulerCfg(emitters=2, batch_size=16, method="surrogate", training_steps=20, candidates=8, generations=2)
+
+
+def crossed(genes, seed: int, space=SUPER_GAUSSIAN) -> Evaluation:
+    """Six penalties that follow from slopes and heights of six parts of the way; the same mirrored."""
+    heights = corridor_heights(genes, space, device="cpu").numpy().astype(float)
+    parts = np.array_split(heights[:, 10:31, 30:91], 6, axis=2)
+    steep = np.stack([np.abs(np.diff(part, axis=2)).mean(axis=(1, 2)) for part in parts], axis=1)
+    high = np.stack([np.abs(part).mean(axis=(1, 2)) for part in parts], axis=1)
+    noise = np.random.default_rng(seed).uniform(0.9, 1.1, (len(genes), 4, 6))
+    result = stand_in.make_result((0.0005 + 0.1 * (30.0 * steep + 4.0 * high) ** 2)[:, None] * noise * stand_in.SCALES)
+    return evaluation_of(result, CELLS, FITNESS)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_steps():
+    """Steps of training that take a quarter of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "BATCH", 16)
+        yield
+
+
+def make_surrogate(cfg: SchedulerCfg = CFG, seed: int = 0) -> Surrogate:
+    return Surrogate(cfg, CELLS, SUPER_GAUSSIAN, np.random.SeedSequence(seed))
+
+
+@pytest.fixture(scope="module")
+def learned() -> Surrogate:
+    """A surrogate that knows 400 random terrains."""
+    found = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=6))
+    for seed in range(4):
+        genes = SUPER_GAUSSIAN.hard_random(100, seed)
+        evaluation = crossed(genes, seed)
+        found.learn(genes, evaluation, evaluation.fitness)
+    return found
+
+
+def test_what_it_learned_holds_for_other_terrains(learned):
+    genes = SUPER_GAUSSIAN.hard_random(150, 100)
+    truth = crossed(genes, 100)
+    found = learned.predict(genes)
+    assert len(learned) == 400
+    mean = found.ratios.mean(axis=0)
+    assert np.abs(mean.sum(axis=1) - 1.0).max() < 1e-12
+    # Against the mean ratios of all, which is what it would say that has learned nothing of heights.
+    error, spread = ((mean - truth.ratios) ** 2).sum(), ((truth.ratios - truth.ratios.mean(axis=0)) ** 2).sum()
+    assert error < 0.7 * spread
+    assert np.corrcoef(np.arcsinh(found.fitness).mean(axis=0), np.arcsinh(truth.fitness))[0, 1] > 0.6
+    total = found.penalty_mean.mean(axis=0).sum(axis=1)
+    assert np.corrcoef(np.log(total), np.log(truth.penalty_mean.sum(axis=1)))[0, 1] > 0.6
+    assert (found.penalty_std >= 0.0).all()
+    assert found.goal_rate.mean() > 0.8  # all robots of the stand-in reach the goal, none collides
+    assert found.collision_rate.mean() < 0.2 and found.collided.mean() < 0.1
+
+
+def test_networks_differ_and_learn_apart(learned):
+    ratios = learned.predict(SUPER_GAUSSIAN.hard_random(10, 5)).ratios
+    assert (ratios.std(axis=0).sum(axis=1) > 1e-3).all()
+
+
+def test_grouped_networks_are_the_same_as_one_by_one(learned):
+    heights = learned._rasterised(SUPER_GAUSSIAN.hard_random(5, 6)).float()[:, None].expand(-1, module.MEMBERS, -1, -1)
+    with torch.no_grad():
+        one_by_one = learned._networks(heights)
+        together = learned._networks._through(heights, slice(None)).reshape(5, module.MEMBERS, -1)
+    torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-5)
+
+
+def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
+    cfg = SchedulerCfg(emitters=2, batch_size=16, explore_share=0.0, disagree_share=0.0, candidates=20, generations=2)
+    learned.cfg = cfg
+    elites = SUPER_GAUSSIAN.hard_random(60, 0)
+    told = crossed(elites, 0)
+    under_way = SUPER_GAUSSIAN.hard_random(8, 9)
+    genes = learned.propose(6, elites, told.cell, told.fitness, under_way)
+    assert genes.shape == (6, 64) and np.abs(genes).max() <= 1.0
+
+    def expected(genes):
+        found = learned.predict(genes)
+        return found, CELLS.cell_of(found.ratios.mean(axis=0) / found.ratios.mean(axis=0).sum(axis=1, keepdims=True))
+
+    found, cells = expected(genes)
+    assert len(set(cells)) == 6
+    best = np.full(CELLS.num_cells, -20.0)
+    np.maximum.at(best, told.cell, told.fitness)
+    there, at = expected(under_way)
+    np.maximum.at(best, at, there.fitness.mean(axis=0))
+    assert (learned._gain(found, best) > 0.0).all()
+    # By hand for the first: each network's fitness less that of the cell where it puts the terrain.
+    gains = [
+        max(0.0, f - best[CELLS.cell_of(r[None])[0]])
+        for f, r in zip(found.fitness[:, 0], found.ratios[:, 0], strict=True)
+    ]
+    assert learned._gain(found, best)[0] == pytest.approx(np.mean(gains))
+    chance = learned._gain(expected(learned._varied(elites, 60))[0], best)
+    assert learned._gain(found, best).mean() > chance.mean()
+
+
+def test_before_it_knows_enough_it_draws_and_varies():
+    search = make_surrogate()
+    none = np.zeros((0, 64), np.float32)
+    first = search.propose(8, none, np.zeros(0, int), np.zeros(0), none)
+    assert (np.abs(first[:, 7::8]) == 1.0).all()  # hard-random
+    told = crossed(first, 0)
+    search.learn(first, told, told.fitness)
+    later = search.propose(8, first[:1], told.cell[:1], told.fitness[:1], none)
+    assert 0.0 < np.abs(later - first[0]).max() < 0.2  # one elite, varied by .02
+
+
+def test_invalid_terrains_are_not_learned():
+    search = make_surrogate()
+    genes = SUPER_GAUSSIAN.hard_random(4, 0)
+    penalties = np.ones((4, 4, 6))
+    invalid = np.zeros((4, 4), bool)
+    invalid[1:3] = True
+    told = evaluation_of(stand_in.make_result(penalties, invalid=invalid), CELLS, FITNESS)
+    search.learn(genes, told, told.fitness)
+    assert len(search) == 2
+
+
+def test_the_newest_are_kept(monkeypatch):
+    monkeypatch.setattr(module, "MOST", 70)
+    search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=1))
+    for seed in range(3):
+        genes = SUPER_GAUSSIAN.hard_random(40, seed)
+        told = crossed(genes, seed)
+        search.learn(genes, told, told.fitness)
+    assert len(search) == 70
+    assert np.array_equal(search._genes[-40:], genes)
+    assert torch.equal(search._heights[-40:], search._rasterised(genes))
+
+
+@pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE], ids=lambda space: space.name)
+def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
+    cfg = SchedulerCfg(
+        emitters=5, batch_size=8, groups=2, method="surrogate+cma_mae", training_steps=3, candidates=2, generations=2,
+        crossover_share=0.3,
+    )  # fmt: skip
+
+    def advance_groups(search, first, last):
+        for iteration in range(first, last + 1):
+            for group in range(2):
+                genes = search.ask(group)
+                search.tell(crossed(genes, 2 * iteration + group, space), iteration, group)
+                search.ask(group)
+
+    straight, cut = (Scheduler(cfg, cells=CELLS, seed=1, space=space) for _ in range(2))
+    advance_groups(straight, 1, 4)
+    advance_groups(cut, 1, 3)
+    save_checkpoint(tmp_path / "saved", cut.state())
+    cut = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
+    assert len(cut.surrogate) == 3 * 40
+    assert (
+        sum(emitter.batch_size for emitter in cut.emitters if getattr(emitter, "surrogate", 0) is cut.surrogate) == 24
+    )
+    advance_groups(cut, 4, 4)
+    for name, rows in straight.elites().items():
+        assert np.array_equal(rows, cut.elites()[name]), name
+    for group in range(2):
+        assert np.array_equal(straight.ask(group), cut.ask(group))
+
+
+def test_collision_is_a_descriptor_where_the_cells_have_it():
+    cells = Cells(6, 5, collision_bit=True)
+    search = Surrogate(CFG, cells, SUPER_GAUSSIAN, np.random.SeedSequence(0))
+    ratios = np.full((2, 6), 1 / 6)
+    low, high = search._cells(ratios, np.array([False, True]))
+    assert high - low == len(cells.tuples)
+
+
+def test_in_a_search_for_certified_failures_it_learns_the_gated_fitness():
+    search = Scheduler(CFG, cells=CELLS, seed=0, num_certifiers=1)
+    rates = np.full((32, 1), 0.2)
+    for iteration in (1, 2, 3):
+        told = crossed(search.ask(), iteration)
+        search.tell(told, iteration, certifier_goal_rate=rates)
+    # Nobody crosses them: at most 0, less 10 times the .3 that are lacking to half.
+    fitness = np.sinh(search.surrogate._targets[-32:, 18])
+    np.testing.assert_allclose(fitness, np.minimum(told.fitness, 0.0) - 3.0, rtol=1e-5)
+    assert np.sinh(search.surrogate._targets[:, 18]).max() < -2.9
+    assert search.ask().shape == (32, 64)

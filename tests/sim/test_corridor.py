@@ -1,0 +1,31 @@
+import numpy as np
+
+from sim.bank import heights_of
+from sim.corridor import SHAPE, corridor_heights
+from sim.space import SUPER_GAUSSIAN
+from sim.spaces.course import COURSE
+
+
+def test_every_second_node_around_the_way():
+    genes = SUPER_GAUSSIAN.hard_random(3, 0)
+    found = corridor_heights(genes, SUPER_GAUSSIAN, device="cpu").numpy()
+    assert found.shape == (3, *SHAPE) == (3, 41, 121)
+    np.testing.assert_allclose(found, heights_of(genes)[:, 40:121:2, 40:281:2], atol=1e-6)
+
+
+def test_a_space_of_one_spacing_gives_means_of_its_nodes():
+    genes = COURSE.hard_random(3, 0)
+    found, nodes = corridor_heights(genes, COURSE, device="cpu").numpy(), heights_of(genes, COURSE)
+    assert found.shape == (3, 41, 121)
+    for row, col in ((0, 0), (20, 57), (40, 120), (7, 71)):
+        y, x = 40 + 2 * row, 40 + 2 * col
+        around = nodes[:, y - 1 : y + 2, x - 1 : x + 2].mean(axis=(1, 2))
+        np.testing.assert_allclose(found[:, row, col], around, atol=1e-6)
+
+
+def test_mirrored_bumps_are_the_mirrored_terrain():
+    genes = SUPER_GAUSSIAN.hard_random(3, 1)
+    mirrored = SUPER_GAUSSIAN.mirrored(genes)
+    assert not np.array_equal(mirrored, genes)
+    np.testing.assert_allclose(heights_of(mirrored), heights_of(genes)[:, ::-1], atol=1e-5)
+    assert np.array_equal(SUPER_GAUSSIAN.mirrored(mirrored), genes)
