@@ -59,8 +59,8 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
         Interrupted: On Ctrl-C; what was crossed is kept.
     """
     from qd.show.elites import Found, elites_of
+    from qd.show.modes import find_modes
     from qd.show.report.material import Shown, gather
-    from qd.show.report.modes import find_modes
     from qd.show.report.rounds import rounds_report
 
     check(cfg)

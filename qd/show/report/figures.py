@@ -9,7 +9,7 @@ import numpy as np
 
 from qd.show.elites import Elites
 from qd.show.figures import label_of, look_of, new_figure
-from qd.show.report.modes import TOLERANCE, Modes
+from qd.show.modes import TOLERANCE, Modes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
 from qd.show.elites import Elites, find_archive
 from qd.show.figures import summary
-from qd.show.report.modes import Modes
+from qd.show.modes import Modes
 from qd.show.report.tables import Change, Changes, read_tables
 from sim.files.atomic import prepare_output
 from sim.files.command import command_line

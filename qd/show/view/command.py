@@ -4,6 +4,7 @@ import errno
 import socket
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from sim.files.settings import check, setting
 from sim.policy.spec import ControllerSpec
 
 if TYPE_CHECKING:
+    from qd.show.view.plots import Axes
     from sim.robots.robot import RobotCfg
 
 SEARCHED = "as searched"
@@ -26,11 +28,12 @@ SEARCHED = "as searched"
 class View(OfRobot, Which):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
-    Left, the archive on parallel axes. Under "Ranges" drag the ends of an axis: elites outside turn grey and leave the
-    list under "Worst first". Click a line of the list to see that terrain. Right, its crossing: play, pause, drag the
-    time, go from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are contact forces
-    (1 m is 1,000 N), the green one over the robot is its command; curves are what it is penalised for. Crossings that
-    were not recorded before are run on the CPU, which takes seconds, and are kept under --cache.
+    Left, the archive on parallel axes; a click on a line of the plot or of the list under "Elites" shows that terrain.
+    The list begins with one terrain of each way of failing, and can be sorted and narrowed. Under "Ranges" drag the
+    ends of an axis: elites outside turn grey and leave the list. Right, its crossing: play, pause, drag the time, go
+    from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are contact forces (1 m is
+    1,000 N), the green one over the robot is its command; curves are what it is penalised for. Crossings that were not
+    recorded before are run on the CPU, which takes seconds, and are kept under --cache.
 
     Every tab of a browser is on its own, and its address holds what it shows: ?elite=12&controller=C-G&t=8.4 opens
     just that.
@@ -39,6 +42,8 @@ class View(OfRobot, Which):
     open the page at home.
     """
 
+    elite: str = ""
+    """Number of the elite to show first; the first of the list if left out."""
     policies: tuple[str, ...] = ()
     """Controllers to choose from, each NAME=FILE, NAME=module:callable or NAME=shipped, such as base=shipped
     C-G=runs/tuned/policy.pt; the one the archive was made with if none is given."""
@@ -63,12 +68,19 @@ class Show:
 
     cfg: View
     found: Found
-    elite: int
-    """Which to show first."""
+    elite: int | None
+    """Which to show first; None for the first of the list."""
     controllers: dict[str, str]
     """What each controller is loaded from, by its name; empty if that of the search is lost."""
     note: str
     """Why there is no controller; empty if there is one."""
+
+    @cached_property
+    def axes(self) -> "Axes":
+        """All elites, and the orders to list them in."""
+        from qd.show.view.plots import axes_of
+
+        return axes_of(self.found.archive, self.found.space)
 
     @property
     def robot(self) -> "RobotCfg":
@@ -117,7 +129,7 @@ def show_of(cfg: View) -> Show:
     found = find_archive(cfg.robot, cfg.run, space=cfg.space)
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: {found.go_on}, or give another --run")
-    elite = found.one(cfg.elite)
+    elite = found.one(cfg.elite) if cfg.elite else None
     controllers, note = _controllers_of(cfg, found)
     prepare_output(cfg.cache / "recording.npz")
     return Show(cfg=cfg, found=found, elite=elite, controllers=controllers, note=note)

@@ -22,6 +22,7 @@ from qd.show.view.playing import (
     paths_of,
 )
 from qd.show.view.plots import Axes, Curves
+from qd.show.view.pointing import let_point
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, Shapes, View, first_view_of, overview_of
 from sim.bank import heights_of
@@ -85,14 +86,16 @@ class Tab:
         self._panel = CrossingPanel(client, list(show.controllers), self)
         add_keys(client, self)
         keep_keys(client, _KEPT_KEYS)
+        let_point(client)
         self._open(address, refused)
 
     def _open(self, address: Address, refused: list[str]) -> None:
         show, episodes = self.common.show, self.common.show.cfg.replicas
-        elite = show.elite if address.elite is None else address.elite
+        first = self._selection.picked if show.elite is None else show.elite
+        elite = first if address.elite is None else address.elite
         if not 0 <= elite < len(self._archive):
             refused.append(self._no_elite(elite))
-            elite = show.elite
+            elite = first
         if address.controller in show.controllers:
             self._controller = address.controller
         elif address.controller is not None:
@@ -304,7 +307,7 @@ class Tab:
     def _show_elite(self) -> None:
         elite = self._selection.picked
         self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], self.common.show.found.space)[0])
-        self._panel.show_elite(self.common.axes.details(elite))
+        self._panel.show_elite(self.common.axes.details(elite, {}))
         self._show_crossings()
 
     def _show_crossings(self) -> None:

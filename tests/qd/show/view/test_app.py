@@ -34,7 +34,7 @@ def run(published):
 @pytest.fixture(scope="module")
 def show(anymal, run):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return show_of(View(run=run, port=free_port(), policies=policies))
+    return show_of(View(run=run, elite="0", port=free_port(), policies=policies))
 
 
 class Shown:
@@ -110,8 +110,8 @@ def test_the_worst_elite_is_there_with_its_crossing(tab):
     assert "Elite 0" in tab._panel._details.content
     assert status(tab).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
     assert tab.scene._robot.visible and not tab._panel._play.disabled
-    worst = tab.common.axes.axis("fitness").values[0]
-    assert tab._list._lines[0].label.startswith(f"0: {worst:.1f} ")
+    place = tab._selection.listed.index(0)
+    assert tab._list._lines[place].label.startswith("0: goal 0% ")
     assert tab._clock.duration_s == pytest.approx(20.0)
 
 
@@ -186,10 +186,11 @@ def test_a_camera_in_the_address_is_left_where_it_is(shown):
 
 
 def test_what_is_not_there_is_refused_in_words(shown):
-    shown.come("?elite=480&controller=C-HR&episode=21&t=soon")
+    count = len(shown.tab._archive)
+    shown.come("?elite=999&controller=C-HR&episode=21&t=soon")
     assert notes(shown, 4, visitor=1) == [
         "t=soon in the address is no time in seconds: it is left out.",
-        "There is no elite 480 here: there are 0 to 479.",
+        f"There is no elite 999 here: there are 0 to {count - 1}.",
         "There is no controller 'C-HR' here: there are base, other.",
         "There is no episode 21 here: there are 1 to 20.",
     ]
@@ -307,8 +308,28 @@ def test_the_list_follows_the_ranges(shown):
     shown.do((tab.pick_line, 0))
     assert tab._selection.picked == first and tab._list._number.value == str(first)
     shown.do((tab._list.change, tab._selection.clear), (tab.step, 1))
-    assert tab._selection.picked == first + 1
     assert len(tab._selection.kept) == len(tab._archive)
+    assert tab._selection.picked == tab._selection.kept[tab._selection.kept.tolist().index(first) + 1]
+
+
+def test_the_first_of_the_list_is_shown_where_none_is_named(show, tmp_path):
+    shown = Shown(dataclasses.replace(show, elite=None), Recordings(show.robot, folder=tmp_path))
+    try:
+        ranking = shown.tab.common.axes.ranking
+        assert shown.tab._selection.picked == ranking.leaders()[0] == shown.tab._selection.listed[0]
+        assert shown.tab._list._lines[0].color == (213, 94, 0)
+    finally:
+        shown.close()
+
+
+def test_an_empty_list_says_so_and_leads_back(shown):
+    panel = shown.tab._list
+    assert not panel._again.visible
+    shown.do((panel.choose, "kind", "faults"))  # nobody looked for any here
+    assert panel._count.content.startswith("**None of") and panel._again.visible
+    assert not any(line.visible for line in panel._lines) and panel._choosers["kind"][0].value == "faults (0)"
+    shown.do((panel.change, shown.tab._selection.clear))
+    assert not panel._again.visible and panel._lines[0].visible and panel._choosers["kind"][0].value.startswith("all ")
 
 
 def test_playing_and_dragging_move_the_robot(shown):
@@ -408,5 +429,5 @@ def test_the_help_says_what_to_do():
         [sys.executable, "-m", "faultline", "view", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert ended.returncode == 0
-    for word in ("Ranges", "Worst first", "ssh -L", "Ctrl-C", "--policies", "--host"):
+    for word in ("Ranges", "Elites", "ssh -L", "Ctrl-C", "--policies", "--host"):
         assert word in ended.stdout
