@@ -8,13 +8,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from qd.archive import goal_rates
 from qd.run.directory import RESULTS, RUNS
 from qd.show.elites import Found, find_archive
 from qd.workers.evaluator import check_policy
 from sim.files.atomic import prepare_output
 from sim.files.command import OfRobot, Which
 from sim.files.settings import check, setting
-from sim.policy.spec import ControllerSpec
+from sim.policy.spec import ControllerSpec, controller_hash
 
 if TYPE_CHECKING:
     from qd.show.view.plots import Axes
@@ -46,7 +47,8 @@ class View(OfRobot, Which):
     """Number of the elite to show first; the first of the list if left out."""
     policies: tuple[str, ...] = ()
     """Controllers to choose from, each NAME=FILE, NAME=module:callable or NAME=shipped, such as base=shipped
-    C-G=runs/tuned/policy.pt; the one the archive was made with if none is given."""
+    C-G=runs/tuned/policy.pt; if none is given, the one the archive was made with, and those of the robot's panel that
+    certify its faults."""
     replicas: int = setting(20, least=1, most=100)
     """Episodes of each elite, from different starts; fewer are recorded sooner."""
     port: int = 8080
@@ -81,6 +83,24 @@ class Show:
         from qd.show.view.plots import axes_of
 
         return axes_of(self.found.archive, self.found.space)
+
+    @cached_property
+    def _certifiers(self) -> dict[str, int]:
+        """Place among the archive's certifiers of the controllers that are some."""
+        faults = self.found.archive.faults
+        known = () if faults is None else faults.certifier_sha256
+        hashes = {name: controller_hash(policy) for name, policy in self.controllers.items()}
+        return {name: known.index(digest) for name, digest in hashes.items() if digest in known}
+
+    def certifying(self, number: int) -> str | None:
+        """The controller that crosses an elite which fails, the best of several; None if none of these does."""
+        archive = self.found.archive
+        faults = archive.faults
+        if faults is None or not archive.certified[number]:
+            return None
+        crosses, rates = faults.certificates()[number], goal_rates(faults.certifier_outcomes[number])
+        found = [name for name, place in self._certifiers.items() if crosses[place]]
+        return max(found, key=lambda name: rates[self._certifiers[name]], default=None)
 
     @property
     def robot(self) -> "RobotCfg":
@@ -152,7 +172,19 @@ def _controllers_of(cfg: View, found: Found) -> tuple[dict[str, str], str]:
         check_policy(policy, found.robot, "cpu")
     except ValueError as error:
         return {}, f"{error}; name a controller with --policies to see crossings"
-    return {SEARCHED: policy}, ""
+    return {SEARCHED: policy, **_panel_of(found, policy)}, ""
+
+
+def _panel_of(found: Found, searched: str) -> dict[str, str]:
+    """The robot's panel as far as it crossed the archive, by the names it has there."""
+    from qd.run.judge import panel_files
+
+    faults = found.archive.faults
+    if faults is None:
+        return {}
+    names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
+    files = panel_files(found.robot, lambda file: controller_hash(file) == controller_hash(searched))
+    return {names[digest]: file for file in files.values() if (digest := str(controller_hash(file))) in names}
 
 
 def check_port(host: str, port: int) -> None:

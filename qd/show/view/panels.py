@@ -278,11 +278,14 @@ class CrossingPanel:
         self._details = gui.add_markdown("")
         self._controller = gui.add_dropdown("Controller", tuple(controllers) or ("none",), disabled=not controllers)
         _on_visit(self._controller, lambda name: self._post(tab.choose_controller, str(name)))
+        self._ghost: Any = gui.add_dropdown("Ghost", tab.ghost.choices, disabled=not controllers)
+        _on_visit(self._ghost, lambda name: self._post(tab.choose_ghost, str(name)))
         self._groups: Any = gui.add_dropdown("Episodes", ("none",), disabled=True)
         _on_visit(self._groups, lambda name: self._post(tab.choose_group, str(name)))
         self._episode: Any = gui.add_dropdown("Episode", ("none",), disabled=True)
         _on_visit(self._episode, lambda name: self._post(tab.choose_replica, int(str(name).split(":")[0]) - 1))
         self._status = gui.add_html("")
+        self._ghost_status = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         self._play.on_click(lambda event: self._post(tab.play))
@@ -320,6 +323,11 @@ class CrossingPanel:
         if name is not None:
             self._controller.value = name
 
+    def show_ghost(self, choice: str, words: str) -> None:
+        """Say who the ghost is to be, and as HTML what became of it."""
+        self._ghost.value = choice
+        self._ghost_status.content = _small(words)
+
     def show_episodes(self, groups: Sequence[str], group: str, episodes: dict[int, str], shown: int) -> None:
         """Offer episodes.
 
@@ -341,7 +349,7 @@ class CrossingPanel:
 
     def show_status(self, text: str, share: float | None = None) -> None:
         """Say how the crossing ended, as HTML, or how far its recording is (0 to 1)."""
-        self._status.content = f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>'
+        self._status.content = _small(text)
         self._progress.visible = share is not None
         if share is not None:
             self._progress.value = 100.0 * share
@@ -406,6 +414,11 @@ def add_keys(client: viser.ClientHandle, tab: "Tab") -> None:
     for label, (key, act) in asked.items():
         command = client.gui.add_command(label, hotkey=key)
         command.on_trigger(lambda event, act=act: tab.common.post(*act))
+
+
+def _small(text: str) -> str:
+    """HTML in small print."""
+    return f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>' if text else ""
 
 
 def _add_choices(gui: Any, label: str, choices: dict[str, Any], act: Callable[[Any], None]) -> None:

@@ -331,7 +331,7 @@ class Curves:
 
     def at(self, time_s: float) -> str:
         """The curves with a mark at a time [s]."""
-        x = float(self._x(np.array([time_s]))[0])
+        x = float(self._x(np.array([min(time_s, self._end)]))[0])  # a second crossing may last longer
         bottom = self._top + _CURVES_HEIGHT - 18
         mark = f'<line x1="{x:.1f}" y1="6" x2="{x:.1f}" y2="{bottom}" stroke="#d00" stroke-width="1.5"/>'
         return _svg(self._top + _CURVES_HEIGHT, [self._drawn, mark])
