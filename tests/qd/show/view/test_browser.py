@@ -124,7 +124,7 @@ def test_a_line_of_the_plot_is_named_and_clicked(opened):
         page.mouse.move(x, y + step)
         if page.locator("svg text.pointed").count():
             break
-    named = re.match(r"elite (\d+)", page.locator("svg text.pointed").inner_text())
+    named = re.match(r"elite (\d+)", page.locator("svg text.pointed").text_content() or "")
     assert named is not None
     page.mouse.down()
     page.mouse.up()
