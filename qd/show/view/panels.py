@@ -191,7 +191,7 @@ class ArchivePanel:
             "kind": (self._add_chooser("Only", "kind", kinds := self._axes.kinds()), kinds),
             "mode": (self._add_chooser("Mode", "mode", modes := self._axes.modes()), modes),
         }
-        self._gui.add_markdown("Elite: goal reached · base collision, with 95 % intervals")
+        self._gui.add_markdown("Elite: what it is · goal reached, with its 95 % interval · base collision")
         self._lines = [self._add_button("", self._tab.pick_line, k) for k in range(PAGE)]
         count = len(self._axes.elites)
         turns = {"first": -count, "previous": -1, "next": 1, "last": count}

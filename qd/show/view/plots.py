@@ -126,16 +126,19 @@ class Axes:
         return rate_words(self.elites.hits(name, number), int(self.elites.counted[number]), short=True)
 
     def line(self, number: int) -> str:
-        """An elite on one line of the list: number, rates, verdict."""
-        goal, collided = (self.rate_text(name, number) for name in ("goal_rate", "collision_rate"))
-        verdict = VERDICTS[int(self.elites.verdict[number])]
-        return f"{number}: goal {goal} · collision {collided}{f' · {verdict}' * bool(verdict)}"
+        """An elite on one line of the list: number, verdict, goal rate with its interval, collisions."""
+        verdict, collided = self.verdict(number), self.elites.collision_rate[number]
+        goal = self.rate_text("goal_rate", number)
+        return f"{number}: {f'{verdict} · ' * bool(verdict)}goal {goal} · collision {collided:.0%}"
+
+    def verdict(self, number: int) -> str:
+        """What an elite is, one of :data:`qd.faults.VERDICTS`."""
+        return VERDICTS[int(self.elites.verdict[number])]
 
     def hint(self, number: int) -> str:
         """An elite in a few words."""
-        verdict = VERDICTS[int(self.elites.verdict[number])]
-        goal = rate_words(self.elites.hits("goal_rate", number), int(self.elites.counted[number]), short=True)
-        return f"elite {number}{f', {verdict}' * bool(verdict)}: goal {goal.split(' ')[0]}"
+        verdict = self.verdict(number)
+        return f"elite {number}{f', {verdict}' * bool(verdict)}: goal {self.elites.goal_rate[number]:.0%}"
 
     def details(self, number: int, crossings: Mapping[str, Mapping[str, Rate]]) -> str:
         """All that is known of an elite, as Markdown.
@@ -146,7 +149,7 @@ class Axes:
                 they are.
         """
         archive, elites, ranking = self.archive, self.elites, self.ranking
-        count, verdict = int(elites.counted[number]), VERDICTS[int(elites.verdict[number])]
+        count, verdict = int(elites.counted[number]), self.verdict(number)
         of = f"{count} fresh episodes" if elites.fresh[number] else f"the {count} episodes that found it"
         mode = ranking.modes.modes[int(ranking.modes.labels[number]) - 1]
         family = int((ranking.families == ranking.families[number]).sum())

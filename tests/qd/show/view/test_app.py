@@ -112,7 +112,7 @@ def test_the_worst_elite_is_there_with_its_crossing(tab):
     assert status(tab).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
     assert tab.scene._robot.visible and not tab._panel._play.disabled
     place = tab._selection.listed.index(0)
-    assert tab._list._lines[place].label.startswith("0: goal 0% ")
+    assert tab._list._lines[place].label.startswith("0: failing · goal 0% ")
     assert tab._clock.duration_s == pytest.approx(20.0)
 
 

@@ -96,7 +96,7 @@ def see(page, text):
 
 def click_another(page, shown):
     """Clicks a line of the list that is not the one shown; returns its number."""
-    for line in page.get_by_role("button", name=re.compile(r"^\d+: goal")).all():
+    for line in page.get_by_role("button", name=re.compile(r"^\d+: .*goal")).all():
         number = line.inner_text().split(":")[0]
         if number != shown:
             line.click()

@@ -90,7 +90,11 @@ def test_faults_come_before_certified_confirmed_and_other_failing_elites():
     }  # fmt: skip
     assert list(axes.kinds()) == ["all (5)", "faults (1)", "certified (2)", "confirmed (2)", "failing (4)",
                                   "not failing (1)"]  # fmt: skip
-    assert axes.line(0).endswith(" · fault") and "C-G" in axes.details(0, {}) and "It is a fault" in axes.details(0, {})
+    assert (
+        axes.line(0).startswith("0: fault · goal 0% ")
+        and "C-G" in axes.details(0, {})
+        and "It is a fault" in axes.details(0, {})
+    )
 
 
 def test_each_line_of_the_plot_names_its_elite(axes):
@@ -116,7 +120,7 @@ def test_numbers_of_fresh_episodes_come_first():
     assert axes.axis("fitness").values.tolist() == [0.0, 0.0, archive.fitness[2]]
     # Wilson, z^2 = 3.8415, of 20 of 40: .5 +- 1.96 sqrt(.25/40 + 3.8415/6400) / 1.0960 = .5 +- .148
     assert axes.rate_text("collision_rate", 0) == "50% (35 to 65%)"
-    assert "collision 50% (35 to 65%)" in axes.line(0) and "as searched, 40 fresh episodes" in axes.details(0, {})
+    assert "collision 50%" in axes.line(0) and "as searched, 40 fresh episodes" in axes.details(0, {})
     assert "the 4 episodes that found it" in axes.details(2, {})
 
 
