@@ -377,9 +377,7 @@ def test_minimal_terrains_are_shown_where_there_are_some(reported, run):
 def test_minimal_files_that_do_not_belong_together_are_refused(reported, run):
     _, entries = minimal_of(run, 2)
     (run / "minimal.json").write_bytes(to_json({"elites": entries[:1]}))
-    with pytest.raises(
-        ValueError, match=r"must hold the 1 minimal terrain of minimal\.json, got one of 2"
-    ):
+    with pytest.raises(ValueError, match=r"must hold the 1 minimal terrain of minimal\.json, got one of 2"):
         reported()
     (run / "minimal.json").write_bytes(to_json({"elites": [{}]}))
     with pytest.raises(ValueError, match=r"minimal\.json must hold minimal terrains, but it is damaged"):

