@@ -208,7 +208,8 @@ _LABELS = {"goal": "goal reached", "success": 'no base collision ("success")', "
 
 def _headline(report: dict[str, Any]) -> str:
     count = report["episodes"] - report["invalid_episodes"]
-    return ", ".join(f"{name} {rate_words(report['rates'][name]['hits'], count)}" for name in ("goal", "success"))
+    words = {"goal": "goal", "success": "no base collision"}
+    return ", ".join(f"{label} {rate_words(report['rates'][name]['hits'], count)}" for name, label in words.items())
 
 
 def describe(report: dict[str, Any]) -> str:

@@ -33,6 +33,7 @@ from sim.files.intervals import bootstrap_interval
 from sim.policy.spec import SHIPPED, ControllerSpec
 
 _AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes
+_MIN_PICTURED = 4  # terrains that the page begins with
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
@@ -89,10 +90,11 @@ def _no_faults(shown: Shown) -> Block:
 
 
 def _pictured(shown: Shown) -> list[Block]:
-    """A terrain of each way of failing, the worst there is, no two alike."""
-    elites, modes = shown.elites, shown.modes
+    """The worst terrain of each way of failing, and where these are few some more that are unlike them."""
+    elites, modes, leaders = shown.elites, shown.modes, shown.ranking.leaders()
+    failing = [number for number in shown.worst if elites.failing[elites.place_of(number)]]
     drawn, told = {}, []
-    for number in shown.ranking.leaders():
+    for number in list(dict.fromkeys([*leaders, *failing]))[: max(_MIN_PICTURED, len(leaders))]:
         place = elites.place_of(number)
         mode = modes.modes[int(modes.labels[place]) - 1]
         verdict = VERDICTS[int(elites.verdict[place])]
@@ -104,7 +106,8 @@ def _pictured(shown: Shown) -> list[Block]:
             told.append(f"mode {mode.number}, the robot {mode.deed}: elite {number} ({verdict}), goal {arrived}")
     if not drawn:
         return []
-    text = f"The worst terrain of each way of failing, crossed again, with 95 % intervals: {'; '.join(told)}."
+    more = " and others unlike these," * (len(told) > len(leaders))
+    text = f"The worst terrain of each way of failing,{more} crossed again, with 95 % intervals: {'; '.join(told)}."
     shows = "Height map of a terrain of each way of failing with the robots' paths"
     figure = draw_maps(drawn, f"{shown.material.archive.robot}: a terrain of each way of failing")
     return [paragraph(text), picture("failing", figure, shows)]

@@ -2,6 +2,7 @@
 // Lines of the archive's plot can be pointed at: the nearest one is named and drawn thick, a click shows its elite.
 {
   const NEAR = 8; // pixels of the plot's own scale
+  let pointed = null; // the line that is named
 
   const lineAt = (event) => {
     const plot = event.target.closest?.("svg");
@@ -28,9 +29,9 @@
 
   document.addEventListener("pointermove", (event) => {
     drop();
-    const line = lineAt(event);
-    if (!line) return;
-    const { plot, path, k, x, y } = line;
+    pointed = lineAt(event);
+    if (!pointed) return;
+    const { plot, path, k, x, y } = pointed;
     const drawn = document.createElementNS(plot.namespaceURI, "path");
     drawn.setAttribute("d", "M" + path.getAttribute("d").split("M")[k + 1]);
     drawn.setAttribute("style", "fill:none;stroke:#000;stroke-width:2;pointer-events:none");
@@ -49,7 +50,10 @@
 
   // The page has no other way to its server than its own widgets: the number is typed into the field for it.
   document.addEventListener("click", (event) => {
-    const line = lineAt(event), field = document.querySelector("form input[type=text], form input:not([type])");
+    let line = lineAt(event);
+    // A click's place is rounded, and lines are dense: what is named is what is meant.
+    if (line && pointed?.path.isConnected && Math.hypot(pointed.x - line.x, pointed.y - line.y) < 2) line = pointed;
+    const field = document.querySelector("form input[type=text], form input:not([type])");
     if (!line || !field) return;
     const number = line.path.dataset.elites.split(" ")[line.k];
     Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, number);
