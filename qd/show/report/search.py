@@ -109,7 +109,7 @@ def _pictured(shown: Shown) -> list[Block]:
     more = " and others unlike these," * (len(told) > len(leaders))
     text = f"The worst terrain of each way of failing,{more} crossed again, with 95 % intervals: {'; '.join(told)}."
     shows = "Height map of a terrain of each way of failing with the robots' paths"
-    figure = draw_maps(drawn, f"{shown.material.archive.robot}: a terrain of each way of failing")
+    figure = draw_maps(drawn, f"{shown.material.archive.robot}: terrains that are not crossed")
     return [paragraph(text), picture("failing", figure, shows)]
 
 
