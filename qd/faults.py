@@ -360,12 +360,16 @@ VERDICTS = ("", "failing", "confirmed", "certified", "fault")
 """What an elite is, in a word."""
 
 
+def verdicts_of(archive: Archive) -> NDArray[np.int64]:
+    """The verdicts on all elites as places in :data:`VERDICTS`, shape (N,)."""
+    confirmed, certified = archive.confirmed, archive.certified
+    unconfirmed = np.where(certified, VERDICTS.index("certified"), archive.failing.astype(np.int64))
+    return np.where(confirmed, np.where(certified, VERDICTS.index("fault"), VERDICTS.index("confirmed")), unconfirmed)
+
+
 def verdict_of(archive: Archive, number: int) -> str:
     """The verdict on an elite: empty if it does not fail."""
-    confirmed, certified = bool(archive.confirmed[number]), bool(archive.certified[number])
-    if confirmed and certified:
-        return "fault"
-    return "confirmed" if confirmed else "certified" if certified else "failing" if archive.failing[number] else ""
+    return VERDICTS[int(verdicts_of(archive)[number])]
 
 
 def elite_words(archive: Archive, number: int) -> list[str]:

@@ -258,7 +258,8 @@ def minimise_run(args: Minimise, *, open_evaluator: Open = open_evaluator) -> di
                 from qd.show.figures import save_figure
                 from qd.show.minimal_figure import draw_minimal
 
-                save_figure(path / FIGURE_FILE, draw_minimal(terrains, numbers))
+                minimal_genes = {n: terrains.genes(n, one) for n, one in terrains.minima().items()}
+                save_figure(path / FIGURE_FILE, draw_minimal(cfg.robot, numbers, minimal_genes, space))
     for line in minimal_words(numbers, judged):
         print(line)
     print(f"In {path / SUMMARY_FILE}, {path / MINIMAL_FILE} and {path / FIGURE_FILE}." if numbers["elites"] else "")

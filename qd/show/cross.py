@@ -203,19 +203,21 @@ def numbers_of(crossed: "Crossed") -> dict[str, Any]:
     }
 
 
-_LABELS = {"success": "success (no base collision)", "goal": "goal reached", "fallen": "fallen"}
+_LABELS = {"goal": "goal reached", "success": 'no base collision ("success")', "fallen": "fallen"}
 
 
 def _headline(report: dict[str, Any]) -> str:
     count = report["episodes"] - report["invalid_episodes"]
-    return ", ".join(f"{name} {rate_words(report['rates'][name]['hits'], count)}" for name in ("success", "goal"))
+    words = {"goal": "goal", "success": "no base collision"}
+    return ", ".join(f"{label} {rate_words(report['rates'][name]['hits'], count)}" for name, label in words.items())
 
 
 def describe(report: dict[str, Any]) -> str:
     """The numbers of a terrain, in words."""
     count = report["episodes"] - report["invalid_episodes"]
     lines = [f"{report['robot']} with {report['policy']} on {report['terrain']}, {report['episodes']} episodes:"]
-    lines += [f"  {_LABELS[name]:30}{rate_words(rate['hits'], count):>30}" for name, rate in report["rates"].items()]
+    rates = {label: report["rates"][name]["hits"] for name, label in _LABELS.items()}
+    lines += [f"  {label:30}{rate_words(hits, count):>30}" for label, hits in rates.items()]
     for name, cost in report["penalties"].items():
         label = f"{name} [{cost['unit']}]"
         lines.append(f"  {label:30}{cost['mean']:>17.2f} +- {cost['std']:<9.2f}")
@@ -224,7 +226,5 @@ def describe(report: dict[str, Any]) -> str:
     if report["invalid_episodes"]:
         why = reason_words(report["invalid_reasons"])
         lines.append(f"  {report['invalid_episodes']} invalid episodes are left out: {why}.")
-    lines.append(
-        "  Rates with their 95 % intervals (Wilson). A robot that stands still succeeds: read the goal rate too."
-    )
+    lines.append("  Rates with their 95 % intervals (Wilson). A robot that stands still has no base collision either.")
     return "\n".join(lines)

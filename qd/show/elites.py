@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
+from qd.faults import verdicts_of
 from qd.fitness import FAILING_GOAL_RATE, FitnessCfg
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, named_by, newest_or_published
 from qd.run.settings import SearchCfg, own_policy, suffix_of
@@ -195,6 +196,9 @@ class Elites:
     """Share that ended tilted by more than 60 degrees, shape (N,)."""
     reproduced: NDArray[np.bool_]
     """Whether fresh episodes landed in its cell or a neighbour; True where there are none; shape (N,)."""
+    verdict: NDArray[np.int64]
+    """Place in :data:`qd.faults.VERDICTS` of what is known of it, shape (N,). Where there are no fresh episodes those
+    that found it say whether it fails."""
 
     def __len__(self) -> int:
         """N."""
@@ -223,12 +227,14 @@ class Elites:
         """Episodes of the elite in a row that a rate counts."""
         return round(float(getattr(self, rate)[place]) * int(self.counted[place]))
 
-    def worst(self, count: int) -> list[int]:
-        """Numbers of the failed terrains of highest fitness, the highest first; if fewer fail, of others after them.
+    def by_severity(self) -> NDArray[np.int64]:
+        """Rows by how badly the robot fares, shape (N,), the worst first.
 
-        An elite may have the highest fitness of all and be crossed by every robot, with trouble.
+        Faults come before certified, confirmed, failing and other elites, of these the ones with the lowest goal rate,
+        the most base collisions, the most falls and the highest fitness. Fitness alone does not order by failure: it
+        prizes trouble that is the same in every episode.
         """
-        return self.numbers[np.lexsort((-self.fitness, ~self.failing))[:count]].tolist()
+        return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
 
     def most_reproducible(self, count: int) -> list[int]:
         """Numbers of the terrains whose penalties vary least between episodes, for their size; the steadiest first.
@@ -269,5 +275,6 @@ def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
         variation=stds / np.maximum(means, np.finfo(float).tiny),
         counted=found["episodes"] - found["invalid_episodes"],
         reproduced=reproduced[kept],
+        verdict=np.maximum(verdicts_of(archive)[kept], found["goal_rate"] < FAILING_GOAL_RATE),
         **{name: found[name] for name in ("cell", "fitness", "ratios", *_RATES)},
     )

@@ -1,8 +1,11 @@
 """The figure of minimal terrains: how many parts a failure takes, and a gallery."""
 
+from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qd.show.crossing_figures import draw_heights
 from qd.show.figures import new_figure
@@ -12,31 +15,34 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from qd.run.minimise import MinimalTerrains
+    from sim.space import TerrainSpace
 
 _SHOWN = 12  # terrains of the gallery
 _COLUMNS = 3
 _COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#999999")
 
 
-def draw_minimal(terrains: "MinimalTerrains", numbers: dict[str, Any]) -> "Figure":
+def draw_minimal(
+    robot: str, numbers: dict[str, Any], genes: Mapping[int, NDArray[np.float32]], space: "TerrainSpace"
+) -> "Figure":
     """How many parts failures take, by the kind of the cause, and some minimal terrains from above.
 
     Of every kind of cause the gallery has one terrain before it has a second of another.
 
     Args:
-        terrains: At least one that is minimal.
-        numbers: The same as ``minimal.json`` has them.
+        robot: Its name.
+        numbers: At least one terrain, as ``minimal.json`` has them.
+        genes: Of the minimal terrains by number of the elite, each of shape (num_genes,).
+        space: What they mean.
     """
-    entries, minima = numbers["elites"], terrains.minima()
+    entries = numbers["elites"]
     shown = _gallery(entries)
     rows = -(-len(shown) // _COLUMNS)
     figure = new_figure(13.0, 3.2 + 2.3 * rows)
-    figure.suptitle(f"{terrains.archive.robot}: {len(entries):,} minimal terrains")
+    figure.suptitle(f"{robot}: {len(entries):,} minimal terrains")
     grid = figure.add_gridspec(rows + 1, _COLUMNS, height_ratios=(1.3, *[1.0] * rows))
     _draw_histogram(figure.add_subplot(grid[0, :]), numbers)
-    genes = [terrains.genes(entry["elite"], minima[entry["elite"]]) for entry in shown]
-    heights = heights_of(np.array(genes), terrains.space)
+    heights = heights_of(np.array([genes[entry["elite"]] for entry in shown]), space)
     limits = (float(heights.min()), float(heights.max()))
     panels = [figure.add_subplot(grid[1 + place // _COLUMNS, place % _COLUMNS]) for place in range(len(shown))]
     for axes, entry, ground in zip(panels, shown, heights, strict=True):
@@ -64,7 +70,7 @@ def _draw_histogram(axes: "Axes", numbers: dict[str, Any]) -> None:
     entries = numbers["elites"]
     sizes = np.arange(max(len(entry["bumps"]) for entry in entries) + 1)
     bottom = np.zeros(len(sizes))
-    kinds = [*numbers["causes"], *[None] * any(entry["cause"] is None for entry in entries)]
+    kinds = [kind for kind, _ in Counter((entry["cause"] or {}).get("kind") for entry in entries).most_common()]
     for place, kind in enumerate(kinds):
         own = [len(entry["bumps"]) for entry in entries if (entry["cause"] or {}).get("kind") == kind]
         counts = np.bincount(own, minlength=len(sizes))

@@ -59,26 +59,25 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
         Interrupted: On Ctrl-C; what was crossed is kept.
     """
     from qd.show.elites import Found, elites_of
+    from qd.show.ranking import rank
     from qd.show.report.material import Shown, gather
-    from qd.show.report.modes import find_modes
     from qd.show.report.rounds import rounds_report
 
     check(cfg)
     if cfg.run is not None and (cfg.run / ROUNDS_FILE).exists():
         return rounds_report(cfg.run, cfg.robot, cfg.out)
     material = gather(cfg)
-    elites = elites_of(material.archive, judged=True)
-    if not len(elites):
+    if not len(elites_of(material.archive, judged=True)):
         raise ValueError(
             f"{material.run} must have elites to report on, got {len(material.archive)} whose fresh episodes are all "
             f"invalid: {Found(run=material.run, archive=material.archive, robot=material.robot).go_on}"
         )
+    ranking = rank(material.archive, material.space, judged=True)
     shown = Shown(
         material=material,
-        elites=elites,
-        modes=find_modes(elites),
-        worst=elites.worst(cfg.elites),
-        steady=elites.most_reproducible(cfg.elites),
+        ranking=ranking,
+        worst=ranking.worst(cfg.elites),
+        steady=ranking.elites.most_reproducible(cfg.elites),
     )
     with naming_what_is_next("what was crossed is kept", lambda: "The same command goes on"):
         shown = _with_crossings(shown, cross)
@@ -164,17 +163,18 @@ def _lead(material: "Material") -> str:
 
 def _write(shown: "Shown") -> Path:
     """Writes figures and page."""
-    from qd.show.report import elites, evaluation, search
+    from qd.show.report import elites, evaluation, minimal, search
     from qd.show.report.page import Section, publish_page
 
     material = shown.material
     chapters = {
         ("What breaks the controller", "outcome"): search.outcome_section,
+        ("The smallest terrains that still break it", "minimal"): minimal.minimal_section,
+        ("Terrains worth a look", "terrains"): elites.detail_section,
+        ("Modes", "modes"): elites.modes_section,
         ("The search", "search"): search.curves_section,
         ("The archive", "archive"): search.archive_section,
         ("Shares against each other", "pairs"): search.pairs_section,
-        ("Failure modes", "modes"): elites.modes_section,
-        ("Terrains worth a look", "terrains"): elites.detail_section,
         ("Controllers compared", "tables"): evaluation.tables_section,
         ("The same terrain before and after", "before-after"): evaluation.before_after_section,
         ("All elites", "all"): elites.all_section,

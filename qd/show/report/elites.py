@@ -1,13 +1,13 @@
 """The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
 
-from qd.faults import VERDICTS, elite_words, verdict_of
+from qd.faults import VERDICTS, elite_words
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
 from qd.show.crossing_figures import draw_crossing, draw_maps
 from qd.show.elites import Elites
 from qd.show.figures import label_of, look_of
+from qd.show.modes import MAX_MODES, TOLERANCE, Mode
 from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
-from qd.show.report.modes import MAX_MODES, TOLERANCE, Mode
 from qd.show.report.page import Block, absent, counted, heading, paragraph, percent, picture, table
 from sim.files.command import plain_command
 from sim.files.intervals import wilson_interval
@@ -25,7 +25,9 @@ def modes_section(shown: Shown) -> list[Block]:
     text = (
         f"The {counted(len(elites), 'elite')} fall into {counted(len(modes.modes), 'mode')} by how the robot "
         f"struggles and how its crossings end. The largest, mode {largest.number}, has {len(largest.members):,} "
-        f"({percent(len(largest.members) / len(elites))}): {_described(largest)}."
+        f"({percent(len(largest.members) / len(elites))}): {_described(largest)}. "
+        f"{counted(sum(mode.failing for mode in modes.modes), 'mode is a failure mode', 'modes are failure modes')}: "
+        "under half of their robots reach the goal."
     )
     shows = "Mean shares of the penalties and of the ends of crossings by group; silhouette by number of groups"
     drawn = picture("modes", draw_modes(elites, modes), shows)
@@ -111,16 +113,19 @@ def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
 
     Args:
         elites: All elites.
-        worst: Numbers of the failed ones of highest fitness, and of others after them if too few fail.
+        worst: Numbers of the worst ones, and of others after them if too few fail.
         steady: Numbers of those that vary least.
     """
     fails = {number: bool(elites.failing[elites.place_of(number)]) for number in worst}
     failed, others = ([number for number in worst if fails[number] is kind] for kind in (True, False))
     parts = []
     if failed:
-        parts.append(f"terrains on which the controller fails, the highest fitness first ({_list(failed)})")
+        parts.append(
+            f"terrains on which the controller fails, one of each way of failing first, no two alike while there are "
+            f"others ({_list(failed)})"
+        )
     if others:
-        parts.append(f"{'other ' * bool(failed)}terrains of high fitness on which it does not fail ({_list(others)})")
+        parts.append(f"{'other ' * bool(failed)}terrains on which it does not fail ({_list(others)})")
     parts.append(
         f"terrains whose penalties vary least between episodes for their size, failed ones first ({_list(steady)})"
     )
@@ -136,7 +141,7 @@ def _elite(shown: Shown, number: int) -> list[Block]:
     crossed, archive = shown.crossed[number], shown.material.archive
     place = shown.elites.place_of(number)
     failed = shown.elites.failing[place]
-    ranked = (("worst failed" if failed else "high fitness", shown.worst), ("most reproducible", shown.steady))
+    ranked = (("worst failed" if failed else "hard", shown.worst), ("most reproducible", shown.steady))
     roles = [f"{what}, rank {numbers.index(number) + 1}" for what, numbers in ranked if number in numbers]
     roles += [f"typical of mode {mode.number}" for mode in shown.modes.modes if mode.typical == number]
     headed = heading(f"Elite {number}: {'; '.join(roles)}", anchor_of(number))
@@ -207,33 +212,30 @@ def _rate_table(crossed: Crossed) -> str:
 
 def all_section(shown: Shown) -> list[Block]:
     """Every elite in a table that can be sorted."""
-    elites, archive = shown.elites, shown.material.archive
-    head = ["elite", "fitness", "mode", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]", "std / mean",
-            "iteration", *(f"{label_of(name)} [%]" for name in elites.penalties)]  # fmt: skip
+    elites, archive, families = shown.elites, shown.material.archive, shown.ranking.families
+    head = ["elite", "goal [%]", "95 % interval", "judged", "base collision [%]", "fallen [%]", "mode", "family",
+            "fitness", "std / mean", "iteration", *(f"{label_of(name)} [%]" for name in elites.penalties)]  # fmt: skip
     rows, keys = [], []
-    for k, number in enumerate(elites.numbers.tolist()):
+    order = elites.by_severity()
+    for k, number in zip(order.tolist(), elites.numbers[order].tolist(), strict=True):
         rate = Rate(elites.hits("goal_rate", k), int(elites.counted[k]))
         rates = [float(values[k]) for values in (elites.goal_rate, elites.collision_rate, elites.fallen_rate)]
         goal, collision, fallen = (f"{100 * value:.0f}" for value in rates)
-        mode, found = int(shown.modes.labels[k]), int(archive.iteration[number])
+        mode, family, found = int(shown.modes.labels[k]), int(families[k]), int(archive.iteration[number])
+        judged = int(elites.verdict[k])
         shares, fitness, variation = elites.ratios[k].tolist(), elites.fitness[k], elites.variation[k]
         rows.append(
-            [f"{number}", f"{fitness:.2f}", f"{mode}", goal, rate.limits, collision, fallen, f"{variation:.2f}",
-             f"{found}", *(f"{100 * share:.0f}" for share in shares)]
+            [f"{number}", goal, rate.limits, VERDICTS[judged], collision, fallen, f"{mode}", f"{family}",
+             f"{fitness:.2f}", f"{variation:.2f}", f"{found}", *(f"{100 * share:.0f}" for share in shares)]
         )  # fmt: skip
         low = wilson_interval(*rate)[0]
-        values = [number, fitness, mode, rates[0], low, *rates[1:], variation, found, *shares]
+        values = [number, rates[0], low, judged, *rates[1:], mode, family, fitness, variation, found, *shares]
         keys.append([f"{value:.5g}" for value in values])
-    if archive.faults is not None:
-        head.append("judged")
-        for row, key, number in zip(rows, keys, elites.numbers.tolist(), strict=True):
-            row.append(judged := verdict_of(archive, number))
-            key.append(f"{VERDICTS.index(judged)}")
-    links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers.tolist()]
+    links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers[order].tolist()]
     again = plain_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
     listed = table(head, rows, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
     text = (
-        f"All {counted(len(rows), 'elite')}, the highest fitness first; a click on a heading sorts. `{again}` crosses "
-        "one again."
+        f"All {counted(len(rows), 'elite')}, faults first, then what fails most; a click on a heading sorts. Terrains "
+        f"of one family look alike. `{again}` crosses one again."
     )
     return [paragraph(text), listed]

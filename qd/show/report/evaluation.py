@@ -105,6 +105,10 @@ def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     several = len(kinds["controllers"]) < len(tables["controllers"])
     text += ", of several trainings that differ in their seed over these." if several else "."
     trained = [f"{who} on {what}" for who, what in _TRAINED_ON.items() if who in tables["controllers"]]
+    text += (
+        " A robot that stands still or walks off has no base collision either: it may have 100 % there and never "
+        "reach the goal. Read the goal rate first."
+    )
     return text + (f" By their names these are {first} trained further: {'; '.join(trained)}." if trained else "")
 
 

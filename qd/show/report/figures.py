@@ -9,7 +9,7 @@ import numpy as np
 
 from qd.show.elites import Elites
 from qd.show.figures import label_of, look_of, new_figure
-from qd.show.report.modes import TOLERANCE, Modes
+from qd.show.modes import TOLERANCE, Modes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,7 +65,7 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
     place: dict[str, Any] = (
         {"loc": "upper right"} if count > 3 else {"loc": "outside lower center", "ncols": len(labels)}
     )
-    figure.legend(handles, labels, title="failure mode (elites)", markerscale=1.8, frameon=False, **place)
+    figure.legend(handles, labels, title="mode (elites)", markerscale=1.8, frameon=False, **place)
     return figure
 
 

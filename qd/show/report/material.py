@@ -11,7 +11,9 @@ from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
 from qd.show.elites import Elites, find_archive
 from qd.show.figures import summary
-from qd.show.report.modes import Modes
+from qd.show.modes import Modes
+from qd.show.ranking import Ranking
+from qd.show.report.minimal import MinimalFound, read_minimal_numbers
 from qd.show.report.tables import Change, Changes, read_tables
 from sim.files.atomic import prepare_output
 from sim.files.command import command_line
@@ -45,6 +47,7 @@ class Material:
     reproduced_by: dict[str, Any]
     """Where the fresh episodes come from, likewise; empty if there are none or that is not on record."""
     gpus: int | None
+    minimal: MinimalFound | None
     tables: dict[str, Any] | None
     tables_file: Path
     """Where the tables are, or would be looked for."""
@@ -75,10 +78,9 @@ class Shown:
     """All that the sections take their numbers from."""
 
     material: Material
-    elites: Elites
-    modes: Modes
+    ranking: Ranking
     worst: list[int]
-    """Numbers of the failed terrains with the highest fitness; if there are fewer, of others after them."""
+    """Numbers of the worst terrains: one of each way of failing, then of other families, then others."""
     steady: list[int]
     """Numbers of the most reproducible ones."""
     crossed: Mapping[int, Crossed] = field(default_factory=dict)
@@ -93,10 +95,20 @@ class Shown:
     """What both controllers make of each."""
 
     @property
+    def elites(self) -> Elites:
+        """All elites."""
+        return self.ranking.elites
+
+    @property
+    def modes(self) -> Modes:
+        """Their groups."""
+        return self.ranking.modes
+
+    @property
     def numbers(self) -> list[int]:
         """Elites to be shown in detail, each once: the worst, the steadiest, and the typical one of each mode."""
         typical = [mode.typical for mode in self.modes.modes]
-        return list(dict.fromkeys([*self.worst, *self.steady, *typical]))
+        return list(dict.fromkeys([*self.ranking.leaders(), *self.worst, *self.steady, *typical]))
 
 
 def gather(cfg: "Report") -> Material:
@@ -135,6 +147,7 @@ def gather(cfg: "Report") -> Material:
         origin={key: config[key] for key in _ORIGIN if key in config},
         reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
+        minimal=read_minimal_numbers(found.folder, archive),
         tables=read_tables(tables_file, robot) if has_tables else None,
         tables_file=tables_file,
     )

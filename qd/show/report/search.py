@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 
 from qd.archive import Archive
-from qd.faults import any_of, fault_numbers, fault_words
+from qd.faults import VERDICTS, any_of, fault_numbers, fault_words
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
+from qd.show.crossed import ARRIVED
+from qd.show.crossing_figures import draw_maps
 from qd.show.elites import Elites
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
 from qd.show.report.evaluation import most_mended
@@ -31,6 +33,7 @@ from sim.files.intervals import bootstrap_interval
 from sim.policy.spec import SHIPPED, ControllerSpec
 
 _AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes
+_MIN_PICTURED = 4  # terrains that the page begins with
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
@@ -47,9 +50,9 @@ def outcome_section(shown: Shown) -> list[Block]:
     mended = most_mended(tables) if tables else None
     facts = at_a_glance(
         [
+            *_faults_at_a_glance(archive),
             ("terrains, the hardest of each cell, that under half of the robots cross", f"{failing:,}"),
             ("different ways of failing: cells that these fall into", f"{ways:,}"),
-            *_faults_at_a_glance(archive),
             ("failure modes: kinds of these ways", f"{sum(mode.failing for mode in shown.modes.modes)}"),
             ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
             ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
@@ -73,8 +76,41 @@ def outcome_section(shown: Shown) -> list[Block]:
         f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal. The rates are means over terrains"
         f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
-    told = (_common(shown), text, *fault_words(archive), explained)
-    return [_searched(shown), facts, *map(paragraph, told)]
+    known = fault_words(archive)
+    about = [paragraph(" ".join([*known, text]))] if known else [paragraph(text), _no_faults(shown)]
+    return [_searched(shown), facts, *about, paragraph(_common(shown)), *_pictured(shown), paragraph(explained)]
+
+
+def _no_faults(shown: Shown) -> Block:
+    """That nobody knows yet which of what fails are faults, and the command that says it."""
+    material = shown.material
+    word = "certify" if material.archive.fresh is not None else "reevaluate"
+    text = "Which of these are faults, terrains that another controller crosses, is not known yet. Next:"
+    return absent(text, plain_command(word, robot=material.robot.spec, run=material.run))
+
+
+def _pictured(shown: Shown) -> list[Block]:
+    """The worst terrain of each way of failing, and where these are few some more that are unlike them."""
+    elites, modes, leaders = shown.elites, shown.modes, shown.ranking.leaders()
+    failing = [number for number in shown.worst if elites.failing[elites.place_of(number)]]
+    drawn, told = {}, []
+    for number in list(dict.fromkeys([*leaders, *failing]))[: max(_MIN_PICTURED, len(leaders))]:
+        place = elites.place_of(number)
+        mode = modes.modes[int(modes.labels[place]) - 1]
+        verdict = VERDICTS[int(elites.verdict[place])]
+        if number in shown.crossed and len(shown.crossed[number].chosen):
+            arrived = shown.crossed[number].rates[ARRIVED]
+            drawn[f"mode {mode.number}: elite {number}, {verdict}, goal {arrived.hits} of {arrived.count}"] = (
+                shown.crossed[number]
+            )
+            told.append(f"mode {mode.number}, the robot {mode.deed}: elite {number} ({verdict}), goal {arrived}")
+    if not drawn:
+        return []
+    more = " and others unlike these," * (len(told) > len(leaders))
+    text = f"The worst terrain of each way of failing,{more} crossed again, with 95 % intervals: {'; '.join(told)}."
+    shows = "Height map of a terrain of each way of failing with the robots' paths"
+    figure = draw_maps(drawn, f"{shown.material.archive.robot}: terrains that are not crossed")
+    return [paragraph(text), picture("failing", figure, shows)]
 
 
 def _faults_at_a_glance(archive: Archive) -> list[tuple[str, str]]:
@@ -99,7 +135,7 @@ def _common(shown: Shown) -> str:
         f"{mode.deed} on {counted(len(mode.members), 'elite')} (mode {mode.number}; goal {percent(mode.goal_rate)})"
         for mode in modes
     ]
-    return f"The robot {'; '.join(told)}. The chapters Failure modes and Terrains worth a look show where and how."
+    return f"The robot {'; '.join(told)}. The chapters Terrains worth a look and Modes show where and how."
 
 
 def _rate(rates: np.ndarray) -> str:
@@ -196,7 +232,7 @@ def pairs_section(shown: Shown) -> list[Block]:
         too_few = f"The projections are left out: they need 3 elites, and there are {len(elites)}."
         longer = plain_command("archive", resume=shown.material.run, iterations="N")
         return [absent(f"{too_few} A longer search finds more:", longer)]
-    text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode (next chapter)."
+    text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its mode (chapter Modes)."
     text += _related(elites)
     shows = "Scatter plots of every two shares of the penalties, by failure mode"
     return [paragraph(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]

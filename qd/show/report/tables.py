@@ -14,7 +14,11 @@ from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
 from sim.robots.identity import check_robot
 from sim.robots.robot import RobotCfg
 
-MEASURES = {"success": "success (no base collision)", "goal": "goal reached", "reward": "training reward"}
+MEASURES = {
+    "goal": "goal reached",
+    "success": "no base collision (the paper's success)",
+    "reward": "training reward",
+}
 """Measures shown, in words; the first two are fractions."""
 CHANGES = ("mended", "still_failing", "newly_broken", "fine")
 """What may have become of a terrain between two controllers."""

@@ -24,6 +24,8 @@ class Address:
 
     elite: int | None = None
     controller: str | None = None
+    ghost: str | None = None
+    """The controller that crosses beside it."""
     episode: int | None = None
     """Counted from 1."""
     time_s: float | None = None
@@ -36,7 +38,8 @@ class Address:
     def query(self) -> str:
         """The address behind its question mark."""
         said: list[tuple[str, str]] = list(self.others)
-        named = (("elite", self.elite), ("controller", self.controller), ("episode", self.episode))
+        named = (("elite", self.elite), ("controller", self.controller), ("ghost", self.ghost),
+                 ("episode", self.episode))  # fmt: skip
         said += [(name, str(value)) for name, value in named if value is not None]
         if self.time_s is not None:
             said.append(("t", f"{self.time_s:.2f}".rstrip("0").rstrip(".")))
@@ -59,7 +62,7 @@ def read_address(query: str) -> tuple[Address, list[str]]:
     """
     pairs = parse_qsl(query.removeprefix("?"), keep_blank_values=True)
     said, refused = dict(pairs), []
-    ours = {"elite", "controller", "episode", "t", "follow", _POSITION, _LOOK_AT}
+    ours = {"elite", "controller", "ghost", "episode", "t", "follow", _POSITION, _LOOK_AT}
 
     def number(name: str, words: str) -> float | None:
         if name not in said:
@@ -78,6 +81,7 @@ def read_address(query: str) -> tuple[Address, list[str]]:
     return Address(
         elite=None if elite is None else int(elite),
         controller=said.get("controller"),
+        ghost=said.get("ghost"),
         episode=None if episode is None else int(episode),
         time_s=time_s,
         follow=said.get("follow") == "1",
@@ -102,7 +106,7 @@ def ask_query(client: viser.ClientHandle) -> str:
     """
     key = f"faultline-address-{uuid.uuid4()}"
     client.local_storage.set_item(key, "")
-    _run(client, f"for (const k of Object.keys(localStorage)) if (k.endsWith({json.dumps(key)})) "
+    run_script(client, f"for (const k of Object.keys(localStorage)) if (k.endsWith({json.dumps(key)})) "
          "localStorage.setItem(k, location.search);")  # fmt: skip
     try:
         return client.local_storage.get_item(key, timeout=_ANSWER_S) or ""
@@ -114,12 +118,12 @@ def ask_query(client: viser.ClientHandle) -> str:
 
 def show_query(client: viser.ClientHandle, query: str) -> None:
     """Have a browser show another address, without loading anything or an entry in its history."""
-    _run(client, f"history.replaceState(history.state, '', {json.dumps('?' + query)});")
+    run_script(client, f"history.replaceState(history.state, '', {json.dumps('?' + query)});")
 
 
 def copy_link(client: viser.ClientHandle) -> None:
     """Have a browser copy its address; where it may not, it shows the link to be copied by hand."""
-    _run(client, "const link = location.href, ask = () => window.prompt('Copy this link', link);"
+    run_script(client, "const link = location.href, ask = () => window.prompt('Copy this link', link);"
          "navigator.clipboard ? navigator.clipboard.writeText(link).catch(ask) : ask();")  # fmt: skip
 
 
@@ -130,11 +134,11 @@ def keep_keys(client: viser.ClientHandle, names: Sequence[str]) -> None:
         client: The browser.
         names: As a keyboard event's ``code`` has them.
     """
-    _run(client, f"const kept = {json.dumps(list(names))};"
+    run_script(client, f"const kept = {json.dumps(list(names))};"
          "document.documentElement.addEventListener('keydown', e => "
          "{ if (kept.includes(e.code)) e.stopPropagation(); });")  # fmt: skip
 
 
-def _run(client: viser.ClientHandle, script: str) -> None:
+def run_script(client: viser.ClientHandle, script: str) -> None:
     """Run a script in a browser; viser does so for its plots, and has no public name for it."""
     client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=script))

@@ -10,7 +10,6 @@ import viser
 from qd.show.recordings import Recordings
 from qd.show.view.address import ask_query, read_address
 from qd.show.view.command import Show
-from qd.show.view.plots import axes_of
 from qd.show.view.recorder import Recorder, Report
 from qd.show.view.scene import first_view_of, shapes_of
 from qd.show.view.tab import Common, Tab
@@ -51,7 +50,7 @@ class App:
         skeleton = Skeleton(show.robot)
         self._common = Common(
             show=show,
-            axes=axes_of(show.found.archive),
+            axes=show.axes,
             skeleton=skeleton,
             shapes=shapes_of(skeleton, show.robot),
             recordings=recordings,

@@ -4,18 +4,21 @@ import errno
 import socket
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from qd.archive import goal_rates
 from qd.run.directory import RESULTS, RUNS
 from qd.show.elites import Found, find_archive
 from qd.workers.evaluator import check_policy
 from sim.files.atomic import prepare_output
 from sim.files.command import OfRobot, Which
 from sim.files.settings import check, setting
-from sim.policy.spec import ControllerSpec
+from sim.policy.spec import ControllerSpec, controller_hash
 
 if TYPE_CHECKING:
+    from qd.show.view.plots import Axes
     from sim.robots.robot import RobotCfg
 
 SEARCHED = "as searched"
@@ -26,11 +29,12 @@ SEARCHED = "as searched"
 class View(OfRobot, Which):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
-    Left, the archive on parallel axes. Under "Ranges" drag the ends of an axis: elites outside turn grey and leave the
-    list under "Worst first". Click a line of the list to see that terrain. Right, its crossing: play, pause, drag the
-    time, go from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are contact forces
-    (1 m is 1,000 N), the green one over the robot is its command; curves are what it is penalised for. Crossings that
-    were not recorded before are run on the CPU, which takes seconds, and are kept under --cache.
+    Left, the archive on parallel axes; a click on a line of the plot or of the list under "Elites" shows that terrain.
+    The list begins with one terrain of each way of failing, and can be sorted and narrowed. Under "Ranges" drag the
+    ends of an axis: elites outside turn grey and leave the list. Right, its crossing: play, pause, drag the time, go
+    from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are contact forces (1 m is
+    1,000 N), the green one over the robot is its command; curves are what it is penalised for. Crossings that were not
+    recorded before are run on the CPU, which takes seconds, and are kept under --cache.
 
     Every tab of a browser is on its own, and its address holds what it shows: ?elite=12&controller=C-G&t=8.4 opens
     just that.
@@ -39,9 +43,12 @@ class View(OfRobot, Which):
     open the page at home.
     """
 
+    elite: str = ""
+    """Number of the elite to show first; the first of the list if left out."""
     policies: tuple[str, ...] = ()
     """Controllers to choose from, each NAME=FILE, NAME=module:callable or NAME=shipped, such as base=shipped
-    C-G=runs/tuned/policy.pt; the one the archive was made with if none is given."""
+    C-G=runs/tuned/policy.pt; if none is given, the one the archive was made with, and those of the robot's panel that
+    certify its faults."""
     replicas: int = setting(20, least=1, most=100)
     """Episodes of each elite, from different starts; fewer are recorded sooner."""
     port: int = 8080
@@ -63,12 +70,37 @@ class Show:
 
     cfg: View
     found: Found
-    elite: int
-    """Which to show first."""
+    elite: int | None
+    """Which to show first; None for the first of the list."""
     controllers: dict[str, str]
     """What each controller is loaded from, by its name; empty if that of the search is lost."""
     note: str
     """Why there is no controller; empty if there is one."""
+
+    @cached_property
+    def axes(self) -> "Axes":
+        """All elites, and the orders to list them in."""
+        from qd.show.view.plots import axes_of
+
+        return axes_of(self.found.archive, self.found.space)
+
+    @cached_property
+    def _certifiers(self) -> dict[str, int]:
+        """Place among the archive's certifiers of the controllers that are some."""
+        faults = self.found.archive.faults
+        known = () if faults is None else faults.certifier_sha256
+        hashes = {name: controller_hash(policy) for name, policy in self.controllers.items()}
+        return {name: known.index(digest) for name, digest in hashes.items() if digest in known}
+
+    def certifying(self, number: int) -> str | None:
+        """The controller that crosses an elite which fails, the best of several; None if none of these does."""
+        archive = self.found.archive
+        faults = archive.faults
+        if faults is None or not archive.certified[number]:
+            return None
+        crosses, rates = faults.certificates()[number], goal_rates(faults.certifier_outcomes[number])
+        found = [name for name, place in self._certifiers.items() if crosses[place]]
+        return max(found, key=lambda name: rates[self._certifiers[name]], default=None)
 
     @property
     def robot(self) -> "RobotCfg":
@@ -117,7 +149,7 @@ def show_of(cfg: View) -> Show:
     found = find_archive(cfg.robot, cfg.run, space=cfg.space)
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: {found.go_on}, or give another --run")
-    elite = found.one(cfg.elite)
+    elite = found.one(cfg.elite) if cfg.elite else None
     controllers, note = _controllers_of(cfg, found)
     prepare_output(cfg.cache / "recording.npz")
     return Show(cfg=cfg, found=found, elite=elite, controllers=controllers, note=note)
@@ -140,7 +172,19 @@ def _controllers_of(cfg: View, found: Found) -> tuple[dict[str, str], str]:
         check_policy(policy, found.robot, "cpu")
     except ValueError as error:
         return {}, f"{error}; name a controller with --policies to see crossings"
-    return {SEARCHED: policy}, ""
+    return {SEARCHED: policy, **_panel_of(found, policy)}, ""
+
+
+def _panel_of(found: Found, searched: str) -> dict[str, str]:
+    """The robot's panel as far as it crossed the archive, by the names it has there."""
+    from qd.run.judge import panel_files
+
+    faults = found.archive.faults
+    if faults is None:
+        return {}
+    names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
+    files = panel_files(found.robot, lambda file: controller_hash(file) == controller_hash(searched))
+    return {names[digest]: file for file in files.values() if (digest := str(controller_hash(file))) in names}
 
 
 def check_port(host: str, port: int) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from qd.show.crossed import ENDINGS
 from qd.show.view.meshes import Color
-from qd.show.view.scene import COMMAND_COLOR, FOOT_TOUCH_COLOR, FORCE_COLOR, TOUCH_COLOR
+from qd.show.view.scene import COMMAND_COLOR, FOOT_TOUCH_COLOR, FORCE_COLOR, GHOST_COLOR, TOUCH_COLOR
 from sim.recording.scene import height_colors
 
 
@@ -31,6 +31,7 @@ def legend_html(controllers: Sequence[str]) -> str:
         + _swatch(_hex(COMMAND_COLOR), "commanded velocity, 1 m is 1 m/s"),
         f"<b>Controllers</b>: {', '.join(map(escape, controllers)) or 'none'}; robot, paths and curves are those of "
         "the one that is chosen.",
+        "<b>Ghost</b>: " + _swatch(_hex(GHOST_COLOR), "a second controller, at the same time from the same start"),
     ]
     return "".join(f'<div style="font-size:0.85em;padding:0.15em 0.6em">{row}</div>' for row in rows)
 

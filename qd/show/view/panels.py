@@ -3,8 +3,8 @@
 They hand on what a visitor does to the :class:`qd.show.view.tab.Tab`, by the viewer's loop.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from qd.show.ranking import ORDERS
 from qd.show.view.legend import legend_html
-from qd.show.view.plots import Axes, axes_svg
+from qd.show.view.plots import FITNESS_WORDS, Axes, Choice, axes_svg
 from qd.show.view.scene import first_view_of
 
 if TYPE_CHECKING:
@@ -31,10 +32,10 @@ _CONTROL_DT = 0.02  # step of the time slider [s]
 
 
 class Selection:
-    """Which elites are in the brushed ranges, and which of them is picked."""
+    """Which elites are listed in which order, and which of them is picked."""
 
     def __init__(self, axes: Axes) -> None:
-        """Nothing brushed, the worst elite picked.
+        """All elites listed, the first picked.
 
         Args:
             axes: Of at least one elite.
@@ -42,10 +43,12 @@ class Selection:
         self._axes = axes
         self.ranges: dict[str, tuple[float, float]] = {}
         """Brushed ranges by axis; an axis that is open at both ends has none."""
-        self.kept: NDArray[np.int64] = axes.within({})
-        """Numbers of the elites in all ranges, worst first."""
-        self.picked = 0
-        """Number of the elite that is shown; it stays when a range leaves it out."""
+        self.choice = Choice(ranges=self.ranges)
+        """What is listed."""
+        self.kept: NDArray[np.int64] = axes.listed(self.choice)
+        """Numbers of the elites that are listed, in their order."""
+        self.picked = int(self.kept[0])
+        """Number of the elite that is shown; it stays when it is not listed any more."""
         self.page = 0
         """Page of the list, from 0."""
 
@@ -69,13 +72,18 @@ class Selection:
             self.ranges[name] = (low, high)
         self._keep()
 
-    def clear(self) -> None:
-        """Free all axes."""
-        self.ranges.clear()
+    def choose(self, **changes: Any) -> None:
+        """List other elites, or in another order: fields of :class:`qd.show.view.plots.Choice`."""
+        self.choice = replace(self.choice, **changes)
         self._keep()
 
+    def clear(self) -> None:
+        """List all elites, in the order that was chosen."""
+        self.ranges.clear()
+        self.choose(kind="all", mode=None)
+
     def _keep(self) -> None:
-        self.kept = self._axes.within(self.ranges)
+        self.kept = self._axes.listed(self.choice)
         self.page = 0
 
     def turn(self, pages: int) -> None:
@@ -83,21 +91,24 @@ class Selection:
         self.page = int(np.clip(self.page + pages, 0, self.num_pages - 1))
 
     def pick(self, number: int) -> bool:
-        """Show an elite, and its page of the list if it is in the ranges; returns whether it is another one."""
-        place = np.searchsorted(self.kept, number)
-        if place < len(self.kept) and self.kept[place] == number:
-            self.page = int(place) // PAGE
+        """Show an elite, and its page of the list if it is listed; returns whether it is another one."""
+        place = np.flatnonzero(self.kept == number)
+        if len(place):
+            self.page = int(place[0]) // PAGE
         changed = number != self.picked
         self.picked = number
         return changed
 
     def step(self, by: int) -> int:
-        """Number of the next (1) or previous (-1) elite in the ranges; the picked one if there is none."""
-        if by > 0:
-            later = self.kept[self.kept > self.picked]
-            return int(later[0]) if len(later) else self.picked
-        earlier = self.kept[self.kept < self.picked]
-        return int(earlier[-1]) if len(earlier) else self.picked
+        """Number of the next (1) or previous (-1) elite of the list; the picked one if there is none.
+
+        Of one that is not listed any more, the neighbours are those of its place among all elites.
+        """
+        everyone = self._axes.listed(Choice(ranges={}, order=self.choice.order))
+        place = np.argsort(everyone)  # of each elite by its number
+        there = place[self.kept] - place[self.picked]
+        near = self.kept[there > 0][:1] if by > 0 else self.kept[there < 0][-1:]
+        return int(near[0]) if len(near) else self.picked
 
 
 @dataclass(kw_only=True)
@@ -162,23 +173,36 @@ class ArchivePanel:
             self._title = self._gui.add_html(f'<div style="padding:0.2em 0.6em">{words}</div>')
             self._plot = self._gui.add_html("")
             self._count = self._gui.add_markdown("")
+            self._again = self._add_button("List all elites", self.change, selection.clear)
+            with self._gui.add_form(None) as form:
+                self._number = self._gui.add_text("Number, Enter", "0")
+            form.on_submit(lambda event: self._post(self._tab.pick_typed, self._number.value))
             tabs = self._gui.add_tab_group()
-            with tabs.add_tab("Worst first"):
+            with tabs.add_tab("Elites"):
                 self._add_list()
             with tabs.add_tab("Ranges"):
                 self._sliders = {axis.name: self._add_slider(axis.name) for axis in axes.axes}
                 self._add_button("Free all axes", self.change, selection.clear)
 
     def _add_list(self) -> None:
-        self._gui.add_markdown("Elite: fitness · base collision · goal reached, with 95 % intervals")
+        orders = {words: name for name, words in ORDERS.items()}
+        self._choosers = {
+            "order": (self._add_chooser("Sort", "order", orders, FITNESS_WORDS), orders),
+            "kind": (self._add_chooser("Only", "kind", kinds := self._axes.kinds()), kinds),
+            "mode": (self._add_chooser("Mode", "mode", modes := self._axes.modes()), modes),
+        }
+        self._gui.add_markdown("Elite: what it is · goal reached, with its 95 % interval · base collision")
         self._lines = [self._add_button("", self._tab.pick_line, k) for k in range(PAGE)]
         count = len(self._axes.elites)
         turns = {"first": -count, "previous": -1, "next": 1, "last": count}
         _add_choices(self._gui, "Page", turns, lambda by: self._post(self.change, self._selection.turn, by))
-        _add_choices(self._gui, "Elite", {"worse": -1, "milder": 1}, lambda by: self._post(self._tab.step, by))
-        with self._gui.add_form(None) as form:
-            self._number = self._gui.add_text("Number, Enter", "0")
-        form.on_submit(lambda event: self._post(self._tab.pick_typed, self._number.value))
+        _add_choices(self._gui, "Elite", {"previous": -1, "next": 1}, lambda by: self._post(self._tab.step, by))
+
+    def _add_chooser(self, label: str, name: str, options: Mapping[str, object], hint: str | None = None) -> Any:
+        """A list of what a field of the choice can be."""
+        chooser = self._gui.add_dropdown(label, tuple(options), hint=hint)
+        _on_visit(chooser, lambda words: self._post(self.choose, name, options[str(words)]))
+        return chooser
 
     def _post(self, act: Callable[..., None], *args: object, only_last: object = None) -> None:
         self._tab.common.post(act, *args, only_last=only_last)
@@ -205,13 +229,25 @@ class ArchivePanel:
         """List the elites in a range of an axis."""
         self.change(self._selection.brush, name, low, high)
 
+    def choose(self, name: str, value: object) -> None:
+        """List other elites, or in another order."""
+        self._selection.choose(**{name: value})
+        self.show()
+
     def show(self) -> None:
         """Draw plot and list anew."""
         selection = self._selection
         kept, listed = selection.kept, selection.listed
         self._plot.content = axes_svg(self._axes, kept, selection.ranges, selection.picked)
-        pages = f" · page {selection.page + 1} of {selection.num_pages}" if len(kept) else ""
-        self._count.content = f"**{len(kept):,}** of {len(self._axes.elites):,} elites in the ranges{pages}"
+        pages = f" · page {selection.page + 1} of {selection.num_pages}"
+        words = f"**{len(kept):,}** of {len(self._axes.elites):,} elites{pages}"
+        if not len(kept):
+            words = f"**None of {len(self._axes.elites):,} elites** is of this kind and mode within these ranges."
+        self._count.content = words
+        self._again.visible = not len(kept)
+        for name, (chooser, options) in self._choosers.items():
+            chosen = getattr(selection.choice, name)
+            chooser.value = next(words for words, value in options.items() if value == chosen)
         for k, button in enumerate(self._lines):
             there = k < len(listed)
             button.visible = there
@@ -242,11 +278,14 @@ class CrossingPanel:
         self._details = gui.add_markdown("")
         self._controller = gui.add_dropdown("Controller", tuple(controllers) or ("none",), disabled=not controllers)
         _on_visit(self._controller, lambda name: self._post(tab.choose_controller, str(name)))
+        self._ghost: Any = gui.add_dropdown("Ghost", tab.ghost.choices, disabled=not controllers)
+        _on_visit(self._ghost, lambda name: self._post(tab.choose_ghost, str(name)))
         self._groups: Any = gui.add_dropdown("Episodes", ("none",), disabled=True)
         _on_visit(self._groups, lambda name: self._post(tab.choose_group, str(name)))
         self._episode: Any = gui.add_dropdown("Episode", ("none",), disabled=True)
         _on_visit(self._episode, lambda name: self._post(tab.choose_replica, int(str(name).split(":")[0]) - 1))
         self._status = gui.add_html("")
+        self._ghost_status = gui.add_html("")
         self._progress = gui.add_progress_bar(0.0, visible=False)
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         self._play.on_click(lambda event: self._post(tab.play))
@@ -284,6 +323,11 @@ class CrossingPanel:
         if name is not None:
             self._controller.value = name
 
+    def show_ghost(self, choice: str, words: str) -> None:
+        """Say who the ghost is to be, and as HTML what became of it."""
+        self._ghost.value = choice
+        self._ghost_status.content = _small(words)
+
     def show_episodes(self, groups: Sequence[str], group: str, episodes: dict[int, str], shown: int) -> None:
         """Offer episodes.
 
@@ -305,7 +349,7 @@ class CrossingPanel:
 
     def show_status(self, text: str, share: float | None = None) -> None:
         """Say how the crossing ended, as HTML, or how far its recording is (0 to 1)."""
-        self._status.content = f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>'
+        self._status.content = _small(text)
         self._progress.visible = share is not None
         if share is not None:
             self._progress.value = 100.0 * share
@@ -370,6 +414,11 @@ def add_keys(client: viser.ClientHandle, tab: "Tab") -> None:
     for label, (key, act) in asked.items():
         command = client.gui.add_command(label, hotkey=key)
         command.on_trigger(lambda event, act=act: tab.common.post(*act))
+
+
+def _small(text: str) -> str:
+    """HTML in small print."""
+    return f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>' if text else ""
 
 
 def _add_choices(gui: Any, label: str, choices: dict[str, Any], act: Callable[[Any], None]) -> None:

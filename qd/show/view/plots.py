@@ -1,23 +1,44 @@
 """Plots of the page as SVG: the elites on parallel axes, and the penalties of a crossing over its time."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.show.elites import Elites, elites_of
+from qd.faults import VERDICTS, elite_words
+from qd.show.crossed import ARRIVED, Rate
+from qd.show.elites import Elites
 from qd.show.figures import label_of, look_of
+from qd.show.ranking import ORDERS, Ranking, rank
 from sim.files.intervals import rate_words
+from sim.space import TerrainSpace
 
-_SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites by fitness, the worst darkest
+_SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites in the list's order, the first darkest
 _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
 _WIDTH, _HEIGHT = 460, 350
 _TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 16
 _CURVES_HEIGHT, _MARGIN, _MARK_ROW = 170, 24, 14
-_RATES = {"collision_rate": "base collision", "goal_rate": "goal reached", "fallen_rate": "fallen"}
+_RATES = {"goal_rate": "goal reached", "collision_rate": "base collision", "fallen_rate": "fallen"}
+_CROSSED = {**_RATES, "goal_rate": ARRIVED}  # as recordings name them
+FITNESS_WORDS = (
+    "Fitness is what the search looks for: the mean of the scaled penalties, less how much they differ between "
+    "episodes, less a share of episodes without a base collision where others have one. High means costly in every "
+    "episode alike. It does not say that the robot fails: read the goal rate for that."
+)
+"""What fitness is, and what it is not."""
+KINDS = {
+    "all": VERDICTS,
+    "faults": ("fault",),
+    "certified": ("certified", "fault"),
+    "confirmed": ("confirmed", "fault"),
+    "failing": VERDICTS[1:],
+    "not failing": ("",),
+}
+"""Kinds of elites to choose from: the verdicts that each has."""
 _RATE_STEP, _FITNESS_STEP = 0.01, 0.1
 
 
@@ -40,63 +61,136 @@ class Axis:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Which elites are listed, and in which order."""
+
+    ranges: Mapping[str, tuple[float, float]]
+    """Lower and upper limit by the name of an axis, limits included; an axis without one is not looked at."""
+    order: str = next(iter(ORDERS))
+    """One of the :data:`qd.show.ranking.ORDERS`."""
+    kind: str = "all"
+    """One of the :data:`KINDS`."""
+    mode: int | None = None
+    """Number of the failure mode; None for all of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Axes:
     """All elites of an archive on axes: ratios in the archive's order, fitness, rates."""
 
     archive: Archive
-    elites: Elites
+    ranking: Ranking
     axes: tuple[Axis, ...]
+
+    @property
+    def elites(self) -> Elites:
+        """All elites."""
+        return self.ranking.elites
+
+    @cached_property
+    def _orders(self) -> dict[str, NDArray[np.int64]]:
+        return {name: self.ranking.order(name) for name in ORDERS}
 
     def axis(self, name: str) -> Axis:
         """The axis of a name."""
         return next(axis for axis in self.axes if axis.name == name)
 
-    def within(self, ranges: dict[str, tuple[float, float]]) -> NDArray[np.int64]:
-        """Numbers of the elites that lie in all ranges, limits included, worst first.
-
-        Args:
-            ranges: Lower and upper limit by the name of an axis; an axis without one is not looked at.
-        """
-        kept = np.ones(len(self.elites), dtype=bool)
-        for name, (low, high) in ranges.items():
+    def listed(self, choice: Choice) -> NDArray[np.int64]:
+        """Numbers of the elites that are chosen, in the chosen order."""
+        kept = self._of_kind(choice.kind)
+        if choice.mode is not None:
+            kept = kept & (self.ranking.modes.labels == choice.mode)
+        for name, (low, high) in choice.ranges.items():
             axis = self.axis(name)
             slack = 1e-6 * axis.step  # a slider's decimals are not those of float64
-            kept &= (axis.values >= low - slack) & (axis.values <= high + slack)
-        return np.flatnonzero(kept)
+            kept = kept & (axis.values >= low - slack) & (axis.values <= high + slack)
+        order = self._orders[choice.order]
+        return order[kept[order]]
+
+    def _of_kind(self, kind: str) -> NDArray[np.bool_]:
+        return np.isin(self.elites.verdict, [VERDICTS.index(verdict) for verdict in KINDS[kind]])
+
+    def kinds(self) -> dict[str, str]:
+        """Kinds of elites by what they are called in words, with how many there are."""
+        return {f"{kind} ({int(self._of_kind(kind).sum()):,})": kind for kind in KINDS}
+
+    def modes(self) -> dict[str, int | None]:
+        """Failure modes by what they are called in words, with how many elites are in each."""
+        found: dict[str, int | None] = {"all modes": None}
+        for mode in self.ranking.modes.modes:
+            found[f"{mode.number}: {mode.ending} ({len(mode.members):,})"] = mode.number
+        return found
 
     def rate_text(self, name: str, number: int) -> str:
         """A rate of an elite with its 95 % interval (Wilson), such as ``45% (31 to 60%)``."""
         return rate_words(self.elites.hits(name, number), int(self.elites.counted[number]), short=True)
 
     def line(self, number: int) -> str:
-        """An elite on one line of the list: number, fitness, rates."""
-        collided, goal = (self.rate_text(name, number) for name in ("collision_rate", "goal_rate"))
-        return f"{number}: {self.elites.fitness[number]:.1f} · collision {collided} · goal {goal}"
+        """An elite on one line of the list: number, verdict, goal rate with its interval, collisions."""
+        verdict, collided = self.verdict(number), self.elites.collision_rate[number]
+        goal = self.rate_text("goal_rate", number)
+        return f"{number}: {f'{verdict} · ' * bool(verdict)}goal {goal} · collision {collided:.0%}"
 
-    def details(self, number: int) -> str:
-        """All that the archive says of an elite, as Markdown."""
-        archive, elites = self.archive, self.elites
-        count = elites.counted[number]
+    def verdict(self, number: int) -> str:
+        """What an elite is, one of :data:`qd.faults.VERDICTS`."""
+        return VERDICTS[int(self.elites.verdict[number])]
+
+    def hint(self, number: int) -> str:
+        """An elite in a few words."""
+        verdict = self.verdict(number)
+        return f"elite {number}{f', {verdict}' * bool(verdict)}: goal {self.elites.goal_rate[number]:.0%}"
+
+    def details(self, number: int, crossings: Mapping[str, Mapping[str, Rate]]) -> str:
+        """All that is known of an elite, as Markdown.
+
+        Args:
+            number: Its number.
+            crossings: Rates of the crossings that are shown, as :class:`qd.show.crossed.Crossed` has them, by whose
+                they are.
+        """
+        archive, elites, ranking = self.archive, self.elites, self.ranking
+        count, verdict = int(elites.counted[number]), self.verdict(number)
         of = f"{count} fresh episodes" if elites.fresh[number] else f"the {count} episodes that found it"
+        mode = ranking.modes.modes[int(ranking.modes.labels[number]) - 1]
+        family = int((ranking.families == ranking.families[number]).sum())
+        alike = f"{family - 1} other elite{'s' * (family != 2)} like it" if family > 1 else "no other elite like it"
+        heads = ["95 % intervals", f"as searched, {of}"]
+        heads += [
+            f"{escape(who)}, {next(iter(rates.values())).count} episodes here" for who, rates in crossings.items()
+        ]
+        rows = [
+            [label, self.rate_text(name, number)]
+            + [rate_words(*rates[_CROSSED[name]], short=True) for rates in crossings.values()]
+            for name, label in _RATES.items()
+        ]
         lines = [
-            f"**Elite {number}** of {len(elites)} · fitness **{elites.fitness[number]:.2f}** "
-            f"({archive.fitness[number]:.2f} as found in iteration {archive.iteration[number]})",
+            f"**Elite {number}** of {len(elites):,}{f' · **{verdict}**' * bool(verdict)} · mode {mode.number}: "
+            f"{mode.ending} · {alike}",
             "",
-            f"| as searched | of {of}, 95 % interval |",
-            "|---|---|",
-            *(f"| {label} | {self.rate_text(name, number)} |" for name, label in _RATES.items()),
+            *(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)),
+            "",
+            *elite_words(archive, number),
+            "",
+            f"Fitness **{elites.fitness[number]:.2f}** ({archive.fitness[number]:.2f} as found in iteration "
+            f"{archive.iteration[number]}). {FITNESS_WORDS}",
         ]
         return "\n".join(lines)
 
 
-def axes_of(archive: Archive) -> Axes:
-    """The axes of an archive that has elites."""
-    elites = elites_of(archive)
+def axes_of(archive: Archive, space: TerrainSpace) -> Axes:
+    """The axes of an archive that has elites.
+
+    Args:
+        archive: The archive.
+        space: Of its genes.
+    """
+    ranking = rank(archive, space)
+    elites = ranking.elites
     axes = [_axis_of(name, label_of(name), elites.ratios[:, k], _RATE_STEP) for k, name in enumerate(archive.penalties)]
     axes.append(_axis_of("fitness", "fitness", elites.fitness, _FITNESS_STEP))
     rates = {name: np.asarray(getattr(elites, name)) for name in _RATES}
     axes += [_axis_of(name, label, rates[name], _RATE_STEP) for name, label in _RATES.items()]
-    return Axes(archive=archive, elites=elites, axes=tuple(axes))
+    return Axes(archive=archive, ranking=ranking, axes=tuple(axes))
 
 
 def _axis_of(name: str, label: str, values: NDArray[np.float64], step: float) -> Axis:
@@ -108,12 +202,14 @@ def _axis_of(name: str, label: str, values: NDArray[np.float64], step: float) ->
     return Axis(name=name, label=label, values=values, low=round(low, 6), high=round(high, 6), step=step)
 
 
-def axes_svg(axes: Axes, kept: NDArray[np.int64], ranges: dict[str, tuple[float, float]], picked: int | None) -> str:
-    """The archive on parallel axes: a line an elite, grey outside the ranges, the picked one on top.
+def axes_svg(axes: Axes, kept: NDArray[np.int64], ranges: Mapping[str, tuple[float, float]], picked: int | None) -> str:
+    """The archive on parallel axes: a line an elite, grey if it is not listed, the picked one on top.
+
+    The lines can be pointed at in the browser (``pointing.js``): their paths name the elites they are of.
 
     Args:
         axes: Of all elites.
-        kept: Numbers of those in the ranges.
+        kept: Numbers of those that are listed, in their order.
         ranges: Range of each brushed axis.
         picked: Number of the picked elite, if any.
     """
@@ -121,13 +217,19 @@ def axes_svg(axes: Axes, kept: NDArray[np.int64], ranges: dict[str, tuple[float,
     y = np.stack([_height_of(axis, axis.values) for axis in axes.axes], axis=1)
     dropped = np.setdiff1d(np.arange(len(axes.elites)), kept)
     parts = [_lines(x, y[dropped], _GREY, 0.6, 0.6)]
-    # Equally many a shade, so that the worst stand out whatever the range of fitness.
+    # Equally many a shade, so that the first stand out whatever they are sorted by.
     for shade, numbers in zip(_SHADES, reversed(np.array_split(kept, len(_SHADES))), strict=True):
-        parts.append(_lines(x, y[numbers], shade, 0.8, 0.75))
+        parts.append(_lines(x, y[numbers], shade, 0.8, 0.75, _named(axes, numbers)))
     if picked is not None:
         parts.append(_lines(x, y[[picked]], _PICKED, 2.5, 1.0))
     parts += [_axis(axis, float(place), ranges.get(axis.name)) for axis, place in zip(axes.axes, x, strict=True)]
     return _svg(_HEIGHT, parts)
+
+
+def _named(axes: Axes, numbers: NDArray[np.int64]) -> str:
+    """Attributes of a path that name the elites its lines are of."""
+    hints = "|".join(map(axes.hint, numbers.tolist()))
+    return f'data-elites="{" ".join(map(str, numbers.tolist()))}" data-hints="{escape(hints)}"'
 
 
 def _height_of(axis: Axis, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -136,11 +238,13 @@ def _height_of(axis: Axis, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
 
 
-def _lines(x: NDArray[np.float64], rows: NDArray[np.float64], color: str, width: float, opacity: float) -> str:
+def _lines(
+    x: NDArray[np.float64], rows: NDArray[np.float64], color: str, width: float, opacity: float, more: str = ""
+) -> str:
     """Lines over the same x as one path."""
     path = "".join("M" + "L".join(f"{a:.0f} {b:.1f}" for a, b in zip(x, row, strict=True)) for row in rows)
     style = f'fill="none" stroke="{color}" stroke-width="{width}" stroke-opacity="{opacity}"'
-    return f'<path d="{path}" {style}/>' if path else ""
+    return f'<path d="{path}" {style} {more}/>' if path else ""
 
 
 def _axis(axis: Axis, x: float, brushed: tuple[float, float] | None) -> str:
@@ -155,7 +259,8 @@ def _axis(axis: Axis, x: float, brushed: tuple[float, float] | None) -> str:
     parts.append(_text(x, _TOP - 5, f"{axis.high:.{decimals}f}", "middle"))
     parts.append(_text(x, bottom + 12, f"{axis.low:.{decimals}f}", "middle"))
     turned = f'transform="rotate(-52 {x:.0f} {bottom + 24})"'
-    parts.append(_text(x + 4, bottom + 24, _shortened(axis.label), "end", turned))
+    explained = f"<title>{escape(FITNESS_WORDS)}</title>" if axis.name == "fitness" else ""
+    parts.append(f"<g>{explained}{_text(x + 4, bottom + 24, _shortened(axis.label), 'end', turned)}</g>")
     return "".join(parts)
 
 
@@ -229,7 +334,7 @@ class Curves:
 
     def at(self, time_s: float) -> str:
         """The curves with a mark at a time [s]."""
-        x = float(self._x(np.array([time_s]))[0])
+        x = float(self._x(np.array([min(time_s, self._end)]))[0])  # a second crossing may last longer
         bottom = self._top + _CURVES_HEIGHT - 18
         mark = f'<line x1="{x:.1f}" y1="6" x2="{x:.1f}" y2="{bottom}" stroke="#d00" stroke-width="1.5"/>'
         return _svg(self._top + _CURVES_HEIGHT, [self._drawn, mark])

@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -73,13 +73,13 @@ class Recorder:
         """
         self._robot, self._report, self._build = robot, report, build
         self._workers: dict[str, WorkerProcess] = {}  # by controller, the one used last at the end
-        self._wishes: dict[int, Wanted] = {}  # by tab, the oldest first
+        self._wishes: dict[Hashable, Wanted] = {}  # by tab, the oldest first
         self._stopped = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, wanted: Wanted | None, *, tab: int = 0) -> None:
+    def record(self, wanted: Wanted | None, *, tab: Hashable = 0) -> None:
         """Record these crossings for a tab when its turn comes; with None, nothing more for it after those at hand."""
         with self._changed:
             self._wishes.pop(tab, None)

@@ -19,6 +19,8 @@ from sim.terrain import SPACING
 TOUCH_COLOR, FOOT_TOUCH_COLOR = (214, 22, 122), (255, 214, 10)
 """Of base and limbs, and of feet, while they touch."""
 FORCE_COLOR, COMMAND_COLOR = (215, 25, 28), (0, 158, 115)
+GHOST_COLOR = (0, 114, 178)
+"""Of the second robot, which is translucent."""
 _START_COLOR, _GOAL_COLOR = (240, 200, 60), (0, 158, 115)
 _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
@@ -28,6 +30,7 @@ _PATH_RADIUS, _PATH_OPACITY = 0.008, 0.35
 _WAY_LIFT = 0.03  # over the ground [m]
 _POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
 _DISC_HEIGHT, _DISC_RADIUS = 0.03, 0.15  # at the start, where a post would stand in the robot
+_GHOST_OPACITY = 0.4
 _NAME_HEIGHT = 0.12  # of a foot's name over it [m]
 
 Points = NDArray[np.floating]
@@ -101,6 +104,8 @@ class Scene:
             name: self._add_mesh(f"/robot/touch/{name}", mesh, FOOT_TOUCH_COLOR if name in shapes.feet else TOUCH_COLOR)
             for name, _, mesh in shapes.touches
         }
+        self._ghost = scene.add_frame("/ghost", show_axes=False, visible=False)
+        self._ghosts: list[Any] = []  # its bodies, from when there is one
         # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
         arrow = arrow_mesh()
         self._forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(len(shapes.feet))]
@@ -178,6 +183,7 @@ class Scene:
     def hide_crossing(self) -> None:
         """Show the terrain alone."""
         self._robot.visible = False
+        self.hide_ghost()
         self._followed = None
         for handle in (*self._touches.values(), *self._forces, self._command, *self._names):
             handle.visible = False
@@ -240,6 +246,24 @@ class Scene:
                 handle.visible = self.show_names
                 handle.position = tuple(arrow[0] + np.array([0.0, 0.0, _NAME_HEIGHT]))
         self._go_along(positions[0])
+
+    def show_ghost(self, crossing: Crossing, frame: int) -> None:
+        """Put a second, translucent robot where it is at a frame of its own crossing."""
+        with self._client.atomic():
+            if not self._ghosts:
+                self._ghosts = [
+                    None if mesh is None else self._add_mesh(f"/ghost/{k}", mesh, GHOST_COLOR, opacity=_GHOST_OPACITY)
+                    for k, mesh in enumerate(self._shapes.bodies)
+                ]
+            self._ghost.visible = True
+            for k, handle in enumerate(self._ghosts):
+                if handle is not None:
+                    handle.visible = True
+                    _place(handle, crossing.positions[frame, k], crossing.quaternions[frame, k])
+
+    def hide_ghost(self) -> None:
+        """Show the robot alone."""
+        self._ghost.visible = False
 
     def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, *, opacity: float | None = None) -> Any:
         """A shape of one colour that is not to be seen yet."""

@@ -1,15 +1,17 @@
 """A browser tab: what it shows, and what happens when its visitor does something. No tab knows of another."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
 
 import viser
 
+from qd.show.crossed import crossed_of
 from qd.show.recordings import Recordings, Wanted, on_elite
 from qd.show.view.address import Address, copy_link, keep_keys, show_query
+from qd.show.view.ghost import CERTIFYING, Ghost
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection, add_keys
 from qd.show.view.playing import (
     Crossing,
@@ -22,6 +24,7 @@ from qd.show.view.playing import (
     paths_of,
 )
 from qd.show.view.plots import Axes, Curves
+from qd.show.view.pointing import let_point
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, Shapes, View, first_view_of, overview_of
 from sim.bank import heights_of
@@ -48,8 +51,8 @@ class Common:
     skeleton: Skeleton
     shapes: Shapes
     recordings: Recordings
-    record: Callable[[Wanted | None, int], None]
-    """Asks for crossings on behalf of a tab, by its number; of each tab the last ones count."""
+    record: Callable[[Wanted | None, Hashable], None]
+    """Asks for crossings on behalf of a tab or of its ghost; of each the last ones count."""
     post: Callable[..., None]
     """Has something done by the loop, with arguments; of what has equal ``only_last``, the last."""
 
@@ -79,25 +82,31 @@ class Tab:
         self._crossing: Crossing | None = None
         self._curves: Curves | None = None
         self._query, self._told, self._addressed = "", 0.0, time.perf_counter()
+        self.ghost = Ghost(common, client.client_id)
         self.scene = Scene(client, common.shapes, CrossingCfg())
         title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
         self._list = ArchivePanel(client, common.axes, self._selection, title, self)
         self._panel = CrossingPanel(client, list(show.controllers), self)
         add_keys(client, self)
         keep_keys(client, _KEPT_KEYS)
+        let_point(client)
         self._open(address, refused)
 
     def _open(self, address: Address, refused: list[str]) -> None:
         show, episodes = self.common.show, self.common.show.cfg.replicas
-        elite = show.elite if address.elite is None else address.elite
+        first = self._selection.picked if show.elite is None else show.elite
+        elite = first if address.elite is None else address.elite
         if not 0 <= elite < len(self._archive):
             refused.append(self._no_elite(elite))
-            elite = show.elite
+            elite = first
         if address.controller in show.controllers:
             self._controller = address.controller
         elif address.controller is not None:
-            there = ", ".join(show.controllers) or "none"
-            refused.append(f"There is no controller '{address.controller}' here: there are {there}.")
+            refused.append(self._no_controller(address.controller))
+        if address.ghost in self.ghost.choices:
+            self.ghost.choice = address.ghost
+        elif address.ghost is not None:
+            refused.append(self._no_controller(address.ghost))
         if address.episode is not None and not 1 <= address.episode <= episodes:
             refused.append(f"There is no episode {address.episode} here: there are 1 to {episodes}.")
         elif address.episode is not None:
@@ -138,6 +147,7 @@ class Tab:
         shown = Address(
             elite=self._selection.picked,
             controller=self._controller,
+            ghost=None if self.ghost.choice == CERTIFYING else self.ghost.choice,
             episode=self._replica + 1,
             time_s=self._clock.time_s if self._crossing is not None else self._begin_s,
             follow=self.scene.follow,
@@ -160,6 +170,10 @@ class Tab:
 
     def _no_elite(self, number: object) -> str:
         return f"There is no elite {number} here: there are 0 to {len(self._archive) - 1}."
+
+    def _no_controller(self, name: str) -> str:
+        there = ", ".join(self.common.show.controllers) or "none"
+        return f"There is no controller '{name}' here: there are {there}."
 
     def look(self, view_of: Callable[[int, int], View]) -> None:
         """Move the camera to a view that depends on the picture's width and height."""
@@ -204,6 +218,13 @@ class Tab:
             self._controller = name
             self._begin_s = 0.0
             self._show_crossings()
+
+    def choose_ghost(self, name: str) -> None:
+        """Show the crossings of a second controller beside the chosen one's."""
+        if name in self.ghost.choices and name != self.ghost.choice:
+            self.ghost.choice = name
+            self._load_ghost()
+            self._show_ghost()
 
     def choose_group(self, name: str) -> None:
         """Choose from the episodes that have something in common."""
@@ -277,7 +298,13 @@ class Tab:
         self._show_frame()
 
     def show_report(self, report: Report) -> None:
-        """Say how a recording goes on, and show it, if it is the one that is wanted here."""
+        """Say how a recording goes on, and show it, if it is one that is wanted here."""
+        told = self.ghost.take(report)
+        if told is not None:
+            self._panel.show_ghost(self.ghost.choice, told)
+            if report.recording is not None:
+                self._show_details()
+                self._show_ghost()
         if report.wanted != self._wanted() or self._recording is not None:
             return
         if report.recording is not None:
@@ -292,6 +319,7 @@ class Tab:
         """Ask for nothing more; the browser is gone."""
         self._clock.playing = False
         self.common.record(None, self.client.client_id)
+        self.ghost.leave()
 
     def _wanted(self) -> Wanted | None:
         """The crossings that are to be shown; None without a controller."""
@@ -304,14 +332,43 @@ class Tab:
     def _show_elite(self) -> None:
         elite = self._selection.picked
         self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], self.common.show.found.space)[0])
-        self._panel.show_elite(self.common.axes.details(elite))
         self._show_crossings()
+
+    def _show_details(self) -> None:
+        """Say what is known of the elite, with the rates of the crossings that are shown."""
+        shown = ((self._controller, self._recording, "shown"), (self.ghost.name, self.ghost.recording, "ghost"))
+        penalties, scales = self._archive.penalties, self._archive.scales
+        rates = {
+            f"{name} ({what})": crossed_of(recording, penalties, scales).rates
+            for name, recording, what in shown
+            if recording is not None
+        }
+        self._panel.show_elite(self.common.axes.details(self._selection.picked, rates))
+
+    def _load_ghost(self) -> None:
+        """Take the ghost of the elite and the controller that are shown."""
+        words = self.ghost.load(self._selection.picked, self._controller)
+        self._panel.show_ghost(self.ghost.choice, words)
+        self._show_details()
+
+    def _show_ghost(self) -> None:
+        """Show the ghost's crossing of the episode beside the robot's; time lasts as long as the longer one."""
+        words = self.ghost.show_episode(self._replica)
+        crossing, ghost = self._crossing, self.ghost.crossing
+        self.scene.hide_ghost()
+        if crossing is not None:
+            self._clock.duration_s = max(crossing.duration_s, 0.0 if ghost is None else ghost.duration_s)
+            self._clock.seek(self._clock.time_s)
+            self._panel.show_ghost(self.ghost.choice, words)
+            self._panel.show_controls(self._clock, enabled=True)
+            self._show_frame()
 
     def _show_crossings(self) -> None:
         """Show the picked elite's crossings if they are recorded, else have them recorded."""
         self._recording = self._crossing = self._curves = None
         self._groups = {}
         self.scene.hide_crossing()
+        self._load_ghost()
         self._clock.load(0.0)
         self._panel.show_controls(self._clock, enabled=False)
         self._panel.show_moment("", "")
@@ -329,6 +386,7 @@ class Tab:
         self._recording = recording
         self._groups = episodes_by_outcome(recording)
         self._group = next(iter(self._groups))
+        self._show_details()
         self.scene.set_paths(paths_of(recording))
         self._show_episode()
 
@@ -355,6 +413,7 @@ class Tab:
             self._panel.show_status(f"<b>Episode {self._replica + 1} broke at once.</b> {all_of_them}")
         else:
             self._clock.load(crossing.duration_s)
+            self._show_ghost()
             self._clock.seek(self._begin_s)
             self._curves = Curves(crossing.times_s, crossing.penalties, archive.penalties, crossing.marks)
             ended = f"<b>Episode {self._replica + 1}: {crossing.ending} after {crossing.duration_s:.1f} s.</b>"
@@ -368,6 +427,8 @@ class Tab:
     def _show_frame(self) -> None:
         if self._crossing is not None:
             self.scene.show_frame(self._crossing, self._clock.frame(self._crossing.dt, self._crossing.num_frames))
+            if (ghost := self.ghost.crossing) is not None:
+                self.scene.show_ghost(ghost, self._clock.frame(ghost.dt, ghost.num_frames))
 
     def _show_moment(self) -> None:
         crossing, curves = self._crossing, self._curves

@@ -11,9 +11,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from qd.archive import FaultCounts, read_archive, write_archive
+from qd.minimal import Case, Minimal
+from qd.run.minimal_file import write_minimal
 from qd.run.settings import as_settings, preset
 from qd.show.elites import elites_of
 from qd.show.figures import as_png, new_figure, summary
+from qd.show.ranking import rank
 from qd.show.report import command
 from qd.show.report import page as page_module
 from qd.show.report.command import Report
@@ -22,6 +25,7 @@ from qd.show.report.page import MAX_BYTES, Section, absent, at_a_glance, heading
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
 from sim.robots.robot import get_robot
+from sim.space import SUPER_GAUSSIAN
 from tests.builders import fresh_values
 from tests.qd.recordings import stand_in_cross
 from tests.qd.show.report.test_numbers import grouped_archive
@@ -332,6 +336,66 @@ def test_published_results_are_not_written_to(monkeypatch, tmp_path, run):
     material = gather(Report())
     assert str(material.run) == "results/anymal/archive"
     assert str(material.out) == "runs/anymal-published/report.html"
+
+
+def minimal_of(run, count=1):
+    """The first failing elites of a run, each with its first part alone as the minimal terrain."""
+    archive = read_archive(run)
+    numbers = np.flatnonzero(archive.failing)[:count].tolist()
+    cases = {n: Case(parts=(0, 1), how="greedy", scalable=True) for n in numbers}
+    never, much = np.array([0, 40, 0, 0]), np.array([20, 0, 0, 0])
+    one = Minimal(parts=(0,), counts=never, without={0: much}, scale=0.5, passing_scale=None, scales={}, subsets=1)
+    genes = dict(zip(numbers, archive.genes[numbers], strict=True))
+    write_minimal(run, archive, cases, dict.fromkeys(numbers, one), archive.rows(np.array(numbers)), genes)
+    entries = [
+        {"elite": n, "cell": int(archive.cell[n]), "iteration": int(archive.iteration[n]), "bumps": [0],
+         "words": ["bump of <0.24> m"], "of": 2, "goal_rate": 0.0, "goal_interval": [0.0, 0.088],
+         "cause": {"bump": 0, "kind": "rise"}, "margin_m": 0.12, "verdict": "failing"}
+        for n in numbers
+    ]  # fmt: skip
+    (run / "minimal.json").write_bytes(to_json({"elites": entries}))
+    return numbers, entries
+
+
+def test_minimal_terrains_are_shown_where_there_are_some(reported, run):
+    text = Page(reported()[0].read_bytes()).text
+    assert re.search(r"there is no minimal\.json of these elites\. It is made by \S*faultline minimise", text)
+    (first, second), entries = minimal_of(run, 2)
+    out = reported()[0]
+    text = Page(out.read_bytes()).text
+    assert "Parts of 2 failing terrains were taken away" in text
+    assert "It takes 1 part to fail (median), in 2 of them a single one." in text and "12.0 cm (median)" in text
+    row = " 0 % 0 to 9 % 1 of 2 rise 12.0 failing bump of <0.24> m"
+    assert f"{first}{row}" in text and f"{second}{row}" in text
+    assert (out.with_name("report-figures") / "minimal.png").exists()
+    entries[0]["cell"] += 1  # the search went on: another elite has that number now
+    (run / "minimal.json").write_bytes(to_json({"elites": entries}))
+    text = Page(reported()[0].read_bytes()).text
+    assert "Parts of 1 failing terrain were taken away" in text and f"{first}{row}" not in text
+
+
+def test_minimal_files_that_do_not_belong_together_are_refused(reported, run):
+    _, entries = minimal_of(run, 2)
+    (run / "minimal.json").write_bytes(to_json({"elites": entries[:1]}))
+    with pytest.raises(ValueError, match=r"must hold the 1 minimal terrain of minimal\.json, got one of 2"):
+        reported()
+    (run / "minimal.json").write_bytes(to_json({"elites": [{}]}))
+    with pytest.raises(ValueError, match=r"minimal\.json must hold minimal terrains, but it is damaged"):
+        reported()
+
+
+def test_the_page_leads_with_what_fails_one_terrain_a_mode(whole):
+    page = whole[0].read_bytes()
+    text = Page(page).text
+    first = text[: text.index("The smallest terrains that still break it", text.index("judged (by"))]
+    assert re.search(
+        "The worst terrain of each way of failing,( and others unlike these,)? crossed again, with 95 %", first
+    )
+    assert "Which of these are faults, terrains that another controller crosses, is not known yet." in first
+    assert page.index(b'id="outcome"') < page.index(b'id="minimal"') < page.index(b'id="terrains"')
+    archive = gather(Report(run=whole[0].parent)).archive
+    for number in rank(archive, SUPER_GAUSSIAN, judged=True).leaders():
+        assert re.search(rf"elite {number} \(failing\), goal \d of 4", first)
 
 
 def test_faults_are_told_where_other_controllers_crossed_what_fails(run, reported, whole):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from qd.show.view.plots import axes_of
+from sim.space import SUPER_GAUSSIAN
 from tests.builders import small_archive
 
 collect_ignore = [] if find_spec("viser") else ["test_app.py", "test_panels.py", "test_address.py", "test_browser.py"]
@@ -23,4 +24,4 @@ def axes():
         fitness=10.0 - numbers,
         episodes=np.full(20, 20),
     )
-    return axes_of(archive)
+    return axes_of(archive, SUPER_GAUSSIAN)

@@ -18,8 +18,9 @@ from qd.show.view.command import View, show_of
 from qd.show.view.recorder import Report
 from qd.show.view.scene import first_view_of
 from qd.show.view.tab import Tab
+from sim.policy.spec import controller_hash
 from sim.recording.file import read_recording
-from tests.builders import free_port
+from tests.builders import free_port, judged_archive
 from tests.qd.show.view.visitor import HEIGHT, ROOT, WIDTH, Visitor, serve, view_command
 
 PICK_LIMIT_S = 1.0
@@ -34,7 +35,7 @@ def run(published):
 @pytest.fixture(scope="module")
 def show(anymal, run):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return show_of(View(run=run, port=free_port(), policies=policies))
+    return show_of(View(run=run, elite="0", port=free_port(), policies=policies))
 
 
 class Shown:
@@ -112,8 +113,8 @@ def test_the_worst_elite_is_there_with_its_crossing(tab):
     assert "Elite 0" in tab._panel._details.content
     assert status(tab).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
     assert tab.scene._robot.visible and not tab._panel._play.disabled
-    worst = tab.common.axes.axis("fitness").values[0]
-    assert tab._list._lines[0].label.startswith(f"0: {worst:.1f} ")
+    place = tab._selection.listed.index(0)
+    assert tab._list._lines[place].label.startswith("0: failing · goal 0% ")
     assert tab._clock.duration_s == pytest.approx(20.0)
 
 
@@ -188,10 +189,11 @@ def test_a_camera_in_the_address_is_left_where_it_is(shown):
 
 
 def test_what_is_not_there_is_refused_in_words(shown):
-    shown.come("?elite=9999&controller=C-HR&episode=21&t=soon")
+    count = len(shown.tab._archive)
+    shown.come("?elite=999&controller=C-HR&episode=21&t=soon")
     assert notes(shown, 4, visitor=1) == [
         "t=soon in the address is no time in seconds: it is left out.",
-        f"There is no elite 9999 here: there are 0 to {len(shown.tab._archive) - 1}.",
+        f"There is no elite 999 here: there are 0 to {count - 1}.",
         "There is no controller 'C-HR' here: there are base, other.",
         "There is no episode 21 here: there are 1 to 20.",
     ]
@@ -309,8 +311,28 @@ def test_the_list_follows_the_ranges(shown):
     shown.do((tab.pick_line, 0))
     assert tab._selection.picked == first and tab._list._number.value == str(first)
     shown.do((tab._list.change, tab._selection.clear), (tab.step, 1))
-    assert tab._selection.picked == first + 1
     assert len(tab._selection.kept) == len(tab._archive)
+    assert tab._selection.picked == tab._selection.kept[tab._selection.kept.tolist().index(first) + 1]
+
+
+def test_the_first_of_the_list_is_shown_where_none_is_named(show, tmp_path):
+    shown = Shown(dataclasses.replace(show, elite=None), Recordings(show.robot, folder=tmp_path))
+    try:
+        ranking = shown.tab.common.axes.ranking
+        assert shown.tab._selection.picked == ranking.leaders()[0] == shown.tab._selection.listed[0]
+        assert shown.tab._list._lines[0].color == (213, 94, 0)
+    finally:
+        shown.close()
+
+
+def test_an_empty_list_says_so_and_leads_back(shown):
+    panel = shown.tab._list
+    assert not panel._again.visible
+    shown.do((panel.choose, "kind", "faults"))  # nobody looked for any here
+    assert panel._count.content.startswith("**None of") and panel._again.visible
+    assert not any(line.visible for line in panel._lines) and panel._choosers["kind"][0].value == "faults (0)"
+    shown.do((panel.change, shown.tab._selection.clear))
+    assert not panel._again.visible and panel._lines[0].visible and panel._choosers["kind"][0].value.startswith("all ")
 
 
 def test_playing_and_dragging_move_the_robot(shown):
@@ -351,6 +373,72 @@ def test_another_controller_has_its_own_crossing(shown):
     shown.do((tab.choose_controller, "other"))  # it is the same file
     assert status(tab).startswith("Episode 1: out of time")
     assert shown.asked[-1] is None
+
+
+def rows_of(details):
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in details.splitlines() if "|" in line]
+
+
+def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
+    tab = shown.tab
+    assert not tab.scene._ghost.visible and tab._panel._ghost.value == "who certifies it"  # nobody does here
+    head, _, goal, *_ = rows_of(tab._panel._details.content)
+    assert head[1].startswith("as searched, ") and head[2:] == ["base (shown), 20 episodes here"]
+    assert goal[0] == "goal reached" and goal[2] == "0% (0 to 16%)"  # of 20: Wilson
+    shown.do((tab.choose_ghost, "other"), (tab.seek, 5.0))  # the same file, so the same crossing
+    head, _, goal, collided, _ = rows_of(tab._panel._details.content)
+    assert head[2:] == ["base (shown), 20 episodes here", "other (ghost), 20 episodes here"]
+    assert goal[2] == goal[3] and collided[2] == "5% (1 to 24%)"
+    assert tab.scene._ghost.visible and tab.scene._robot.visible
+    np.testing.assert_array_equal(tab.scene._ghosts[0].position, tab.scene._bodies[0].position)
+    assert tab.scene._ghosts[0].opacity == 0.4
+    assert "Ghost, other: " in tab._panel._ghost_status.content
+    tab.show_address()
+    assert "&ghost=other" in tab._query
+    assert shown.come(f"?{tab._query}").scene._ghost.visible
+    shown.do((tab.choose_controller, "other"))  # none is its own ghost
+    assert not tab.scene._ghost.visible and tab._panel._ghost_status.content == ""
+    shown.do((tab.choose_controller, "base"), (tab.choose_ghost, "none"))
+    assert not tab.scene._ghost.visible
+
+
+def test_time_lasts_until_the_longer_of_both_has_ended(shown):
+    tab = shown.tab
+    shown.do((tab.choose_replica, 16))  # 5.3 s
+    short = tab._clock.duration_s
+    assert short < 6.0
+    shown.do((tab.choose_ghost, "other"))
+    tab.ghost.recording = dataclasses.replace(  # the others' way: 20 s
+        tab.ghost.recording, num_frames=np.roll(tab.ghost.recording.num_frames, 1, axis=1),
+        duration_s=np.roll(tab.ghost.recording.duration_s, 1, axis=1),
+    )  # fmt: skip
+    shown.do((tab.choose_replica, 15), (tab.choose_replica, 16), (tab.seek, 19.0))
+    assert tab._clock.duration_s == pytest.approx(20.0) and tab._clock.time_s == 19.0
+    ended = tab._crossing.positions[-1, 0]
+    np.testing.assert_allclose(tab.scene._bodies[0].position, ended)  # it stays where it ended
+
+
+def test_a_ghost_is_recorded_like_what_is_shown(shown):
+    tab = shown.tab
+    recording = tab._recording
+    shown.do((tab.choose_ghost, "other"), (tab.pick, 7))
+    wanted = shown.asked[-2:]
+    assert [one.label for one in wanted] == ["elite 7 of anymal"] * 2
+    assert "are recorded" in tab._panel._ghost_status.content
+    shown.do((shown.app.show_report, Report(wanted=wanted[0], text="recorded", recording=recording)))
+    assert tab.scene._ghost.visible and tab.scene._robot.visible
+    shown.do((tab.choose_ghost, "none"))
+    assert shown.asked[-1] is None or tab.ghost._wanted is None
+
+
+def test_the_ghost_is_who_certifies_the_elite_if_nobody_is_chosen(show):
+    archive = judged_archive()
+    digest = controller_hash(show.controllers["other"])
+    faults = dataclasses.replace(archive.faults, certifier_sha256=("a" * 64, digest))
+    found = dataclasses.replace(show.found, archive=dataclasses.replace(archive, faults=faults))
+    judged = dataclasses.replace(show, found=found, controllers={"S": show.controllers["other"]})
+    by = archive.certified & faults.certificates()[:, 1]
+    assert by.any() and [judged.certifying(k) for k in range(5)] == ["S" if one else None for one in by]
 
 
 def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
@@ -410,5 +498,5 @@ def test_the_help_says_what_to_do():
         [sys.executable, "-m", "faultline", "view", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert ended.returncode == 0
-    for word in ("Ranges", "Worst first", "ssh -L", "Ctrl-C", "--policies", "--host"):
+    for word in ("Ranges", "Elites", "ssh -L", "Ctrl-C", "--policies", "--host"):
         assert word in ended.stdout

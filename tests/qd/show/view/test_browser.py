@@ -17,7 +17,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None, reason="there is no browser: apt-get install chromium"),
 ]
-LIMIT_MS = 60_000
+LIMIT_MS = 120_000
 """From a click to what it shows, on a busy machine that draws without a GPU."""
 WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
@@ -28,7 +28,19 @@ def address(tmp_path_factory, published):
     port = free_port()
     cache = str(tmp_path_factory.mktemp("cache"))
     run = published / "anymal" / "archive"
-    flags = ["--run", str(run), "--port", str(port), "--cache", cache, "--policies", "base=shipped", "C-G=shipped"]
+    flags = [
+        "--run",
+        str(run),
+        "--elite",
+        "0",
+        "--port",
+        str(port),
+        "--cache",
+        cache,
+        "--policies",
+        "base=shipped",
+        "C-G=shipped",
+    ]
     process, lines = serve(view_command(*flags))
     assert process.poll() is None, "".join(lines)
     yield f"http://127.0.0.1:{port}/"
@@ -82,29 +94,59 @@ def see(page, text):
     page.get_by_text(re.compile(text)).first.wait_for()
 
 
+def click_another(page, shown):
+    """Clicks a line of the list that is not the one shown; returns its number."""
+    for line in page.get_by_role("button", name=re.compile(r"^\d+: .*goal")).all():
+        number = line.inner_text().split(":")[0]
+        if number != shown:
+            line.click()
+            return number
+    raise AssertionError("the list has no other elite")
+
+
 def test_an_elite_is_chosen_and_the_address_says_so(opened):
     page = opened()
-    see(page, "^Episode 1: out of time after 20.0 s")
+    see(page, "^Episode 1: ")
     wait_until(page, lambda now: now.get("elite") == "0" and now.get("controller") == "base")
-    page.get_by_role("button", name=re.compile("^3: ")).click()
-    see(page, "^Elite 3$")
-    wait_until(page, lambda now: now["elite"] == "3")
+    number = click_another(page, "0")
+    see(page, f"^Elite {number}$")
+    wait_until(page, lambda now: now["elite"] == number)
+
+
+def test_a_line_of_the_plot_is_named_and_clicked(opened):
+    page = opened("?elite=0")
+    see(page, "^Elite 0$")
+    plot = page.locator("svg:has(path[data-elites])").first
+    box = plot.bounding_box()
+    assert box is not None
+    x, y = box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"]
+    for step in range(100):  # down a line across the plot, until an elite is near
+        page.mouse.move(x, y + step)
+        if page.locator("svg text.pointed").count():
+            break
+    page.wait_for_timeout(1000)  # a browser takes pointers frame by frame
+    named = re.match(r"elite (\d+)", page.locator("svg text.pointed").text_content() or "")
+    assert named is not None
+    page.mouse.down()
+    page.mouse.up()
+    wait_until(page, lambda now: now["elite"] == named[1])
+    see(page, f"^Elite {named[1]}$")
 
 
 def test_two_tabs_have_states_of_their_own(opened):
     one, two = opened("?elite=0"), opened("?elite=0&controller=C-G")
     for page in (one, two):
-        see(page, "^Episode 1: out of time")
+        see(page, "^Episode 1: ")
     one.bring_to_front()
     one.keyboard.press("m")
-    wait_until(one, lambda now: 3.0 < float(now.get("t", 0)) < 5.0)
+    wait_until(one, lambda now: float(now.get("t", 0)) > 0.0)
     one.keyboard.press("o")
     two.bring_to_front()
     two.wait_for_timeout(1500)
     assert (said(two)["controller"], said(two)["t"]) == ("C-G", "0")
-    two.get_by_role("button", name=re.compile("^5: ")).click()
-    see(two, "^Elite 5$")
-    wait_until(two, lambda now: now["elite"] == "5")
+    number = click_another(two, "0")
+    see(two, f"^Elite {number}$")
+    wait_until(two, lambda now: now["elite"] == number)
     one.bring_to_front()
     one.wait_for_timeout(1500)
     assert said(one)["elite"] == "0" and said(one)["controller"] == "base"
@@ -112,35 +154,36 @@ def test_two_tabs_have_states_of_their_own(opened):
 
 
 def test_a_link_opens_what_it_shows_and_a_reload_keeps_it(opened):
-    one = opened("?elite=0&controller=C-G&episode=17&t=4.4")
-    see(one, "^Episode 17: base collision after 5.3 s")
+    one = opened("?elite=0&controller=C-G&ghost=base&episode=17&t=1.4")
+    see(one, "^Episode 17: ")
+    see(one, "^Ghost, base: ")
     one.keyboard.press("o")
     one.wait_for_timeout(1500)
     one.get_by_role("button", name="copy link").click()
     see(one, "^Link copied$")
     link = one.evaluate("navigator.clipboard.readText()")
     before = said(one)
-    assert (before["t"], before["episode"], before["controller"]) == ("4.4", "17", "C-G")
+    assert (before["t"], before["episode"], before["controller"], before["ghost"]) == ("1.4", "17", "C-G", "base")
     two = opened(link)
     one.reload()
     for page in (one, two):
         page.bring_to_front()  # a browser draws nothing in a tab behind another
-        see(page, "^Episode 17: base collision")
+        see(page, "^Episode 17: ")
         page.wait_for_timeout(2000)
         assert said(page) == before
 
 
 def test_what_is_not_there_is_refused_in_words(opened):
-    page = opened("?elite=480")
-    see(page, "^There is no elite 480 here: there are 0 to 479.$")
+    page = opened("?elite=999")
+    see(page, r"^There is no elite 999 here: there are 0 to \d+\.$")
     see(page, "^Episode 1: ")
     number = page.locator("form input[type=text], form input:not([type])").first
     number.fill("")
-    number.press_sequentially("999", delay=100)
+    number.press_sequentially("9999", delay=100)
     page.wait_for_timeout(1000)
     assert said(page)["elite"] == "0"  # nothing happens before Enter
     number.press("Enter")
-    see(page, "^There is no elite '999' here")
+    see(page, "^There is no elite '9999' here")
     number.fill("")
     number.press_sequentially("12", delay=100)
     number.press("Enter")
@@ -149,7 +192,7 @@ def test_what_is_not_there_is_refused_in_words(opened):
 
 def test_keys_do_what_the_panels_do(opened):
     page = opened("?elite=0")
-    see(page, "^Episode 1: out of time")
+    see(page, "^Episode 1: ")
     page.wait_for_timeout(1500)
     page.keyboard.press("ArrowRight")
     wait_until(page, lambda now: now["t"] == "0.1")
@@ -169,7 +212,7 @@ def test_keys_do_what_the_panels_do(opened):
     page.keyboard.press("3")
     see(page, "^Episode 3: ")
     page.keyboard.press("n")
-    wait_until(page, lambda now: now["elite"] == "1")
+    wait_until(page, lambda now: now["elite"] != "0")
     page.keyboard.press("p")
     wait_until(page, lambda now: now["elite"] == "0")
 
@@ -177,7 +220,7 @@ def test_keys_do_what_the_panels_do(opened):
 @pytest.mark.parametrize("size", [(1400, 900), (1024, 768), (390, 844)])
 def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
     page = opened("?elite=0", *size)
-    see(page, "^Episode 1: out of time")
+    see(page, "^Episode 1: ")
     page.wait_for_timeout(2000)
     width = size[0]
     assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -186,7 +229,7 @@ def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
     canvas = page.locator("canvas").first.bounding_box()
     assert canvas is not None and canvas["width"] >= 0.4 * width
     if width < 1200:
-        assert not page.get_by_text("Worst first").first.is_visible()  # the archive is folded
+        assert not page.get_by_text("Sort", exact=True).first.is_visible()  # the archive is folded
     if width < 576:
         panel = page.get_by_text("faultline", exact=True).first
         panel.click()  # folds the rest

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -6,13 +7,16 @@ import pytest
 from qd.show.crossed import ENDINGS
 from qd.show.view.legend import legend_html
 from qd.show.view.panels import PAGE, Clock, Selection
-from qd.show.view.plots import axes_of
-from tests.builders import fresh_values, small_archive
+from qd.show.view.plots import FITNESS_WORDS, KINDS, Choice, axes_of, axes_svg
+from sim.space import SUPER_GAUSSIAN
+from tests.builders import fresh_values, judged_archive, small_archive
 
 
 @pytest.fixture
 def selection(axes):
-    return Selection(axes)
+    selection = Selection(axes)
+    selection.choose(order="fault")  # by the goal rate, so as they are numbered
+    return selection
 
 
 def test_ranges_keep_what_lies_in_all_of_them(selection):
@@ -31,7 +35,9 @@ def test_ranges_keep_what_lies_in_all_of_them(selection):
 def test_ranges_may_keep_nothing(selection):
     selection.brush("goal_rate", 0.92, 0.94)
     assert (selection.kept.tolist(), selection.listed, selection.num_pages) == ([], [], 1)
-    assert selection.step(1) == selection.picked == 0
+    assert selection.step(1) == selection.picked
+    selection.clear()
+    assert len(selection.kept) == 20
 
 
 def test_the_list_has_pages(selection):
@@ -55,27 +61,75 @@ def test_a_pick_stays_when_a_range_leaves_it_out(selection):
     assert (selection.step(1), selection.step(-1)) == (13, 11)
 
 
+def test_the_list_begins_with_each_way_of_failing_and_sorts_by_what_is_chosen(axes):
+    selection = Selection(axes)
+    ranking = axes.ranking
+    leaders, failing = ranking.leaders(), [mode for mode in ranking.modes.modes if (mode.members < 10).any()]
+    assert selection.picked == 0 and selection.kept[: len(leaders)].tolist() == leaders
+    assert sorted(ranking.modes.labels[leaders].tolist()) == [mode.number for mode in failing]
+    assert sorted(selection.kept.tolist()) == list(range(20))
+    selection.choose(order="collision_rate")
+    assert selection.kept.tolist() == [*range(1, 20, 2), *range(0, 20, 2)]
+    selection.choose(order="goal_rate")
+    assert selection.kept.tolist() == list(range(20)) and (selection.pick(3), selection.step(1)) == (True, 4)
+    selection.choose(kind="not failing", order="fitness")
+    assert selection.kept.tolist() == list(range(10, 20)) and selection.step(1) == 10  # on from where it was
+    selection.choose(kind="faults")
+    assert selection.kept.tolist() == []
+    selection.choose(kind="all", mode=failing[0].number)
+    assert selection.kept.tolist() == failing[0].members.tolist()
+
+
+def test_faults_come_before_certified_confirmed_and_other_failing_elites():
+    axes = axes_of(judged_archive(), SUPER_GAUSSIAN)  # fault, confirmed, certified, failing, not failing
+    assert axes.listed(Choice(ranges={}, order="fault")).tolist() == [0, 2, 1, 3, 4]
+    listed = {kind: sorted(axes.listed(Choice(ranges={}, kind=kind)).tolist()) for kind in KINDS}
+    assert listed == {
+        "all": [0, 1, 2, 3, 4], "faults": [0], "certified": [0, 2], "confirmed": [0, 1], "failing": [0, 1, 2, 3],
+        "not failing": [4],
+    }  # fmt: skip
+    assert list(axes.kinds()) == ["all (5)", "faults (1)", "certified (2)", "confirmed (2)", "failing (4)",
+                                  "not failing (1)"]  # fmt: skip
+    assert (
+        axes.line(0).startswith("0: fault · goal 0% ")
+        and "C-G" in axes.details(0, {})
+        and "It is a fault" in axes.details(0, {})
+    )
+
+
+def test_each_line_of_the_plot_names_its_elite(axes):
+    kept = axes.listed(Choice(ranges={"goal_rate": (0.0, 0.2)}, order="fault"))
+    svg = axes_svg(axes, kept, {}, 0)
+    named = [numbers.split() for numbers in re.findall(r'data-elites="([^"]*)"', svg)]
+    assert [int(number) for numbers in reversed(named) for number in numbers] == [0, 1, 2, 3, 4]
+    for tag, numbers in zip(re.findall(r"<path [^>]*data-elites[^>]*>", svg), named, strict=True):
+        assert tag.count("M") == len(numbers) == len(re.search('data-hints="([^"]*)"', tag)[1].split("|"))
+    assert "elite 4, failing: goal 20%" in svg and FITNESS_WORDS[:40] in svg
+
+
 def test_numbers_of_fresh_episodes_come_first():
     archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
     fresh = fresh_values(archive)
     fresh = dataclasses.replace(
         fresh, collision_rate=np.array([0.5, 0.25, 0.0]), invalid_episodes=np.array([0, 0, 39]), fitness=np.zeros(3)
     )
-    axes = axes_of(dataclasses.replace(archive, fresh=fresh))
+    axes = axes_of(dataclasses.replace(archive, fresh=fresh), SUPER_GAUSSIAN)
     assert axes.elites.fresh.tolist() == [True, True, False]
     assert axes.elites.counted.tolist() == [40, 40, 4]
     assert axes.axis("collision_rate").values.tolist() == [0.5, 0.25, 1.0]
     assert axes.axis("fitness").values.tolist() == [0.0, 0.0, archive.fitness[2]]
     # Wilson, z^2 = 3.8415, of 20 of 40: .5 +- 1.96 sqrt(.25/40 + 3.8415/6400) / 1.0960 = .5 +- .148
     assert axes.rate_text("collision_rate", 0) == "50% (35 to 65%)"
-    assert "collision 50% (35 to 65%)" in axes.line(0) and "of 40 fresh episodes" in axes.details(0)
-    assert "of the 4 episodes that found it" in axes.details(2)
+    assert "collision 50%" in axes.line(0) and "as searched, 40 fresh episodes" in axes.details(0, {})
+    assert "the 4 episodes that found it" in axes.details(2, {})
 
 
 def test_an_axis_reaches_over_all_values_in_whole_steps(axes):
     axis = axes.axis("goal_rate")
     assert (axis.low, axis.high) == (0.0, 0.95)
-    same = axes_of(dataclasses.replace(small_archive(1), fitness=np.array([1.0]), goal_rate=np.array([0.5])))
+    same = axes_of(
+        dataclasses.replace(small_archive(1), fitness=np.array([1.0]), goal_rate=np.array([0.5])), SUPER_GAUSSIAN
+    )
     for axis in same.axes:  # of one elite too
         assert axis.low <= axis.values[0] <= axis.high and axis.high > axis.low
 

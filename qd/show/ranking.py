@@ -1,0 +1,130 @@
+"""The orders that elites are shown in: what is a fault before what merely costs much, and no kind of failure twice.
+
+A family is of terrains that look alike: average linkage on the root mean square of the difference of their heights, cut
+at 6 cm. That is half of what hard-random terrains lie apart; elites that descend from each other lie some 3 cm apart.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.archive import Archive
+from qd.show.elites import Elites, elites_of
+from qd.show.modes import Modes, find_modes
+
+if TYPE_CHECKING:
+    from sim.space import TerrainSpace
+
+FAMILY_M = 0.06
+"""Mean distance of heights, RMS, up to which terrains are of one family [m]."""
+_EVERY = 8  # nodes from one compared height to the next: 0.4 m
+_AT_ONCE = 256  # terrains whose heights are computed together
+
+ORDERS = {
+    "modes": "each way of failing once first",
+    "fault": "faults first",
+    "goal_rate": "goal rate, the lowest first",
+    "collision_rate": "base collision, the most first",
+    "fallen_rate": "fallen, the most first",
+    "fitness": "fitness, the highest first",
+    "family": "families of like terrains",
+}
+"""Orders of elites, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranking:
+    """N elites, their failure modes and their families, in orders to show them in."""
+
+    elites: Elites
+    modes: Modes
+    """Groups of them by how the robot struggles."""
+    families: NDArray[np.int64]
+    """Family of each, shape (N,), numbered from 1 by its worst member."""
+
+    @cached_property
+    def _severity(self) -> NDArray[np.int64]:
+        return self.elites.by_severity()
+
+    def order(self, by: str = "modes") -> NDArray[np.int64]:
+        """Rows of all elites, shape (N,), in one of the :data:`ORDERS`; ties are by severity.
+
+        ``modes`` begins with the worst terrain of each mode that has one on which the controller fails, no two of one
+        family where that can be had. The worst failing terrain of each other family follows, then the rest.
+        """
+        severity = self._severity
+        if by == "fault":
+            return severity
+        if by == "modes":
+            return self._leading(severity)
+        values = self.families if by == "family" else np.asarray(getattr(self.elites, by))
+        sign = 1 if by in ("family", "goal_rate") else -1
+        return severity[np.argsort(sign * values[severity], kind="stable")]
+
+    def _leading(self, severity: NDArray[np.int64]) -> NDArray[np.int64]:
+        failing = severity[self.elites.failing[severity]]
+        labels, families = self.modes.labels, set[int]()
+        first: list[int] = []
+        for mode in dict.fromkeys(labels[failing].tolist()):
+            own = failing[labels[failing] == mode].tolist()
+            chosen = next((row for row in own if int(self.families[row]) not in families), own[0])
+            first.append(chosen)
+            families.add(int(self.families[chosen]))
+        for row in failing.tolist():
+            if int(self.families[row]) not in families:
+                first.append(row)
+                families.add(int(self.families[row]))
+        return np.array([*first, *np.setdiff1d(severity, first, assume_unique=True)], dtype=np.int64)
+
+    def leaders(self) -> list[int]:
+        """Numbers of the terrains that stand for a way of failing, one for each mode in which terrains fail."""
+        count = len(np.unique(self.modes.labels[self.elites.failing]))
+        return self.elites.numbers[self.order()[:count]].tolist()
+
+    def worst(self, count: int) -> list[int]:
+        """Numbers of the first terrains of the order ``modes``."""
+        return self.elites.numbers[self.order()[:count]].tolist()
+
+
+def rank(archive: Archive, space: "TerrainSpace", *, judged: bool = False) -> Ranking:
+    """The ranking of an archive that has elites.
+
+    Args:
+        archive: The archive.
+        space: Of its genes.
+        judged: Leaves out elites whose fresh episodes are invalid.
+    """
+    elites = elites_of(archive, judged=judged)
+    families = families_of(archive.genes[elites.numbers], space)
+    places = {int(family): place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()]), start=1)}
+    numbered = np.array([places[int(family)] for family in families], dtype=np.int64)
+    return Ranking(elites=elites, modes=find_modes(elites), families=numbered)
+
+
+def families_of(genes: NDArray[np.floating], space: "TerrainSpace") -> NDArray[np.int64]:
+    """Family of each terrain, shape (N,).
+
+    Args:
+        genes: Shape (N, num_genes).
+        space: What they mean.
+    """
+    if len(genes) < 2:
+        return np.ones(len(genes), np.int64)
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial.distance import pdist
+
+    heights = np.concatenate(list(_some_heights(genes, space)))
+    distances = pdist(heights) / np.sqrt(heights.shape[1])
+    return fcluster(linkage(distances, "average"), FAMILY_M, "distance").astype(np.int64)
+
+
+def _some_heights(genes: NDArray[np.floating], space: "TerrainSpace") -> "Sequence[NDArray[np.float32]]":
+    """Heights of some nodes [m], of some terrains at a time, each of shape (num_terrains, num_nodes)."""
+    from sim.bank import heights_of
+
+    lots = [genes[first : first + _AT_ONCE] for first in range(0, len(genes), _AT_ONCE)]
+    return [heights_of(lot, space)[:, ::_EVERY, ::_EVERY].reshape(len(lot), -1).copy() for lot in lots]

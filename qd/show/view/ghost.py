@@ -1,0 +1,102 @@
+"""The ghost: a second controller on the same terrain at the same time, such as the one that certifies a fault."""
+
+from html import escape
+from typing import TYPE_CHECKING
+
+from qd.show.crossed import ending_of
+from qd.show.recordings import Wanted, on_elite
+from qd.show.view.playing import Crossing, crossing_of
+from qd.show.view.recorder import Report
+from sim.recording.recorder import Recording
+
+if TYPE_CHECKING:
+    from qd.show.view.tab import Common
+
+CERTIFYING, NOBODY = "who certifies it", "none"
+"""Choices beside the names of controllers: of each elite the one that certifies it, if it is at hand; nobody."""
+
+
+class Ghost:
+    """Whose crossing is shown beside the chosen controller's, and what is recorded of it."""
+
+    def __init__(self, common: "Common", tab: int) -> None:
+        """Who certifies the elite, if anybody does.
+
+        Args:
+            common: What all tabs share.
+            tab: Number of the tab.
+        """
+        self._common, self._tab = common, tab
+        self.choice = CERTIFYING
+        """What was chosen: a controller's name, :data:`CERTIFYING` or :data:`NOBODY`."""
+        self.name: str | None = None
+        """Of the controller; None if there is no ghost."""
+        self.recording: Recording | None = None
+        self.crossing: Crossing | None = None
+        self._wanted: Wanted | None = None
+        self._asked = False
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """What can be chosen."""
+        return (CERTIFYING, NOBODY, *self._common.show.controllers)
+
+    def load(self, elite: int, beside: str | None) -> str:
+        """Take another elite or controller; what is not recorded is asked for.
+
+        Args:
+            elite: Number of the elite.
+            beside: The controller that is shown already, which can be no ghost of itself.
+
+        Returns:
+            What to say of it, as HTML.
+        """
+        show = self._common.show
+        self.recording = self.crossing = self._wanted = None
+        chosen = show.certifying(elite) if self.choice == CERTIFYING else self.choice
+        self.name = chosen if chosen in show.controllers and chosen != beside else None
+        if self.name is not None:
+            archive, policy = show.found.archive, show.controllers[self.name]
+            self._wanted = on_elite(archive, elite, policy=policy, replicas=show.cfg.replicas)
+            self.recording = self._common.recordings.read(self._wanted)
+        missing = self._wanted if self.recording is None else None
+        if missing is not None or self._asked:
+            self._common.record(missing, (self._tab, "ghost"))
+        self._asked = missing is not None
+        return self.words(0)
+
+    def leave(self) -> None:
+        """Ask for nothing more."""
+        if self._asked:
+            self._common.record(None, (self._tab, "ghost"))
+
+    def take(self, report: Report) -> str | None:
+        """Take what was recorded, if it is of the ghost; returns what to say of it, as HTML, None of another's."""
+        if self._wanted is None or report.wanted != self._wanted or self.recording is not None:
+            return None
+        self.recording = report.recording
+        if report.recording is not None:
+            return self.words(0)
+        if report.failed:
+            return f"No ghost: {escape(report.text)}"
+        return f"{self.words(0)} {report.text}, {report.share:.0%}"
+
+    def show_episode(self, replica: int) -> str:
+        """Take an episode, counted from 0; returns what to say of it, as HTML."""
+        archive = self._common.show.found.archive
+        self.crossing = None
+        if self.recording is not None:
+            skeleton = self._common.skeleton
+            self.crossing = crossing_of(self.recording, replica, skeleton, archive.penalties, archive.scales)
+        return self.words(replica)
+
+    def words(self, replica: int) -> str:
+        """How its episode ended, as HTML; nothing without a ghost."""
+        if self.name is None:
+            return ""
+        who = f"Ghost, {escape(self.name)}:"
+        if self.recording is None:
+            return f"{who} its {self._common.show.cfg.replicas} episodes are recorded …"
+        ending = ending_of(self.recording.outcome[0, replica])
+        ended = f'<span style="color:{ending.color}">{ending.words}</span>'
+        return f"{who} {ended} after {float(self.recording.duration_s[0, replica]):.1f} s."

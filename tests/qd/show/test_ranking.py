@@ -1,0 +1,69 @@
+"""Orders of elites: faults before costs, and no kind of failure twice among the first."""
+
+import dataclasses
+
+import numpy as np
+
+from qd.show.elites import elites_of
+from qd.show.ranking import FAMILY_M, ORDERS, families_of, rank
+from sim.bank import heights_of
+from sim.space import SUPER_GAUSSIAN
+from tests.builders import judged_archive, small_archive
+from tests.qd.show.report.test_numbers import grouped_archive
+
+
+def test_verdicts_come_before_rates_and_rates_before_fitness():
+    elites = elites_of(judged_archive())
+    assert elites.verdict.tolist() == [4, 2, 3, 1, 0]  # fault, confirmed, certified, failing, not failing
+    assert elites.by_severity().tolist() == [0, 2, 1, 3, 4]
+    archive = dataclasses.replace(
+        small_archive(5),
+        goal_rate=np.array([0.9, 0.1, 0.0, 0.0, 0.0]),
+        collision_rate=np.array([0.0, 0.9, 0.2, 0.3, 0.3]),
+        fallen_rate=np.array([0.0, 0.0, 0.5, 0.0, 0.1]),
+        fitness=np.array([9.0, 5.0, 4.0, 3.0, 2.0]),
+    )
+    found = elites_of(archive)
+    assert found.verdict.tolist() == [0, 1, 1, 1, 1]  # by the episodes that found them: nobody else looked
+    assert found.by_severity().tolist() == [4, 3, 2, 1, 0]
+
+
+def test_terrains_that_lie_close_are_a_family():
+    genes = np.repeat(small_archive(2).genes, 3, axis=0)
+    genes[1:3] += np.float32(0.004)
+    genes[4:6] -= np.float32(0.004)
+    heights = heights_of(np.clip(genes, -1.0, 1.0), SUPER_GAUSSIAN)
+    near, far = (float(np.sqrt(np.mean((heights[0] - heights[k]) ** 2))) for k in (1, 3))
+    assert near < FAMILY_M < far
+    first, second = np.split(families_of(np.clip(genes, -1.0, 1.0), SUPER_GAUSSIAN), 2)
+    assert len(set(first)) == len(set(second)) == 1 and first[0] != second[0]
+    assert families_of(genes[:1], SUPER_GAUSSIAN).tolist() == [1]
+
+
+def test_the_first_are_one_of_each_way_of_failing_and_of_different_families():
+    archive, kinds = grouped_archive()  # 6 stuck, 9 collided, 5 across
+    genes = archive.genes.copy()
+    genes[7] = genes[6]  # of the collided ones these two are the same terrain
+    goal_rate = archive.goal_rate.copy()
+    goal_rate[8:15], goal_rate[0:6] = 0.05, np.linspace(0.01, 0.06, 6)
+    ranking = rank(dataclasses.replace(archive, genes=genes, goal_rate=goal_rate), SUPER_GAUSSIAN)
+    order = ranking.order()
+    assert sorted(order.tolist()) == list(range(20))
+    assert ranking.leaders() == [6, 0] and ranking.worst(2) == [6, 0]
+    assert kinds[order[:2]].tolist() == [1, 0]
+    assert ranking.families[6] == ranking.families[7] == 1  # of the worst
+    count = len(set(ranking.families[:15]))
+    assert len(set(ranking.families[order[:count]])) == count and 7 not in order[:count]  # other families come first
+    assert set(order[15:].tolist()) == set(range(15, 20))
+    assert ranking.order("fault").tolist()[:2] == [6, 7]
+    families = ranking.families[ranking.order("family")]
+    assert families.tolist() == sorted(families) and families[0] == families[1] == 1
+    for name in ("goal_rate", "collision_rate", "fallen_rate", "fitness"):
+        values = getattr(ranking.elites, name)[ranking.order(name)]
+        assert np.all(np.diff(values if name == "goal_rate" else -values) >= 0.0) and name in ORDERS
+
+
+def test_without_failing_elites_nothing_leads():
+    archive = dataclasses.replace(small_archive(4), goal_rate=np.ones(4))
+    ranking = rank(archive, SUPER_GAUSSIAN)
+    assert ranking.leaders() == [] and sorted(ranking.worst(4)) == [0, 1, 2, 3]
