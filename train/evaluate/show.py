@@ -1,11 +1,11 @@
 """What evaluations show: rates and tables on the terminal, tables as a figure, the paper's numbers beside ours."""
 
-import io
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sim.files.figures import as_png, new_figure
 from sim.files.intervals import value_words
 from sim.policy.spec import firsts, kind_of
 from train.evaluate.measures import invalid_lines
@@ -146,17 +146,13 @@ def _print_over_seeds(found: dict[str, Any]) -> None:
 
 def picture_of(report: dict[str, Any]) -> bytes:
     """The tables, as ``tables.json`` has them, as PNG."""
-    buffer = io.BytesIO()
-    draw_tables(report).savefig(buffer, format="png", dpi=150)
-    return buffer.getvalue()
+    return as_png(draw_tables(report))
 
 
 def draw_tables(report: dict[str, Any]) -> "Figure":
     """Success, goal rate and reward of every controller by set with 95 % intervals, and what became of terrains."""
-    from matplotlib.figure import Figure
-
     pairs = _pairs_from_first(report)
-    figure = Figure(figsize=(11.5, 8.0) if pairs else (13.0, 4.2), layout="constrained")
+    figure = new_figure(*((11.5, 8.0) if pairs else (13.0, 4.2)))
     panels = np.ravel(figure.subplots(2, 2) if pairs else figure.subplots(1, 3))
     for axes, (measure, (label, factor)) in zip(panels, _PANELS.items(), strict=False):
         _draw_measure(axes, report, measure, factor)

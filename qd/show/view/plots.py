@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.show.elites import Elites, elites_of
+from qd.elites import Elites, elites_of
 from qd.show.figures import label_of, look_of
 from sim.files.intervals import rate_words
 

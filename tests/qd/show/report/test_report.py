@@ -11,9 +11,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from qd.archive import FaultCounts, read_archive, write_archive
+from qd.elites import elites_of
 from qd.run.settings import as_settings, preset
-from qd.show.elites import elites_of
-from qd.show.figures import as_png, new_figure, summary
+from qd.show.figures import summary
 from qd.show.report import command
 from qd.show.report import page as page_module
 from qd.show.report.command import Report
@@ -21,6 +21,7 @@ from qd.show.report.material import gather
 from qd.show.report.page import MAX_BYTES, Section, absent, at_a_glance, heading, paragraph, render, table
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
+from sim.files.figures import as_png, new_figure
 from sim.robots.robot import get_robot
 from tests.builders import fresh_values
 from tests.qd.recordings import stand_in_cross
