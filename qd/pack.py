@@ -1,4 +1,4 @@
-"""A pack: terrains of a run on which any controller can be tested, spread over the ways in which the searched one fails.
+"""A pack: terrains on which any controller can be tested, spread over the ways in which the searched one fails.
 
 Every terrain is a fault or a *near-fault*: under :data:`NEAR_GOAL_RATE` of the robots reach the goal in 40 fresh
 episodes, and it is known to be passable, since another controller is certified on it or the searched one crosses it in
