@@ -61,7 +61,8 @@ class Evaluate(Who, Where):
     """Draws other test sets."""
     out: Path | None = None
     """Where to write the numbers: runs/<robot>-rates.json, of another controller than the shipped
-    runs/<robot>-<its name>-rates.json, of a pack -pack.json with a figure beside; tables RUN_DIR/tables.json, their figure beside as .png."""
+    runs/<robot>-<its name>-rates.json, of a pack -pack.json, its figure beside as .png; tables RUN_DIR/tables.json,
+    their figure likewise."""
     run_dir: Path | None = None
     """Where tables keep what is crossed, so that they can go on; runs/<robot>-tables."""
 

@@ -302,8 +302,8 @@ def over_all(rows: Sequence[Row], abouts: Sequence[dict[str, Any]], seed: int) -
         seed: Of the bootstrap.
 
     Returns:
-        ``goal_rate``, ``success_rate`` and ``fallen_rate`` with ``goal_interval`` and so on; ``failing`` and ``terrains``
-        that are valid, and the ``failing_families`` of all ``families``.
+        ``goal_rate``, ``success_rate`` and ``fallen_rate`` with ``goal_interval`` and so on; of the valid ``terrains``
+        how many are ``failing``, and of their ``families`` in how many one is (``failing_families``).
     """
     valid = [place for place, row in enumerate(rows) if row["goal_rate"] is not None]
     families = np.array([abouts[place]["family"] for place in valid], np.int64)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.fitness import FAILING_GOAL_RATE
 from sim.files.command import command_line
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import value_words
 from sim.maps.picture import draw_heights
 from sim.policy.spec import firsts, kind_of
 from train.evaluate.measures import invalid_lines
+from train.evaluate.pack import fails
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -180,7 +180,7 @@ def print_pack_test(report: dict[str, Any], folder: Path) -> None:
     own = report["rates"]
     print(f"It fails {own['failing']} of {own['terrains']} terrains, of {own['failing_families']} families.")
     worst = worst_of(report["terrains"], "this")[:10]
-    for place in (place for place in worst if is_failing(report["terrains"][place], "this")):
+    for place in (place for place in worst if fails(report["terrains"][place]["rates"]["this"])):
         about, row = report["terrains"][place], report["terrains"][place]["rates"]["this"]
         rate = value_words(row["goal_rate"], row["goal_interval"], ".0%")
         print(f"  {place:>3} {about['name']:<22}{rate:<22}family {about['family']:<5}{about['cause'] or ''}")
@@ -195,12 +195,6 @@ def _print_rates_of(rows: Mapping[str, dict[str, Any]]) -> None:
         print(f"{who:<{wide}}{''.join(f'{words:>24}' for words in rates)}{row['failing']:>8}{row['terrains']:>5}")
 
 
-def is_failing(about: dict[str, Any], who: str) -> bool:
-    """Whether a controller fails a terrain of a pack."""
-    rate = about["rates"][who]["goal_rate"]
-    return rate is not None and rate < FAILING_GOAL_RATE
-
-
 def worst_of(terrains: Sequence[dict[str, Any]], who: str) -> list[int]:
     """Places of the valid terrains of a pack, those with the lowest goal rate first, one of each family before two."""
     valid = [place for place, about in enumerate(terrains) if about["rates"][who]["goal_rate"] is not None]
@@ -208,7 +202,7 @@ def worst_of(terrains: Sequence[dict[str, Any]], who: str) -> list[int]:
     for place in sorted(valid, key=lambda place: (terrains[place]["rates"][who]["goal_rate"], place)):
         turns[place] = seen[terrains[place]["family"]]
         seen[terrains[place]["family"]] += 1
-    failing = {place: is_failing(terrains[place], who) for place in valid}
+    failing = {place: fails(terrains[place]["rates"][who]) for place in valid}
     return sorted(
         valid, key=lambda place: (not failing[place], turns[place], terrains[place]["rates"][who]["goal_rate"], place)
     )
@@ -224,7 +218,7 @@ def picture_of_pack(terrains: Sequence[dict[str, Any]], heights: NDArray[np.floa
         title: What the controller is called.
     """
     shown = worst_of(terrains, who)[:_GALLERY]
-    failing = sum(is_failing(about, who) for about in terrains)
+    failing = sum(fails(about["rates"][who]) for about in terrains)
     rows = max(1, -(-len(shown) // _GALLERY_COLUMNS))
     figure = new_figure(13.0, 0.9 + 2.3 * rows)
     figure.suptitle(f"{title}: fails {failing} of {len(terrains)} terrains of the pack; those with the fewest arrivals")
