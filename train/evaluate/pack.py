@@ -1,6 +1,6 @@
 """A pack of terrains: the command that makes one, and any controller tested on it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.faults import EPISODES
-from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import Open
 from qd.pack import (
     PACK_FILE,
@@ -30,23 +29,14 @@ from qd.run.judge import PANEL_FOLDER, config_of, judged_run, searched_policy
 from qd.workers.evaluator import check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import InSpace, Where, Who, naming_what_is_next, publish
-from sim.files.intervals import bootstrap_interval, wilson_interval
 from sim.files.settings import setting
 from sim.policy.spec import controller_hash, controllers_of, is_same, who_crossed
 from sim.robots.identity import identity
-from train.evaluate.measures import terrain_rates, valid_episodes
-from train.evaluate.sets import TerrainSet, set_rng
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
-    from sim.rollout import RolloutResult
     from train.evaluate.evaluate import Evaluate
-
-GROUPS = ("verdict", "mode", "cause", "kind")
-"""What terrains are grouped by."""
-_RATES = ("goal_rate", "success_rate", "fallen_rate")
-Row = dict[str, Any]
-"""What a controller made of one terrain, as JSON values; rates are None on an invalid one."""
+    from train.evaluate.sets import TerrainSet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +88,7 @@ def make_pack(args: MakePack, *, open_evaluator: Open = open_evaluator) -> dict[
     from sim.bank import heights_of
     from sim.space import get_space
     from train.evaluate.crossings import cross_all
+    from train.evaluate.pack_rates import grouped, over_all, rows_of
     from train.evaluate.show import picture_of_pack, print_pack
 
     path, cfg, robot = config_of(args, args.run, args.space)
@@ -179,6 +170,7 @@ def evaluate_pack(flags: "Evaluate", *, open_evaluator: Open = open_evaluator) -
     from sim.robots.robot import robot_of
     from train.evaluate.crossings import cross_all
     from train.evaluate.evaluate import evaluator_of
+    from train.evaluate.pack_rates import grouped, over_all, rows_of
     from train.evaluate.show import picture_of_pack, print_pack_test
 
     assert flags.pack is not None
@@ -271,84 +263,9 @@ def _kept(robot: "RobotCfg") -> Path:
     return RUNS / f"{robot.name}-packs" / "crossings"
 
 
-def _set_of(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
+def _set_of(heights: NDArray[np.float32], count: int, seed: int) -> "TerrainSet":
     """The first terrains of a pack, with episodes that nothing else has."""
+    from train.evaluate.sets import TerrainSet, set_rng
+
     seeds = set_rng("pack", seed).integers(2**32, size=len(heights), dtype=np.uint32)
     return TerrainSet(name="pack", terrains=heights[:count], seeds=seeds[:count], numbers=np.arange(count))
-
-
-def rows_of(result: "RolloutResult") -> list[Row]:
-    """What crossings say of each terrain: rates, the goal rate with its interval (Wilson), and valid episodes."""
-    counted, rates = valid_episodes(result), terrain_rates(result)
-    hits, valid = (result.reached_goal & counted).sum(axis=1).tolist(), counted.sum(axis=1).tolist()
-    return [
-        {f"{name}_rate": None if np.isnan(values[place]) else float(values[place]) for name, values in rates.items()}
-        | {"goal_interval": list(wilson_interval(hits[place], valid[place])), "valid_episodes": valid[place]}
-        for place in range(len(valid))
-    ]
-
-
-def fails(row: Row) -> bool:
-    """Whether a controller fails a terrain: under half of its valid episodes reach the goal."""
-    return row["goal_rate"] is not None and row["goal_rate"] < FAILING_GOAL_RATE
-
-
-def over_all(rows: Sequence[Row], abouts: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
-    """Means over terrains with 95 % intervals, bootstrap over families, as JSON values.
-
-    Args:
-        rows: What a controller made of each terrain.
-        abouts: What is known of each.
-        seed: Of the bootstrap.
-
-    Returns:
-        ``goal_rate``, ``success_rate`` and ``fallen_rate`` with ``goal_interval`` and so on; of the valid ``terrains``
-        how many are ``failing``, and of their ``families`` in how many one is (``failing_families``).
-    """
-    valid = [place for place, row in enumerate(rows) if row["goal_rate"] is not None]
-    families = np.array([abouts[place]["family"] for place in valid], np.int64)
-    found: dict[str, Any] = {}
-    for name in _RATES:
-        values = np.array([rows[place][name] for place in valid], np.float64)
-        found[name] = float(values.mean()) if valid else None
-        found[name.replace("_rate", "_interval")] = bootstrap_interval(values, seed, families=families)
-    failing = np.array([fails(rows[place]) for place in valid], bool)
-    return found | {
-        "failing": int(failing.sum()),
-        "terrains": len(valid),
-        "failing_families": len(np.unique(families[failing])),
-        "families": len(np.unique(families)),
-    }
-
-
-def grouped(abouts: Sequence[dict[str, Any]], rows: Mapping[str, Sequence[Row]]) -> dict[str, list[dict[str, Any]]]:
-    """How controllers fare by :data:`GROUPS`, and in the families: mean goal rates and how many terrains fail.
-
-    Args:
-        abouts: What is known of each terrain.
-        rows: Controller -> what it made of each.
-
-    Returns:
-        Group -> its values, the most frequent first, each with ``terrains`` and, by controller, ``goal_rate`` (None
-        without a valid terrain) and ``failing``.
-    """
-    return {group: _by(group, abouts, rows) for group in (*GROUPS, "family")}
-
-
-def _by(group: str, abouts: Sequence[dict[str, Any]], rows: Mapping[str, Sequence[Row]]) -> list[dict[str, Any]]:
-    members: dict[Any, list[int]] = {}
-    for place, about in enumerate(abouts):
-        members.setdefault(about[group], []).append(place)
-    found = []
-    for value, places in sorted(members.items(), key=lambda one: (-len(one[1]), str(one[0]))):
-        own = {who: [row[place] for place in places] for who, row in rows.items()}
-        known = {who: [row["goal_rate"] for row in some if row["goal_rate"] is not None] for who, some in own.items()}
-        found.append(
-            {
-                group: value,
-                "terrains": len(places),
-                "goal_rate": {who: float(np.mean(rates)) if rates else None for who, rates in known.items()},
-                "failing": {who: sum(map(fails, some)) for who, some in own.items()},
-            }
-        )
-    return found

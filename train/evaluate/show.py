@@ -14,7 +14,7 @@ from sim.files.intervals import value_words
 from sim.maps.picture import draw_heights
 from sim.policy.spec import firsts, kind_of
 from train.evaluate.measures import invalid_lines
-from train.evaluate.pack import fails
+from train.evaluate.pack_rates import fails
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
