@@ -154,7 +154,8 @@ def _print_over_seeds(found: dict[str, Any]) -> None:
 def print_pack(report: dict[str, Any]) -> None:
     """Prints the rates of a pack's controllers, as ``pack.json`` has them."""
     count = Counter(about["verdict"] for about in report["terrains"])
-    print(f"{len(report['terrains'])} terrains: {', '.join(f'{many} {what}s' for what, many in count.items())}")
+    words = (f"{many} {what}{'s' * (many != 1)}" for what, many in count.items())
+    print(f"{len(report['terrains'])} terrains: {', '.join(words)}")
     _print_rates_of(report["rates"])
 
 
@@ -169,14 +170,14 @@ def print_pack_test(report: dict[str, Any], folder: Path) -> None:
     _print_rates_of(rows)
     if report["seed"] != report["pack"]["seed"] or report["episodes"] != report["pack"]["episodes"]:
         print("Episodes differ from those of the pack's controllers in number or start.")
-    names = {one["mode"]: f"{one['mode']}: {one['ending']}" for one in report["pack"]["modes"]}
+    names = {one["mode"]: f"{one['mode']}: {one['ending']}, {one['marked_by']}" for one in report["pack"]["modes"]}
     wide = max(map(len, rows))
     for group, title in (("verdict", "verdict"), ("mode", "failure mode"), ("cause", "cause"), ("kind", "kind")):
-        print(f"by {title:<41}{'terrains':>9}  failed by {'  '.join(f'{who:>{wide}}' for who in rows)}")
+        print(f"by {title:<61}{'terrains':>9}  failed by {'  '.join(f'{who:>{wide}}' for who in rows)}")
         for one in report["by"][group]:
             value = names.get(one[group], one[group]) if group == "mode" else one[group] or "not looked for"
             cells = "  ".join(f"{one['failing'][who]:>{wide}}" for who in rows)
-            print(f"  {value:<42}{one['terrains']:>9}            {cells}")
+            print(f"  {value:<62}{one['terrains']:>9}            {cells}")
     own = report["rates"]
     print(f"It fails {own['failing']} of {own['terrains']} terrains, of {own['failing_families']} families.")
     worst = worst_of(report["terrains"], "this")[:10]
