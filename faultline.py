@@ -21,6 +21,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "confirm": Command("qd.run.judge:Confirm", "cross the failing elites again with contact resolved"),
         "certify": Command("qd.run.judge:Certify", "which failing elites other controllers cross: faults"),
         "minimise": Command("qd.run.minimise:Minimise", "which parts of a failing terrain it takes to fail"),
+        "pack": Command("train.evaluate.pack:MakePack", "faults of a run as a pack to test any controller on"),
         "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
         "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
     },

@@ -22,7 +22,7 @@ from qd.run.progress import share_bar
 from qd.workers.evaluator import EvaluatorCfg, origin_of, parse_workers, pipeline_of
 from qd.workers.invalid import invalid_reasons, invalid_words
 from sim.files.atomic import to_json, write_atomically
-from sim.files.intervals import rate_words
+from sim.files.intervals import rate_words, wilson_interval
 from sim.policy.spec import certifier_hash, controller_hash
 
 if TYPE_CHECKING:
@@ -370,6 +370,34 @@ def verdicts_of(archive: Archive) -> NDArray[np.int64]:
 def verdict_of(archive: Archive, number: int) -> str:
     """The verdict on an elite: empty if it does not fail."""
     return VERDICTS[int(verdicts_of(archive)[number])]
+
+
+def rate_of(counts: NDArray[np.int64]) -> dict[str, Any]:
+    """Goal rate of episodes, shape (4,), with its 95 % interval (Wilson); a rate of None: too many are invalid."""
+    valid, rate = int(counts.sum() - counts[OUTCOMES.index("invalid")]), float(goal_rates(counts))
+    interval = list(wilson_interval(int(counts[0]), valid))
+    return {"goal_rate": None if np.isnan(rate) else rate, "goal_interval": interval, "valid_episodes": valid}
+
+
+def judgement(archive: Archive, number: int) -> dict[str, Any]:
+    """What is known of an elite under other conditions, as JSON values; None of what nobody looked at.
+
+    Returns:
+        ``resolved``: rate of the controller with contact resolved; ``certificates``: of each controller that certifies
+        it name, hash, and rates at the ``searched`` settings and with contact ``resolved``.
+    """
+    faults = archive.faults or FaultCounts.none_of(len(archive))
+    crossed = faults.resolved_outcomes[number]
+    kinds = {"searched": faults.certifier_outcomes, "resolved": faults.certifier_resolved_outcomes}
+    return {
+        "resolved": rate_of(crossed) if crossed.any() else None,
+        "certificates": [
+            {"controller": name, "policy_sha256": digest}
+            | {kind: rate_of(counts[number, column]) for kind, counts in kinds.items()}
+            for column, (name, digest) in enumerate(zip(faults.certifiers, faults.certifier_sha256, strict=True))
+            if faults.certificates()[number, column]
+        ],
+    }
 
 
 def elite_words(archive: Archive, number: int) -> list[str]:

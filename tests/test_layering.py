@@ -8,7 +8,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("kernels", "sim", "qd", "train")  # a room may import itself and the rooms before it
-QD_DOORS_FOR_TRAIN = ("search", "archive", "space", "descriptors", "fitness", "fresh", "faults", "run", "workers")
+QD_DOORS_FOR_TRAIN = (
+    "search", "archive", "space", "descriptors", "fitness", "fresh", "faults", "families", "pack", "run", "workers",
+)  # fmt: skip
 LIBRARY_DOORS = {  # a room, or a folder of one
     "warp": ("kernels", "sim"),
     "newton": ("sim",),

@@ -1,7 +1,7 @@
 """The command that finds minimal terrains: which parts of a failing terrain, and how much of their height, it takes."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import OUTCOMES, Archive, FaultCounts
-from qd.faults import Work, certify, confirm, fault_numbers, fault_words, known_names, verdict_of
+from qd.archive import OUTCOMES, Archive
+from qd.faults import Work, certify, confirm, fault_numbers, fault_words, judgement, known_names, rate_of, verdict_of
 from qd.fresh import Open
 from qd.minimal import MOST_PARTS, Case, How, Minimal, Parts, Trial, fresh_counts, genes_of, goal_rate, minimise
 from qd.run.arguments import evaluator_of
@@ -21,11 +21,12 @@ from qd.run.settings import code_of
 from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import InSpace, Where, Who, command_line, naming_what_is_next
-from sim.files.intervals import rate_words, wilson_interval
+from sim.files.intervals import rate_words
 from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.causes import Shape
+    from sim.robots.robot import RobotCfg
     from sim.space import TerrainSpace
 
 SUMMARY_FILE = "minimal.json"
@@ -156,19 +157,19 @@ class MinimalTerrains:
             "of": len(case.parts),
             "how": case.how,
             "subsets_crossed": minimal.subsets,
-            **_rate(minimal.counts),
-            "without": {str(part): goal_rate_or_none(counts) for part, counts in minimal.without.items()},
+            **rate_of(minimal.counts),
+            "without": {str(part): rate_of(counts)["goal_rate"] for part, counts in minimal.without.items()},
             "without_intervals": {
-                str(part): _rate(counts)["goal_interval"] for part, counts in minimal.without.items()
+                str(part): rate_of(counts)["goal_interval"] for part, counts in minimal.without.items()
             },
             "cause": None if cause is None else {"bump": cause, **asdict(shapes[cause])},
             "scale": minimal.scale,
             "passing_scale": minimal.passing_scale,
             "height_m": height,
             "margin_m": margin,
-            "scales": [{"scale": scale, **_rate(counts)} for scale, counts in sorted(minimal.scales.items())],
+            "scales": [{"scale": scale, **rate_of(counts)} for scale, counts in sorted(minimal.scales.items())],
             "verdict": verdict_of(judged, place),
-            **_judged(judged, place),
+            **judgement(judged, place),
         }
 
     def numbers(self, judged: Archive) -> dict[str, Any]:
@@ -223,14 +224,9 @@ def minimise_run(args: Minimise, *, open_evaluator: Open = open_evaluator) -> di
         kind = device.partition(":")[0]
         chosen = run.chosen if args.elite else _first(run.archive, run.chosen, _MOST[kind])
         known = read_minimal(path, run.archive)
-        on_gpu = kind == "cuda"
         hows: dict[int, How | None] = {**known.hows, **{n: args.how or known.hows.get(n) for n in chosen}}
-        cases = {
-            number: _case_of(run.archive, number, space, robot.footprint[1], hows[number], on_gpu) for number in hows
-        }
-        for number, counts in known.counts.items():
-            cases[number].counts.update(counts)
-        terrains = MinimalTerrains(archive=run.archive, space=space, half_width=robot.footprint[1], cases=cases)
+        terrains = _terrains_of(run.archive, known, hows, space, robot.footprint[1], on_gpu=kind == "cuda")
+        cases = terrains.cases
         origin = {**origin_of(device, cfg.seed, args.workers), **identity(robot, policy), "space": cfg.space}
 
         def save(judged: Archive | None = None) -> dict[str, Any]:
@@ -269,6 +265,41 @@ def minimise_run(args: Minimise, *, open_evaluator: Open = open_evaluator) -> di
     return numbers
 
 
+def minimal_of_run(path: Path, archive: Archive, robot: "RobotCfg") -> tuple[dict[str, Any], Archive]:
+    """The minimal terrains that a run has, if any.
+
+    Args:
+        path: The run directory.
+        archive: Its elites.
+        robot: Its robot.
+
+    Returns:
+        The numbers of ``minimal.json``, and the terrains as elites (:meth:`MinimalTerrains.as_archive`), in the same
+        order.
+
+    Raises:
+        ValueError: If their file is damaged.
+    """
+    from sim.space import get_space  # with Warp: not for `--help`
+
+    known = read_minimal(path, archive)
+    space = get_space(archive.space, archive.space_sha256)
+    terrains = _terrains_of(archive, known, known.hows, space, robot.footprint[1], on_gpu=False)
+    judged = terrains.as_archive(known)
+    return terrains.numbers(judged), judged
+
+
+def _terrains_of(
+    archive: Archive, known: Kept, hows: Mapping[int, How | None], space: "TerrainSpace", half_width: float, *,
+    on_gpu: bool,
+) -> MinimalTerrains:  # fmt: skip
+    """Elites that are taken apart, with what was crossed of them before."""
+    cases = {number: _case_of(archive, number, space, half_width, how, on_gpu) for number, how in hows.items()}
+    for number, counts in known.counts.items():
+        cases[number].counts.update(counts)
+    return MinimalTerrains(archive=archive, space=space, half_width=half_width, cases=cases)
+
+
 def _first(archive: Archive, chosen: Sequence[int], most: int) -> list[int]:
     """Some of the failing elites: faults first, then confirmed and certified ones, in the order of the archive."""
     return sorted(sorted(chosen, key=lambda number: (_FIRST.index(verdict_of(archive, number)), number))[:most])
@@ -303,35 +334,6 @@ def _case_of(
         scalable=space.scaled(archive.genes[number][None], 0.5) is not None,
         counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
     )
-
-
-def goal_rate_or_none(counts: NDArray[np.int64]) -> float | None:
-    """The goal rate as JSON has it: None where too many episodes are invalid."""
-    rate = goal_rate(counts)
-    return None if np.isnan(rate) else rate
-
-
-def _rate(counts: NDArray[np.int64]) -> dict[str, Any]:
-    """Goal rate of episodes with its 95 % interval (Wilson)."""
-    valid = int(counts.sum() - counts[OUTCOMES.index("invalid")])
-    interval = list(wilson_interval(int(counts[0]), valid))
-    return {"goal_rate": goal_rate_or_none(counts), "goal_interval": interval, "valid_episodes": valid}
-
-
-def _judged(judged: Archive, place: int) -> dict[str, Any]:
-    """What is known of a minimal terrain under other conditions; None of what nobody looked at."""
-    faults = judged.faults or FaultCounts.none_of(len(judged))
-    crossed = faults.resolved_outcomes[place]
-    kinds = {"searched": faults.certifier_outcomes, "resolved": faults.certifier_resolved_outcomes}
-    return {
-        "resolved": _rate(crossed) if crossed.any() else None,
-        "certificates": [
-            {"controller": name, "policy_sha256": digest}
-            | {kind: _rate(counts[place, column]) for kind, counts in kinds.items()}
-            for column, (name, digest) in enumerate(zip(faults.certifiers, faults.certifier_sha256, strict=True))
-            if faults.certificates()[place, column]
-        ],
-    }
 
 
 def _median(values: Sequence[float]) -> float | None:

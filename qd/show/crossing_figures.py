@@ -4,20 +4,16 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qd.show.crossed import ENDINGS, Crossed, penalties_by_place
-from qd.show.figures import look_of, new_figure
-from sim.crossing import CrossingCfg
+from qd.show.figures import look_of
+from sim.files.figures import new_figure
+from sim.maps.picture import GOAL, LENGTH, START, draw_heights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_LENGTH, _WIDTH = 16.0, 8.0  # of a terrain [m]
-_WHITE: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
-_START = {"marker": ">", "markersize": 11, "label": "start", **_WHITE}
-_GOAL = {"marker": "*", "markersize": 16, "label": "goal", **_WHITE}
 _BELOW: dict[str, Any] = {"loc": "outside lower center", "ncols": 6, "frameon": False, "handlelength": 3}  # a legend
 _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
@@ -83,28 +79,6 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
     return image
 
 
-def draw_heights(axes: "Axes", heights: NDArray[np.float32], limits: tuple[float, float] | None = None) -> Any:
-    """A height map from above with start and goal; returns the image.
-
-    Args:
-        axes: Where.
-        heights: Of a terrain [m], shape (nrow, ncol).
-        limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
-    """
-    from matplotlib.colors import LinearSegmentedColormap
-
-    low, high = limits or (float(heights.min()), float(heights.max()))
-    greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
-    image = axes.imshow(
-        heights, origin="lower", extent=(0.0, _LENGTH, 0.0, _WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
-    )
-    for place, look in ((CrossingCfg.start, _START), (CrossingCfg.goal, _GOAL)):
-        axes.plot(*place, **look)
-    axes.set_ylabel("y [m]")
-    axes.set_aspect("equal")
-    return image
-
-
 def _legend(drawn: Sequence[Crossed]) -> list[Any]:
     """Marks of the ends there are, with the lines of the paths to them, of start and goal; counts of a single map."""
     from matplotlib.lines import Line2D
@@ -116,12 +90,12 @@ def _legend(drawn: Sequence[Crossed]) -> list[Any]:
             label = f"{end.words} ({count})" if len(drawn) == 1 else end.words
             looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line, "label": label}
             handles.append(Line2D([], [], **looks, markeredgecolor="white", markersize=9))
-    return handles + [Line2D([], [], **look) for look in (_START, _GOAL)]
+    return handles + [Line2D([], [], **look) for look in (START, GOAL)]
 
 
 def _x_limits(drawn: Sequence[Crossed]) -> tuple[float, float]:
     """The terrain, and what robots left it for."""
-    xs = np.concatenate([[0.0, _LENGTH], *(crossed.ends[:, 0] for crossed in drawn)])
+    xs = np.concatenate([[0.0, LENGTH], *(crossed.ends[:, 0] for crossed in drawn)])
     return float(xs.min()), float(xs.max())
 
 
@@ -129,7 +103,7 @@ def _draw_profile(axes: "Axes", crossed: Crossed) -> None:
     """Heights along the straight line from start to goal."""
     heights = crossed.recording.heights[0]
     row = heights[heights.shape[0] // 2]
-    x = np.linspace(0.0, _LENGTH, len(row))
+    x = np.linspace(0.0, LENGTH, len(row))
     axes.fill_between(x, row, min(float(row.min()), 0.0) - 0.1, color="0.75")
     axes.plot(x, row, color="0.2", linewidth=1.0)
     axes.set_ylabel("height at\ny = 4 m [m]", fontsize=9)
@@ -138,7 +112,7 @@ def _draw_profile(axes: "Axes", crossed: Crossed) -> None:
 
 def _draw_places(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) -> None:
     """Scaled penalties of an episode by where they were incurred."""
-    edges = np.arange(0.0, _LENGTH + _PLACE / 2, _PLACE)
+    edges = np.arange(0.0, LENGTH + _PLACE / 2, _PLACE)
     amounts = penalties_by_place(crossed, penalties, edges)
     bottom = np.zeros(len(amounts))
     for penalty, amount in zip(penalties, amounts.T, strict=True):

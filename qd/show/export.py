@@ -1,7 +1,8 @@
-"""Elites as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
+"""Elites, or terrains of a pack, as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.archive import Archive
-from qd.run.directory import folder_for
+from qd.pack import PACK_FILE, pack_folder, read_pack
+from qd.run.directory import RUNS, folder_for
 from qd.show.elites import find_archive
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OfRobot, Which, chosen_elites, split_words
@@ -25,7 +27,7 @@ _AT_ONCE = 32  # terrains rasterised
 
 @dataclass(frozen=True, kw_only=True)
 class Export(OfRobot, Which):
-    """Write elites of an archive as files that other programs read.
+    """Write elites of an archive, or terrains of a pack, as files that other programs read.
 
     Of each elite: `elite-N.npz` (heights in m, rows along y; genes), `elite-N.png` (16-bit grayscale seen from above;
     scale and offset in `elite-N.json`), `elite-N.xml` (MJCF: a scene of the terrain alone, whose surface is the
@@ -33,8 +35,12 @@ class Export(OfRobot, Which):
     with the .png, crosses it again.
     """
 
+    pack: str | None = None
+    """Take the terrains of a pack instead: a folder that `faultline pack` made, or anymal or cassie for the published
+    one. --elite counts its terrains, from 0; their files are called as the pack calls them."""
     out: Path | None = None
-    """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published."""
+    """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published; of a pack
+    runs/<robot>-pack-terrains."""
     formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
     """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
     overwrite: bool = False
@@ -45,6 +51,28 @@ class Export(OfRobot, Which):
         export(self)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """Terrains that may be exported."""
+
+    whose: Path
+    count: int
+    folder: Path
+    """Where their files go if nothing is said."""
+    origin: dict[str, Any]
+    """Where they come from, for every file."""
+    named: dict[str, Any]
+    """The same for the index alone."""
+    stem: Callable[[int], str]
+    """Name of a terrain's files."""
+    genes: NDArray[np.float32] | None
+    """Shape (count, num_genes)."""
+    heights: Callable[[list[int]], NDArray[np.float32]]
+    """Of some terrains [m], shape (number of them, nrow, ncol)."""
+    about: Callable[[int], dict[str, Any]]
+    """What is known of a terrain."""
+
+
 def export(cfg: Export) -> list[Path]:
     """Writes the files.
 
@@ -52,41 +80,80 @@ def export(cfg: Export) -> list[Path]:
         The files, the index last.
 
     Raises:
-        FileNotFoundError: If there is no archive.
-        ValueError: If there is no such elite or format, or no room; before anything is written.
+        FileNotFoundError: If there is no archive or pack.
+        ValueError: If there is no such elite or format, a pack is damaged or of another robot, or there is no room;
+            before anything is written.
         OSError: If a file cannot be written.
     """
-    from sim.bank import heights_of
     from sim.maps.terrain_files import check_formats, write_terrain
 
-    found = find_archive(cfg.robot, cfg.run, space=cfg.space)
-    elites = chosen_elites(cfg.elite, len(found.archive), found.run)
+    source = _of_archive(cfg) if cfg.pack is None else _of_pack(cfg, cfg.pack)
+    elites = chosen_elites(cfg.elite, source.count, source.whose)
     formats = list(dict.fromkeys(split_words(cfg.formats)))
     check_formats(formats)
-    folder = cfg.out or folder_for(found.run, found.robot.name) / _FOLDER
+    folder = cfg.out or source.folder
     if not cfg.overwrite:
-        _refuse_to_replace(folder, elites)
+        _refuse_to_replace(folder, {source.stem(elite) for elite in elites})
     _check_room(folder, len(elites), formats)
     prepare_output(folder / INDEX_FILE)
-    of_space = {"space": found.archive.space, "space_sha256": found.archive.space_sha256}
-    origin = {"run": str(found.run), **of_space, **provenance("cpu", 0)}
+    origin = {**source.origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
-    archive, files, index = found.archive, [], []
-    space = found.space
-    with tqdm(total=len(elites), desc="exporting", unit="elite", file=sys.stderr, disable=None) as bar:
+    files, index = [], []
+    with tqdm(total=len(elites), desc="exporting", unit="terrain", file=sys.stderr, disable=None) as bar:
         for first in range(0, len(elites), _AT_ONCE):
             numbers = elites[first : first + _AT_ONCE]
-            for elite, heights in zip(numbers, heights_of(archive.genes[numbers], space), strict=True):
-                about = {**about_elite(archive, elite), "terrain": space.describe(archive.genes[elite])}
-                stem = folder / f"elite-{elite}"
-                genes: NDArray[np.float32] = archive.genes[elite]
+            for number, heights in zip(numbers, source.heights(numbers), strict=True):
+                about, stem = source.about(number), folder / source.stem(number)
+                genes = None if source.genes is None else source.genes[number]
                 files += write_terrain(stem, heights, formats=formats, about={**about, **origin}, genes=genes)
                 index.append({**about, "files": stem.name})
                 bar.update()
     files.append(folder / INDEX_FILE)
-    write_atomically(files[-1], to_json({**archive.named(), "formats": formats, "elites": index, **origin}))
-    print(f"{len(elites)} elite{'s' * (len(elites) != 1)} as {', '.join(formats)}: {folder}")
+    write_atomically(files[-1], to_json({**source.named, "formats": formats, "elites": index, **origin}))
+    what = "elite" if cfg.pack is None else "terrain"
+    print(f"{len(elites)} {what}{'s' * (len(elites) != 1)} as {', '.join(formats)}: {folder}")
     return files
+
+
+def _of_archive(cfg: Export) -> _Source:
+    """The elites of an archive."""
+    from sim.bank import heights_of
+
+    found = find_archive(cfg.robot, cfg.run, space=cfg.space)
+    archive, space = found.archive, found.space
+    return _Source(
+        whose=found.run,
+        count=len(archive),
+        folder=folder_for(found.run, found.robot.name) / _FOLDER,
+        origin={"run": str(found.run), "space": archive.space, "space_sha256": archive.space_sha256},
+        named=archive.named(),
+        stem=lambda elite: f"elite-{elite}",
+        genes=archive.genes,
+        heights=lambda numbers: heights_of(archive.genes[numbers], space),
+        about=lambda elite: {**about_elite(archive, elite), "terrain": space.describe(archive.genes[elite])},
+    )
+
+
+def _of_pack(cfg: Export, named: str) -> _Source:
+    """The terrains of a pack."""
+    from sim.robots.robot import robot_of
+
+    if cfg.run is not None or cfg.space is not None:
+        raise ValueError("a pack has its own terrains, got --run or --space beside --pack: leave one of them out")
+    folder = pack_folder(named)
+    pack = read_pack(folder)
+    robot = robot_of(pack.content, cfg.robot, folder / PACK_FILE, flag="pack")
+    return _Source(
+        whose=folder,
+        count=len(pack),
+        folder=RUNS / f"{robot.name}-pack-{_FOLDER}",
+        origin={"pack": folder.name, "terrains_sha256": pack.content["terrains_sha256"]},
+        named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
+        stem=lambda place: pack.terrains[place]["name"],
+        genes=pack.genes,
+        heights=lambda numbers: pack.heights[numbers],
+        about=lambda place: {"robot": robot.name, "place": place, **pack.terrains[place]},
+    )
 
 
 def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
@@ -111,9 +178,9 @@ def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
     }
 
 
-def _refuse_to_replace(folder: Path, elites: list[int]) -> None:
+def _refuse_to_replace(folder: Path, stems: set[str]) -> None:
     there = [file for file in (folder / INDEX_FILE, *folder.glob("elite-*")) if file.exists()]
-    wanted = {INDEX_FILE, *(f"elite-{elite}" for elite in elites)}
+    wanted = {INDEX_FILE, *stems}
     found = sorted({file.name for file in there if file.name == INDEX_FILE or file.stem in wanted})
     if found:
         names = ", ".join(found[:3]) + ", ..." * (len(found) > 3)

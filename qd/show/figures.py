@@ -1,6 +1,5 @@
 """What a search leaves to look at: its curves, its archive, and its numbers."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,6 +11,7 @@ from qd.faults import fault_numbers
 from qd.fresh import FRESH_EPISODES, numbers_of
 from qd.run.directory import episodes_in
 from sim.files.atomic import write_atomically
+from sim.files.figures import as_png, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,26 +86,6 @@ def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, An
 def save_figure(path: Path, figure: "Figure") -> None:
     """Writes a figure, atomically."""
     write_atomically(path, as_png(figure))
-
-
-def as_png(figure: "Figure") -> bytes:
-    """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold."""
-    from matplotlib.text import Text
-
-    for text in figure.findobj(Text):
-        assert isinstance(text, Text)
-        text.set_parse_math(False)  # a file may be called $x$.npz, or something that is no formula
-        text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or hold bytes that are no text
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
-    return buffer.getvalue()
-
-
-def new_figure(width: float, height: float) -> "Figure":
-    """An empty figure of a size in inches that needs no screen and no global state."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
 
 
 def _title(archive: Archive) -> str:

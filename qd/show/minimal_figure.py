@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.show.crossing_figures import draw_heights
-from qd.show.figures import new_figure
 from sim.bank import heights_of
+from sim.files.figures import new_figure
+from sim.maps.picture import draw_heights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

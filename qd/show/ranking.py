@@ -1,10 +1,8 @@
 """The orders that elites are shown in: what is a fault before what merely costs much, and no kind of failure twice.
 
-A family is of terrains that look alike: average linkage on the root mean square of the difference of their heights, cut
-at 6 cm. That is half of what hard-random terrains lie apart; elites that descend from each other lie some 3 cm apart.
+Families are those of :mod:`qd.families`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -13,16 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.show.elites import Elites, elites_of
-from qd.show.modes import Modes, find_modes
+from qd.elites import Elites, elites_of
+from qd.families import families_of
+from qd.modes import Modes, find_modes
 
 if TYPE_CHECKING:
     from sim.space import TerrainSpace
-
-FAMILY_M = 0.06
-"""Mean distance of heights, RMS, up to which terrains are of one family [m]."""
-_EVERY = 8  # nodes from one compared height to the next: 0.4 m
-_AT_ONCE = 256  # terrains whose heights are computed together
 
 ORDERS = {
     "modes": "each way of failing once first",
@@ -103,28 +97,3 @@ def rank(archive: Archive, space: "TerrainSpace", *, judged: bool = False) -> Ra
     places = {int(family): place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()]), start=1)}
     numbered = np.array([places[int(family)] for family in families], dtype=np.int64)
     return Ranking(elites=elites, modes=find_modes(elites), families=numbered)
-
-
-def families_of(genes: NDArray[np.floating], space: "TerrainSpace") -> NDArray[np.int64]:
-    """Family of each terrain, shape (N,).
-
-    Args:
-        genes: Shape (N, num_genes).
-        space: What they mean.
-    """
-    if len(genes) < 2:
-        return np.ones(len(genes), np.int64)
-    from scipy.cluster.hierarchy import fcluster, linkage
-    from scipy.spatial.distance import pdist
-
-    heights = np.concatenate(list(_some_heights(genes, space)))
-    distances = pdist(heights) / np.sqrt(heights.shape[1])
-    return fcluster(linkage(distances, "average"), FAMILY_M, "distance").astype(np.int64)
-
-
-def _some_heights(genes: NDArray[np.floating], space: "TerrainSpace") -> "Sequence[NDArray[np.float32]]":
-    """Heights of some nodes [m], of some terrains at a time, each of shape (num_terrains, num_nodes)."""
-    from sim.bank import heights_of
-
-    lots = [genes[first : first + _AT_ONCE] for first in range(0, len(genes), _AT_ONCE)]
-    return [heights_of(lot, space)[:, ::_EVERY, ::_EVERY].reshape(len(lot), -1).copy() for lot in lots]

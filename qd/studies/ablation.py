@@ -62,7 +62,7 @@ class Ablation(StudyFlags):
             Interrupted: On Ctrl-C; all iterations that ended are saved.
             EvaluatorError: If a worker is lost; likewise.
         """
-        from qd.show.figures import as_png
+        from sim.files.figures import as_png
         from sim.robots.robot import get_robot, robot_of
 
         device, moved, names = resolve_device(self.device, self.workers), None, list(_ALPHAS)
@@ -166,7 +166,7 @@ def _show(report: dict[str, Any]) -> None:
 
 def draw_ablation(report: dict[str, Any]) -> "Figure":
     """Mean STD over the iterations with its intervals, and the number of elites (the paper's ablation figure)."""
-    from qd.show.figures import new_figure
+    from sim.files.figures import new_figure
 
     figure = new_figure(8.5, 3.6)
     figure.suptitle(f"{report['robot']}: the standard deviations in the fitness (alpha 1) and left out (alpha 0)")

@@ -44,7 +44,7 @@ class Beside:
             FileNotFoundError: If there is no run.
             ValueError: If runs cannot be compared, or a file cannot be written.
         """
-        from qd.show.figures import as_png
+        from sim.files.figures import as_png
         from sim.files.provenance import provenance
 
         sides = sides_of(self.runs)
@@ -127,8 +127,8 @@ def numbers_of(side: Side) -> dict[str, Any]:
 
 def draw_beside(sides: Sequence[Side]) -> "Figure":
     """Curves of the searches, how often their elites are crossed, and where their penalties lie."""
-    from qd.show.figures import new_figure
     from qd.studies.study import LOOKS
+    from sim.files.figures import new_figure
 
     figure = new_figure(13.0, 4.4)
     archive = sides[0].archive

@@ -120,7 +120,7 @@ class Compare(StudyFlags):
             Interrupted: On Ctrl-C; all iterations that ended are saved.
             EvaluatorError: If a worker is lost; likewise.
         """
-        from qd.show.figures import as_png
+        from sim.files.figures import as_png
         from sim.robots.robot import get_robot
 
         check(self)
@@ -323,7 +323,7 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     Args:
         report: As of :func:`report_of`, with ``robot`` and ``seeds``.
     """
-    from qd.show.figures import new_figure
+    from sim.files.figures import new_figure
 
     figure, seeds = new_figure(12.0, 4.6), len(report["seeds"])
     most = max(method["terrains_evaluated"][-1] for method in report["methods"].values())

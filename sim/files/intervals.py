@@ -60,14 +60,23 @@ def _resamples(count: int, seed: int) -> NDArray[np.float64]:
     return np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape).astype(np.float64)
 
 
-def bootstrap_interval(values: NDArray[np.floating], seed: int) -> list[float] | None:
+def bootstrap_interval(
+    values: NDArray[np.floating], seed: int, *, families: NDArray[np.int64] | None = None
+) -> list[float] | None:
     """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains; None without any.
 
     One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
+
+    Args:
+        values: Of each terrain.
+        seed: Of the resamples.
+        families: Terrains of one number are not independent: they are drawn together, shape (num_terrains,).
     """
     if len(values) == 0:
         return None
-    means = _resamples(len(values), seed) @ values / len(values)
+    own = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
+    drawn = _resamples(int(own.max()) + 1, seed)
+    means = (drawn @ np.bincount(own, weights=values)) / (drawn @ np.bincount(own).astype(np.float64))
     return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
 
 

@@ -289,7 +289,7 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     )
 
 
-def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Path) -> RobotCfg:
+def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, flag: str = "run") -> RobotCfg:
     """The robot that a file names, for example a run's, if it is still what it was.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
@@ -299,6 +299,7 @@ def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Pat
         there: What the file says: ``robot``, its name, and the rest of :func:`sim.robots.identity.identity`.
         given: What the command line names, if anything.
         file: The file, for errors.
+        flag: The flag that names it, likewise.
 
     Raises:
         ValueError: If the two are not the same, the robot or the definition of its penalties has changed since, or the
@@ -306,7 +307,7 @@ def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Pat
     """
     name, robot = there["robot"], None if given is None else get_robot(given)
     if robot is not None and robot.name != name:
-        raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --run")
+        raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --{flag}")
     if robot is None and name not in ROBOTS:
         raise ValueError(
             f"{file} is of robot '{name}', which is not shipped: name its settings file too (--robot .../{name}.py), "

@@ -48,15 +48,16 @@ class KeptCrossings:
 
     Args:
         folder: Where they are kept; made when the first is written.
-        evaluator: What crosses: its robot, episodes a terrain and kind of device count. Crossings of a CPU and of a
-            GPU differ in their last bits.
+        evaluator: What crosses: its robot, episodes a terrain, kind of device and whether rewards are summed count.
+            Crossings of a CPU and of a GPU differ in their last bits.
     """
 
     def __init__(self, folder: Path, evaluator: EvaluatorCfg) -> None:
         self.folder, self._episodes = folder, evaluator.num_replicas
         robot = get_robot(evaluator.robot)
         kind = "cuda" if evaluator.device.startswith("cuda") else "cpu"
-        self._common = [robot_identity(robot), self._episodes, kind, code_fingerprint(_ROOMS)]
+        unpaid = [] if evaluator.reward else ["without reward"]
+        self._common = [robot_identity(robot), self._episodes, kind, code_fingerprint(_ROOMS), *unpaid]
 
     def file(self, policy: str, terrains: TerrainSet) -> Path:
         """Where the crossings of one controller on one set are kept."""
@@ -75,7 +76,7 @@ class KeptCrossings:
         try:
             check_zip(file)
             with np.load(file, allow_pickle=False) as content:
-                found: dict[str, Any] = {name: content[name] for name in _FIELDS}
+                found: dict[str, Any] = {name: content[name] for name in _FIELDS if name != "reward" or name in content}
             found["penalty_names"] = tuple(found["penalty_names"].tolist())
             numbers = {
                 name: value.item() for name, value in found.items() if isinstance(value, np.ndarray) and not value.ndim
@@ -97,7 +98,8 @@ class KeptCrossings:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         buffer = io.BytesIO()
-        content: dict[str, Any] = {name: np.asarray(getattr(result, name)) for name in _FIELDS}
+        values = {name: getattr(result, name) for name in _FIELDS}
+        content: dict[str, Any] = {name: np.asarray(value) for name, value in values.items() if value is not None}
         np.savez_compressed(buffer, **content)
         write_atomically(self.file(policy, terrains), buffer.getvalue())
 

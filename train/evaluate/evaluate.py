@@ -29,13 +29,17 @@ _SMALL = (24, 4)  # on a machine without a GPU
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Who, Where):
-    """Rates of one controller by terrain type and level, or the paper's tables of several.
+    """Rates of one controller by terrain type and level or on a pack, or the paper's tables of several.
 
     Rates say how often the controller gets through, and its velocity error on flat ground. With --policies, --archive
     or --sets it makes tables: any controllers on the same hand-crafted, hard-random and held-out generated terrains,
-    with rewards, penalties and intervals. Tables that were killed go on by the same command.
+    with rewards, penalties and intervals. Tables that were killed go on by the same command. With --pack it says what
+    of a pack of faults a controller fails.
     """
 
+    pack: str | None = None
+    """Pack of faults that the controller is tested on: a folder that `faultline pack` made, or anymal or cassie for the
+    published one. --terrains takes the first of it; all on CUDA."""
     policies: tuple[str, ...] = ()
     """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped; the first
     is the one that the others are held against; base=shipped. C-G, C-G@1, C-G@2 are one kind of several seeds, whose
@@ -57,7 +61,8 @@ class Evaluate(Who, Where):
     """Draws other test sets."""
     out: Path | None = None
     """Where to write the numbers: runs/<robot>-rates.json, of another controller than the shipped
-    runs/<robot>-<its name>-rates.json; tables RUN_DIR/tables.json, their figure beside as .png."""
+    runs/<robot>-<its name>-rates.json, of a pack -pack.json, its figure beside as .png; tables RUN_DIR/tables.json,
+    their figure likewise."""
     run_dir: Path | None = None
     """Where tables keep what is crossed, so that they can go on; runs/<robot>-tables."""
 
@@ -72,6 +77,11 @@ class Evaluate(Who, Where):
         Raises:
             ValueError: If something asked for cannot be had; raised before any long work.
         """
+        if self.pack is not None:
+            from train.evaluate.pack import evaluate_pack
+
+            evaluate_pack(self)
+            return
         if not self.makes_tables:
             evaluate_rates(self)
             return
@@ -79,8 +89,13 @@ class Evaluate(Who, Where):
             evaluate_tables(self)
 
 
-def evaluator_of(flags: Evaluate, robot: "RobotCfg") -> EvaluatorCfg:
+def evaluator_of(flags: Evaluate, robot: "RobotCfg", full: tuple[int, int] | None = None) -> EvaluatorCfg:
     """How much is crossed, where; says so where it is less than on a GPU. The controller is still to be named.
+
+    Args:
+        flags: What was asked for.
+        robot: The robot.
+        full: Terrains a set and episodes a terrain on a GPU; what rates or tables take if None.
 
     Raises:
         ValueError: If the device is unknown, or a number is out of range.
@@ -89,8 +104,8 @@ def evaluator_of(flags: Evaluate, robot: "RobotCfg") -> EvaluatorCfg:
 
     check(flags)
     device = resolve_device(flags.device, flags.workers)
-    full = (paper_terrains(robot.name), _FULL[1]) if flags.makes_tables else _FULL
-    terrains, episodes = full if device.startswith("cuda") else _SMALL
+    full = full or ((paper_terrains(robot.name), _FULL[1]) if flags.makes_tables else _FULL)
+    terrains, episodes = full if device.startswith("cuda") else (min(full[0], _SMALL[0]), _SMALL[1])
     if not device.startswith("cuda") and flags.terrains is None and flags.episodes is None:
         print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {full[0]} x {full[1]}.")
     return EvaluatorCfg(

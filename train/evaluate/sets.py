@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
+from qd.families import rms_distances
 from qd.run.directory import directory_of
 from sim.bank import heights_of
 from sim.files.atomic import read_json
@@ -41,7 +42,7 @@ MIN_ELITES = 5
 
 _TEST_KEY = 20250604  # with the set's number and the seed, the entropy of a test set
 _SPLIT_KEY = 20250605
-_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3}
+_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3, "pack": 4}
 _BANK = 50  # height maps that are compared at once
 
 TRAINED_ON = "trained_on"
@@ -208,13 +209,12 @@ def nearest_distance(
     nearest = np.full(len(maps), np.inf)
     for first in range(0, len(training_genes), _BANK):
         others = _heights(training_genes[first : first + _BANK], space)
-        squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
-        nearest = np.minimum(nearest, squares.min(axis=1))
-    return np.sqrt(np.maximum(nearest, 0.0) / maps.shape[1])
+        nearest = np.minimum(nearest, rms_distances(maps, others).min(axis=1))
+    return nearest
 
 
 def _heights(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:
-    """Height maps [m] as rows, float64 since their squares are subtracted from each other."""
+    """Height maps [m] as rows, as :func:`qd.families.rms_distances` takes them."""
     return heights_of(genes, space).reshape(len(genes), -1).astype(np.float64)
 
 

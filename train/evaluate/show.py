@@ -1,14 +1,20 @@
 """What evaluations show: rates and tables on the terminal, tables as a figure, the paper's numbers beside ours."""
 
-import io
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sim.files.command import command_line
+from sim.files.figures import as_png, new_figure
 from sim.files.intervals import value_words
+from sim.maps.picture import draw_heights
 from sim.policy.spec import firsts, kind_of
 from train.evaluate.measures import invalid_lines
+from train.evaluate.pack_rates import fails
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,6 +38,7 @@ _PANELS = {
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
 _CHANGES = {"mended": "#0072b2", "still_failing": "#bbbbbb", "newly_broken": "#d55e00"}
+_GALLERY, _GALLERY_COLUMNS = 12, 3  # terrains of a pack that are drawn
 _PAPER_LABEL = "of that name in the paper"
 
 
@@ -144,19 +151,103 @@ def _print_over_seeds(found: dict[str, Any]) -> None:
             print(f"  {name}, {kind}: " + ", ".join(words))
 
 
+def print_pack(report: dict[str, Any]) -> None:
+    """Prints the rates of a pack's controllers, as ``pack.json`` has them."""
+    count = Counter(about["verdict"] for about in report["terrains"])
+    words = (f"{many} {what}{'s' * (many != 1)}" for what, many in count.items())
+    print(f"{len(report['terrains'])} terrains: {', '.join(words)}")
+    _print_rates_of(report["rates"])
+
+
+def print_pack_test(report: dict[str, Any], folder: Path) -> None:
+    """Prints what of a pack a controller fails, beside the pack's controllers.
+
+    Args:
+        report: As the result file has it.
+        folder: Of the pack.
+    """
+    rows = {"this": report["rates"], **report["beside"]}
+    _print_rates_of(rows)
+    if report["seed"] != report["pack"]["seed"] or report["episodes"] != report["pack"]["episodes"]:
+        print("Episodes differ from those of the pack's controllers in number or start.")
+    names = {one["mode"]: f"{one['mode']}: {one['ending']}, {one['marked_by']}" for one in report["pack"]["modes"]}
+    wide = max(map(len, rows))
+    for group, title in (("verdict", "verdict"), ("mode", "failure mode"), ("cause", "cause"), ("kind", "kind")):
+        print(f"by {title:<61}{'terrains':>9}  failed by {'  '.join(f'{who:>{wide}}' for who in rows)}")
+        for one in report["by"][group]:
+            value = names.get(one[group], one[group]) if group == "mode" else one[group] or "not looked for"
+            cells = "  ".join(f"{one['failing'][who]:>{wide}}" for who in rows)
+            print(f"  {value:<62}{one['terrains']:>9}            {cells}")
+    own = report["rates"]
+    print(f"It fails {own['failing']} of {own['terrains']} terrains, of {own['failing_families']} families.")
+    worst = worst_of(report["terrains"], "this")[:10]
+    for place in (place for place in worst if fails(report["terrains"][place]["rates"]["this"])):
+        about, row = report["terrains"][place], report["terrains"][place]["rates"]["this"]
+        rate = value_words(row["goal_rate"], row["goal_interval"], ".0%")
+        print(f"  {place:>3} {about['name']:<22}{rate:<22}family {about['family']:<5}{about['cause'] or ''}")
+    print(f"As files:  {command_line('export', pack=folder, elite='all')}")
+
+
+def _print_rates_of(rows: Mapping[str, dict[str, Any]]) -> None:
+    wide = max(12, *(len(who) + 2 for who in rows))
+    print(f"{'':<{wide}}{'goal':>24}{'success':>24}{'fallen':>24}{'failed':>8}{'of':>5}")
+    for who, row in rows.items():
+        rates = (value_words(row[f"{name}_rate"], row[f"{name}_interval"]) for name in ("goal", "success", "fallen"))
+        print(f"{who:<{wide}}{''.join(f'{words:>24}' for words in rates)}{row['failing']:>8}{row['terrains']:>5}")
+
+
+def worst_of(terrains: Sequence[dict[str, Any]], who: str) -> list[int]:
+    """Places of the valid terrains of a pack, those with the lowest goal rate first, one of each family before two."""
+    valid = [place for place, about in enumerate(terrains) if about["rates"][who]["goal_rate"] is not None]
+    seen, turns = Counter[int](), dict[int, int]()
+    for place in sorted(valid, key=lambda place: (terrains[place]["rates"][who]["goal_rate"], place)):
+        turns[place] = seen[terrains[place]["family"]]
+        seen[terrains[place]["family"]] += 1
+    failing = {place: fails(terrains[place]["rates"][who]) for place in valid}
+    return sorted(
+        valid, key=lambda place: (not failing[place], turns[place], terrains[place]["rates"][who]["goal_rate"], place)
+    )
+
+
+def picture_of_pack(terrains: Sequence[dict[str, Any]], heights: NDArray[np.float32], who: str, title: str) -> bytes:
+    """Terrains of a pack that a controller fails, as PNG; where it fails fewer, others with the lowest goal rates.
+
+    Args:
+        terrains: What is known of each.
+        heights: [m], shape (at least as many, nrow, ncol).
+        who: The controller, by its name among the rates.
+        title: What the controller is called.
+    """
+    shown = worst_of(terrains, who)[:_GALLERY]
+    failing = sum(fails(about["rates"][who]) for about in terrains)
+    rows = max(1, -(-len(shown) // _GALLERY_COLUMNS))
+    figure = new_figure(13.0, 0.9 + 2.3 * rows)
+    figure.suptitle(f"{title}: fails {failing} of {len(terrains)} terrains of the pack; those with the fewest arrivals")
+    panels = [figure.add_subplot(rows, _GALLERY_COLUMNS, place + 1) for place in range(len(shown))]
+    grounds = [heights[place] for place in shown]
+    limits = (min(map(np.min, grounds)), max(map(np.max, grounds))) if grounds else None
+    image = None
+    for axes, place in zip(panels, shown, strict=True):
+        about = terrains[place]
+        image = draw_heights(axes, heights[place], limits)
+        words = ", ".join(
+            filter(None, [about["verdict"], about["cause"], f"{about['rates'][who]['goal_rate']:.0%} arrive"])
+        )
+        axes.set_title(f"{place}: {about['name']}: {words}", fontsize=9)
+    if image is not None:
+        figure.colorbar(image, ax=panels, label="height [m]", shrink=0.8, pad=0.01)
+    return as_png(figure)
+
+
 def picture_of(report: dict[str, Any]) -> bytes:
     """The tables, as ``tables.json`` has them, as PNG."""
-    buffer = io.BytesIO()
-    draw_tables(report).savefig(buffer, format="png", dpi=150)
-    return buffer.getvalue()
+    return as_png(draw_tables(report))
 
 
 def draw_tables(report: dict[str, Any]) -> "Figure":
     """Success, goal rate and reward of every controller by set with 95 % intervals, and what became of terrains."""
-    from matplotlib.figure import Figure
-
     pairs = _pairs_from_first(report)
-    figure = Figure(figsize=(11.5, 8.0) if pairs else (13.0, 4.2), layout="constrained")
+    figure = new_figure(*((11.5, 8.0) if pairs else (13.0, 4.2)))
     panels = np.ravel(figure.subplots(2, 2) if pairs else figure.subplots(1, 3))
     for axes, (measure, (label, factor)) in zip(panels, _PANELS.items(), strict=False):
         _draw_measure(axes, report, measure, factor)

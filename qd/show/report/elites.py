@@ -1,11 +1,11 @@
 """The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
 
+from qd.elites import Elites
 from qd.faults import VERDICTS, elite_words
+from qd.modes import MAX_MODES, TOLERANCE, Mode
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
 from qd.show.crossing_figures import draw_crossing, draw_maps
-from qd.show.elites import Elites
 from qd.show.figures import label_of, look_of
-from qd.show.modes import MAX_MODES, TOLERANCE, Mode
 from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, absent, counted, heading, paragraph, percent, picture, table

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.show.elites import Elites
-from qd.show.figures import label_of, look_of, new_figure
-from qd.show.modes import TOLERANCE, Modes
+from qd.elites import Elites
+from qd.modes import TOLERANCE, Modes
+from qd.show.figures import label_of, look_of
+from sim.files.figures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

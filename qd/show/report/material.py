@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive
+from qd.elites import Elites
+from qd.modes import Modes
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
-from qd.show.elites import Elites, find_archive
+from qd.show.elites import find_archive
 from qd.show.figures import summary
-from qd.show.modes import Modes
 from qd.show.ranking import Ranking
 from qd.show.report.minimal import MinimalFound, read_minimal_numbers
 from qd.show.report.tables import Change, Changes, read_tables

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qd.run.progress import clock
-from qd.show.figures import as_png
 from sim.files.atomic import write_atomically
+from sim.files.figures import as_png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qd.run.directory import ROUNDS_FILE
-from qd.show.figures import new_figure
 from qd.show.report.evaluation import changes_tables, measure_table
 from qd.show.report.page import (
     Block,
@@ -23,6 +22,7 @@ from qd.show.report.page import (
 from qd.show.report.tables import LABELS, MEASURES, by_kind, unreadable
 from sim.files.atomic import prepare_output, read_json
 from sim.files.command import plain_command
+from sim.files.figures import new_figure
 from sim.robots.robot import get_robot
 
 if TYPE_CHECKING:

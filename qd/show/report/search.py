@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 
 from qd.archive import Archive
+from qd.elites import Elites
 from qd.faults import VERDICTS, any_of, fault_numbers, fault_words
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
 from qd.show.crossed import ARRIVED
 from qd.show.crossing_figures import draw_maps
-from qd.show.elites import Elites
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
 from qd.show.report.evaluation import most_mended
 from qd.show.report.figures import draw_pairs

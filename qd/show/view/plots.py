@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
+from qd.elites import Elites
 from qd.faults import VERDICTS, elite_words
 from qd.show.crossed import ARRIVED, Rate
-from qd.show.elites import Elites
 from qd.show.figures import label_of, look_of
 from qd.show.ranking import ORDERS, Ranking, rank
 from sim.files.intervals import rate_words

@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from qd.show.elites import elites_of
-from qd.show.ranking import FAMILY_M, ORDERS, families_of, rank
-from sim.bank import heights_of
+from qd.elites import elites_of
+from qd.show.ranking import ORDERS, rank
 from sim.space import SUPER_GAUSSIAN
 from tests.builders import judged_archive, small_archive
 from tests.qd.show.report.test_numbers import grouped_archive
@@ -26,18 +25,6 @@ def test_verdicts_come_before_rates_and_rates_before_fitness():
     found = elites_of(archive)
     assert found.verdict.tolist() == [0, 1, 1, 1, 1]  # by the episodes that found them: nobody else looked
     assert found.by_severity().tolist() == [4, 3, 2, 1, 0]
-
-
-def test_terrains_that_lie_close_are_a_family():
-    genes = np.repeat(small_archive(2).genes, 3, axis=0)
-    genes[1:3] += np.float32(0.004)
-    genes[4:6] -= np.float32(0.004)
-    heights = heights_of(np.clip(genes, -1.0, 1.0), SUPER_GAUSSIAN)
-    near, far = (float(np.sqrt(np.mean((heights[0] - heights[k]) ** 2))) for k in (1, 3))
-    assert near < FAMILY_M < far
-    first, second = np.split(families_of(np.clip(genes, -1.0, 1.0), SUPER_GAUSSIAN), 2)
-    assert len(set(first)) == len(set(second)) == 1 and first[0] != second[0]
-    assert families_of(genes[:1], SUPER_GAUSSIAN).tolist() == [1]
 
 
 def test_the_first_are_one_of_each_way_of_failing_and_of_different_families():

@@ -37,7 +37,7 @@ ASKED = {
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
-    monkeypatch.setattr("qd.show.figures.as_png", lambda figure: b"a figure")
+    monkeypatch.setattr("sim.files.figures.as_png", lambda figure: b"a figure")
     monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
 
 

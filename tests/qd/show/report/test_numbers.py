@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
+from qd.elites import elites_of
+from qd.modes import MAX_MODES, find_modes
 from qd.show.crossed import crossed_of, penalties_by_place
-from qd.show.elites import elites_of
-from qd.show.modes import MAX_MODES, find_modes
 from qd.show.ranking import rank
 from qd.show.report.elites import choice_told
 from qd.show.report.page import percent

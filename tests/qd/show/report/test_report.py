@@ -11,11 +11,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from qd.archive import FaultCounts, read_archive, write_archive
+from qd.elites import elites_of
 from qd.minimal import Case, Minimal
 from qd.run.minimal_file import write_minimal
 from qd.run.settings import as_settings, preset
-from qd.show.elites import elites_of
-from qd.show.figures import as_png, new_figure, summary
+from qd.show.figures import summary
 from qd.show.ranking import rank
 from qd.show.report import command
 from qd.show.report import page as page_module
@@ -24,6 +24,7 @@ from qd.show.report.material import gather
 from qd.show.report.page import MAX_BYTES, Section, absent, at_a_glance, heading, paragraph, render, table
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
+from sim.files.figures import as_png, new_figure
 from sim.robots.robot import get_robot
 from sim.space import SUPER_GAUSSIAN
 from tests.builders import fresh_values

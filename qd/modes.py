@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.elites import Elites
 from qd.fitness import FAILING_GOAL_RATE
-from qd.show.elites import Elites
 
 MAX_MODES = 7
 """Most groups that are tried: as many as colours and markers stay apart."""
