@@ -73,7 +73,7 @@ view: setup ## Show an archive in the browser
 bench: setup ## Time every kernel against torch and against the device's ceiling
 	$(call faultline,bench)
 
-test: setup ## Run the quick tests: about seven minutes on two cores
+test: setup ## Run the quick tests: about five minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray and not kills' $(ARGS)
 
 test-all: setup ## Run all tests: about fifteen minutes on two cores

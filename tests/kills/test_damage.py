@@ -137,6 +137,7 @@ def test_damaged_files_of_a_training_and_going_on_with_it(folder, training_run):
     each(cases, check)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "command"),
     [

@@ -152,6 +152,7 @@ LOADERS = {
 }
 
 
+@pytest.mark.kills
 @pytest.mark.parametrize("what", LOADERS)
 def test_mutated_files(made, tmp_path, what):
     name, read = LOADERS[what]
@@ -252,6 +253,7 @@ def bombs(target: Path) -> dict[str, bytes]:
     return {"pickle": pickle.dumps(bomb), "torch": packed.getvalue(), "search": search, "npz": objects}
 
 
+@pytest.mark.kills
 @pytest.mark.parametrize("what", LOADERS)
 @pytest.mark.parametrize("kind", ["pickle", "torch", "search", "npz"])
 def test_no_code_in_a_file_runs(tmp_path, what, kind):

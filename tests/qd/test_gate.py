@@ -133,6 +133,7 @@ def test_certificates_come_back_from_the_file_with_their_elites(tmp_path):
         read_archive(file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [1, 2, 4, 5])
 def test_lost_at_any_lot_it_goes_on_as_if_it_had_not_been(tmp_path, groups):
     """Four groups and more leave one with the certifiers while the next is crossed."""
@@ -147,6 +148,7 @@ def test_lost_at_any_lot_it_goes_on_as_if_it_had_not_been(tmp_path, groups):
         assert ((path / "archive.npz").read_bytes(), rows_of(path)) == expected, (policy, lots)
 
 
+@pytest.mark.slow
 def test_who_crosses_changes_nothing(tmp_path):
     search(tmp_path / "whole", groups=4, iterations=2)
     search(tmp_path / "pieces", groups=4, iterations=1)

@@ -137,6 +137,7 @@ class Lost(Pipeline):
         assert not self.lots  # whatever is crossed anew finds nothing under way
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [2, 3])
 def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path, plain_figures, groups):
     """Five emitters make groups of two and three, or of one, two and two; elites are looked at again."""
@@ -169,6 +170,7 @@ def test_groups_are_put_in_ahead(tmp_path, plain_figures):
     assert pipeline.most == 3 and not lots
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [1, 2, 3])
 def test_who_crosses_the_lots_of_groups_changes_nothing(tmp_path, plain_figures, groups):
     in_groups(tmp_path / "whole", groups)

@@ -150,6 +150,7 @@ def test_the_newest_are_kept(monkeypatch):
     assert torch.equal(search._heights[-40:], search._rasterised(genes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE], ids=lambda space: space.name)
 def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
     cfg = SchedulerCfg(

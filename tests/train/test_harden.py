@@ -152,6 +152,7 @@ def test_every_controller_is_evaluated_on_the_fixed_sets_and_every_archive(place
     assert set(fates["mended"]["terrains"]) <= set(held_out.tolist())
 
 
+@pytest.mark.slow
 def test_stopped_after_every_crossing_it_comes_to_the_same(places, stubbed):
     whole = config(places, rounds=1, run_dir=places / "whole")
     harden(whole, open_evaluator=Crossings().open)
@@ -209,6 +210,7 @@ def test_more_rounds_continue_a_finished_run(places, stubbed):
     assert (str(places / "start.pt"), False, 12) not in crossings.made  # the first search is not made again
 
 
+@pytest.mark.slow
 def test_comparisons_spend_as_many_trainings_otherwise(places, stubbed):
     harden(config(places, rounds=2, against=("hard_random", "first_archive")), open_evaluator=Crossings().open)
     content = rounds_of(places)

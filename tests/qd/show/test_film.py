@@ -104,6 +104,7 @@ def test_films_of_elites_and_of_their_recordings(opengl, run, capsys):
     assert "Film: again.mp4" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_film_of_ones_own_terrain(opengl):
     np.savez("hill.npz", heights=np.zeros((3, 5)), size_m=[16.0, 8.0])
     films = make_films(

@@ -99,6 +99,7 @@ def test_every_run_is_the_searchs_own():
             assert np.array_equal(together[key], alone[key]), key
 
 
+@pytest.mark.slow
 def test_a_surrogate_and_exchange_of_parts_are_compared_and_stopped_as_all_others_are():
     few = "training-steps=1,candidates=1,generations=1"
     methods = (f"surrogate:{few}", f"surrogate:method=surrogate+map_elites,{few}", "map_elites:crossover-share=0.3")
@@ -179,6 +180,7 @@ def interrupt_at_save(monkeypatch, number: int) -> None:
     monkeypatch.setattr(RunDirectory, "save", interrupted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 6, 11], ids=["the first", "with corrected rows", "the last"])
 def test_runs_behind_the_others_catch_up(monkeypatch, number):
     whole = run("whole")
@@ -191,6 +193,7 @@ def test_runs_behind_the_others_catch_up(monkeypatch, number):
     assert_same(run("a"), whole)
 
 
+@pytest.mark.slow
 def test_it_is_extended_and_keeps_its_corrected_rows():
     path, whole = run("a"), run("whole", iterations=4)
     assert run("a", iterations=4) == path
@@ -201,6 +204,7 @@ def test_it_is_extended_and_keeps_its_corrected_rows():
         assert json.loads((path / name / "config.json").read_text())["iterations"] == 4
 
 
+@pytest.mark.slow
 def test_stopped_in_its_last_iteration_and_extended_only_what_all_runs_have_is_compared(monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(Interrupted):
         interrupt_at_save(patch, 11)
@@ -219,6 +223,7 @@ def search_alone(path: Path, **given):
     return run_search(job_of(asked), open_evaluator=open_stand_in)
 
 
+@pytest.mark.slow
 def test_a_run_is_extended_alone_and_the_others_follow():
     path, whole, name = run("a"), run("whole", iterations=5), "cma_mae_narrow-6"
     search_alone(path / name, iterations=5)

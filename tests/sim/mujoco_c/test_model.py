@@ -223,6 +223,7 @@ def test_what_ends_a_crossing(robot):
     assert both.outcome.shape == (8,) and both.penalties.shape == (8, len(PENALTIES))
 
 
+@pytest.mark.slow
 def test_episodes_shared_out_over_processes_come_back_in_order(anymal):
     flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
     heights = np.stack([flat, flat + np.float32(0.2)])

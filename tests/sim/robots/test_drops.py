@@ -140,6 +140,7 @@ def dropped(robot, device):
     return sim, extremes
 
 
+@pytest.mark.slow
 def test_nothing_overflows(dropped, robot, capsys):
     sim, extremes = dropped
     rows, contacts = extremes.rows.numpy(), int(extremes.contacts.numpy()[0])

@@ -113,6 +113,7 @@ def test_feet_that_bounce_are_told_and_armature_or_softer_contact_mend_it(tmp_pa
         assert describe_standing(mended, stand(mended, device=device, drops=1))[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "says"),
     [

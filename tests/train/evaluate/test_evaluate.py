@@ -118,6 +118,7 @@ def test_rates_of_one_controller_go_under_runs(tmp_path, monkeypatch, capsys):
     assert json.loads(Path("runs/anymal-rates.json").read_text()) == json.loads(json.dumps(shipped))
 
 
+@pytest.mark.slow
 def test_a_killed_evaluation_goes_on(tmp_path, archive, capsys):
     cfg = config(tmp_path, archive=archive)
     killed = Crossings(die_after=4)

@@ -303,6 +303,7 @@ def test_a_fine_tuning_records_what_it_and_those_before_it_were_trained_on(tmp_p
     assert not expected & set(marks_of(second.genes[split_elites(second, "anymal").test]))
 
 
+@pytest.mark.slow
 def test_the_nearest_is_found_among_all_elites_trained_on(published):
     run = published / "cassie" / "archive"
     report = distances(Distances(robot="cassie", archive=run, terrains=3))

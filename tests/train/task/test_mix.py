@@ -129,6 +129,7 @@ def test_without_a_goal_it_is_the_end_of_the_time_that_counts():
     assert (mix.success()[first] == 1.0).all()
 
 
+@pytest.mark.slow
 def test_failing_elites_are_drawn_more_often():
     drawn = np.zeros(7)
     for seed in range(300):

@@ -316,6 +316,7 @@ def test_bad_input_is_refused_before_any_work(reported, run, tmp_path, monkeypat
     refused(ValueError, "penalties that robot anymal does not have: <b>")
 
 
+@pytest.mark.slow
 def test_a_page_is_whole_or_as_it_was(reported, run, monkeypatch):
     out, _ = reported()
     before = out.read_bytes()

@@ -168,6 +168,7 @@ def test_of_several_trainings_the_mean_over_their_seeds_is_shown():
     assert list(kinds["controllers"]) == ["base", "C-G (2 seeds)", "C-R@1"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

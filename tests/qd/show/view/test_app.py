@@ -76,8 +76,8 @@ def worst_crossed(show):
     (file,) = (RESULTS.resolve() / "anymal" / "view").glob("*.npz")
     recording = read_recording(file)
     outcome, frames = np.full_like(recording.outcome, Outcome.TIME_OUT), recording.num_frames.copy()
-    outcome[0, 16], frames[0, 16] = Outcome.BASE_COLLISION, frames[0, 16] // 2
-    duration_s = np.where(outcome == Outcome.TIME_OUT, recording.duration_s, 10.0).astype(np.float32)
+    outcome[0, 16], frames[0, 16] = Outcome.BASE_COLLISION, round(5.3 / recording.dt)
+    duration_s = np.where(outcome == Outcome.TIME_OUT, recording.duration_s, 5.3).astype(np.float32)
     wanted = on_elite(show.found.archive, 0, policy=str(show.robot.policy_file), replicas=20)
     return wanted, dataclasses.replace(recording, outcome=outcome, num_frames=frames, duration_s=duration_s)
 
