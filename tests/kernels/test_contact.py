@@ -95,6 +95,7 @@ def sphere_poses(rng, grid, count):
     return np.float32(poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["genes", "stairs_up_down", "boxes", "noise"])
 def test_random_spheres_against_the_oracle(device, kind):
     rng = np.random.default_rng(7)

@@ -61,7 +61,7 @@ def same(one, other, own=slice(None)):
             np.testing.assert_array_equal(expected[own], got, err_msg=name)
 
 
-@pytest.mark.parametrize("reward", [False, True])
+@pytest.mark.parametrize("reward", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_any_number_of_robots_runs_the_same_episodes(robot, reward):
     cfg = dataclasses.replace(NEAR, reward=reward)
     alone = rollout_of(robot, None, cfg=cfg).evaluate(GRIDS, SEEDS)

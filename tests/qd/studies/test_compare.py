@@ -114,6 +114,7 @@ def test_a_surrogate_and_exchange_of_parts_are_compared_and_stopped_as_all_other
         assert len(rows_of(again / name)) == 3
 
 
+@pytest.mark.slow
 def test_corrected_rows_are_at_the_iterations_asked_for():
     path = run("a", iterations=5)
     for name in runs_of(path):

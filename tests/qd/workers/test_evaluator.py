@@ -80,6 +80,7 @@ def test_workers_that_are_no_number_and_not_on_ray(text):
         resolve_device("cpu", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_processes", [1, 2, 4])
 def test_how_terrains_are_spread_changes_nothing(num_processes):
     cfg = dataclasses.replace(CFG, workers=str(num_processes))

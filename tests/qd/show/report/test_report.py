@@ -359,6 +359,7 @@ def minimal_of(run, count=1):
     return numbers, entries
 
 
+@pytest.mark.slow
 def test_minimal_terrains_are_shown_where_there_are_some(reported, run):
     text = Page(reported()[0].read_bytes()).text
     assert re.search(r"there is no minimal\.json of these elites\. It is made by \S*faultline minimise", text)

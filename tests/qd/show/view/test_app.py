@@ -470,6 +470,7 @@ def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
         shown.close()
 
 
+@pytest.mark.slow
 def test_the_command_serves_a_page_and_ends_on_ctrl_c(run, tmp_path):
     port = free_port()
     command = view_command("--run", str(run), "--port", str(port), "--cache", str(tmp_path))

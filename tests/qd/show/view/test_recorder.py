@@ -46,6 +46,7 @@ def test_progress_comes_before_the_recording(recorder, reports):
     assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
 
 
+@pytest.mark.slow
 def test_a_simulation_is_recorded(anymal, reports):
     recorder = Recorder(anymal, reports.put)
     try:
