@@ -1,6 +1,5 @@
 """The file of minimal terrains: their genes, and every crossing by which they were found, from which work goes on."""
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -12,8 +11,10 @@ from numpy.typing import NDArray
 from qd.archive import OUTCOMES, Archive, FaultCounts
 from qd.minimal import Case, How, Minimal, Trial
 from sim.files.atomic import write_atomically
+from sim.files.npz import npz_bytes
 
 MINIMAL_FILE = "minimal.npz"
+NUMBERS_FILE = "minimal.json"
 
 _HOWS: dict[str, How] = {"exhaustive": "exhaustive", "greedy": "greedy"}
 _FAULTS = tuple(one.name for one in fields(FaultCounts))
@@ -100,9 +101,7 @@ def write_minimal(
     if judged.faults is not None:
         values = {name: getattr(judged.faults, name) for name in _FAULTS}
         content |= {name: np.array(v, np.str_) if isinstance(v, tuple) else v for name, v in values.items()}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **content)
-    write_atomically(path / MINIMAL_FILE, buffer.getvalue())
+    write_atomically(path / MINIMAL_FILE, npz_bytes(content))
 
 
 def _flags(parts: list[tuple[int, ...]], count: int) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from qd.fresh import Open
 from qd.minimal import MOST_PARTS, Case, How, Minimal, Parts, Trial, fresh_counts, genes_of, goal_rate, minimise
 from qd.run.arguments import evaluator_of
 from qd.run.judge import certifiers_of, config_of, judged_run, searched_policy
-from qd.run.minimal_file import MINIMAL_FILE, Kept, read_minimal, write_minimal
+from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Kept, read_minimal, write_minimal
 from qd.run.settings import code_of
 from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.atomic import to_json, write_atomically
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
     from sim.space import TerrainSpace
 
-SUMMARY_FILE = "minimal.json"
 FIGURE_FILE = "minimal.png"
 
 _MOST = {"cuda": 200, "cpu": 3}  # elites that are taken where none are named
@@ -234,7 +233,7 @@ def minimise_run(args: Minimise, *, open_evaluator: Open = open_evaluator) -> di
             scaled = {n: terrains.genes(n, one, one.scale or 1.0) for n, one in terrains.minima().items()}
             write_minimal(path, run.archive, cases, terrains.minima(), judged, scaled)
             numbers = {**origin, "space_sha256": cfg.space_sha256, **terrains.numbers(judged)}
-            write_atomically(path / SUMMARY_FILE, to_json(numbers))
+            write_atomically(path / NUMBERS_FILE, to_json(numbers))
             return numbers
 
         with naming_what_is_next("what was crossed is kept", lambda: "The same command goes on"):
@@ -258,7 +257,7 @@ def minimise_run(args: Minimise, *, open_evaluator: Open = open_evaluator) -> di
                 save_figure(path / FIGURE_FILE, draw_minimal(cfg.robot, numbers, minimal_genes, space))
     for line in minimal_words(numbers, judged):
         print(line)
-    print(f"In {path / SUMMARY_FILE}, {path / MINIMAL_FILE} and {path / FIGURE_FILE}." if numbers["elites"] else "")
+    print(f"In {path / NUMBERS_FILE}, {path / MINIMAL_FILE} and {path / FIGURE_FILE}." if numbers["elites"] else "")
     if numbers["elites"] and not (args.confirm or certifiers):
         named = {"robot": robot.spec, "run": path, "elite": args.elite, "policy": code_of(cfg), "confirm": True}
         print(f"Next, confirm them with contact resolved:  {command_line('minimise', **named)}")

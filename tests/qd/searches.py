@@ -2,16 +2,23 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
+
+import pytest
 
 from kernels.penalties import PENALTY_DEFINITION
 from qd.fitness import FitnessCfg
+from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.arguments import Job
 from qd.run.directory import RunDirectory, origin_in
 from qd.run.settings import SchedulerCfg, SearchCfg
 from qd.search import run_search
+from qd.show import figures
 from qd.workers.evaluator import EvaluatorCfg
 from sim.files.provenance import provenance
+from sim.policy.spec import controller_hash
+from sim.robots.robot import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 
@@ -53,8 +60,22 @@ def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, conf
     )
 
 
+SHIPPED = {"policy": "shipped", "policy_sha256": controller_hash(get_robot("anymal").policy_file)}
+"""Settings of a search against the robot's own controller, which has a file."""
+
+
 def run(path: Path, **settings):
     return run_search(make_job(path, **settings), open_evaluator=open_stand_in)
+
+
+def found_and_fresh(folder: Path) -> Path:
+    """Two runs of one search, without figures: ``found`` as it ended, ``fresh`` with fresh episodes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
+        run(folder / "found", iterations=6, **SHIPPED)
+        shutil.copytree(folder / "found", folder / "fresh")
+        reevaluate_run(Reevaluate(run=folder / "fresh", device="cpu"), open_evaluator=open_stand_in)
+    return folder
 
 
 def rows_of(path: Path, *, timed: bool = False) -> list[dict]:

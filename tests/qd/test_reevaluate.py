@@ -15,13 +15,11 @@ from qd.show import figures
 from qd.workers.evaluator import EvaluatorError
 from sim.files.command import Interrupted
 from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
 from tests.qd import stand_in
-from tests.qd.searches import make_job, rows_of, run
+from tests.qd.searches import SHIPPED, make_job, rows_of, run
 from tests.qd.stand_in import open_stand_in
 
 POLICY = "tests.sim.policies:stand"
-SHIPPED = {"policy": "shipped", "policy_sha256": controller_hash(get_robot("anymal").policy_file)}
 
 
 @pytest.fixture(autouse=True)

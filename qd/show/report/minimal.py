@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.run.minimal_file import MINIMAL_FILE, read_minimal
+from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, read_minimal
 from qd.show.minimal_figure import draw_minimal
 from qd.show.report.page import Block, absent, counted, paragraph, percent, picture, table
 from sim.files.atomic import read_json
@@ -17,7 +17,6 @@ from sim.files.command import plain_command
 if TYPE_CHECKING:
     from qd.show.report.material import Shown
 
-NUMBERS_FILE = "minimal.json"
 _ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "goal_interval", "cause", "margin_m")
 _ROWS = 12  # of a table that is not folded
 

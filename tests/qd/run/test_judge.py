@@ -20,35 +20,16 @@ from sim.files.command import Interrupted
 from sim.policy.spec import controller_hash
 from sim.robots.robot import get_robot
 from tests.qd.recordings import stand_in_cross
-from tests.qd.searches import make_job, run
+from tests.qd.searches import SHIPPED, make_job, run
 from tests.qd.stand_in import make_result, open_stand_in
 
 RESULTS = Path(__file__).parents[3] / "results"
-SHIPPED = {"policy": "shipped", "policy_sha256": controller_hash(get_robot("anymal").policy_file)}
 OTHER = f"C-G={RESULTS}/anymal/C-G.pt"
 
 
 @pytest.fixture(autouse=True)
 def no_figures(monkeypatch):
     monkeypatch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A run, once with fresh episodes and once without."""
-    folder = tmp_path_factory.mktemp("made")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
-        run(folder / "found", iterations=6, **SHIPPED)
-        shutil.copytree(folder / "found", folder / "fresh")
-        reevaluate_run(Reevaluate(run=folder / "fresh", device="cpu"), open_evaluator=open_stand_in)
-    return folder
-
-
-@pytest.fixture
-def path(made, tmp_path):
-    """A run with fresh episodes."""
-    return Path(shutil.copytree(made / "fresh", tmp_path / "run"))
 
 
 def crosses(policy, resolved, genes):

@@ -10,38 +10,16 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.minimise import Minimise, minimise_run
-from qd.show import figures
 from sim.files.command import Interrupted
 from sim.policy.spec import controller_hash
 from sim.robots.robot import get_robot
 from sim.space import read_pool
-from tests.qd.searches import run
-from tests.qd.stand_in import make_result, open_stand_in
+from tests.qd.stand_in import make_result
 
 RESULTS = Path(__file__).parents[3] / "results"
-SHIPPED = {"policy": "shipped", "policy_sha256": controller_hash(get_robot("anymal").policy_file)}
 OTHER = f"C-G={RESULTS}/anymal/C-G.pt"
 NOT_OF_THE_WORK = ("date", "command")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A run, once with fresh episodes and once without."""
-    folder = tmp_path_factory.mktemp("made")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
-        run(folder / "found", iterations=6, **SHIPPED)
-        shutil.copytree(folder / "found", folder / "fresh")
-        reevaluate_run(Reevaluate(run=folder / "fresh", device="cpu"), open_evaluator=open_stand_in)
-    return folder
-
-
-@pytest.fixture
-def path(made, tmp_path):
-    """A run with fresh episodes."""
-    return Path(shutil.copytree(made / "fresh", tmp_path / "run"))
 
 
 @pytest.fixture

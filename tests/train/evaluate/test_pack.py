@@ -10,16 +10,13 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run
 from qd.run.minimise import Minimise, minimise_run
 from qd.show import figures
 from qd.show.export import Export, export
 from sim.files.command import Interrupted
-from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
-from tests.qd.searches import run
-from tests.qd.stand_in import make_result, open_stand_in
+from tests.qd.searches import found_and_fresh
+from tests.qd.stand_in import make_result
 from tests.train.evaluate.test_evaluate import Crossings
 from tests.train.results import GOAL, HIT, LATE, result_of
 from train.evaluate.evaluate import Evaluate
@@ -27,7 +24,6 @@ from train.evaluate.pack import MakePack, evaluate_pack, make_pack
 from train.evaluate.pack_rates import grouped, over_all, rows_of
 
 RESULTS = Path(__file__).parents[3] / "results"
-SHIPPED = {"policy": "shipped", "policy_sha256": controller_hash(get_robot("anymal").policy_file)}
 OTHER = f"C-G={RESULTS}/anymal/C-G.pt"
 HERE = {"device": "cpu", "workers": "1"}
 
@@ -67,11 +63,9 @@ class Crosses:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A run with fresh episodes, once as it is and once confirmed, certified and with minimal terrains."""
-    folder = tmp_path_factory.mktemp("made")
+    folder = found_and_fresh(tmp_path_factory.mktemp("made"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
-        run(folder / "fresh", iterations=6, **SHIPPED)
-        reevaluate_run(Reevaluate(run=folder / "fresh", device="cpu"), open_evaluator=open_stand_in)
         path = folder / "fresh"
         archive = read_archive(path)
         first = np.flatnonzero(archive.failing)[:2]
