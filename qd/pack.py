@@ -6,6 +6,7 @@ at least half of its episodes. What nobody is known to cross is in no pack.
 """
 
 import hashlib
+import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -248,7 +249,7 @@ def write_terrains(
         "searched_goal_rate": np.array([one.about["searched"]["goal_rate"] for one in chosen], np.float64),
         **more,
     }
-    data = npz_bytes(content)
+    data = npz_bytes(content, compression=zipfile.ZIP_BZIP2)
     write_atomically(folder / TERRAINS_FILE, data)
     return hashlib.sha256(data).hexdigest()
 

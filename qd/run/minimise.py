@@ -16,7 +16,7 @@ from qd.fresh import Open
 from qd.minimal import MOST_PARTS, Case, How, Minimal, Parts, Trial, fresh_counts, genes_of, goal_rate, minimise
 from qd.run.arguments import evaluator_of
 from qd.run.judge import certifiers_of, config_of, judged_run, searched_policy
-from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Kept, read_minimal, write_minimal
+from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Known, read_minimal, write_minimal
 from qd.run.settings import code_of
 from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.atomic import to_json, write_atomically
@@ -94,7 +94,7 @@ class MinimalTerrains:
         """Genes of a minimal terrain, shape (num_genes,)."""
         return genes_of(self.archive, number, self.cases[number], Trial(minimal.parts, scale), self.space)
 
-    def as_archive(self, known: Kept | None = None) -> Archive:
+    def as_archive(self, known: Known | None = None) -> Archive:
         """The minimal terrains as elites whose fresh episodes are their own; of the rest only the names hold.
 
         Args:
@@ -289,7 +289,7 @@ def minimal_of_run(path: Path, archive: Archive, robot: "RobotCfg") -> tuple[dic
 
 
 def _terrains_of(
-    archive: Archive, known: Kept, hows: Mapping[int, How | None], space: "TerrainSpace", half_width: float, *,
+    archive: Archive, known: Known, hows: Mapping[int, How | None], space: "TerrainSpace", half_width: float, *,
     on_gpu: bool,
 ) -> MinimalTerrains:  # fmt: skip
     """Elites that are taken apart, with what was crossed of them before."""

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import RUNS, published_or_newest
 from qd.run.progress import share_bar
-from qd.studies.kept import Kept
 from qd.workers.evaluator import (
     EvaluatorCfg,
     check_policy,
@@ -26,6 +25,7 @@ from qd.workers.evaluator import (
     resolve_device,
 )
 from qd.workers.invalid import refuse_all_invalid
+from qd.workers.kept import Kept
 from sim.files.command import InSpace, Where, Who, chosen_elites, naming_what_is_next, publish
 from sim.files.intervals import value_words
 from sim.files.settings import check, setting
@@ -103,7 +103,7 @@ class Agreement(Who, InSpace, Where):
         evaluator = _evaluator_of(self, terrains)
         out = self.out or RUNS / "agreement" / f"{terrains.robot.name}.json"
         digest = hashlib.sha256(terrains.genes.tobytes()).hexdigest()
-        kept = Kept(out, terrains.robot, evaluator, [self.seed, digest])
+        kept = Kept.beside(out, evaluator, [self.seed, digest])
 
         def measure() -> dict[str, Any]:
             print(_plan(self, terrains, evaluator), flush=True)
@@ -388,7 +388,7 @@ def report_of(drawn: Drawn, outcome: dict[str, NDArray[np.uint8]], seed: int) ->
         seed: Draws the resamples of intervals.
 
     Returns:
-        Of each set its comparisons with ``search`` (:func:`sim.agreement.agreement`), with ``both_resolved``, contact
+        Of each set its comparisons with ``search`` (:func:`sim.rates.agreement`), with ``both_resolved``, contact
         resolved here against contact resolved in MuJoCo C, and the ``rates`` of each terrain; None of a set that was
         not crossed. ``failing`` elites by the first crossings, and how many of them fail again by the second ones, at
         the search's settings (``failing_again``) and with contact resolved (``failing_resolved``); None without
@@ -407,7 +407,7 @@ def report_of(drawn: Drawn, outcome: dict[str, NDArray[np.uint8]], seed: int) ->
 
 
 def _compared(outcome: dict[str, NDArray[np.uint8]], seed: int) -> dict[str, Any]:
-    from sim.agreement import agreement
+    from sim.rates import agreement
 
     pairs = {way: ("search", way) for way in ("again", "resolved", *_PLAIN)}
     pairs["both_resolved"] = ("resolved", "mujoco_c_resolved")
@@ -416,7 +416,7 @@ def _compared(outcome: dict[str, NDArray[np.uint8]], seed: int) -> dict[str, Any
 
 def _rates(outcome: dict[str, NDArray[np.uint8]]) -> dict[str, dict[str, list[float | None]]]:
     """Rates of each terrain by way and kind, None where there is no valid episode."""
-    from sim.agreement import KINDS, crossing_rates
+    from sim.rates import KINDS, crossing_rates
 
     def listed(rates: NDArray[np.float64]) -> list[float | None]:
         return [None if np.isnan(rate) else round(rate, 6) for rate in rates.tolist()]
@@ -426,7 +426,7 @@ def _rates(outcome: dict[str, NDArray[np.uint8]]) -> dict[str, dict[str, list[fl
 
 def _failing(outcome: dict[str, NDArray[np.uint8]] | None) -> dict[str, int | None]:
     """Terrains that fail by the first crossings, and those of them that fail by others too; None without terrains."""
-    from sim.agreement import crossing_rates
+    from sim.rates import crossing_rates
 
     if outcome is None:
         return dict.fromkeys(("failing", "failing_again", "failing_resolved"))
@@ -437,7 +437,7 @@ def _failing(outcome: dict[str, NDArray[np.uint8]] | None) -> dict[str, int | No
 
 
 def _show(report: dict[str, Any]) -> None:
-    from sim.agreement import KINDS
+    from sim.rates import KINDS
 
     print("Rates at the search's settings minus those of other crossings (95 % interval), and their mean distance:")
     for name, title in _NAMES.items():

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.studies.kept import Kept
 from qd.workers.invalid import tell_invalid
+from qd.workers.kept import Kept
 from sim.files.command import Where, Who, naming_what_is_next, publish
 from sim.files.settings import check, setting
 from sim.robots.identity import identity
@@ -95,7 +95,7 @@ class Calibrate(Who, Where):
         genes = load_space(self.space).hard_random(self._most, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self._most, np.uint32)
         out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
-        kept = Kept(out, robot, evaluator, [self.seed, self.terrains, self._most])
+        kept = Kept.beside(out, evaluator, [self.seed, self.terrains, self._most])
 
         def keep(crossed: Crossed) -> None:
             arrays = {name: getattr(crossed, name) for name in _KEPT}

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.agreement import KINDS, agreement
 from sim.commands import SolverOptions
 from sim.files.intervals import value_words
 from sim.files.provenance import provenance
+from sim.rates import KINDS, agreement
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files.atomic import to_json, write_atomically
+from sim.files.npz import npz_bytes
 from sim.terrain import SPACING
 
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
@@ -91,10 +92,8 @@ def png_of(heights: Heights) -> bytes:
 
 def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None) -> bytes:
     """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``."""
-    content: dict[str, Any] = {} if genes is None else {"genes": np.asarray(genes, dtype=np.float32)}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, heights=np.float32(heights), size_m=np.array(size_of(heights)), **content)
-    return buffer.getvalue()
+    content = {"heights": np.asarray(heights, np.float32), "size_m": np.array(size_of(heights))}
+    return npz_bytes(content if genes is None else content | {"genes": np.asarray(genes, dtype=np.float32)})
 
 
 def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:

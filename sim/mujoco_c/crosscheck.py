@@ -12,7 +12,6 @@ from tqdm import tqdm
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.agreement import count_hits, crossing_rates
 from sim.bank import heights_of
 from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
@@ -20,6 +19,7 @@ from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
 from sim.files.provenance import provenance
 from sim.mujoco_c.crossing import cross_plain
 from sim.mujoco_c.model import crossing_model
+from sim.rates import crossing_rates, hits_of
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
@@ -179,8 +179,8 @@ class Pair:
 
 
 def _hits(outcome: NDArray[np.uint8], kind: str) -> tuple[int, int]:
-    hits, count = count_hits(outcome, kind)
-    return int(hits), int(count)
+    hits, counted = hits_of(outcome, kind)
+    return int(hits.sum()), int(counted.sum())
 
 
 def _compare(pair: Pair, kind: str) -> dict[str, Any]:
