@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
 _REWARDS = {"termination": -200.0, "tracking_lin_vel": 2.0}  # the best of six weightings
-_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005, final_kl=0.002)
+_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005)
 
 
 def shipped_space(settings: dict[str, Any]) -> str | None:

@@ -289,8 +289,6 @@ def _measured(crossed: Crossed) -> dict[str, Any]:
         "scaled_by": "failing" if by_failing else "all",
         "scales": penalty_scales(crossed),
         "share_of_episodes_with": dict(zip(crossed.penalty_names, shares, strict=True)),
-        "mean_failing": _means(crossed, crossed.failing),
-        "mean_reached": _means(crossed, ~crossed.invalid & crossed.reached_goal),
     }
 
 
