@@ -38,13 +38,13 @@ _LEAST_EFFECT = 1e-4  # a part that changes no height by more is none [m]
 
 @dataclass(frozen=True, kw_only=True)
 class Minimise(Who, InSpace, Where):
-    """Find the smallest terrains on which the controller still fails: which parts of an elite's terrain does it take?
+    """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
 
-    Parts of a failing elite, such as bumps, are crossed without the others, 20 episodes each. A minimal terrain is a
-    subset that fails, under half of the robots reach the goal, while no smaller one does; 40 fresh episodes check it.
-    Then its heights are scaled down together as long as it still fails: that is the margin. The cause is the part
-    without which most robots arrive. Results are in minimal.json, minimal.npz and minimal.png of the run. What was
-    crossed before is left out, so the same command goes on after Ctrl-C, and results of several calls add up.
+    Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
+    the robots reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes
+    check it. Then its heights are scaled down together as long as it still fails. That is the margin. The cause is the
+    part without which most robots arrive. Results are in minimal.json, minimal.npz and minimal.png of the run. Nothing
+    is crossed twice, so the same command goes on after Ctrl-C. Results of several calls add up.
     """
 
     run: Path | None = None
@@ -53,9 +53,9 @@ class Minimise(Who, InSpace, Where):
     """Numbers of failing elites: one, several as in --elite "0 3", or all that fail. If left out, 200 on a GPU and 3 on
     the CPU: faults first, then confirmed and certified ones, then others that fail."""
     how: Literal["exhaustive", "greedy"] | None = None
-    """exhaustive: all subsets are crossed, from the smallest on, until one fails. greedy: parts are taken away one at a
-    time as long as what is left fails, which takes far fewer crossings where many parts are needed. If left out,
-    exhaustive on a GPU, greedy on the CPU and for terrains of more than 10 parts."""
+    """exhaustive: robots cross all subsets, from the smallest on, until one fails. greedy: parts are taken away one at
+    a time as long as the rest fails. Where many parts are needed, that takes far fewer crossings. If left out,
+    exhaustive on a GPU, and greedy on the CPU and for terrains of more than 10 parts."""
     confirm: bool = False
     """Cross the minimal terrains with contact resolved too, as `faultline confirm` does with elites."""
     certify: bool = False

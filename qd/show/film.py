@@ -48,7 +48,7 @@ class Film(Who, OnDevice, Which, Mapped):
     replicas: int = setting(20, least=1)
     """Episodes to run."""
     replica: int | None = setting(None, least=0)
-    """Which of them to film; of those that end as most do, the one in the middle by its penalties."""
+    """Which episode to film. If left out, of the episodes that end as most do, the one with the median penalties."""
     ghosts: int = setting(2, least=0)
     """How many others to show translucent."""
     seed: int = setting(0, least=0)

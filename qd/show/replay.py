@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class ReplayElite(Who, OnDevice, Which):
     """Print one elite of an archive and draw its terrain with the robots' paths.
 
-    Elites are numbered by descending fitness, the corrected one where all were evaluated again: 0 is the worst.
+    Elites are numbered by descending fitness: 0 is the worst. After fresh episodes their corrected fitness counts.
     """
 
     replicas: int = 20

@@ -57,11 +57,12 @@ _WORDS = {
 class Agreement(Who, InSpace, Where):
     """Measure how far rates at the search's settings lie from contact resolved and from MuJoCo C.
 
-    Hard-random terrains and elites, drawn at random and not by their rates, are crossed twice at the search's settings
-    (steps of 5 ms), from the second starts also with contact resolved (steps of 1 ms, a time constant of 3 ms), and
-    some of them in plain MuJoCo C at both. The bias is the mean rate of the first crossings minus that of the others.
+    The terrains are hard-random ones and elites, drawn at random and not by their rates. Robots cross them twice at the
+    search's settings (steps of 5 ms), from two sets of starts. From the second starts they cross them also with contact
+    resolved (steps of 1 ms, a time constant of 3 ms), and some of them in plain MuJoCo C at both settings. The bias is
+    the mean rate of the first crossings minus that of the others.
 
-    What was crossed is kept: the same command goes on after a stop.
+    Crossings are kept, so the same command goes on after a stop.
     """
 
     run: Path | None = None

@@ -38,14 +38,14 @@ _FEW = 30
 class Calibrate(Who, Where):
     """Measure the penalty scales of a robot with a controller, on hard-random terrains.
 
-    Writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped, where
-    every search reads them.
+    It writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped. Every
+    search reads them there.
     """
 
     terrains: int = setting(1_000, least=1)
-    """Hard-random terrains to begin with; as many again are drawn until 200 episodes did not reach the goal."""
+    """Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal."""
     most_terrains: int = setting(5_000, least=1)
-    """Terrains after which no more are drawn; a controller with fewer failing episodes is scaled by all episodes."""
+    """Largest number of terrains. With fewer failing episodes even then, all episodes give the scales."""
     replicas: int = setting(20, least=1)
     """Episodes a terrain."""
     space: str = "super_gaussian"

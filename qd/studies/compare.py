@@ -78,11 +78,11 @@ _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called,
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(StudyFlags):
-    """Compare ways to search on the same number of terrains, several seeds each, crossed together.
+    """Compare search methods on the same number of terrains, with several seeds each.
 
     Every search is an ordinary run in its own folder METHOD-SEED. State is saved after every iteration: stop with
-    Ctrl-C whenever you like, and the same command goes on. Searches of other widths are compared by
-    mixed:emitters=80,groups=8: eight times the terrains an iteration, in an eighth of the iterations.
+    Ctrl-C whenever you like, and the same command goes on. mixed:emitters=80,groups=8 is a wider search: it has eight
+    times as many terrains in an iteration, and an eighth of the iterations.
     """
 
     methods: tuple[str, ...] = tuple(name for name in METHODS if name not in (GATED, "surrogate"))
@@ -91,21 +91,21 @@ class Compare(StudyFlags):
     others can cross); all but the last two. Settings of the search after a colon make another one of it:
     cma_mae:restart-rule=20,learning-rate=0.3. Of NAME@1 only the first seed is run."""
     certified_by: tuple[str, ...] = ()
-    """Certifiers of the method gated, FILE or NAME=FILE. It ends with as many episodes as the others have, those of the
-    certifiers included, and so after fewer iterations."""
+    """Certifiers of the method gated, FILE or NAME=FILE. This method ends after as many episodes as the others. The
+    certifiers' episodes count too, so it has fewer iterations."""
     certify_episodes: int = setting(10, least=1)
     """Episodes of each of them on a terrain that the controller does not cross."""
     certify: bool = False
     """Confirm and certify the elites of every run afterwards, and count the faults."""
     by: tuple[str, ...] = ()
-    """Who certifies them then, NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt."""
+    """Certifiers for --certify, NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt."""
     seeds: int = setting(3, least=1, most=MAX_T_VALUES)
     """Runs of each method, with seeds from --seed on."""
     seed: int = 0
     """The first seed."""
     iterations: int = 33
-    """Iterations of a run of the preset's size, and so the terrains of every run; more than before extend a comparison
-    that is there."""
+    """Iterations of a run of the preset's size. They set how many terrains every run has. A larger number later extends
+    a comparison."""
     reevaluate_every: int = setting(11, least=1)
     """Every so many iterations, and at the end, all elites cross 40 fresh episodes."""
 

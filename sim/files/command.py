@@ -57,8 +57,8 @@ class Where(OnDevice):
     """Worker processes: a number of them on the CPU (one a core if left out), ray for one on every device of a Ray
     cluster, or ray:N for N of them. RAY_ADDRESS names a running cluster."""
     num_envs: int | None = setting(None, least=1)
-    """Robots at once over all workers, which take episode after episode; as many as the device is good for if left out.
-    It changes how long the work takes, and no result."""
+    """How many robots walk at once, over all workers. Each takes one episode after another. If left out, as many as
+    suit the device. It changes how long the work takes, and no result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,8 @@ class InSpace:
     """The option that names the terrain space of a run."""
 
     space: str | None = None
-    """Terrain space of the run, where it is one of your own: file.py:CLASS. What only the run names is not run."""
+    """Terrain space of the run, where it is one of your own: file.py:CLASS. A space that only the run names is not
+    loaded."""
 
 
 @dataclass(frozen=True, kw_only=True)

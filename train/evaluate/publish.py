@@ -75,7 +75,7 @@ class Tables:
     results: Path = Path("results")
     """Where the results are."""
     page: Path = PAGE
-    """File that holds the lines `<!-- numbers: begin -->` and `<!-- numbers: end -->`; between them is replaced."""
+    """File with the lines `<!-- numbers: begin -->` and `<!-- numbers: end -->`. The text between them is replaced."""
     check: bool = False
     """Write nothing; fail if the file says something else than the results."""
 

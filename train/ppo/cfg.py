@@ -75,9 +75,9 @@ class TrainingFlags(OnDevice):
     robot: str = _ROBOT
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
     num_envs: int | None = setting(None, least=1)
-    """Robots trained at once, per process; left out, as many as suit robot and device."""
+    """Robots trained at once, per process. If left out, as many as suit robot and device."""
     iterations: int | None = setting(None, least=1)
-    """Iterations in all, those before a resume included; left out, as many as suit robot and device."""
+    """Iterations in all, with those before a resume. If left out, as many as suit robot and device."""
     max_seconds: float | None = setting(None, above=0.0)
     """Save and stop in time to be done this many seconds after the start."""
     run_dir: Path | None = None
@@ -92,7 +92,7 @@ class TrainingFlags(OnDevice):
     seed: int = setting(0, least=0)
     """Seed of everything drawn."""
     save_every_s: float = setting(60.0, least=0.0)
-    """A checkpoint every so often [s]."""
+    """Time between checkpoints [s]."""
     rows: int = setting(100, least=1)
     """Progress rows over the whole training."""
     ppo: PpoCfg = field(default_factory=PpoCfg)

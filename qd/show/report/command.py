@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 class Report(Who, OnDevice, InSpace):
     """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
 
-    Elites shown are crossed again for it, 20 times each. The crossings are kept under runs/recordings: the same
-    command, stopped or made again, goes on from there.
+    Robots cross the elites that it shows again, 20 times each. The crossings are kept under runs/recordings, so the
+    same command goes on after a stop.
     """
 
     run: Path | None = None

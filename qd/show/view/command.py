@@ -29,15 +29,15 @@ SEARCHED = "as searched"
 class View(OfRobot, Which):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
-    Left, the archive on parallel axes; a click on a line of the plot or of the list under "Elites" shows that terrain.
-    The list begins with one terrain of each way of failing, and can be sorted and narrowed. Under "Ranges" drag the
-    ends of an axis: elites outside turn grey and leave the list. Right, its crossing: play, pause, drag the time, go
-    from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are contact forces (1 m is
-    1,000 N), the green one over the robot is its command; curves are what it is penalised for. Crossings that were not
-    recorded before are run on the CPU, which takes seconds, and are kept under --cache.
+    On the left is the archive on parallel axes. A click on a line of the plot, or of the list under "Elites", shows
+    that terrain. The list begins with one terrain of each way of failing. It can be sorted and narrowed. Under "Ranges"
+    you drag the ends of an axis: elites outside turn grey and leave the list. On the right is the crossing: play,
+    pause, drag the time, go from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are
+    contact forces (1 m is 1,000 N). The green arrow over the robot is its command. The curves are its penalties.
+    Crossings that are not recorded yet run on the CPU, which takes seconds. They are kept under --cache.
 
-    Every tab of a browser is on its own, and its address holds what it shows: ?elite=12&controller=C-G&t=8.4 opens
-    just that.
+    Browser tabs do not affect each other. The address of a tab holds what it shows: ?elite=12&controller=C-G&t=8.4
+    opens just that.
 
     Ctrl-C ends it. No GPU and no screen are needed: over ssh, forward the port (ssh -L 8080:localhost:8080 HOST) and
     open the page at home.
