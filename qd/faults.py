@@ -135,7 +135,7 @@ def certify(archive: Archive, chosen: Sequence[int], certifiers: Mapping[str, st
     """Lets other controllers cross failing elites, at the search's settings and with contact resolved.
 
     What a controller has crossed before is left out. A terrain that it crosses less than half of the time at the
-    search's settings is not crossed with contact resolved, since there is no certificate to be had.
+    search's settings is not crossed with contact resolved, since it cannot get a certificate.
 
     Args:
         archive: With fresh values.

@@ -214,7 +214,7 @@ def looks_again(cfg: SearchCfg, iteration: int) -> bool:
 
 
 def row_of(cfg: SearchCfg, found: Archive, crossed: Crossed, iteration: int) -> dict[str, Any]:
-    """An iteration's row of metrics but for its timing.
+    """An iteration's row of metrics without its timing.
 
     Args:
         cfg: The search.

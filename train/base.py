@@ -43,7 +43,7 @@ class Train(TrainingFlags):
         """Trains; returns the exit status: 0, or 130 after Ctrl-C.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
         """
         from train.ppo.learner import Ranks
         from train.ppo.run import Training, run_training

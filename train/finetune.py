@@ -106,7 +106,7 @@ class Finetune(TrainingFlags):
         """Fine-tunes; returns the exit status: 0, or 130 after Ctrl-C.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
             FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
         """
         from train.ppo.run import run_training

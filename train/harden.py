@@ -66,7 +66,7 @@ class Harden(OfRobot, Where):
         """Runs what is left; returns the exit status 0, also where the time is up.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
             FloatingPointError: If a training leaves the finite numbers; its last checkpoint is kept.
             Interrupted: On Ctrl-C; what is finished is kept.
             EvaluatorError: If a worker is lost; what is finished is kept.

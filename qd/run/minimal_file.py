@@ -114,7 +114,7 @@ def read_minimal(path: Path, archive: Archive) -> Known:
 
     Args:
         path: The run directory.
-        archive: Its elites; what the file holds of others, or of such as do not fail, is left out.
+        archive: Its elites; what the file holds of other elites, or of ones that do not fail, is left out.
 
     Raises:
         ValueError: If it is damaged.

@@ -58,7 +58,7 @@ class _Source:
     whose: Path
     count: int
     folder: Path
-    """Where their files go if nothing is said."""
+    """Where their files go without ``--out``."""
     origin: dict[str, Any]
     """Where they come from, for every file."""
     named: dict[str, Any]

@@ -1,4 +1,4 @@
-"""Recorded crossings, kept on disk: what is there is read, what is missing is crossed.
+"""Recorded crossings, kept on disk. Those that are missing are crossed.
 
 The name of a file is the hash of all that its crossings depend on: terrain, seed, number of episodes, controller, robot
 and code. So no file is ever out of date, and what one command recorded the others find.
@@ -190,7 +190,7 @@ class Recordings:
         return None
 
     def keep(self, wanted: Wanted, recording: "Recording") -> None:
-        """Keep a recording; where it cannot be written, that is said."""
+        """Keeps a recording; prints a warning if it cannot be written."""
         from sim.recording.file import write_recording
 
         self._last = (wanted, recording)

@@ -92,7 +92,7 @@ class Agreement(Who, InSpace, Where):
 
         Raises:
             FileNotFoundError: If there is no run.
-            ValueError: If something asked for cannot be had.
+            ValueError: If a flag's value cannot be used.
             AllInvalidError: If no episode is valid.
             Interrupted: On Ctrl-C; what was crossed is kept.
             EvaluatorError: If a worker is lost; likewise.
@@ -185,7 +185,7 @@ def drawn(cfg: Agreement) -> Drawn:
 
     Raises:
         FileNotFoundError: If there is no run.
-        ValueError: If terrains, robot or controller cannot be had, or MuJoCo does not read the robot.
+        ValueError: If terrains, robot or controller are not available, or MuJoCo cannot read the robot.
     """
     from sim.mujoco_c.model import crossing_model
     from sim.robots.robot import get_robot
@@ -258,7 +258,7 @@ def _evaluator_of(cfg: Agreement, drawn: Drawn) -> EvaluatorCfg:
     """What crosses the terrains at the search's settings, with a controller that was tried.
 
     Raises:
-        ValueError: If device or workers cannot be had, or the controller does not fit the robot.
+        ValueError: If device or workers are not available, or the controller does not fit the robot.
     """
     device = resolve_device(cfg.device, cfg.workers)
     check_policy(drawn.policy, drawn.robot, device)

@@ -62,7 +62,7 @@ class Calibrate(Who, Where):
             open_evaluator: Opens what crosses the terrains.
 
         Raises:
-            ValueError: If something asked for cannot be had; if a penalty never occurred, once the scales of the others
+            ValueError: If a flag's value cannot be used; if a penalty never occurred, once the scales of the others
                 are written.
             AllInvalidError: If no episode is valid.
             EvaluatorError: If a worker is lost; what was crossed is kept.

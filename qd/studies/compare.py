@@ -161,7 +161,7 @@ class Compare(StudyFlags):
         return publish(study.out, measure, _show, draw=lambda report: as_png(draw_comparison(report)))
 
     def _judged(self, run: Path, robot: str, judges: dict[str, str], open_evaluator: Open) -> dict[str, Any]:
-        """What a run's elites are in fresh episodes, with contact resolved and to the judges; what is there is kept."""
+        """Fresh episodes, confirmations and certificates of a run's elites; those that are there are kept."""
         where = {"robot": robot, "run": run, "device": self.device, "workers": self.workers, "num_envs": self.num_envs}
         if RunDirectory(run).fresh_archive() is None:
             reevaluate_run(Reevaluate(policy=self.policy, **where), open_evaluator=open_evaluator)

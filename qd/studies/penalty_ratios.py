@@ -48,7 +48,7 @@ class PenaltyRatios(Who):
         """Crosses the terrains and publishes the ratios.
 
         Raises:
-            ValueError: If something asked for cannot be had.
+            ValueError: If a flag's value cannot be used.
             AllInvalidError: If no episode is valid.
         """
         from qd.run.directory import RUNS

@@ -190,7 +190,7 @@ def measure(args: Speed) -> dict[str, Any]:
     """Everything of ``speed.json``.
 
     Raises:
-        ValueError: If something asked for cannot be had.
+        ValueError: If a flag's value cannot be used.
     """
     from sim.bench.physics import measure_bare_physics
     from sim.robots.robot import get_robot, robot_of

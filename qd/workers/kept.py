@@ -74,7 +74,7 @@ class Kept:
         return where if self._key else "nothing is kept, since the controller's code has no file"
 
     def read(self) -> dict[str, NDArray[Any]]:
-        """The arrays by name; none if the file is missing, of something else, or damaged, which is said."""
+        """The arrays by name; none if the file is missing, damaged (which it prints), or of something else."""
         if not self.file.is_file():
             return {}
         try:

@@ -55,7 +55,7 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
     """Everything of the results file.
 
     Raises:
-        ValueError: If something asked for cannot be had.
+        ValueError: If a flag's value cannot be used.
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     policy = cfg.policy or robot.policy_file

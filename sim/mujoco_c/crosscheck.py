@@ -51,7 +51,7 @@ class Comparison:
         """Read and load everything.
 
         Raises:
-            ValueError: If something asked for cannot be had.
+            ValueError: If a flag's value cannot be used.
         """
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)

@@ -48,7 +48,7 @@ def open_context(width: int, height: int) -> Any:
         height: Likewise.
 
     Raises:
-        ValueError: If there is none to be had.
+        ValueError: If there is none.
     """
     usual = {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
     name = os.environ.get("MUJOCO_GL", "").strip().lower() or usual
@@ -57,7 +57,7 @@ def open_context(width: int, height: int) -> Any:
         context.make_current()
     except Exception as error:  # a library that is not there fails with anything
         raise ValueError(
-            f"pictures need OpenGL without a screen, but '{name}' cannot be had here: {type(error).__name__}: {error}: "
+            f"pictures need OpenGL without a screen, but '{name}' does not work here: {type(error).__name__}: {error}: "
             "install it (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or name another way in MUJOCO_GL "
             "(egl, osmesa, glfw)"
         ) from None

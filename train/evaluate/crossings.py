@@ -56,7 +56,7 @@ class KeptCrossings:
         return self._kept(policy, terrains).file
 
     def read(self, policy: str, terrains: TerrainSet) -> RolloutResult | None:
-        """Crossings that are kept; None if there are none, or their file is damaged, which is said."""
+        """Crossings that are kept; None if there are none, or their file is damaged, which it prints."""
         kept = self._kept(policy, terrains)
         found: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in kept.read().items()}
         if not found:

@@ -76,7 +76,7 @@ class Evaluate(Who, Where):
         """Evaluates.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
         """
         if self.pack is not None:
             from train.evaluate.pack import evaluate_pack
@@ -136,7 +136,7 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     """Rates of one controller: print the table, write the file; returns its content.
 
     Raises:
-        ValueError: If something asked for cannot be had; raised before any long work.
+        ValueError: If a flag's value cannot be used; raised before any long work.
     """
     from sim.robots.robot import get_robot
     from train.evaluate.measures import VELOCITY_FROM_S, base_rates
@@ -166,7 +166,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
         open_evaluator: Opens what crosses terrains.
 
     Raises:
-        ValueError: If something asked for cannot be had; raised before any long work.
+        ValueError: If a flag's value cannot be used; raised before any long work.
         FileNotFoundError: If there is no archive; likewise.
         EvaluatorError: If a worker is lost; what was crossed is kept.
     """

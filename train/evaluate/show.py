@@ -323,7 +323,7 @@ def _draw_changes(axes: "Axes", report: dict[str, Any], pairs: Sequence[str]) ->
     axes.set_yticks(places, [pair.partition(" -> ")[2] for _, pair in rows], fontsize=8)
     axes.set_ylim(max(places) + 0.7, -0.7)
     axes.set_xlabel(
-        f"failed terrains, held against {first} [% of terrains]\n(under half of the episodes reach the goal)"
+        f"failed terrains, compared with {first} [% of terrains]\n(under half of the episodes reach the goal)"
     )
     axes.set_xlim(left=0)
     axes.legend(frameon=False, fontsize=8, loc="best")

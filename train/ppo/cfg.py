@@ -18,7 +18,7 @@ _ROBOT = "anymal"
 
 @dataclass(frozen=True, kw_only=True)
 class PpoCfg(PaceCfg):
-    """Settings of the learner; the defaults are legged_gym's but for the steps."""
+    """Settings of the learner; the defaults are legged_gym's, except the steps."""
 
     hidden_dims: tuple[int, ...] = setting((512, 256, 128), least=1)
     """Hidden layers (ELU) of actor and critic."""

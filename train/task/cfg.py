@@ -46,7 +46,7 @@ class CurriculumCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskCfg(TrainingCfg):
-    """The task; the defaults are legged_gym's for ANYmal but for the start's yaw, which it leaves at 0."""
+    """The task; the defaults are legged_gym's for ANYmal, except the start's yaw, which is 0 there."""
 
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
