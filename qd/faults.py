@@ -32,7 +32,7 @@ EPISODES = 20
 """Episodes of each kind that an elite is judged by."""
 
 _CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM, _MUJOCO_C_STREAM = 5, 6, 7, 8
-_LOT = {"cuda": 200, "cpu": 1}  # terrains of a worker between two saves
+_LOT = {"cuda": 800, "cpu": 1}  # terrains of a worker between two saves; two lots fill a GPU with 32,000 robots
 _MUJOCO_C_LOT = 4  # likewise of a process
 
 
