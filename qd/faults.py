@@ -326,9 +326,10 @@ def fault_words(archive: Archive) -> list[str]:
     told = []
     if numbers["crossed_resolved"]:
         again = rate_words(numbers["confirmed"], numbers["crossed_resolved"])
+        failing, crossed = numbers["failing"], numbers["crossed_resolved"]
         told.append(
-            f"Of the {numbers['failing']:,} failing elites {numbers['crossed_resolved']:,} were crossed with contact "
-            f"resolved: {again} fail there too and are confirmed."
+            f"Of {failing:,} failing elite{'s' * (failing != 1)} {crossed:,} {'was' if crossed == 1 else 'were'} crossed "
+            f"with contact resolved: {again} confirmed, since under half of the robots arrive there too."
         )
     if numbers["mujoco_c"]["crossed"]:
         there = rate_words(numbers["mujoco_c"]["failing"], numbers["mujoco_c"]["crossed"])

@@ -150,8 +150,11 @@ class Hardening:
         return self.path / f"search-{number}"
 
     def seed(self, number: int) -> int:
-        """Seed of a round: searches of one seed would begin with the same terrains, some of which are held out."""
-        return _SEEDS * self.flags.seed + number
+        """Seed of a round: searches of one seed would begin with the same terrains, some of which are held out.
+
+        From 100 on, so that it is apart from searches of seed 0, 1 and so on, on whose elites controllers are tested.
+        """
+        return _SEEDS * (self.flags.seed + 1) + number
 
     def certifiers(self, policy: str) -> dict[str, str]:
         """Who certifies the faults of a controller, by name: the panel, or those named, without itself.

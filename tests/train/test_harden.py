@@ -201,6 +201,13 @@ def test_a_training_that_is_cut_short_is_not_taken_for_whole(places, stubbed):
     assert job.is_tuned(tune)
 
 
+def test_its_searches_begin_with_other_terrains_than_those_that_controllers_are_tested_on(places):
+    job = hardening_of(config(places), open_evaluator=Crossings().open)
+    other = hardening_of(config(places, seed=1), open_evaluator=Crossings().open)
+    seeds = [stage.seed for stage in (*job.stages, *other.stages)]
+    assert seeds == [100, 101, 102, 200, 201, 202]  # plain searches have seeds 0, 1, ...
+
+
 def test_more_rounds_continue_a_finished_run(places, stubbed):
     harden(config(places, rounds=1), open_evaluator=Crossings().open)
     first = rounds_of(places)["rounds"]
