@@ -289,10 +289,13 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
         "faults": None,
         "panel": list(faults.certifiers) if faults is not None else [],
     }
+    if numbers["failing"] == 0:  # nobody had to cross anything
+        numbers |= dict.fromkeys(("confirmed", "certified", "faults"), 0)
     if faults is None:
         return numbers
     resolved, in_c = faults.resolved_outcomes.any(axis=1), faults.mujoco_c_outcomes.any(axis=1) & failing
-    numbers["confirmed"] = int(archive.confirmed.sum()) if resolved.any() else None
+    if resolved.any():
+        numbers["confirmed"] = int(archive.confirmed.sum())
     if known and resolved.any():
         numbers["faults"] = int((archive.confirmed & archive.certified).sum())
     numbers["crossed_resolved"] = int((resolved & failing).sum())

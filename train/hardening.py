@@ -49,7 +49,6 @@ _COUNTS = (
     "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "failing", "confirmed",
     "certified", "faults", "panel",
 )  # fmt: skip
-_VERDICTS = ("confirmed", "certified", "faults")
 _SESSION = ("command", "commit", "device", "date")
 
 
@@ -437,8 +436,6 @@ def _row(job: Hardening, stage: Stage) -> dict[str, Any]:
     """What the search against a controller found."""
     summary = RunDirectory(stage.search).read_summary()
     counts = {name: summary.get(name) for name in _COUNTS}
-    if counts["failing"] == 0:  # nobody had to cross anything
-        counts |= dict.fromkeys(_VERDICTS, 0)
     who = {name: value for name, value in identity(job.robot, stage.policy).items() if name.startswith("policy")}
     return {
         "controller": stage.controller,
