@@ -331,8 +331,8 @@ def fault_words(archive: Archive) -> list[str]:
         again = rate_words(numbers["confirmed"], numbers["crossed_resolved"])
         failing, crossed = numbers["failing"], numbers["crossed_resolved"]
         told.append(
-            f"Of {failing:,} failing elite{'s' * (failing != 1)} {crossed:,} {'was' if crossed == 1 else 'were'} crossed "
-            f"with contact resolved: {again} confirmed, since under half of the robots arrive there too."
+            f"Of {failing:,} failing elite{'s' * (failing != 1)} {crossed:,} {'was' if crossed == 1 else 'were'} "
+            f"crossed with contact resolved: {again} confirmed, since under half of the robots arrive there too."
         )
     if numbers["mujoco_c"]["crossed"]:
         there = rate_words(numbers["mujoco_c"]["failing"], numbers["mujoco_c"]["crossed"])

@@ -313,6 +313,8 @@ def _time_limit(seconds: float | None) -> Iterator[Callable[[], bool]]:
 
     def ring(kind: int, _frame: object) -> None:
         rung.append(kind)
+        if not callable(signal.getsignal(signal.SIGINT)):  # a shell has its background jobs ignore Ctrl-C
+            raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
     if seconds is None:

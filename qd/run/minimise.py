@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from qd.archive import OUTCOMES, Archive
 from qd.faults import Work, certify, confirm, fault_numbers, fault_words, judgement, known_names, rate_of, verdict_of
 from qd.fresh import Open
-from qd.minimal import MOST_PARTS, Case, How, Minimal, Parts, Trial, fresh_counts, genes_of, goal_rate, minimise
+from qd.minimal import MOST_PARTS, Case, How, Minimal, Trial, fresh_counts, genes_of, goal_rate, minimise
 from qd.run.arguments import evaluator_of
 from qd.run.judge import certifiers_of, config_of, judged_run, searched_policy
 from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Kept, read_minimal, write_minimal

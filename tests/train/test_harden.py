@@ -263,6 +263,16 @@ def test_the_time_limit_stops_it_as_ctrl_c_does(places, monkeypatch, capsys):
     assert signal.getsignal(signal.SIGALRM) == before
 
 
+def test_the_time_limit_holds_in_the_background_where_ctrl_c_is_ignored(places, monkeypatch, capsys):
+    monkeypatch.setattr(hardening, "_run", lambda job, stage: time.sleep(60))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert harden(config(places, max_seconds=0.5), open_evaluator=Crossings().open) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "The time is up. Stopped" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
