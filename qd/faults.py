@@ -321,8 +321,13 @@ def any_of(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
-def fault_words(archive: Archive) -> list[str]:
-    """What is known of the failing elites, in sentences; nothing where none was crossed under other conditions."""
+def fault_words(archive: Archive, *, what: str = "failing elite") -> list[str]:
+    """What is known of the failing elites, in sentences; nothing where none was crossed under other conditions.
+
+    Args:
+        archive: The elites.
+        what: What one of them is called.
+    """
     faults, numbers = archive.faults, fault_numbers(archive)
     if faults is None:
         return []
@@ -331,7 +336,7 @@ def fault_words(archive: Archive) -> list[str]:
         again = rate_words(numbers["confirmed"], numbers["crossed_resolved"])
         failing, crossed = numbers["failing"], numbers["crossed_resolved"]
         told.append(
-            f"Of {failing:,} failing elite{'s' * (failing != 1)} {crossed:,} {'was' if crossed == 1 else 'were'} "
+            f"Of {failing:,} {what}{'s' * (failing != 1)} {crossed:,} {'was' if crossed == 1 else 'were'} "
             f"crossed with contact resolved: {again} confirmed, since under half of the robots arrive there too."
         )
     if numbers["mujoco_c"]["crossed"]:
@@ -340,12 +345,12 @@ def fault_words(archive: Archive) -> list[str]:
     if faults.certifiers:
         who, rest = any_of(faults.certifiers), int((archive.failing & ~archive.certified).sum())
         if numbers["faults"] is not None:
-            what = "fault: a terrain" if numbers["faults"] == 1 else "faults: terrains"
-            told.append(f"{numbers['faults']:,} {what} that {who} crosses and this controller does not.")
+            found = "fault: a terrain" if numbers["faults"] == 1 else "faults: terrains"
+            told.append(f"{numbers['faults']:,} {found} that {who} crosses and this controller does not.")
         waiting = int((archive.certified & ~faults.resolved_outcomes.any(axis=1)).sum())
         if waiting:
             told.append(f"{waiting:,} that {who} crosses {'is' if waiting == 1 else 'are'} still to be confirmed.")
-        told.append(f"{rest:,} failing elite{' is' if rest == 1 else 's are'} not known to be passable.")
+        told.append(f"{rest:,} {what}{' is' if rest == 1 else 's are'} not known to be passable.")
     return told
 
 

@@ -375,8 +375,7 @@ def minimal_words(numbers: dict[str, Any], judged: Archive) -> list[str]:
         )
     if numbers["causes"]:
         told.append(f"Causes: {', '.join(f'{kind} {many}' for kind, many in numbers['causes'].items())}.")
-    words = fault_words(judged)
-    return told + ([f"Of these minimal terrains: {words[0]}", *words[1:]] if words else [])
+    return told + fault_words(judged, what="minimal terrain")
 
 
 _SHOWN = 10  # terrains that are told one by one
