@@ -67,19 +67,22 @@ class Candidates:
 
 
 def check_judged(archive: Archive, run: Path, robot: "RobotCfg") -> None:
-    """That the failing elites of a run were confirmed and certified.
+    """That all failing elites of a run, if there are any, were confirmed and certified.
 
     Raises:
         ValueError: If not, naming the command.
     """
-    faults = archive.faults or FaultCounts.none_of(len(archive))
-    missing = {"confirm": not faults.resolved_outcomes.any(), "certify": not faults.certifier_outcomes.any()}
-    for name, is_missing in missing.items():
-        if is_missing:
+    faults, failing = archive.faults or FaultCounts.none_of(len(archive)), archive.failing
+    crossed = {
+        "confirm": faults.resolved_outcomes.any(axis=1),
+        "certify": faults.certifier_outcomes.any(axis=(1, 2)),
+    }
+    for name, there in crossed.items():
+        if (failing & ~there).any():
             remedy = command_line(name, robot=robot.spec, run=run)
             raise ValueError(
-                f"{run} must have its failing elites crossed by `faultline {name}`, which says what is a fault, got "
-                f"none: run `{remedy}` first"
+                f"{run} must have its {failing.sum():,} failing elites crossed by `faultline {name}`, which says what "
+                f"is a fault, got {(failing & there).sum():,} of them: run `{remedy}` first"
             )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from qd.archive import OUTCOMES, Archive
 from qd.faults import Work, certify, confirm, fault_numbers, fault_words, judgement, known_names, rate_of, verdict_of
 from qd.fresh import Open
-from qd.minimal import MOST_PARTS, Case, How, Minimal, Parts, Trial, fresh_counts, genes_of, goal_rate, minimise
+from qd.minimal import MOST_PARTS, Case, How, Minimal, Trial, fresh_counts, genes_of, goal_rate, minimise
 from qd.run.arguments import evaluator_of
 from qd.run.judge import certifiers_of, config_of, judged_run, searched_policy
 from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Known, read_minimal, write_minimal
@@ -82,13 +82,25 @@ class MinimalTerrains:
     """By number of the elite; their counts grow."""
 
     @cached_property
-    def _shapes(self) -> dict[tuple[int, Parts], dict[int, "Shape"]]:
+    def _known(self) -> dict[int, tuple[int, Minimal | None]]:
+        """By number of the elite, as of how many trials: every lot of crossings asks again about all of them."""
+        return {}
+
+    @cached_property
+    def _entries(self) -> dict[int, dict[str, Any]]:
         return {}
 
     def minima(self) -> dict[int, Minimal]:
         """The minimal terrains that are known, by number of the elite."""
-        found = {number: case.minimal() for number, case in sorted(self.cases.items())}
-        return {number: minimal for number, minimal in found.items() if minimal is not None}
+        found = {}
+        for number, case in sorted(self.cases.items()):
+            trials, minimal = self._known.get(number, (-1, None))
+            if trials != len(case.counts):
+                minimal = case.minimal()
+                self._known[number] = len(case.counts), minimal
+            if minimal is not None:
+                found[number] = minimal
+        return found
 
     def genes(self, number: int, minimal: Minimal, scale: float = 1.0) -> NDArray[np.float32]:
         """Genes of a minimal terrain, shape (num_genes,)."""
@@ -117,14 +129,11 @@ class MinimalTerrains:
 
     def shapes(self, number: int, minimal: Minimal) -> dict[int, "Shape"]:
         """Shapes of the parts of a minimal terrain, by their numbers."""
-        key = (number, minimal.parts)
-        if key not in self._shapes:
-            from qd.causes import fields_of, shape_of  # with Warp: not for `--help`
+        from qd.causes import fields_of, shape_of  # with Warp: not for `--help`
 
-            fields = fields_of(self.genes(number, minimal), minimal.parts, self.space)
-            shapes = (shape_of(field, self.half_width) for field in fields)
-            self._shapes[key] = dict(zip(minimal.parts, shapes, strict=True))
-        return self._shapes[key]
+        fields = fields_of(self.genes(number, minimal), minimal.parts, self.space)
+        shapes = (shape_of(field, self.half_width) for field in fields)
+        return dict(zip(minimal.parts, shapes, strict=True))
 
     def margin(self, number: int, minimal: Minimal) -> tuple[float, float | None]:
         """Largest height or depth of a minimal terrain, and how far it moves to the least scale that fails [m]."""
@@ -144,6 +153,12 @@ class MinimalTerrains:
             judged: The minimal terrains as elites, with fault counts where they were crossed for these.
             place: The terrain's among them.
         """
+        if number not in self._entries:  # nothing more is crossed of a minimal terrain
+            self._entries[number] = self._entry(number, minimal)
+        return {**self._entries[number], "verdict": verdict_of(judged, place), **judgement(judged, place)}
+
+    def _entry(self, number: int, minimal: Minimal) -> dict[str, Any]:
+        """What does not change when others cross it."""
         words, case = self.space.parts(self.archive.genes[number]), self.cases[number]
         shapes, (height, margin) = self.shapes(number, minimal), self.margin(number, minimal)
         cause = minimal.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
@@ -167,8 +182,6 @@ class MinimalTerrains:
             "height_m": height,
             "margin_m": margin,
             "scales": [{"scale": scale, **rate_of(counts)} for scale, counts in sorted(minimal.scales.items())],
-            "verdict": verdict_of(judged, place),
-            **judgement(judged, place),
         }
 
     def numbers(self, judged: Archive) -> dict[str, Any]:
@@ -362,8 +375,7 @@ def minimal_words(numbers: dict[str, Any], judged: Archive) -> list[str]:
         )
     if numbers["causes"]:
         told.append(f"Causes: {', '.join(f'{kind} {many}' for kind, many in numbers['causes'].items())}.")
-    words = fault_words(judged)
-    return told + ([f"Of these minimal terrains: {words[0]}", *words[1:]] if words else [])
+    return told + fault_words(judged, what="minimal terrain")
 
 
 _SHOWN = 10  # terrains that are told one by one

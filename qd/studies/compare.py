@@ -18,6 +18,7 @@ from qd.run.judge import Certify, Confirm, certifiers_of, certify_run, confirm_r
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
 from qd.studies.study import StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, parse_workers, resolve_device
+from qd.workers.kept_open import kept_open
 from sim.files.command import publish
 from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
 from sim.files.settings import check, setting
@@ -141,10 +142,10 @@ class Compare(StudyFlags):
             found = run_study(study, open_evaluator)
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds[name]] for name in methods}
             report = report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()})
+            counts = self._judged(study.path, list(runs), robot.spec, judges, open_evaluator) if self.certify else {}
             for name in methods if self.certify else ():
-                folders = [study.path / f"{name}-{seed}" for seed in seeds[name]]
-                counts = [self._judged(folder, robot.spec, judges, open_evaluator) for folder in folders]
-                report["methods"][name] |= {key: _over_seeds([one[key] for one in counts]) for key in FAULTS}
+                own = [counts[f"{name}-{seed}"] for seed in seeds[name]]
+                report["methods"][name] |= {key: _over_seeds([one[key] for one in own]) for key in FAULTS}
             return {
                 **study.origin,
                 **identity(robot, study.evaluator.policy),
@@ -160,14 +161,26 @@ class Compare(StudyFlags):
 
         return publish(study.out, measure, _show, draw=lambda report: as_png(draw_comparison(report)))
 
-    def _judged(self, run: Path, robot: str, judges: dict[str, str], open_evaluator: Open) -> dict[str, Any]:
-        """Fresh episodes, confirmations and certificates of a run's elites; those that are there are kept."""
-        where = {"robot": robot, "run": run, "device": self.device, "workers": self.workers, "num_envs": self.num_envs}
-        if RunDirectory(run).fresh_archive() is None:
-            reevaluate_run(Reevaluate(policy=self.policy, **where), open_evaluator=open_evaluator)
-        confirm_run(Confirm(policy=self.policy, **where), open_evaluator=open_evaluator)
-        by = tuple(f"{name}={policy}" for name, policy in judges.items())
-        return fault_numbers(certify_run(Certify(by=by, **where), open_evaluator=open_evaluator))
+    def _judged(
+        self, path: Path, names: Sequence[str], robot: str, judges: dict[str, str], open_evaluator: Open
+    ) -> dict[str, dict[str, Any]]:
+        """What the elites of runs are in fresh episodes, with contact resolved and to the judges, by name of the run.
+
+        What is there is kept. One step after the other, so that all runs are crossed by the same simulations.
+        """
+        shared = {"robot": robot, "device": self.device, "workers": self.workers, "num_envs": self.num_envs}
+        by, found = tuple(f"{name}={policy}" for name, policy in judges.items()), {}
+        with kept_open(open_evaluator) as opened:
+            for name in names:
+                if RunDirectory(path / name).fresh_archive() is None:
+                    again = Reevaluate(policy=self.policy, run=path / name, **shared)
+                    reevaluate_run(again, open_evaluator=opened)
+            for name in names:
+                confirm_run(Confirm(policy=self.policy, run=path / name, **shared), open_evaluator=opened)
+            for name in names:
+                certify = Certify(by=by, run=path / name, **shared)
+                found[name] = fault_numbers(certify_run(certify, open_evaluator=opened))
+        return found
 
     def _methods(self, shared: SearchCfg, certifiers: dict[str, str]) -> dict[str, SearchCfg]:
         """Settings of each method: different searches on the same number of terrains, or of episodes.

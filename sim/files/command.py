@@ -9,13 +9,14 @@ import shlex
 import shutil
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.settings import check, setting
@@ -166,7 +167,18 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
         return 130
 
 
-def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:
+_COMPILER, _AGAIN_S = f"{os.sep}llvmlite{os.sep}", 0.1
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    while frame is not None:
+        if _COMPILER in frame.f_code.co_filename:
+            # Its C code calls Python back and drops what is raised there: the signal comes again until it is over.
+            later = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), signum))
+            later.daemon = True
+            later.start()
+            return
+        frame = frame.f_back
     raise KeyboardInterrupt
 
 

@@ -247,15 +247,15 @@ def _tell_choice(candidates: Candidates, count: int, size: int, path: Path) -> N
     Raises:
         ValueError: If there is none.
     """
-    rest = f"{candidates.not_passable:,} more fail that nobody is known to cross"
+    rest = f"failing terrains that nobody is known to cross: {candidates.not_passable:,}"
     if not count:
         raise ValueError(
             f"{path} must have faults or near-faults to make a pack of, got none, and {rest}: let its search go on, or "
             "certify with more controllers (`faultline certify --by NAME=FILE`)"
         )
-    if count < size:
-        print(f"{path} has {count:,} faults and near-faults, {size:,} were asked for: the pack has {count:,}.")
-    print(f"{count:,} of {len(candidates.terrains):,} terrains are taken; {rest} and are left out.", flush=True)
+    told = f"Faults and near-faults in {path}: {len(candidates.terrains):,}, of which the pack has {count:,}"
+    print(f"{told}, {size:,} were asked for." if count < size else f"{told}.")
+    print(f"Left out, {rest}.", flush=True)
 
 
 def _kept(robot: "RobotCfg") -> Path:
