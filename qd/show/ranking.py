@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from qd.archive import Archive
 from qd.elites import Elites, elites_of
 from qd.families import families_of
-from qd.modes import Modes, find_modes
+from qd.modes import Modes, failure_modes
 
 if TYPE_CHECKING:
     from sim.space import TerrainSpace
@@ -36,7 +36,7 @@ class Ranking:
 
     elites: Elites
     modes: Modes
-    """Groups of them by how the robot struggles."""
+    """Groups of those that fail, by how the robot struggles."""
     families: NDArray[np.int64]
     """Family of each, shape (N,), numbered from 1 by its worst member."""
 
@@ -96,4 +96,4 @@ def rank(archive: Archive, space: "TerrainSpace", *, judged: bool = False) -> Ra
     families = families_of(archive.genes[elites.numbers], space)
     places = {int(family): place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()]), start=1)}
     numbered = np.array([places[int(family)] for family in families], dtype=np.int64)
-    return Ranking(elites=elites, modes=find_modes(elites), families=numbered)
+    return Ranking(elites=elites, modes=failure_modes(elites), families=numbered)

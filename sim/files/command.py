@@ -77,6 +77,9 @@ class Which(InSpace):
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
     """Numbers of the elites, 0 the worst: one, several as in --elite "0 3", or all. replay and view take one."""
+    minimal: str | None = None
+    """Instead of whole elites, the minimal terrains that `faultline minimise` left of them: numbers of the elites, as
+    --elite has them; all are those that have one."""
 
 
 class UserError(Exception):
@@ -263,8 +266,9 @@ def publish(
     report = measure()
     show(report)
     for file, make in makers.items():
+        replaced = " (replaced)" if file.exists() else ""
         write_atomically(file, make(report))
-        print(f"written to {file}")
+        print(f"written to {file}{replaced}")
     return report
 
 
