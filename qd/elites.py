@@ -1,6 +1,7 @@
 """The elites of an archive by what is known best of each."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +67,8 @@ class Elites:
 
     def rows(self, chosen: NDArray[np.int64]) -> "Elites":
         """The elites in some rows, in their order."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        return Elites(**{name: v if isinstance(v, tuple) else v[chosen] for name, v in values.items()})
+        values: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        return replace(self, **{name: v[chosen] for name, v in values.items() if isinstance(v, np.ndarray)})
 
     def place_of(self, number: int) -> int:
         """Row of an elite by its number in the archive."""

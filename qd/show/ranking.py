@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from qd.archive import Archive
 from qd.elites import Elites, elites_of
 from qd.families import families_of
-from qd.modes import Modes, failure_modes
+from qd.modes import Mode, Modes, failure_modes
+from qd.show.figures import label_of
 
 if TYPE_CHECKING:
     from sim.space import TerrainSpace
@@ -28,6 +29,11 @@ ORDERS = {
     "family": "families of like terrains",
 }
 """Orders of elites, in words."""
+
+
+def mode_words(mode: Mode) -> str:
+    """A mode in a few words: how its crossings end, and the penalty that stands out."""
+    return f"{mode.ending} · {label_of(mode.marked_by)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +79,11 @@ class Ranking:
                 first.append(row)
                 families.add(int(self.families[row]))
         return np.array([*first, *np.setdiff1d(severity, first, assume_unique=True)], dtype=np.int64)
+
+    def mode_of(self, place: int) -> Mode | None:
+        """The mode of the elite in a row; None of one that does not fail."""
+        number = int(self.modes.labels[place])
+        return self.modes.modes[number - 1] if number else None
 
     def leaders(self) -> list[int]:
         """Numbers of the terrains that stand for a way of failing, one for each mode in which terrains fail."""

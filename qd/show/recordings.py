@@ -60,9 +60,16 @@ class Wanted:
 
 
 def on_elite(
-    archive: Archive, number: int, *, policy: str, replicas: int, seed: int = 0, label: str | None = None
+    archive: Archive,
+    number: int,
+    *,
+    policy: str,
+    replicas: int,
+    seed: int = 0,
+    label: str | None = None,
+    minimal: NDArray[np.float32] | None = None,
 ) -> Wanted:
-    """The crossings of an elite that ``faultline replay`` shows.
+    """The crossings of an elite, or of its minimal terrain, that ``faultline replay`` shows.
 
     Args:
         archive: That it is of.
@@ -71,6 +78,7 @@ def on_elite(
         replicas: Episodes.
         seed: Other episodes for another seed.
         label: What the terrain is, in words.
+        minimal: Genes of its minimal terrain, which is crossed from the same starts.
 
     Raises:
         ValueError: If a number is out of range, or the terrain space is not at hand.
@@ -78,8 +86,8 @@ def on_elite(
     from sim.space import get_space
 
     return Wanted(
-        label=label or f"elite {number} of {archive.robot}",
-        terrain=archive.genes[number],
+        label=label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}",
+        terrain=archive.genes[number] if minimal is None else minimal,
         policy=policy,
         replicas=replicas,
         seed=seed,

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.provenance import without_machine
 from sim.files.settings import check, setting
 
 _ALL = "all"
@@ -183,8 +184,8 @@ def command_line(name: str, **flags: object) -> str:
 
 
 def plain_command(name: str, **flags: object) -> str:
-    """:func:`command_line` for a file that others read: ``faultline`` without where it is installed here."""
-    return shlex.join(["faultline", name, *_words(flags)])
+    """:func:`command_line` for a file that others read, without where things lie on this machine."""
+    return shlex.join(["faultline", name, *map(without_machine, _words(flags))])
 
 
 def _words(flags: Mapping[str, object]) -> Iterator[str]:

@@ -23,7 +23,7 @@ _GHOST_OPACITY, _GHOST_PALENESS = 0.25, 0.6
 _ARROW = 0.8  # length of the arrow of a force at the robot's limit [m]
 _ARROW_WIDTH = 0.012
 _LEAST_FORCE = 5.0  # shown [N]
-_PATH_RADIUS = 0.012  # [m]
+_PATH_RADIUS = 0.009  # [m]
 _SUN_AWAY = 8.0  # from what one looks at [m]
 _CALM, _ALARMED = np.array([0.95, 0.80, 0.20, 0.9], np.float32), np.array([0.85, 0.10, 0.10, 0.9], np.float32)
 
@@ -124,7 +124,7 @@ class Renderer:
         *,
         ghosts: Sequence[NDArray[np.floating]] = (),
         foot_force: NDArray[np.floating] | None = None,
-        paths: Sequence[tuple[NDArray[np.floating], tuple[float, float, float]]] = (),
+        paths: Sequence[tuple[NDArray[np.floating], tuple[float, float, float, float]]] = (),
     ) -> NDArray[np.uint8]:
         """A picture of one pose.
 
@@ -133,7 +133,7 @@ class Renderer:
             camera: Where from.
             ghosts: Poses of others, shown translucent.
             foot_force: Contact force on each foot, world frame [N], shape (num_feet, 3), shown as arrows.
-            paths: Ways, each by its points [m], shape (num_points, 3), and its colour, RGB 0 to 1.
+            paths: Ways, each by its points [m], shape (num_points, 3), and its colour, RGBA 0 to 1.
 
         Returns:
             RGB, shape (height, width, 3).
@@ -153,7 +153,7 @@ class Renderer:
                 if index >= 0:
                     self._add_arrow(data.geom_xpos[index], np.asarray(force, dtype=np.float64))
         for points, color in paths:
-            self._add_path(points, np.array([*color, 1.0], np.float32))
+            self._add_path(points, np.array(color, np.float32))
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         return self._image[::-1].copy()  # OpenGL's lowest row is first

@@ -182,7 +182,9 @@ def test_paths_are_drawn_where_they_run(opengl):
     camera = Camera(target=(8.0, 4.0, 0.5), distance=9.0, azimuth=90.0, elevation=-89.0)
     with Renderer(robot, heights, width=640, height=320, shadows=False) as renderer:
         pose = standing(robot, 2.0, 1.0, 0.0)
-        bare, drawn = (renderer.render(pose, camera, paths=p).astype(int) for p in ((), [(points, (1.0, 0.0, 0.0))]))
+        bare, drawn = (
+            renderer.render(pose, camera, paths=p).astype(int) for p in ((), [(points, (1.0, 0.0, 0.0, 1.0))])
+        )
     rows, columns = np.nonzero(np.abs(drawn - bare).sum(axis=2) > 60)
     assert abs(rows.mean() - 160) < 3 and np.ptp(rows) < 8  # level across the middle of the picture
     assert abs(columns.mean() - 320) < 5 and np.ptp(columns) > 200

@@ -117,7 +117,7 @@ def test_a_file_that_cannot_be_shown_is_named(robot, tmp_path):
 
 
 def test_visual_shapes_are_shown_alone_on_bodies_that_have_some(tmp_path):
-    """A URDF's visuals where they can be read, and meshes of an MJCF that touch nothing; names stay the simulation's."""
+    """A URDF's visuals where they can be read, and meshes of an MJCF that touch nothing; names are the simulation's."""
     shown = '<visual><geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
     file = write_dog(tmp_path, **KINDS["urdf"])
     model = next(tmp_path.glob("*.urdf"))
