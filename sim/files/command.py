@@ -180,12 +180,17 @@ def command_line(name: str, **flags: object) -> str:
         name: The word that calls it.
         flags: Values by field name; None and False are left out, True is a bare flag.
     """
-    return shlex.join([*_program(), name, *_words(flags)])
+    return shlex.join([*_program(), *command_words(name, **flags)])
 
 
 def plain_command(name: str, **flags: object) -> str:
     """:func:`command_line` for a file that others read, without where things lie on this machine."""
-    return shlex.join(["faultline", name, *map(without_machine, _words(flags))])
+    return shlex.join(["faultline", *map(without_machine, command_words(name, **flags))])
+
+
+def command_words(name: str, **flags: object) -> list[str]:
+    """The words of :func:`command_line` after ``faultline``."""
+    return [name, *_words(flags)]
 
 
 def _words(flags: Mapping[str, object]) -> Iterator[str]:

@@ -44,7 +44,9 @@ class Shown:
     def __init__(self, show, recordings, query=""):
         self.app = App(show, recordings)
         self.asked = []
+        self.ahead = []
         self.app._recorder.record = lambda wanted, tab=0: self.asked.append(wanted)
+        self.app._recorder.record_ahead = lambda wanted, tab=0: self.ahead.append([one.label for one in wanted])
         self.visitors = []
         self.tab = self.come(query)
 
@@ -156,7 +158,7 @@ def test_a_link_opens_what_it_was_copied_from(shown):
         (shown.tab.choose_controller, "other"),
         (shown.tab.seek, 1.25),
         (shown.tab.set_follow, True),
-        (shown.tab.copy_link,),
+        (shown.tab.taking.link,),
     )
     query = shown.tab._query
     assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
