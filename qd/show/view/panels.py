@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from qd.show.ranking import ORDERS
 from qd.show.view.legend import legend_html
 from qd.show.view.plots import FITNESS_WORDS, Axes, Choice, axes_svg
-from qd.show.view.scene import first_view_of
+from qd.show.view.scene import PHONE, first_view_of
 
 if TYPE_CHECKING:
     from qd.show.view.tab import Tab
@@ -274,8 +274,9 @@ class CrossingPanel:
             tab: Does what a visitor asks for.
         """
         gui, self._post = client.gui, tab.common.post
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(_WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH)
+        if client.camera.image_width >= PHONE:  # else viser makes a sheet of it
+            gui.main_panel.dock_right()
+            gui.main_panel.set_width(_WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH)
         self._details = gui.add_markdown("")
         self._controller = gui.add_dropdown("Controller", tuple(controllers) or ("none",), disabled=not controllers)
         _on_visit(self._controller, lambda name: self._post(tab.choose_controller, str(name)))

@@ -20,7 +20,7 @@ from sim.space import TerrainSpace
 _SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites in the list's order, the first darkest
 _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
 _WIDTH, _HEIGHT = 460, 350
-_TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 16
+_TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 32
 _CURVES_HEIGHT, _MARGIN, _MARK_ROW = 170, 24, 14
 _RATES = {"goal_rate": "goal reached", "collision_rate": "base collision", "fallen_rate": "fallen"}
 _CROSSED = {**_RATES, "goal_rate": ARRIVED}  # as recordings name them
@@ -30,6 +30,7 @@ FITNESS_WORDS = (
     "episode alike. It does not say that the robot fails: read the goal rate for that."
 )
 """What fitness is, and what it is not."""
+_FITNESS_SHORT = "what the search looks for, costly in every episode alike; whether the robot fails says the goal rate"
 KINDS = {
     "all": VERDICTS,
     "faults": ("fault",),
@@ -179,7 +180,7 @@ class Axes:
             *elite_words(archive, number),
             "",
             f"Fitness **{elites.fitness[number]:.2f}** ({archive.fitness[number]:.2f} as found in iteration "
-            f"{archive.iteration[number]}). {FITNESS_WORDS}",
+            f"{archive.iteration[number]}): {_FITNESS_SHORT}.",
         ]
         return "\n".join(lines)
 
