@@ -6,12 +6,17 @@ not there yet. Pictures are JPEGs of docs/pictures.
 
 import argparse
 import io
+import itertools
 import signal
 from pathlib import Path
 
 from PIL import Image
 
+from qd.show.elites import find_archive
+from qd.show.recordings import Recordings, on_elite
 from qd.show.report.command import Report, html_report
+from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode
+from sim.recording.renderer import Renderer
 from tests.builders import free_port
 from tests.qd.show.view.browser import LIMIT_MS, open_chromium, see
 from tests.qd.show.view.visitor import ROOT, serve, view_command
@@ -19,6 +24,7 @@ from tests.qd.show.view.visitor import ROOT, serve, view_command
 FOLDER = ROOT / "docs" / "pictures"
 WIDE, NARROW = (1400, 900), (390, 844)
 QUALITY = 80
+FRAME = 5  # of the film [s]
 SETTLE_MS = 3000  # for the last frames of a browser that draws without a GPU
 
 
@@ -55,8 +61,7 @@ def viewer_pictures(browser, address: str, elite: int) -> None:
     take(page, "viewer-follow")
     page.keyboard.press("f")
     page.keyboard.press("o")
-    page.get_by_text("Mode", exact=True).first.scroll_into_view_if_needed()
-    page.locator("input[value='all modes']").click()
+    page.get_by_role("combobox", name="Mode").click()
     page.get_by_role("option").nth(1).click()
     take(page, "viewer-mode")
     page.close()
@@ -75,6 +80,21 @@ def report_picture(browser, file: Path) -> None:
     page.close()
 
 
+def film_picture(run: Path, elite: int) -> None:
+    """A frame of the film of an elite that the viewer has recorded."""
+    found = find_archive(None, run)
+    archive, robot = found.archive, found.robot
+    wanted = on_elite(archive, elite, policy=found.policy(None), replicas=20)
+    (recording,) = Recordings(robot).all_of([wanted])
+    scales = dict(zip(archive.penalties, archive.scales, strict=True))
+    shot = Shot(recording=recording, episode=typical_episode(recording, scales), ghosts=(0, 1), scales=scales)
+    cameras = follow(shot, 4.6 * robot.default_base_height)
+    with Renderer(robot, recording.heights[0], width=WIDTH, height=VIEW_HEIGHT) as renderer:
+        pictures = list(itertools.islice(frames_of(shot, renderer, cameras, fps=1), FRAME + 1))
+    Image.fromarray(pictures[-1]).save(FOLDER / "film.jpg", quality=QUALITY)
+    print(FOLDER / "film.jpg")
+
+
 def main() -> None:
     """Takes all pictures."""
     flags = argparse.ArgumentParser(description=__doc__)
@@ -89,6 +109,7 @@ def main() -> None:
         with open_chromium() as browser:
             viewer_pictures(browser, f"http://127.0.0.1:{port}/", args.elite)
             report_picture(browser, report)
+        film_picture(args.run, args.elite)
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)

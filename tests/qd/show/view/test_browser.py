@@ -199,3 +199,17 @@ def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
         panel = page.get_by_text("faultline", exact=True).first
         panel.click()  # folds the rest
         page.get_by_role("button", name="Play").wait_for(state="hidden")
+
+
+def test_command_and_files_are_taken_along(opened):
+    page = opened("?elite=0")
+    see(page, "^Episode 1: ")
+    page.get_by_role("button", name="copy command").click()
+    see(page, "^Command copied$")
+    assert "replay --robot anymal" in page.evaluate("navigator.clipboard.readText()")
+    with page.expect_download(timeout=LIMIT_MS) as download:
+        page.get_by_role("button", name="export this").click()
+        see(page, "is ready$")
+        if page.get_by_role("link", name="elite-0.zip").count():  # where it asks first
+            page.get_by_role("link", name="elite-0.zip").first.click()
+    assert download.value.suggested_filename == "elite-0.zip"
