@@ -108,13 +108,13 @@ def print_rows(report: dict[str, Any]) -> None:
     """Prints a row a choice."""
     names = list(report["rows"][0]["penalties"])
     head = f"{'step':>5} {'iterations':>10} {'search':>6} {'rows':>5} {'contacts':>8} {'wall s':>7} {'M steps/s':>9}"
-    print(f"{head} {'success':>7} {'goal':>6} {'invalid':>7} " + " ".join(f"{name:>13}" for name in names))
+    print(f"{head} {'goal':>6} {'no base collision':>17} {'invalid':>7} " + " ".join(f"{name:>13}" for name in names))
     for row in report["rows"]:
         print(
             f"{row['physics_dt']:>5g} {row['iterations']:>10} {row['ls_iterations']:>6} {row['njmax']:>5} "
             f"{row['nconmax']:>8} "
             f"{row['wall_s']:>7.2f} {row['world_steps_per_s'] / 1e6:>9.3f} "
-            f"{value_words(row['success_rate'], None, '.4f'):>7} {value_words(row['goal_rate'], None, '.4f'):>6} "
+            f"{value_words(row['goal_rate'], None, '.4f'):>6} {value_words(row['success_rate'], None, '.4f'):>17} "
             f"{row['invalid']:>7} "
             + " ".join(f"{value_words(row['penalties'][name], None, '.4f'):>13}" for name in names)
         )

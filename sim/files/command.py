@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Any, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.provenance import without_machine
 from sim.files.settings import check, setting
 
 _ALL = "all"
@@ -79,6 +80,9 @@ class Which(InSpace):
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
     """Numbers of the elites, 0 the worst: one, several as in --elite "0 3", or all. replay and view take one."""
+    minimal: str | None = None
+    """Instead of whole elites, the minimal terrains that `faultline minimise` left of them: numbers of the elites, as
+    --elite has them; all are those that have one."""
 
 
 class UserError(Exception):
@@ -189,12 +193,17 @@ def command_line(name: str, **flags: object) -> str:
         name: The word that calls it.
         flags: Values by field name; None and False are left out, True is a bare flag.
     """
-    return shlex.join([*_program(), name, *_words(flags)])
+    return shlex.join([*_program(), *command_words(name, **flags)])
 
 
 def plain_command(name: str, **flags: object) -> str:
-    """:func:`command_line` for a file that others read: ``faultline`` without where it is installed here."""
-    return shlex.join(["faultline", name, *_words(flags)])
+    """:func:`command_line` for a file that others read, without where things lie on this machine."""
+    return shlex.join(["faultline", *map(without_machine, command_words(name, **flags))])
+
+
+def command_words(name: str, **flags: object) -> list[str]:
+    """The words of :func:`command_line` after ``faultline``."""
+    return [name, *_words(flags)]
 
 
 def _words(flags: Mapping[str, object]) -> Iterator[str]:
@@ -276,8 +285,9 @@ def publish(
     report = measure()
     show(report)
     for file, make in makers.items():
+        replaced = " (replaced)" if file.exists() else ""
         write_atomically(file, make(report))
-        print(f"written to {file}")
+        print(f"written to {file}{replaced}")
     return report
 
 

@@ -239,19 +239,20 @@ def _settings(robot: RobotCfg, time_constant_s: float | None) -> dict[str, Any]:
 
 def print_comparison(report: dict[str, Any]) -> None:
     """Prints a row a terrain, and the means."""
-    print(f"{'terrain':>7} {'success: ours':>22} {'MuJoCo C':>9} {'':>8} {'goal: ours':>22} {'MuJoCo C':>9}")
+    words = {"goal": "goal", "success": "no base collision"}
+    print(" ".join([f"{'terrain':>7}", *(f"{f'{what}: ours':>24} {'MuJoCo C':>9} {'':>8}" for what in words.values())]))
     for row in report["terrains"]:
         cells = [f"{row['index']:>7}"]
-        for kind in ("success", "goal"):
+        for kind in words:
             ours = value_words(row[kind]["ours"], row[kind]["interval"], ".2f")
-            cells.append(f"{ours:>22} {row[kind]['mujoco_c']:>9.2f}")
+            cells.append(f"{ours:>24} {row[kind]['mujoco_c']:>9.2f}")
             cells.append("inside  " if row[kind]["inside"] else "outside ")
         print(" ".join(cells))
-    for kind in ("success", "goal"):
+    for kind, what in words.items():
         total = report[kind]
         bias = value_words(total["bias"], total["bias_interval"], "+.3f")
         print(
-            f"{kind}: {total['inside']} of {len(report['terrains'])} rates of MuJoCo C inside our interval; mean "
+            f"{what}: {total['inside']} of {len(report['terrains'])} rates of MuJoCo C inside our interval; mean "
             f"{total['ours']:.3f} against {total['mujoco_c']:.3f}, bias {bias}"
         )
     print(f"invalid episodes: {report['invalid']}")

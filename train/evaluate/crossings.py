@@ -161,6 +161,7 @@ def _cross(evaluate: Evaluate, terrains: TerrainSet, num_replicas: int, bar: tqd
 
 def _line(who: str, terrains: TerrainSet, result: RolloutResult) -> str:
     rates = {name: values[~np.isnan(values)] for name, values in terrain_rates(result).items()}
-    said = ", ".join(f"{name} {rates[name].mean():.3f}" for name in ("success", "goal") if len(rates[name]))
+    words = {"goal": "goal", "success": "no base collision"}
+    said = ", ".join(f"{what} {rates[name].mean():.3f}" for name, what in words.items() if len(rates[name]))
     size = f"{len(terrains)} terrains x {result.outcome.shape[1]} episodes in {result.wall_s:.0f} s"
     return f"{who} on {terrains.name}: {said or 'all terrains invalid'} ({size})"

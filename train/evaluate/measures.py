@@ -64,7 +64,7 @@ def invalid_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
             success = 1.0 - (counts["base_collision"] + count) / total
             lines.append(
                 f"{what}: {count} of {total} episodes are invalid ({count / total:.1%}) and left out; counted as "
-                f"failures, success would be {success:.3f}, goal {goal:.3f}"
+                f"failures, goal would be {goal:.3f}, no base collision {success:.3f}"
             )
     return lines
 

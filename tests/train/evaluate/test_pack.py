@@ -159,7 +159,7 @@ def test_a_pack_is_exported(made, home):
     assert [one["verdict"] for one in index["elites"]] == ["fault", "fault"] and index["pack"] == "pack"
     with pytest.raises(ValueError, match="holds an export already"):
         export(Export(pack="pack", formats=("npz",), out=Path("files")))
-    with pytest.raises(ValueError, match="got --run or --space beside --pack"):
+    with pytest.raises(ValueError, match="got --run, --space or --minimal beside --pack"):
         export(Export(pack="pack", run=made / "judged"))
 
 
