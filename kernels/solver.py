@@ -5,10 +5,10 @@ search direction from one to the next through global memory. A walking robot has
 mostly is done after one iteration. Here a warp takes one robot, keeps all but the constraint Jacobian in shared memory,
 and iterates until that robot is done.
 
-Algorithm, tests of convergence and line search are mujoco_warp's (Todorov, "Convex and analytically-invertible dynamics
-with contacts and constraints", ICRA 2014, primal form with elliptic cones), so that iterates agree to rounding. Only the
-Hessian of a contact on the side of its cone is put together in another way: C being positive semidefinite, J^T C J is
-the sum of squares of as many combinations of the contact's rows as C's rank (solver.cu, ``find_direction``).
+Algorithm, tests of convergence and line search are mujoco_warp's (Todorov, "Convex and analytically-invertible
+dynamics with contacts and constraints", ICRA 2014; primal form, elliptic cones), so that iterates agree to rounding.
+Only the Hessian of a contact on the side of its cone is put together in another way: its C is positive semidefinite,
+so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu, ``find_direction``).
 """
 
 from functools import cache
@@ -116,7 +116,9 @@ def _kernel(nv: int, rows: int, dim: int, inertia: int) -> tuple[Any, int]:
     @wp.func_native(snippet=snippet)
     def solve_one(problem: Problem, thread: int): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"fast_math": True}, cuda_max_registers=_REGISTERS)
+    options = {"fast_math": True}  # approximate division and roots; slopes below rounding end a line search anyway
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=options, cuda_max_registers=_REGISTERS)
     def solve_all(problem: Problem):
         """Grid (num_envs * 32,); of one thread a robot on a CPU."""
         solve_one(problem, wp.tid())
@@ -135,7 +137,7 @@ def _dim(m: Any) -> int:
 
 
 def fits(m: Any, d: Any) -> bool:
-    """Whether :func:`solve_contacts` solves problems of this mujoco_warp model: dense, elliptic, by Newton, and small."""
+    """Whether :func:`solve_contacts` solves problems of this model: dense, elliptic cones, by Newton, and small."""
     return (
         m.opt.solver == types.SolverType.NEWTON
         and m.opt.cone == types.ConeType.ELLIPTIC
@@ -156,12 +158,10 @@ def solve_contacts(m: Any, d: Any) -> None:
 
     Args:
         m: mujoco_warp's model, one that :func:`fits`.
-        d: Its data. Read are inertia, smooth forces and accelerations, warm start, contacts and constraint rows; written
-            ``qacc``, ``qfrc_constraint``, ``efc.Ma``, ``efc.force``, ``efc.state``, ``solver_niter`` and the bits of the
-            two caps on iterations in ``overflow``.
+        d: Its data. Read are inertia, smooth forces and accelerations, warm start, contacts and constraint rows;
+            written ``qacc``, ``qfrc_constraint``, ``efc.Ma``, ``efc.force``, ``efc.state``, ``solver_niter`` and the
+            bits of the two caps on iterations in ``overflow``.
     """
     kernel, robots = _kernel(m.nv, d.njmax, _dim(m), m.M_colind.shape[0])
     lanes = 1 if d.qacc.device.is_cpu else _WARP
-    wp.launch(
-        kernel, dim=d.nworld * lanes, inputs=[_problem(m, d)], block_dim=robots * _WARP, device=d.qacc.device
-    )
+    wp.launch(kernel, dim=d.nworld * lanes, inputs=[_problem(m, d)], block_dim=robots * _WARP, device=d.qacc.device)

@@ -11,6 +11,7 @@ import warp as wp
 from kernels.solver import fits, solve_contacts
 from sim.solver import solve_theirs, use_own_solver
 
+Mujoco: Any = mujoco  # it names its types at run time
 EVERYTHING = """
 <mujoco>
   <option cone="{cone}" iterations="30" ls_iterations="20" timestep="0.004" integrator="implicitfast"/>
@@ -56,8 +57,8 @@ def assert_alike(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], rel
 
 def everything(device: str, cone: str = "elliptic") -> tuple[Any, Any]:
     """Worlds of a thing with equality, friction losses, a limit and contacts of 1, 3, 4 and 6 dimensions."""
-    model = mujoco.MjModel.from_xml_string(EVERYTHING.format(cone=cone))
-    data = mujoco.MjData(model)
+    model = Mujoco.MjModel.from_xml_string(EVERYTHING.format(cone=cone))
+    data = Mujoco.MjData(model)
     rng = np.random.default_rng(5)
     with wp.ScopedDevice(device):
         m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=WORLDS, nconmax=24, njmax=90)
@@ -88,7 +89,7 @@ def test_every_kind_of_constraint(device: str) -> None:
                     states |= set(ours["state"][world, :count].tolist())
     finally:
         use_own_solver()
-    kinds = mujoco.mjtConstraint
+    kinds = Mujoco.mjtConstraint
     assert seen >= {kinds.mjCNSTR_EQUALITY, kinds.mjCNSTR_FRICTION_DOF, kinds.mjCNSTR_LIMIT_JOINT}
     assert seen >= {kinds.mjCNSTR_CONTACT_FRICTIONLESS, kinds.mjCNSTR_CONTACT_ELLIPTIC}
     assert states == {0, 1, 2, 3, 4}
