@@ -119,10 +119,10 @@ class MinimalTerrains:
         """Shapes of the parts of a minimal terrain, by their numbers."""
         key = (number, minimal.parts)
         if key not in self._shapes:
-            from qd.causes import fields_of, shape_of  # with Warp: not for `--help`
+            from qd.causes import effects_of  # with Warp: not for `--help`
 
-            fields = fields_of(self.genes(number, minimal), minimal.parts, self.space)
-            shapes = (shape_of(field, self.half_width) for field in fields)
+            effects = effects_of(self.genes(number, minimal), minimal.parts, self.space)
+            shapes = (effects.shape(place, self.half_width) for place in range(len(minimal.parts)))
             self._shapes[key] = dict(zip(minimal.parts, shapes, strict=True))
         return self._shapes[key]
 
@@ -312,7 +312,7 @@ def _case_of(
     Raises:
         ValueError: If its terrain has no parts, or too many for all subsets.
     """
-    from qd.causes import fields_of, on_the_way  # with Warp: not for `--help`
+    from qd.causes import effects_of  # with Warp: not for `--help`
 
     count = len(space.parts(archive.genes[number]))
     if not count:
@@ -320,15 +320,15 @@ def _case_of(
             f"terrains of the space {space.name} have no parts that can be taken away, expected some: give the space "
             "parts(genes) and without(genes, parts) (docs/own-space.md)"
         )
-    fields = fields_of(archive.genes[number], range(count), space)
-    parts = [part for part in range(count) if np.abs(fields[part]).max() > _LEAST_EFFECT]
+    effects = effects_of(archive.genes[number], range(count), space)
+    parts = np.flatnonzero(effects.changes(_LEAST_EFFECT)).tolist()
     if how == "exhaustive" and len(parts) > MOST_PARTS:
         raise ValueError(
             f"elite {number} must have at most {MOST_PARTS} parts to cross all its subsets, got {len(parts)}: give "
             "--how greedy"
         )
     return Case(
-        parts=tuple(sorted(parts, key=lambda part: (on_the_way(fields[part], half_width), part))),
+        parts=tuple(sorted(parts, key=lambda part: (*effects.way(part, half_width), part))),
         how=how or ("exhaustive" if on_gpu and len(parts) <= MOST_PARTS else "greedy"),
         scalable=space.scaled(archive.genes[number][None], 0.5) is not None,
         counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},

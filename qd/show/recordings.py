@@ -256,15 +256,16 @@ class Recordings:
     def _is(self, recording: "Recording", wanted: Wanted) -> bool:
         """Whether a recording is of just these crossings; a file may have been renamed."""
         from sim.recording.recorder import space_in
-        from sim.space import space_identity
+        from sim.space import recorded_identity, space_identity
 
+        origin = recording.origin
         terrain = recording.heights if recording.genes is None else recording.genes
         return (
             recording.robot == self._robot.name
             and self._about.items() <= recording.origin.items()
             and recording.joint_names == self._robot.joint_names
             and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
-            and (recording.origin.get("space_sha256") or space_in(recording.origin)) == space_identity(wanted.space)
+            and recorded_identity(space_in(origin), origin.get("space_sha256")) == space_identity(wanted.space)
             and np.array_equal(terrain, wanted.terrain[None])
             and recording.seeds.tolist() == [wanted.terrain_seed]
             and np.array_equal(recording.replicas, np.arange(wanted.replicas))

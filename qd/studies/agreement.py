@@ -352,7 +352,7 @@ class Crossings:
                 self._kept.write(**self.outcome)
 
     def _cross_plain(self, name: str, *, resolved: bool) -> None:
-        from sim.bank import heights_of, host_device
+        from sim.bank import host_device, terrains_of
         from sim.mujoco_c.crossing import cross_plain
         from sim.simulation import SolverCfg
         from sim.simulation import resolved as with_contact_resolved
@@ -366,15 +366,17 @@ class Crossings:
             self.outcome[name][left[terrain]] = crossings.outcome
             self._kept.write(**self.outcome)
 
+        heights, ground = terrains_of(drawn.genes[left], drawn.space)
         cross_plain(
             robot,
             drawn.policy,
-            heights_of(drawn.genes[left], drawn.space),
+            heights,
             drawn.seeds(name)[left],
             num_episodes=self._evaluator.num_replicas,
             device=host_device(),
             processes=parse_workers(self._evaluator.workers).num_processes,
             time_constant_s=solver.time_constant_s,
+            ground=ground,
             crossed=crossed,
         )
 

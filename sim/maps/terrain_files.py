@@ -40,22 +40,27 @@ class Hfield:
     """Of the geom, w x y z: its x axis is the grid's y, its y axis the grid's -x."""
 
 
-def as_hfield(heights: NDArray[np.floating], *, margin: int = 0, thickness: float = 1.0) -> Hfield:
+Margins = tuple[tuple[int, int], tuple[int, int]]
+"""Nodes to add at low y and high y, and at low x and high x."""
+
+
+def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0, thickness: float = 1.0) -> Hfield:
     """A height grid as a heightfield with the same surface.
 
     Args:
         heights: [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`; node (0, 0) stands at x = y = 0.
-        margin: Nodes of edge height to add on every side.
+        margin: Nodes of edge height to add, on every side or on each.
         thickness: Of the ground below its lowest point [m].
     """
-    grid = np.pad(np.asarray(heights, dtype=np.float64), margin, mode="edge")
+    margins = ((margin, margin),) * 2 if isinstance(margin, int) else margin
+    grid = np.pad(np.asarray(heights, dtype=np.float64), margins, mode="edge")
     lowest, extent = float(grid.min()), float(np.ptp(grid)) or _LEAST_EXTENT
     half_y, half_x = (0.5 * SPACING * (count - 1) for count in grid.shape)
-    centre_y, centre_x = (0.5 * SPACING * (count - 1) for count in heights.shape)
+    (low_y, _), (low_x, _) = margins
     return Hfield(
         data=((grid - lowest) / extent).T[::-1],
         size=(half_y, half_x, extent, thickness),
-        position=(centre_x, centre_y, lowest),
+        position=(half_x - SPACING * low_x, half_y - SPACING * low_y, lowest),
     )
 
 
