@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.ground import COLS as COLS
-from kernels.ground import FIRM, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S
+from kernels.ground import FIRM
+from kernels.ground import LEAST_FRICTION as LEAST_FRICTION
+from kernels.ground import LEAST_TIME_CONSTANT_S as LEAST_TIME_CONSTANT_S
+from kernels.ground import MOST_TIME_CONSTANT_S as MOST_TIME_CONSTANT_S
 from kernels.ground import PATCH as PATCH
 from kernels.ground import ROWS as ROWS
 
@@ -17,7 +20,7 @@ GROUND_KINDS = ("friction", "softness")
 _SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(GROUND_KINDS)}))+)$")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GroundMaps:
     """Friction and softness of the patches of T terrains; docs/spaces.md says what the numbers do.
 

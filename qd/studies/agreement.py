@@ -186,7 +186,7 @@ def drawn(cfg: Agreement) -> Drawn:
         FileNotFoundError: If there is no run.
         ValueError: If terrains, robot or controller cannot be had, or MuJoCo does not read the robot.
     """
-    from sim.mujoco_c.model import crossing_model
+    from sim.mujoco_c.model import crossing_model, refuse_softness
     from sim.robots.robot import get_robot
     from sim.space import SUPER_GAUSSIAN, read_pool
 
@@ -210,6 +210,7 @@ def drawn(cfg: Agreement) -> Drawn:
     if cfg.mujoco_c:
         try:
             crossing_model(robot, np.zeros((2, 2)))
+            refuse_softness(space)
         except ValueError as error:
             raise ValueError(f"{error}, or leave MuJoCo C out with --mujoco-c 0") from None
     return Drawn(

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files.atomic import to_json, write_atomically
+from sim.ground import GroundMaps
 from sim.terrain import SPACING
 
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
@@ -94,9 +95,14 @@ def png_of(heights: Heights) -> bytes:
     return buffer.getvalue()
 
 
-def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None) -> bytes:
-    """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``."""
+def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None, ground: GroundMaps | None = None) -> bytes:
+    """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``.
+
+    With ground of its own also ``friction`` and ``time_constant_s``, float32 (4, 8), row along y.
+    """
     content: dict[str, Any] = {} if genes is None else {"genes": np.asarray(genes, dtype=np.float32)}
+    if ground is not None:
+        content |= {"friction": ground.friction[0], "time_constant_s": ground.time_constant_s[0]}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, heights=np.float32(heights), size_m=np.array(size_of(heights)), **content)
     return buffer.getvalue()
@@ -172,6 +178,7 @@ def write_terrain(
     formats: Sequence[str],
     about: dict[str, Any],
     genes: NDArray[np.floating] | None = None,
+    ground: GroundMaps | None = None,
 ) -> list[Path]:
     """Writes a terrain as ``<stem>.<format>``, and as ``<stem>.json`` what the files mean; each atomically.
 
@@ -180,7 +187,8 @@ def write_terrain(
         heights: Height grid [m], shape (nrow, ncol).
         formats: Some of :data:`FORMATS`.
         about: Further keys of the JSON.
-        genes: The terrain's genes, shape (64,), for the npz.
+        genes: The terrain's genes, shape (num_genes,), for the npz.
+        ground: Its friction and softness, for the npz.
 
     Returns:
         The files.
@@ -202,7 +210,7 @@ def write_terrain(
     }
     files = {stem.with_name(f"{stem.name}.{ending}"): ending for ending in formats}
     for path, ending in files.items():
-        write_atomically(path, npz_of(heights, genes) if ending == "npz" else FORMATS[ending](heights))
+        write_atomically(path, npz_of(heights, genes, ground) if ending == "npz" else FORMATS[ending](heights))
     description = stem.with_name(f"{stem.name}.json")
     write_atomically(description, to_json(meaning))
     return [*files, description]

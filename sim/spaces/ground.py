@@ -131,13 +131,12 @@ class OnGround(TerrainSpace):
         return found
 
     def describe(self, genes: ArrayLike) -> str:
-        """The terrain of the space in words, and each map as a table seen from above."""
+        """The terrain of the space in words, and of each map the patches on both sides of the way, a line each."""
         row = clipped(genes)
         told = [self.inner.describe(row[: self.inner.num_genes])]
         for kind in self.kinds:
-            values = self._values(row, kind).reshape(ROWS, COLS)
-            told.append(f"{_TITLES[kind]}, y = 8 m down to 0 m:")
-            told += ["  " + " ".join(f"{value:5.2f}" for value in line) for line in values[::-1]]
+            right, left = self._values(row, kind).reshape(ROWS, COLS)[ROWS // 2 - 1 : ROWS // 2 + 1]
+            told.append(f"{_TITLES[kind]}: left of the way {_numbers(left)}, right of it {_numbers(right)}")
         return "\n".join(told)
 
     def _columns(self, kind: str) -> slice:
@@ -159,9 +158,13 @@ class OnGround(TerrainSpace):
 
 
 _TITLES = {
-    "friction": "friction of patches of 2 m, x = 0 m to 16 m",
-    "softness": "softness of patches of 2 m [s], 0 is firm, x = 0 m to 16 m",
+    "friction": "friction every 2 m along the way",
+    "softness": "time constant of the ground [s] every 2 m along the way, 0 where it is firm",
 }
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.2f}" for value in values)
 
 
 def _patch_words(kind: str, value: float, patch: int) -> str:

@@ -27,7 +27,7 @@ from qd.show.view.plots import Axes, Curves
 from qd.show.view.pointing import let_point
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, Shapes, View, first_view_of, overview_of
-from sim.bank import heights_of
+from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
@@ -331,7 +331,8 @@ class Tab:
 
     def _show_elite(self) -> None:
         elite = self._selection.picked
-        self.scene.set_terrain(heights_of(self._archive.genes[elite : elite + 1], self.common.show.found.space)[0])
+        heights, ground = terrains_of(self._archive.genes[elite : elite + 1], self.common.show.found.space)
+        self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
 
     def _show_details(self) -> None:
