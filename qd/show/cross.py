@@ -22,6 +22,7 @@ from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.show.crossed import Crossed
+    from sim.ground import GroundMaps
     from sim.robots.robot import RobotCfg
 
 OWN_FOLDER = RUNS / "terrains"

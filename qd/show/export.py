@@ -32,10 +32,10 @@ _AT_ONCE = 32  # terrains rasterised
 class Export(OfRobot, Which):
     """Write elites of an archive, or terrains of a pack, as files that other programs read.
 
-    Of each elite: `elite-N.npz` (heights in m, rows along y; genes; friction and softness, if it has any), `elite-N.png` (16-bit grayscale seen from above;
-    scale and offset in `elite-N.json`), `elite-N.xml` (MJCF: a scene of the terrain alone, whose surface is the
-    simulation's, between the nodes too) and `elite-N.stl` (a closed block). `faultline cross --terrain elite-N.npz`, or
-    with the .png, crosses it again.
+    Of each elite: `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground has them),
+    `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml` (MJCF: a scene
+    of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a closed block).
+    `faultline cross --terrain elite-N.npz`, or with the .png, crosses it again.
     """
 
     pack: str | None = None

@@ -250,9 +250,8 @@ class Recordings:
         alike: dict[Any, list[int]] = {}
         for k in missing:
             one = wanted[k]
-            alike.setdefault(
-                (one.policy, one.replicas, one.seed, one.space, one.terrain.shape, one.ground is None), []
-            ).append(k)
+            kind = (one.policy, one.replicas, one.seed, one.space, one.terrain.shape, one.ground is None)
+            alike.setdefault(kind, []).append(k)
         for numbers in alike.values():
             yield from (numbers[k : k + self._at_once] for k in range(0, len(numbers), self._at_once))
 

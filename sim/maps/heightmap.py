@@ -99,8 +99,8 @@ def read_heightmap(
         heights = heights * scale + offset
     if ground is not None and not np.allclose(size, _WHOLE, rtol=0.0, atol=1e-6):
         raise ValueError(
-            f"{path}: a map with friction or softness must be of {_WHOLE[0]:g} x {_WHOLE[1]:g} m, whose patches they are "
-            f"of, got {size[0]:g} x {size[1]:g} m"
+            f"{path}: a map with friction or softness must be {_WHOLE[0]:g} m x {_WHOLE[1]:g} m, got {size[0]:g} m x "
+            f"{size[1]:g} m: they are of patches of a whole terrain"
         )
     return Heightmap(heights=_checked(path, heights), size_m=size, ground=ground)
 
@@ -108,9 +108,8 @@ def read_heightmap(
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
     try:
         found = sorted(array_names(path))
-        arrays = read_arrays(
-            path, [name for name in ("heights", "size_m", *_GROUND) if name in found], max_bytes=_MAX_BYTES
-        )
+        wanted = [name for name in ("heights", "size_m", *_GROUND) if name in found]
+        arrays = read_arrays(path, wanted, max_bytes=_MAX_BYTES)
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
         raise ValueError(f"{path} must be an .npz file of arrays, but it is damaged or another file: {error}") from None
     if "heights" not in arrays:
@@ -131,8 +130,9 @@ def _ground_in(path: Path, arrays: dict[str, NDArray[Any]]) -> GroundMaps | None
         return None
     plain = GroundMaps.plain(1)
     try:
-        maps = {name: np.float32(arrays.get(name, getattr(plain, name)[0]))[None] for name in _GROUND}
-        return GroundMaps(**maps)
+        maps = (np.asarray(arrays.get(name, getattr(plain, name)[0]), dtype=np.float32)[None] for name in _GROUND)
+        friction, time_constant_s = maps
+        return GroundMaps(friction=friction, time_constant_s=time_constant_s)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None
 
