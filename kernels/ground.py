@@ -21,7 +21,7 @@ NUM_PATCHES = ROWS * COLS
 """Genes of a map: the first row of patches, at y = 0 m to 2 m, comes first."""
 LEAST_FRICTION = wp.constant(0.15)
 """Factor of a gene of -1; a gene of 1 changes nothing."""
-LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S = wp.constant(0.01), wp.constant(0.1)
+LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S = wp.constant(0.01), wp.constant(0.06)
 """Limits of a soft patch [s]: of a gene just above -1, and of 1. A gene of -1 is firm ground."""
 FIRM = wp.constant(0.0)
 """Time constant of ground that leaves contacts as stiff as the robot's file has them."""

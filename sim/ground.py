@@ -31,7 +31,7 @@ class GroundMaps:
     friction: NDArray[np.float32]
     """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8); row along y."""
     time_constant_s: NDArray[np.float32]
-    """Contact time constant [s], 0.01 to 0.1, or 0 of firm ground, shape (T, 4, 8)."""
+    """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, shape (T, 4, 8)."""
 
     def __post_init__(self) -> None:
         check_friction(self.friction)
