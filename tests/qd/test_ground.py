@@ -117,7 +117,7 @@ def test_recordings_keep_the_ground(searched, anymal):
     def cross(wanted, progress):
         (one,) = wanted
         asked.append(one)
-        rollout = Rollout(anymal, stand, space=space, has_ground=one.ground is not None, **own)
+        rollout = Rollout(anymal, stand, space=get_space(one.space), has_ground=one.ground is not None, **own)
         seeds = np.array([one.terrain_seed], np.uint32)
         return [record(rollout, one.terrain[None], seeds, policy=one.policy, ground=one.ground)[1]]
 
@@ -132,7 +132,7 @@ def test_recordings_keep_the_ground(searched, anymal):
     assert len(asked) == 3
     np.testing.assert_array_equal(of_elite.ground.friction, terrains_of(archive.genes[:1], space)[1].friction)
     np.testing.assert_array_equal(of_map.ground.time_constant_s, ground.time_constant_s)
-    assert not (plain.ground.friction < 1.0).any()
+    assert plain.ground is None
     labels = [text.get_text() for text in draw_paths(crossed_of(of_map, NAMES, (1.0,) * 6), "").legends[0].get_texts()]
     assert {"slippery", "soft"} <= set(labels)
 
