@@ -3,9 +3,7 @@
 Training and figures read archives without the search's libraries.
 """
 
-import io
 import os
-import zipfile
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.descriptors import Cells
-from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, MAX_INVALID_SHARE, Evaluation
+from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
 from sim.files.intervals import wilson_interval
+from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.rates import MAX_INVALID_SHARE
 from sim.robots.identity import FIRST_DEFINITION
 
 ARCHIVE_FILE = "archive.npz"
@@ -295,12 +295,10 @@ def write_archive(path: Path, archive: Archive) -> None:
         path: File to write, atomically.
         archive: What to write.
     """
-    buffer = io.BytesIO()
     settings = {name: getattr(archive, name) for name in _SETTINGS}
     content: dict[str, Any] = {name: np.asarray(value) for name, value in settings.items() if value is not None}
     content |= _arrays(archive) | _fault_arrays(archive) | _certificate_arrays(archive)
-    np.savez_compressed(buffer, **content)
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, npz_bytes(content))
 
 
 def _arrays(archive: Archive) -> dict[str, NDArray[Any]]:
@@ -356,16 +354,15 @@ def read_archive(path: str | Path) -> Archive:
     if not os.path.isfile(file):  # False too for a name that no file can have
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
-        with zipfile.ZipFile(file) as members:  # np.load would leave some checksums unread
-            there = members.namelist()
-            names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _HASHES or f"{name}.npy" in there]
-            if any(name.startswith(_PREFIX) for name in there):  # then all of them, or it is damage
-                names += [_PREFIX + name for name in FRESH]
-            if any(f"{name}.npy" in there for name in _FAULT_NAMES):  # likewise
-                names += _FAULT_NAMES
-            if any(f"{name}.npy" in there for name in _CERTIFICATES):
-                names += _CERTIFICATES
-            content = {name: _read_array(members.read(f"{name}.npy")) for name in names}
+        there = set(array_names(file))
+        names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _HASHES or name in there]
+        if any(name.startswith(_PREFIX) for name in there):  # then all of them, or it is damage
+            names += [_PREFIX + name for name in FRESH]
+        if not there.isdisjoint(_FAULT_NAMES):  # likewise
+            names += _FAULT_NAMES
+        if not there.isdisjoint(_CERTIFICATES):
+            names += _CERTIFICATES
+        content = read_arrays(file, names)
         _check_kinds(content)
         asked = [content.pop(name) for name in _CERTIFICATES if name in content]
         judged = {name: content.pop(name) for name in _FAULT_NAMES if name in content}
@@ -384,10 +381,6 @@ def read_archive(path: str | Path) -> Archive:
             "run (--resume) writes it again"
         ) from None
     return archive
-
-
-def _read_array(data: bytes) -> NDArray[Any]:
-    return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
 
 
 def _from_array(name: str, value: NDArray) -> Any:

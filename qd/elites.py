@@ -1,6 +1,7 @@
 """The elites of an archive by what is known best of each."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,11 @@ class Elites:
     def other_rate(self) -> NDArray[np.float64]:
         """Share that neither arrived nor collided: out of time or off the terrain, shape (N,)."""
         return np.clip(1.0 - self.goal_rate - self.collision_rate, 0.0, 1.0)
+
+    def rows(self, chosen: NDArray[np.int64]) -> "Elites":
+        """The elites in some rows, in their order."""
+        values: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        return replace(self, **{name: v[chosen] for name, v in values.items() if isinstance(v, np.ndarray)})
 
     def place_of(self, number: int) -> int:
         """Row of an elite by its number in the archive."""

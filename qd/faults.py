@@ -32,7 +32,7 @@ EPISODES = 20
 """Episodes of each kind that an elite is judged by."""
 
 _CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM, _MUJOCO_C_STREAM = 5, 6, 7, 8
-_LOT = {"cuda": 200, "cpu": 1}  # terrains of a worker between two saves
+_LOT = {"cuda": 800, "cpu": 1}  # terrains of a worker between two saves; two lots fill a GPU with 32,000 robots
 _MUJOCO_C_LOT = 4  # likewise of a process
 
 
@@ -135,7 +135,7 @@ def certify(archive: Archive, chosen: Sequence[int], certifiers: Mapping[str, st
     """Lets other controllers cross failing elites, at the search's settings and with contact resolved.
 
     What a controller has crossed before is left out. A terrain that it crosses less than half of the time at the
-    search's settings is not crossed with contact resolved, since there is no certificate to be had.
+    search's settings is not crossed with contact resolved, since it cannot get a certificate.
 
     Args:
         archive: With fresh values.
@@ -290,10 +290,13 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
         "faults": None,
         "panel": list(faults.certifiers) if faults is not None else [],
     }
+    if numbers["failing"] == 0:  # nobody had to cross anything
+        numbers |= dict.fromkeys(("confirmed", "certified", "faults"), 0)
     if faults is None:
         return numbers
     resolved, in_c = faults.resolved_outcomes.any(axis=1), faults.mujoco_c_outcomes.any(axis=1) & failing
-    numbers["confirmed"] = int(archive.confirmed.sum()) if resolved.any() else None
+    if resolved.any():
+        numbers["confirmed"] = int(archive.confirmed.sum())
     if known and resolved.any():
         numbers["faults"] = int((archive.confirmed & archive.certified).sum())
     numbers["crossed_resolved"] = int((resolved & failing).sum())
@@ -319,17 +322,23 @@ def any_of(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
-def fault_words(archive: Archive) -> list[str]:
-    """What is known of the failing elites, in sentences; nothing where none was crossed under other conditions."""
+def fault_words(archive: Archive, *, what: str = "failing elite") -> list[str]:
+    """What is known of the failing elites, in sentences; nothing where none was crossed under other conditions.
+
+    Args:
+        archive: The elites.
+        what: What one of them is called.
+    """
     faults, numbers = archive.faults, fault_numbers(archive)
     if faults is None:
         return []
     told = []
     if numbers["crossed_resolved"]:
         again = rate_words(numbers["confirmed"], numbers["crossed_resolved"])
+        failing, crossed = numbers["failing"], numbers["crossed_resolved"]
         told.append(
-            f"Of the {numbers['failing']:,} failing elites {numbers['crossed_resolved']:,} were crossed with contact "
-            f"resolved: {again} fail there too and are confirmed."
+            f"Of {failing:,} {what}{'s' * (failing != 1)} {crossed:,} {'was' if crossed == 1 else 'were'} "
+            f"crossed with contact resolved: {again} confirmed, since under half of the robots arrive there too."
         )
     if numbers["mujoco_c"]["crossed"]:
         there = rate_words(numbers["mujoco_c"]["failing"], numbers["mujoco_c"]["crossed"])
@@ -337,12 +346,12 @@ def fault_words(archive: Archive) -> list[str]:
     if faults.certifiers:
         who, rest = any_of(faults.certifiers), int((archive.failing & ~archive.certified).sum())
         if numbers["faults"] is not None:
-            what = "fault: a terrain" if numbers["faults"] == 1 else "faults: terrains"
-            told.append(f"{numbers['faults']:,} {what} that {who} crosses and this controller does not.")
+            found = "fault: a terrain" if numbers["faults"] == 1 else "faults: terrains"
+            told.append(f"{numbers['faults']:,} {found} that {who} crosses and this controller does not.")
         waiting = int((archive.certified & ~faults.resolved_outcomes.any(axis=1)).sum())
         if waiting:
             told.append(f"{waiting:,} that {who} crosses {'is' if waiting == 1 else 'are'} still to be confirmed.")
-        told.append(f"{rest:,} failing elite{' is' if rest == 1 else 's are'} not known to be passable.")
+        told.append(f"{rest:,} {what}{' is' if rest == 1 else 's are'} not known to be passable.")
     return told
 
 

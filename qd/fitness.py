@@ -1,6 +1,7 @@
 """Fitness: how hard, and how reliably hard, a terrain is for the controller (the paper's fitness equation)."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from qd.descriptors import Cells, terrain_ratios
 from sim.files.settings import check, setting
+from sim.rates import MAX_INVALID_SHARE, counted_episodes
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
@@ -17,8 +19,6 @@ FITNESS_FLOOR = -20.0
 FAILING_GOAL_RATE = 0.5
 """A controller fails a terrain on which it reaches the goal less often."""
 _SHORTFALL_WEIGHT = 10.0  # fitness that a goal rate of the certifiers 1 lower costs where they fail too
-MAX_INVALID_SHARE = 0.25
-"""A terrain with more than this share of invalid episodes is invalid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +87,12 @@ class Evaluation:
         }
 
 
+def concatenated(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Evaluations of terrains one after the other."""
+    names = [field.name for field in fields(Evaluation)]
+    return Evaluation(**{name: np.concatenate([getattr(one, name) for one in evaluations]) for name in names})
+
+
 def paper_fitness(
     mean: NDArray[np.float64], std: NDArray[np.float64], collision_rate: NDArray[np.float64], cfg: FitnessCfg
 ) -> NDArray[np.float64]:
@@ -138,27 +144,23 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
         ValueError: If the rollout lacks a penalty of ``cfg``, or scales are not positive, one a penalty.
     """
     penalties = _scaled_penalties(result, cfg)
-    episode_valid = ~np.asarray(result.invalid, dtype=bool) & np.isfinite(penalties).all(axis=2)
-    num_terrains, num_replicas = episode_valid.shape
-    invalid_episodes = num_replicas - episode_valid.sum(axis=1)
-    terrain_valid = invalid_episodes <= MAX_INVALID_SHARE * num_replicas
-    episode_valid &= terrain_valid[:, None]
-
-    mean = _mean(penalties, episode_valid)
-    std = np.sqrt(_mean((penalties - mean[:, None]) ** 2, episode_valid))
-    collision_rate = _rate(result.base_collision, episode_valid)
-    ratios = terrain_ratios(penalties, episode_valid)
+    invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
+    counted = counted_episodes(invalid)
+    mean = _mean(penalties, counted)
+    std = np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted))
+    collision_rate = _rate(result.base_collision, counted)
+    ratios = terrain_ratios(penalties, counted)
     return Evaluation(
-        fitness=np.where(terrain_valid, paper_fitness(mean, std, collision_rate, cfg), FITNESS_FLOOR),
+        fitness=np.where(counted.any(axis=1), paper_fitness(mean, std, collision_rate, cfg), FITNESS_FLOOR),
         ratios=ratios,
         cell=cells.cell_of(ratios, collision_rate > 0.0),
         penalty_mean=mean,
         penalty_std=std,
         collision_rate=collision_rate,
-        goal_rate=_rate(result.reached_goal, episode_valid),
-        fallen_rate=_rate(result.fallen, episode_valid),
-        invalid_episodes=invalid_episodes,
-        episodes=np.full(num_terrains, num_replicas),
+        goal_rate=_rate(result.reached_goal, counted),
+        fallen_rate=_rate(result.fallen, counted),
+        invalid_episodes=invalid.sum(axis=1),
+        episodes=np.full(len(invalid), invalid.shape[1]),
     )
 
 

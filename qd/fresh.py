@@ -203,9 +203,9 @@ def numbers_of(again: FreshValues, cells: Cells, *, sampled: bool = False) -> di
 class Reevaluate(Who, Where, InSpace):
     """Evaluate every elite of a run again with 40 fresh episodes.
 
-    An elite is the best of many noisy evaluations; its fresh episodes say what it is worth. The run's archive, numbers
-    and figures are written again with them, elites by descending corrected fitness. With another controller than was
-    searched (--policy), archive-<its name>.npz and archive-<its name>.json are written instead.
+    An elite is the best of many noisy evaluations. Its fresh episodes say what it is worth. The command writes the
+    run's archive, numbers and figures again with them, and sorts elites by descending corrected fitness. With another
+    controller than the searched one (--policy) it writes archive-<its name>.npz and archive-<its name>.json instead.
     """
 
     run: Path | None = None

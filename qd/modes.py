@@ -1,4 +1,4 @@
-"""Failure modes: elites grouped by how the controller struggles and how its crossings end.
+"""Failure modes: failing elites grouped by how the controller struggles and how its crossings end.
 
 Ward's agglomerative clustering on the shares of the penalties and the rates of goal, base collision and fall: all
 fractions, none weighted. The number of groups is the largest whose mean silhouette (Rousseeuw 1987) is within 0.05 of
@@ -6,7 +6,7 @@ the best: of divisions that separate about as well, the finer one says more.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ class Mode:
     fallen_rate: float
     fitness: float
     marked_by: str
-    """Penalty whose share stands out most against all elites."""
+    """Penalty whose share stands out most against all elites that were grouped."""
 
     @property
     def failing(self) -> bool:
@@ -52,13 +52,14 @@ class Mode:
 
     @property
     def ending(self) -> str:
-        """How most of its crossings end, in words; both ways of two that are common."""
+        """How most of its crossings end, in words; both ways of two that are common, the goal only where it leads."""
         ends = {
             "reaches the goal": self.goal_rate,
             "topples" if self.fallen_rate >= 0.5 else "strikes the terrain": self.collision_rate,
             "gets stuck": self.other_rate,
         }
-        first, second, _ = sorted(ends, key=lambda end: -ends[end])
+        first, *others = sorted(ends, key=lambda end: -ends[end])
+        second = next(end for end in others if end != "reaches the goal")
         return first if ends[second] < _COMMON else f"{first} or {second}"
 
     @property
@@ -73,13 +74,28 @@ class Modes:
 
     modes: list[Mode]
     labels: NDArray[np.int64]
-    """Number of the group of each elite, shape (N,)."""
+    """Number of the group of each elite, 0 of one in no group, shape (N,)."""
     silhouettes: Mapping[int, float]
     """Mean silhouette by number of groups; empty of too few elites to divide."""
 
 
+def failure_modes(elites: Elites) -> Modes:
+    """Groups the failing elites; a terrain that is crossed is in no group.
+
+    Args:
+        elites: All elites; where none fails there is no group.
+    """
+    failing = np.flatnonzero(elites.failing)
+    labels = np.zeros(len(elites), np.int64)
+    if not len(failing):
+        return Modes(modes=[], labels=labels, silhouettes={})
+    found = find_modes(elites.rows(failing))
+    labels[failing] = found.labels
+    return replace(found, modes=[replace(mode, members=failing[mode.members]) for mode in found.modes], labels=labels)
+
+
 def find_modes(elites: Elites) -> Modes:
-    """Groups the elites.
+    """Groups all of some elites.
 
     Args:
         elites: At least one.

@@ -6,6 +6,7 @@ at least half of its episodes. What nobody is known to cross is in no pack.
 """
 
 import hashlib
+import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,19 +67,22 @@ class Candidates:
 
 
 def check_judged(archive: Archive, run: Path, robot: "RobotCfg") -> None:
-    """That the failing elites of a run were confirmed and certified.
+    """That all failing elites of a run, if there are any, were confirmed and certified.
 
     Raises:
         ValueError: If not, naming the command.
     """
-    faults = archive.faults or FaultCounts.none_of(len(archive))
-    missing = {"confirm": not faults.resolved_outcomes.any(), "certify": not faults.certifier_outcomes.any()}
-    for name, is_missing in missing.items():
-        if is_missing:
+    faults, failing = archive.faults or FaultCounts.none_of(len(archive)), archive.failing
+    crossed = {
+        "confirm": faults.resolved_outcomes.any(axis=1),
+        "certify": faults.certifier_outcomes.any(axis=(1, 2)),
+    }
+    for name, there in crossed.items():
+        if (failing & ~there).any():
             remedy = command_line(name, robot=robot.spec, run=run)
             raise ValueError(
-                f"{run} must have its failing elites crossed by `faultline {name}`, which says what is a fault, got "
-                f"none: run `{remedy}` first"
+                f"{run} must have its {failing.sum():,} failing elites crossed by `faultline {name}`, which says what "
+                f"is a fault, got {(failing & there).sum():,} of them: run `{remedy}` first"
             )
 
 
@@ -248,7 +252,7 @@ def write_terrains(
         "searched_goal_rate": np.array([one.about["searched"]["goal_rate"] for one in chosen], np.float64),
         **more,
     }
-    data = npz_bytes(content)
+    data = npz_bytes(content, compression=zipfile.ZIP_BZIP2)
     write_atomically(folder / TERRAINS_FILE, data)
     return hashlib.sha256(data).hexdigest()
 

@@ -200,7 +200,7 @@ class Scheduler:
         return slice(sum(sizes[: emitters.start]), sum(sizes[: emitters.stop]))
 
     def ask(self, group: int = 0) -> NDArray[np.float32]:
-        """The next terrains of a group of emitters to evaluate; the same until it is told of them.
+        """The next terrains of a group of emitters; the same ones until the group is told their results.
 
         Args:
             group: Number of the group.

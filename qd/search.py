@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.faults import confirm_all, fault_words, search_words
-from qd.fitness import Evaluation, evaluation_of
+from qd.fitness import Evaluation, concatenated, evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
 from qd.gate import Gate, certifier_seeds, groups_behind, open_gate, rates_of
 from qd.run.arguments import Job
@@ -40,13 +40,11 @@ MOST_DRAWN = 200
 """Elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)."""
 
 
-class _Crossed(NamedTuple):
-    """A group's terrains of one search that the controller has crossed."""
+class Crossed(NamedTuple):
+    """Terrains of one search that the controller has crossed, of a group or of a whole iteration."""
 
     result: "RolloutResult"
     evaluation: Evaluation
-    asked: NDArray[np.bool_] | None
-    """On which of them certifiers are asked, shape (terrains,); None in a search without."""
 
 
 def search_terrains(
@@ -74,9 +72,9 @@ def search_terrains(
     """
     left = range(len(metrics) + 1, cfg.iterations + 1)
     began = time.perf_counter()
-    for iteration, (result,) in crossed_iterations([(cfg, search)], left, evaluate, bar, gate):
+    for iteration, (crossed,) in crossed_iterations([(cfg, search)], left, evaluate, bar, gate):
         found = archive_of(cfg, search, iteration)
-        row = row_of(cfg, found, result, iteration)
+        row = row_of(cfg, found, crossed, iteration)
         if looks_again(cfg, iteration):
             row |= _look_again(cfg, found, evaluate)
         ended = time.perf_counter()
@@ -95,7 +93,7 @@ def crossed_iterations(
     evaluate: Evaluate,
     bar: ProgressBar,
     gate: Gate | None = None,
-) -> "Iterator[tuple[int, list[RolloutResult]]]":
+) -> "Iterator[tuple[int, list[Crossed]]]":
     """Lets the groups of some searches ask, have their terrains crossed, and tells them, in turn.
 
     A group that was told asks again at once, and its next terrains wait in the queue while those of the other groups
@@ -113,7 +111,7 @@ def crossed_iterations(
         gate: The certifiers, if one of the searches has some.
 
     Yields:
-        Number of an iteration whose groups were all told, and its crossings, one result a search. Nothing is under way
+        Number of an iteration whose groups were all told, and what each search crossed in it. Nothing is under way
         before an iteration at whose end elites cross fresh episodes (:func:`looks_again`) goes on.
     """
     cfg, pipeline = searches[0][0], pipeline_of(evaluate)
@@ -131,7 +129,7 @@ def crossed_iterations(
         for group in groups[under_way:]:
             put(iteration, group)
         ahead = iteration + 1 in iterations and not looks_again(cfg, iteration)
-        results: list[list[_Crossed]] = []
+        results: list[list[Crossed]] = []
         waiting: deque[int] = deque()
         for group in groups:
             result = pipeline.take(bar.within(iteration, group, len(groups)))
@@ -145,7 +143,7 @@ def crossed_iterations(
                 if ahead:
                     put(iteration + 1, done)
         under_way = len(groups) if ahead else 0
-        yield iteration, [merged([one.result for one in own], join=1) for own in zip(*results, strict=True)]
+        yield iteration, [_joined(own) for own in zip(*results, strict=True)]
 
 
 def _group_terrains(
@@ -156,7 +154,7 @@ def _group_terrains(
     return search.ask(group), seeds[search.places(group)]
 
 
-def _crossed(searches: "Sequence[tuple[SearchCfg, Scheduler]]", result: "RolloutResult", group: int) -> list[_Crossed]:
+def _crossed(searches: "Sequence[tuple[SearchCfg, Scheduler]]", result: "RolloutResult", group: int) -> list[Crossed]:
     """What the controller made of a group's terrains, one a search."""
     found, first = [], 0
     for cfg, search in searches:
@@ -164,41 +162,48 @@ def _crossed(searches: "Sequence[tuple[SearchCfg, Scheduler]]", result: "Rollout
         own = taken(result, places.stop - places.start, first=first)
         first += places.stop - places.start
         refuse_all_invalid(own)
-        evaluation = evaluation_of(own, cfg.cells, cfg.fitness)
-        found.append(_Crossed(own, evaluation, evaluation.not_crossed if cfg.certified_by else None))
+        found.append(Crossed(own, evaluation_of(own, cfg.cells, cfg.fitness)))
     return found
+
+
+def _joined(groups: Sequence[Crossed]) -> Crossed:
+    """The groups of an iteration, one after the other."""
+    evaluation = concatenated([one.evaluation for one in groups])
+    return Crossed(merged([one.result for one in groups], join=1), evaluation)
 
 
 def _ask_certifiers(
     gate: Gate,
     searches: "Sequence[tuple[SearchCfg, Scheduler]]",
-    crossed: Sequence[_Crossed],
+    crossed: Sequence[Crossed],
     iteration: int,
     group: int,
 ) -> None:
     """Lets certifiers cross what a group's terrains the controller did not, those of all searches together."""
     parts = [
-        (search.ask(group)[one.asked], certifier_seeds(cfg, iteration, search.places(group))[one.asked])
+        (search.ask(group)[asked], certifier_seeds(cfg, iteration, search.places(group))[asked])
         for (cfg, search), one in zip(searches, crossed, strict=True)
-        if one.asked is not None
+        if cfg.certified_by
+        for asked in [one.evaluation.not_crossed]
     ]
     gate.put(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def _tell(
     searches: "Sequence[tuple[SearchCfg, Scheduler]]",
-    crossed: Sequence[_Crossed],
+    crossed: Sequence[Crossed],
     gate: Gate | None,
     iteration: int,
     group: int,
 ) -> None:
     """Tells a group of emitters of each search what became of its terrains, and lets it ask again."""
     counts, first = None if gate is None else gate.take(), 0
-    for (_, search), one in zip(searches, crossed, strict=True):
+    for (cfg, search), one in zip(searches, crossed, strict=True):
         rates = None
-        if one.asked is not None and counts is not None:
-            last = first + int(one.asked.sum())
-            rates, first = rates_of(one.asked, counts[first:last]), last
+        if cfg.certified_by and counts is not None:
+            asked = one.evaluation.not_crossed
+            last = first + int(asked.sum())
+            rates, first = rates_of(asked, counts[first:last]), last
         search.tell(one.evaluation, iteration, group, rates)
         search.ask(group)
 
@@ -208,16 +213,16 @@ def looks_again(cfg: SearchCfg, iteration: int) -> bool:
     return bool(cfg.reevaluate_every) and iteration % cfg.reevaluate_every == 0
 
 
-def row_of(cfg: SearchCfg, found: Archive, result: "RolloutResult", iteration: int) -> dict[str, Any]:
-    """An iteration's row of metrics but for its timing.
+def row_of(cfg: SearchCfg, found: Archive, crossed: Crossed, iteration: int) -> dict[str, Any]:
+    """An iteration's row of metrics without its timing.
 
     Args:
         cfg: The search.
         found: What it has found.
-        result: The iteration's crossings.
+        crossed: The iteration's crossings.
         iteration: Number of the iteration, from 1.
     """
-    evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
+    result, evaluation = crossed
     certified = {}
     if found.certificates is not None:
         asked = int(evaluation.not_crossed.sum()) * len(cfg.certified_by)

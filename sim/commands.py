@@ -15,8 +15,8 @@ from sim.files.settings import setting
 class Stand(OfRobot, OnDevice):
     """Look at a robot before anything is searched or trained.
 
-    Prints its joints and geoms as they were read, whether it stands in its default pose, and how many contacts and
-    constraint rows it needs when it lies on rough ground. The exit status is 1 if something has to be mended.
+    It prints its joints and geoms as they were read, whether it stands in its default pose, and how many contacts and
+    constraint rows it needs when it lies on rough ground. The exit status is 1 if something must be mended.
     """
 
     seconds: float = setting(3.0, above=0, most=60)
@@ -88,8 +88,8 @@ class Crosscheck(Who, OnGround, OnDevice):
     """Terrain space to draw from if --genes is left out, super_gaussian if this is too; or file.py:CLASS that a pool is
     of."""
     elite: str | None = None
-    """Exactly these of --genes instead of a choice by success rates: one number, several as in --elite "97 124", or
-    all; --terrains and --between then count for nothing."""
+    """Compare exactly these of --genes: one number, several as in --elite "97 124", or all. --terrains and --between
+    are then ignored."""
     terrains: int = setting(20, least=1)
     """Terrains to compare on."""
     between: tuple[float, float] = setting((0.3, 0.9), least=0, most=1, rising=True)
@@ -118,8 +118,8 @@ class Crosscheck(Who, OnGround, OnDevice):
 class Bench(OfRobot, OnDevice):
     """Time every kernel against torch, torch.compile and the device's ceilings, and the step against bare physics.
 
-    The shipped controller walks robots into terrains first; every output is compared with a float64 oracle before it
-    is timed.
+    First the shipped controller walks robots into terrains. Every output is compared with a float64 oracle before it is
+    timed.
     """
 
     out: Path | None = None
@@ -158,7 +158,7 @@ class Bench(OfRobot, OnDevice):
 class SolverOptions(Who, OnDevice):
     """Cross the same hard-random terrains under several caps and capacities of the solver.
 
-    Prints wall time, rates and mean penalties of each choice.
+    It prints wall time, rates and mean penalties of each choice.
     """
 
     terrains: int = setting(200, least=1)

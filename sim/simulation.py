@@ -16,10 +16,10 @@ from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.restart import clear_rows
 from sim.bank import TerrainBank
-from sim.convergence import stop_early
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
+from sim.solver import use_own_solver
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
@@ -28,7 +28,7 @@ CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 _RESOLVED_DT = 0.001
 _RESOLVED_TIME_CONSTANT_S = 0.003
 
-stop_early()
+use_own_solver()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,9 @@ class Train(TrainingFlags):
     """Train a base controller from scratch: PPO on legged_gym's rough-terrain task.
 
     On CUDA ANYmal trains 8192 robots for 2240 iterations, Cassie 2048 for 3400; on the CPU 32 for 20, enough to see
-    that it runs. Ctrl-C or --max-seconds saves and stops; --resume RUN_DIR goes on with the settings of that run, but
-    for those that are given. On several GPUs: torchrun --nproc-per-node 4 -m faultline train, each with --num-envs.
+    that it runs. Ctrl-C or --max-seconds saves and stops; --resume RUN_DIR goes on with the settings of that run,
+    except for flags that are given. On several GPUs: torchrun --nproc-per-node 4 -m faultline train, each with
+    --num-envs.
     """
 
     command: ClassVar[str] = "train"
@@ -42,7 +43,7 @@ class Train(TrainingFlags):
         """Trains; returns the exit status: 0, or 130 after Ctrl-C.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
         """
         from train.ppo.learner import Ranks
         from train.ppo.run import Training, run_training

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
 _REWARDS = {"termination": -200.0, "tracking_lin_vel": 2.0}  # the best of six weightings
-_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005, final_kl=0.002)
+_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005)
 
 
 def shipped_space(settings: dict[str, Any]) -> str | None:
@@ -48,26 +48,27 @@ class Finetune(OnGround, TrainingFlags):
     """Runs of searches, or their archive.npz, for mix generated; results/<robot>/archive, or of a robot without one
     its newest run under runs/."""
     shares: Literal["equal", "size"] = "equal"
-    """Of several archives: elites of each are drawn equally often (equal), so that a small archive counts as much as a
-    large one; or every elite is (size)."""
+    """How often elites of several archives are drawn. equal: as often from each archive, so that a small one counts as
+    much as a large one. size: every elite equally often."""
     space: str | None = None
-    """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Elites of
-    a space of one's own, and a resumed training on it, need it named here."""
+    """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Name a
+    space of your own here too, for its elites and for a resumed training on it."""
     split_seed: int = setting(0, least=0)
     """Which elites are held out for the evaluation."""
     only: Literal["all", "failing", "certified", "uncertified"] = "all"
-    """Which elites: all; those that fail by their fresh episodes; of these those that a certifier crosses, or those
-    that none is known to cross."""
+    """Which elites to train on. failing: those that fail by their fresh episodes. certified: those of them that a
+    certifier crosses. uncertified: those of them that none is known to cross."""
     held_out: bool = True
-    """Whether elites are held out for the evaluation; a specialist, which is to certify, may train on all."""
+    """Whether elites are held out for the evaluation. A specialist, which is to certify, may train on all."""
     draw: Literal["uniform", "failing", "learnable"] = "uniform"
-    """How elites are drawn at each exchange: uniform; failing, the likelier the less often they were crossed; or
-    learnable, the likelier the nearer to half of the time, so that harder ones come later."""
+    """How elites are drawn at each exchange. uniform: all alike. failing: rather those that were seldom crossed.
+    learnable: rather those that were crossed about half of the time, so that harder ones come later."""
     task: Literal["crossing", "commands"] = "crossing"
-    """What robots are told: to cross, as in a search; or random velocities, as in the base's training."""
+    """What robots are told. crossing: to cross the terrain, as in a search. commands: random velocities, as in the
+    base's training."""
     start_spread: float = setting(0.0, least=0.0, most=MOST_SPREAD)
-    """Robots start up to so far along the way, uniformly [m], with the goal where it is; task crossing. Where a terrain
-    is hard at its beginning, robots so learn what lies behind."""
+    """Robots start up to so far along the way, drawn uniformly [m]. The goal stays where it is. Only for task crossing.
+    So robots also learn what lies behind a hard beginning."""
     rewards: RewardCfg
     """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel.
     The rewards of an evaluation keep the robot's own."""
@@ -76,8 +77,8 @@ class Finetune(OnGround, TrainingFlags):
     swap_every: int | None = setting(None, least=1)
     """Iterations after which they are exchanged; on CUDA 400 (Cassie: 200), on the CPU 50."""
     critic_iterations: int | None = setting(None, least=0)
-    """Iterations at first in which the critic learns alone, where the controller comes without one; 50, or half of all
-    if they are fewer than 100."""
+    """How many iterations the critic learns alone at first, if the controller comes without one. 50, or half of all if
+    there are fewer than 100."""
     ppo: PpoCfg = field(default_factory=lambda: _PPO)
     """The learner; its layers are those of the controller."""
 
@@ -106,7 +107,7 @@ class Finetune(OnGround, TrainingFlags):
         """Fine-tunes; returns the exit status: 0, or 130 after Ctrl-C.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
             FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
         """
         from train.ppo.run import run_training

@@ -10,7 +10,7 @@ from sim.files.settings import setting
 
 @dataclass(frozen=True, kw_only=True)
 class Harden(OfRobot, OnGround, Where):
-    """Search what breaks a controller, train it on all that was found, and search again, for some rounds.
+    """Search for what breaks a controller, train it on all that was found, and search again, for some rounds.
 
     Each search counts the faults: terrains that a controller of the panel crosses and this one does not. Each training
     is on hand-crafted terrains and on the archives of all searches so far. Every controller is evaluated on
@@ -23,7 +23,7 @@ class Harden(OfRobot, OnGround, Where):
     policy: Path | None = None
     """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one."""
     rounds: int = setting(3, least=1)
-    """Rounds of training; one more search than that. More of them later continue a finished run."""
+    """Rounds of training. There is one search more than rounds. A larger number later continues a finished run."""
     run_dir: Path | None = None
     """Where to work, and to go on; runs/<robot>-harden-<seed>."""
     seed: int = setting(0, least=0, most=10_000_000)
@@ -32,11 +32,10 @@ class Harden(OfRobot, OnGround, Where):
     """Budget of each search in episodes, rounded up to whole iterations; 400,000 on CUDA (5 minutes on one H200), 2,560
     on the CPU. With fewer, less is found: compare numbers of faults only between searches of the same budget."""
     tune_iterations: int | None = setting(None, least=1)
-    """Budget of each round's training in iterations; as of `faultline finetune`: on CUDA 1,200 (Cassie: 3,000), on the
+    """Budget of each round's training in iterations. As of `faultline finetune`, 1,200 on CUDA (Cassie: 3,000). On the
     CPU 100, enough to see that it runs."""
     max_seconds: float | None = setting(None, above=0.0)
-    """Stop after so many seconds, as by Ctrl-C: an iteration of the search that is under way is lost, one of a training
-    is finished."""
+    """Stop after so many seconds, as by Ctrl-C. A search loses its present iteration. A training finishes it."""
     preset: str | None = None
     """Size of a search's iteration: wide (the default on a GPU), paper, or small (the default on the CPU)."""
     emitters: int | None = setting(None, least=1)
@@ -46,7 +45,7 @@ class Harden(OfRobot, OnGround, Where):
     replicas: int | None = setting(None, least=1)
     """Episodes a terrain in a search; the preset's."""
     draw: Literal["uniform", "failing"] = "uniform"
-    """How a training draws elites at each exchange: uniform; or failing, the likelier the less often they were crossed.
+    """How a training draws elites at each exchange. uniform: all alike. failing: rather those that were seldom crossed.
     """
     shares: Literal["equal", "size"] = "equal"
     """Whether a training draws as often from each archive (equal), or each elite as often (size)."""
@@ -60,14 +59,14 @@ class Harden(OfRobot, OnGround, Where):
     space: str | None = None
     """Terrain space: super_gaussian, course, or one of your own, file.py:CLASS; super_gaussian if left out."""
     against: tuple[Literal["hard_random", "first_archive"], ...] = ()
-    """What to compare the rounds with, after them: the same number of trainings of the same length, on hard-random
-    terrains (hard_random), or on the first archive alone (first_archive), and a search against the outcome."""
+    """What to compare the rounds with, after them. hard_random: as many trainings of the same length on hard-random
+    terrains. first_archive: the same on the first archive alone. A search against the outcome follows."""
 
     def execute(self) -> int:
         """Runs what is left; returns the exit status 0, also where the time is up.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
             FloatingPointError: If a training leaves the finite numbers; its last checkpoint is kept.
             Interrupted: On Ctrl-C; what is finished is kept.
             EvaluatorError: If a worker is lost; what is finished is kept.

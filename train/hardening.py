@@ -49,7 +49,6 @@ _COUNTS = (
     "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "failing", "confirmed",
     "certified", "faults", "panel",
 )  # fmt: skip
-_VERDICTS = ("confirmed", "certified", "faults")
 _SESSION = ("command", "commit", "device", "date")
 
 
@@ -150,8 +149,11 @@ class Hardening:
         return self.path / f"search-{number}"
 
     def seed(self, number: int) -> int:
-        """Seed of a round: searches of one seed would begin with the same terrains, some of which are held out."""
-        return _SEEDS * self.flags.seed + number
+        """Seed of a round: searches of one seed would begin with the same terrains, some of which are held out.
+
+        From 100 on, so that it is apart from searches of seed 0, 1 and so on, on whose elites controllers are tested.
+        """
+        return _SEEDS * (self.flags.seed + 1) + number
 
     def certifiers(self, policy: str) -> dict[str, str]:
         """Who certifies the faults of a controller, by name: the panel, or those named, without itself.
@@ -312,6 +314,8 @@ def _time_limit(seconds: float | None) -> Iterator[Callable[[], bool]]:
 
     def ring(kind: int, _frame: object) -> None:
         rung.append(kind)
+        if not callable(signal.getsignal(signal.SIGINT)):  # a shell has its background jobs ignore Ctrl-C
+            raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
     if seconds is None:
@@ -435,8 +439,6 @@ def _row(job: Hardening, stage: Stage) -> dict[str, Any]:
     """What the search against a controller found."""
     summary = RunDirectory(stage.search).read_summary()
     counts = {name: summary.get(name) for name in _COUNTS}
-    if counts["failing"] == 0:  # nobody had to cross anything
-        counts |= dict.fromkeys(_VERDICTS, 0)
     who = {name: value for name, value in identity(job.robot, stage.policy).items() if name.startswith("policy")}
     return {
         "controller": stage.controller,

@@ -262,15 +262,16 @@ def _rows_to_train_on(
         split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path)
         for one, path in zip(archives, paths, strict=True)
     ]
+    held_out = set[str]()
     if flags.held_out:  # searches that begin alike may share an elite
-        held_out = {
+        held_out.update(
             mark for one, split in zip(archives, splits, strict=True) for mark in marks_of(one.genes[split.test])
-        }
-    else:
-        held_out = set()
+        )
     found = []
     for path, one, split in zip(paths, archives, splits, strict=True):
-        rows = split.train if flags.held_out else np.concatenate([split.train, split.test])
+        # All of them are more than the parts of a split, which has no more than the paper's numbers; in an order that
+        # does not depend on that of the file.
+        rows = split.train if flags.held_out else np.lexsort(one.genes.T[::-1])
         rows = rows[chosen_elites(one, flags.only, path)[rows]]
         found.append(rows[[mark not in held_out for mark in marks_of(one.genes[rows])]] if len(rows) else rows)
     if not any(map(len, found)):

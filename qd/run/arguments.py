@@ -87,16 +87,16 @@ class Archive(Who, OnGround, Where):
     lam: float | None = None
     """Weight in the fitness of u, the share of episodes without base collision; u is 0 if none collided."""
     certified_by: tuple[str, ...] | None = None
-    """Search for failures that other controllers can cross: FILE or NAME=FILE of each, as --policy takes it. They cross
-    what the controller does not; terrains that none of them crosses are worth less."""
+    """Search for failures that other controllers can cross: FILE or NAME=FILE of each, as --policy takes it. They try
+    the terrains that the controller does not cross. A terrain that none of them crosses is worth less."""
     certify_episodes: int | None = None
     """Episodes of each of them on such a terrain; 10."""
     reevaluate_every: int | None = None
-    """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
+    """After every so many iterations up to 200 elites cross 40 fresh episodes each. 0: never."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
-    """Evaluate every elite again with 40 fresh episodes at the end; auto: with presets wide and paper."""
+    """Cross every elite again in 40 fresh episodes at the end. auto: with presets wide and paper."""
     confirm: Literal["auto", "yes", "no"] = "auto"
-    """Cross the elites that fail these with contact resolved too; auto: with presets wide and paper."""
+    """Cross the elites that fail in these with contact resolved too. auto: with presets wide and paper."""
 
     def execute(self) -> None:
         """Runs the search."""

@@ -26,8 +26,10 @@ if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
 RUNS = Path("runs")
-RESULTS = Path("results")
-"""Where published archives and tables lie, <robot>/archive and <robot>/tables.json."""
+_OWN_RESULTS = Path(__file__).resolve().parents[2] / "results"
+RESULTS = Path("results") if Path("results").is_dir() or not _OWN_RESULTS.is_dir() else _OWN_RESULTS
+"""Where published archives, tables and panels lie, <robot>/archive and so on: results/ of the present folder, or of
+this checkout where that has none."""
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"

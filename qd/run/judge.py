@@ -31,11 +31,11 @@ PANEL_FOLDER = "panel"
 
 @dataclass(frozen=True, kw_only=True)
 class Confirm(Who, InSpace, Where):
-    """Cross the failing elites of a run again with contact resolved: are they the controller's failures?
+    """Cross the failing elites of a run again with contact resolved. Do they fail there too?
 
-    An elite fails if under half of the robots reach the goal in its 40 fresh episodes. It is confirmed if under half do
-    in 20 more with steps of 1 ms and a contact time constant of 3 ms, about five times the work. What was crossed
-    before is left out, so the same command goes on after Ctrl-C.
+    An elite fails if under half of the robots reach the goal in its 40 fresh episodes. It is confirmed if under half
+    reach it in 20 more episodes too, with steps of 1 ms and a contact time constant of 3 ms. Such an episode is about
+    five times the work. Nothing is crossed twice, so the same command goes on after Ctrl-C.
     """
 
     run: Path | None = None
@@ -43,7 +43,7 @@ class Confirm(Who, InSpace, Where):
     elite: str = "all"
     """Numbers of failing elites: one, several as in --elite "0 3", or all that fail."""
     mujoco_c: int = setting(0, least=0)
-    """How many of them to cross in plain MuJoCo C too, with contact resolved, on the CPU; drawn by the run's seed."""
+    """How many of them to cross in plain MuJoCo C too, on the CPU, with contact resolved. The run's seed draws them."""
 
     def execute(self) -> None:
         """Runs the command."""
@@ -52,11 +52,11 @@ class Confirm(Who, InSpace, Where):
 
 @dataclass(frozen=True, kw_only=True)
 class Certify(OfRobot, InSpace, Where):
-    """Let other controllers cross the failing elites of a run: which of them can be crossed?
+    """Let other controllers cross the failing elites of a run. Which of them can be crossed?
 
     A certificate says that a controller reaches the goal in at least half of 20 episodes at the search's settings, and
-    of 20 with contact resolved. A confirmed elite with a certificate is a fault of the controller that was searched.
-    Certificates add up over calls, and what was crossed before is left out, so the same command goes on after Ctrl-C.
+    in at least half of 20 with contact resolved. A confirmed elite with a certificate is a fault of the controller that
+    was searched. Certificates add up over calls. Nothing is crossed twice, so the same command goes on after Ctrl-C.
     """
 
     by: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from qd.archive import OUTCOMES, Archive, FaultCounts
 from qd.minimal import Case, How, Minimal, Trial
 from sim.files.atomic import write_atomically
-from sim.files.npz import npz_bytes
+from sim.files.npz import array_names, npz_bytes, read_arrays
 
 MINIMAL_FILE = "minimal.npz"
 NUMBERS_FILE = "minimal.json"
@@ -23,7 +23,7 @@ _ASKED = ("asked", "asked_cell", "asked_iteration", "asked_how", "asked_genes")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kept:
+class Known:
     """What the file of a run holds about elites that are still in its archive."""
 
     hows: dict[int, How] = field(default_factory=dict)
@@ -109,24 +109,24 @@ def _flags(parts: list[tuple[int, ...]], count: int) -> NDArray[np.bool_]:
     return np.array([[part in some for part in range(count)] for some in parts], bool).reshape(len(parts), count)
 
 
-def read_minimal(path: Path, archive: Archive) -> Kept:
+def read_minimal(path: Path, archive: Archive) -> Known:
     """Reads the file of a run; data only, nothing in it can run.
 
     Args:
         path: The run directory.
-        archive: Its elites; what the file holds of others, or of such as do not fail, is left out.
+        archive: Its elites; what the file holds of other elites, or of ones that do not fail, is left out.
 
     Raises:
         ValueError: If it is damaged.
     """
     file = path / MINIMAL_FILE
     if not file.exists():
-        return Kept()
+        return Known()
     try:
-        with np.load(file, allow_pickle=False) as content:
-            there = {name: content[name] for name in (*_ASKED, *_TRIALS, "genes")}
-            faults = {name: content[name] for name in _FAULTS if name in content}
-        return _kept(archive, there, faults)
+        names = set(array_names(file))
+        there = read_arrays(file, (*_ASKED, *_TRIALS, "genes"))
+        faults = read_arrays(file, [name for name in _FAULTS if name in names])
+        return _known(archive, there, faults)
     except Exception as error:  # a damaged zip archive can fail with anything
         raise ValueError(
             f"{file} must be minimal terrains, but it is damaged or another file: {error}: move it away, "
@@ -134,7 +134,7 @@ def read_minimal(path: Path, archive: Archive) -> Kept:
         ) from None
 
 
-def _kept(archive: Archive, there: dict[str, NDArray[Any]], faults: dict[str, NDArray[Any]]) -> Kept:
+def _known(archive: Archive, there: dict[str, NDArray[Any]], faults: dict[str, NDArray[Any]]) -> Known:
     names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
     numbers = {name: number for number, name in enumerate(names)}
     hows: dict[int, How] = {}
@@ -151,4 +151,4 @@ def _kept(archive: Archive, there: dict[str, NDArray[Any]], faults: dict[str, ND
             trial = Trial(tuple(np.flatnonzero(parts).tolist()), float(scale), bool(fresh))
             counts[number][trial] = outcomes.astype(np.int64)
     judged: dict[str, Any] = {n: tuple(v.tolist()) if v.dtype.kind == "U" else v for n, v in faults.items()}
-    return Kept(hows=hows, counts=counts, genes=there["genes"], faults=FaultCounts(**judged) if judged else None)
+    return Known(hows=hows, counts=counts, genes=there["genes"], faults=FaultCounts(**judged) if judged else None)

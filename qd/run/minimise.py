@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from qd.archive import OUTCOMES, Archive
 from qd.faults import Work, certify, confirm, fault_numbers, fault_words, judgement, known_names, rate_of, verdict_of
 from qd.fresh import Open
-from qd.minimal import MOST_PARTS, Case, How, Minimal, Parts, Trial, fresh_counts, genes_of, goal_rate, minimise
+from qd.minimal import MOST_PARTS, Case, How, Minimal, Trial, fresh_counts, genes_of, goal_rate, minimise
 from qd.run.arguments import evaluator_of
 from qd.run.judge import certifiers_of, config_of, judged_run, searched_policy
-from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Kept, read_minimal, write_minimal
+from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Known, read_minimal, write_minimal
 from qd.run.settings import code_of
 from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.atomic import to_json, write_atomically
@@ -38,13 +38,13 @@ _LEAST_EFFECT = 1e-4  # a part that changes no height by more is none [m]
 
 @dataclass(frozen=True, kw_only=True)
 class Minimise(Who, InSpace, Where):
-    """Find the smallest terrains on which the controller still fails: which parts of an elite's terrain does it take?
+    """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
 
-    Parts of a failing elite, such as bumps, are crossed without the others, 20 episodes each. A minimal terrain is a
-    subset that fails, under half of the robots reach the goal, while no smaller one does; 40 fresh episodes check it.
-    Then its heights are scaled down together as long as it still fails: that is the margin. The cause is the part
-    without which most robots arrive. Results are in minimal.json, minimal.npz and minimal.png of the run. What was
-    crossed before is left out, so the same command goes on after Ctrl-C, and results of several calls add up.
+    Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
+    the robots reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes
+    check it. Then its heights are scaled down together as long as it still fails. That is the margin. The cause is the
+    part without which most robots arrive. Results are in minimal.json, minimal.npz and minimal.png of the run. Nothing
+    is crossed twice, so the same command goes on after Ctrl-C. Results of several calls add up.
     """
 
     run: Path | None = None
@@ -53,9 +53,9 @@ class Minimise(Who, InSpace, Where):
     """Numbers of failing elites: one, several as in --elite "0 3", or all that fail. If left out, 200 on a GPU and 3 on
     the CPU: faults first, then confirmed and certified ones, then others that fail."""
     how: Literal["exhaustive", "greedy"] | None = None
-    """exhaustive: all subsets are crossed, from the smallest on, until one fails. greedy: parts are taken away one at a
-    time as long as what is left fails, which takes far fewer crossings where many parts are needed. If left out,
-    exhaustive on a GPU, greedy on the CPU and for terrains of more than 10 parts."""
+    """exhaustive: robots cross all subsets, from the smallest on, until one fails. greedy: parts are taken away one at
+    a time as long as the rest fails. Where many parts are needed, that takes far fewer crossings. If left out,
+    exhaustive on a GPU, and greedy on the CPU and for terrains of more than 10 parts."""
     confirm: bool = False
     """Cross the minimal terrains with contact resolved too, as `faultline confirm` does with elites."""
     certify: bool = False
@@ -82,19 +82,31 @@ class MinimalTerrains:
     """By number of the elite; their counts grow."""
 
     @cached_property
-    def _shapes(self) -> dict[tuple[int, Parts], dict[int, "Shape"]]:
+    def _known(self) -> dict[int, tuple[int, Minimal | None]]:
+        """By number of the elite, as of how many trials: every lot of crossings asks again about all of them."""
+        return {}
+
+    @cached_property
+    def _entries(self) -> dict[int, dict[str, Any]]:
         return {}
 
     def minima(self) -> dict[int, Minimal]:
         """The minimal terrains that are known, by number of the elite."""
-        found = {number: case.minimal() for number, case in sorted(self.cases.items())}
-        return {number: minimal for number, minimal in found.items() if minimal is not None}
+        found = {}
+        for number, case in sorted(self.cases.items()):
+            trials, minimal = self._known.get(number, (-1, None))
+            if trials != len(case.counts):
+                minimal = case.minimal()
+                self._known[number] = len(case.counts), minimal
+            if minimal is not None:
+                found[number] = minimal
+        return found
 
     def genes(self, number: int, minimal: Minimal, scale: float = 1.0) -> NDArray[np.float32]:
         """Genes of a minimal terrain, shape (num_genes,)."""
         return genes_of(self.archive, number, self.cases[number], Trial(minimal.parts, scale), self.space)
 
-    def as_archive(self, known: Kept | None = None) -> Archive:
+    def as_archive(self, known: Known | None = None) -> Archive:
         """The minimal terrains as elites whose fresh episodes are their own; of the rest only the names hold.
 
         Args:
@@ -117,14 +129,10 @@ class MinimalTerrains:
 
     def shapes(self, number: int, minimal: Minimal) -> dict[int, "Shape"]:
         """Shapes of the parts of a minimal terrain, by their numbers."""
-        key = (number, minimal.parts)
-        if key not in self._shapes:
-            from qd.causes import effects_of  # with Warp: not for `--help`
+        from qd.causes import effects_of  # with Warp: not for `--help`
 
-            effects = effects_of(self.genes(number, minimal), minimal.parts, self.space)
-            shapes = (effects.shape(place, self.half_width) for place in range(len(minimal.parts)))
-            self._shapes[key] = dict(zip(minimal.parts, shapes, strict=True))
-        return self._shapes[key]
+        effects = effects_of(self.genes(number, minimal), minimal.parts, self.space)
+        return {part: effects.shape(place, self.half_width) for place, part in enumerate(minimal.parts)}
 
     def margin(self, number: int, minimal: Minimal) -> tuple[float, float | None]:
         """Largest height or depth of a minimal terrain, and how far it moves to the least scale that fails [m]."""
@@ -144,6 +152,12 @@ class MinimalTerrains:
             judged: The minimal terrains as elites, with fault counts where they were crossed for these.
             place: The terrain's among them.
         """
+        if number not in self._entries:  # nothing more is crossed of a minimal terrain
+            self._entries[number] = self._entry(number, minimal)
+        return {**self._entries[number], "verdict": verdict_of(judged, place), **judgement(judged, place)}
+
+    def _entry(self, number: int, minimal: Minimal) -> dict[str, Any]:
+        """What does not change when others cross it."""
         words, case = self.space.parts(self.archive.genes[number]), self.cases[number]
         shapes, (height, margin) = self.shapes(number, minimal), self.margin(number, minimal)
         cause = minimal.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
@@ -167,8 +181,6 @@ class MinimalTerrains:
             "height_m": height,
             "margin_m": margin,
             "scales": [{"scale": scale, **rate_of(counts)} for scale, counts in sorted(minimal.scales.items())],
-            "verdict": verdict_of(judged, place),
-            **judgement(judged, place),
         }
 
     def numbers(self, judged: Archive) -> dict[str, Any]:
@@ -289,7 +301,7 @@ def minimal_of_run(path: Path, archive: Archive, robot: "RobotCfg") -> tuple[dic
 
 
 def _terrains_of(
-    archive: Archive, known: Kept, hows: Mapping[int, How | None], space: "TerrainSpace", half_width: float, *,
+    archive: Archive, known: Known, hows: Mapping[int, How | None], space: "TerrainSpace", half_width: float, *,
     on_gpu: bool,
 ) -> MinimalTerrains:  # fmt: skip
     """Elites that are taken apart, with what was crossed of them before."""
@@ -362,8 +374,7 @@ def minimal_words(numbers: dict[str, Any], judged: Archive) -> list[str]:
         )
     if numbers["causes"]:
         told.append(f"Causes: {', '.join(f'{kind} {many}' for kind, many in numbers['causes'].items())}.")
-    words = fault_words(judged)
-    return told + ([f"Of these minimal terrains: {words[0]}", *words[1:]] if words else [])
+    return told + fault_words(judged, what="minimal terrain")
 
 
 _SHOWN = 10  # terrains that are told one by one

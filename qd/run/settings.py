@@ -271,7 +271,7 @@ def policy_spec(cfg: SearchCfg, robot: "RobotCfg") -> str:
 
 
 def kept_penalties(robot: "RobotCfg", without: Sequence[str]) -> tuple[str, ...]:
-    """The robot's penalties but for some.
+    """The robot's penalties without some.
 
     Args:
         robot: The robot.

@@ -52,7 +52,7 @@ class Cross(Who, OnDevice, Mapped):
     the same name beside the .png, such as `faultline export` writes.
 
     Robots start near x = 2 m, y = 4 m and walk to x = 14 m, y = 4 m. The middle of the map lies on the middle of what
-    they cross, 16 m x 8 m. The rest of a larger map is cut off, a smaller one goes on at the height of its edge. The
+    they cross, 16 m x 8 m. The rest of a larger map is cut off. A smaller one goes on at the height of its edge. The
     map is resampled to 0.05 m: linearly, or by weighted means where it is finer.
     """
 
@@ -63,8 +63,8 @@ class Cross(Who, OnDevice, Mapped):
     seed: int = 0
     """Draws their starts."""
     out: Path | None = None
-    """Where to write the numbers, runs/terrains/<map>-<robot>[-<controller>].json, where <map> is the path of the map
-    with - between its folders; beside it the figure, ...-paths.png. Older ones are replaced."""
+    """File for the numbers; runs/terrains/<map>-<robot>[-<controller>].json, where <map> is the path of the map with -
+    between its folders. The figure ...-paths.png is written beside it. Older files are replaced."""
 
     def execute(self) -> None:
         """Crosses the map, prints rates and costs, writes numbers and figure."""

@@ -12,6 +12,7 @@ from sim.files.command import chosen_elites, command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, label_suffix, spec_of
 
 if TYPE_CHECKING:
+    from qd.show.minima import MinimalFound
     from sim.robots.robot import RobotCfg
     from sim.space import TerrainSpace
 
@@ -104,6 +105,23 @@ class Found:
             same = is_same(policy, own) if searched is None else controller_hash(policy) == searched
             return "" if same else label_suffix(policy)
         return suffix_of(cfg, policy, self.robot)
+
+    def minima(self) -> "MinimalFound":
+        """The minimal terrains of its elites.
+
+        Raises:
+            FileNotFoundError: If there are none.
+            ValueError: If their file is damaged.
+        """
+        from qd.show.minima import read_minimal_numbers
+
+        found = read_minimal_numbers(self.folder, self.archive)
+        if found is None:
+            word = "reevaluate" if self.archive.fresh is None else "minimise"
+            first = " first, then `faultline minimise`" if word == "reevaluate" else ""
+            again = command_line(word, robot=self.robot.spec, run=self.run)
+            raise FileNotFoundError(f"{self.run} has no minimal terrains of its elites: `{again}`{first} makes them")
+        return found
 
     def one(self, text: str) -> int:
         """The elite that a command line names, where only one makes sense.

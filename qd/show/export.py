@@ -32,18 +32,18 @@ _AT_ONCE = 32  # terrains rasterised
 class Export(OfRobot, Which):
     """Write elites of an archive, or terrains of a pack, as files that other programs read.
 
-    Of each elite: `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground has them),
-    `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml` (MJCF: a scene
-    of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a closed block).
-    `faultline cross --terrain elite-N.npz`, or with the .png, crosses it again.
+    For each elite it writes `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground
+    has them), `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml`
+    (MJCF: a scene of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a
+    closed block). `faultline cross --terrain elite-N.npz`, or with the .png, crosses it again.
     """
 
     pack: str | None = None
     """Take the terrains of a pack instead: a folder that `faultline pack` made, or anymal or cassie for the published
     one. --elite counts its terrains, from 0; their files are called as the pack calls them."""
     out: Path | None = None
-    """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published; of a pack
-    runs/<robot>-pack-terrains."""
+    """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published; of minimal
+    terrains minimal-terrains/, of a pack runs/<robot>-pack-terrains."""
     formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
     """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
     overwrite: bool = False
@@ -58,18 +58,18 @@ class Export(OfRobot, Which):
 class _Source:
     """Terrains that may be exported."""
 
-    whose: Path
-    count: int
+    numbers: list[int]
+    """Those to be exported."""
     folder: Path
-    """Where their files go if nothing is said."""
+    """Where their files go without ``--out``."""
     origin: dict[str, Any]
     """Where they come from, for every file."""
     named: dict[str, Any]
     """The same for the index alone."""
     stem: Callable[[int], str]
     """Name of a terrain's files."""
-    genes: NDArray[np.float32] | None
-    """Shape (count, num_genes)."""
+    genes: Callable[[int], NDArray[np.float32]] | None
+    """Of a terrain, shape (num_genes,)."""
     terrains: "Callable[[list[int]], tuple[NDArray[np.float32], GroundMaps | None]]"
     """Heights of some terrains [m], shape (number of them, nrow, ncol), and their ground, if it is not as always."""
     about: Callable[[int], dict[str, Any]]
@@ -93,7 +93,7 @@ def export(cfg: Export) -> list[Path]:
     from sim.maps.terrain_files import check_formats, write_terrain
 
     source = _of_archive(cfg) if cfg.pack is None else _of_pack(cfg, cfg.pack)
-    elites = chosen_elites(cfg.elite, source.count, source.whose)
+    elites = source.numbers
     formats = list(dict.fromkeys(split_words(cfg.formats)))
     check_formats(formats)
     _tell_of_ground(source, formats)
@@ -111,7 +111,7 @@ def export(cfg: Export) -> list[Path]:
             grids, maps = source.terrains(numbers)
             for place, (number, heights) in enumerate(zip(numbers, grids, strict=True)):
                 about, stem = source.about(number), folder / source.stem(number)
-                genes = None if source.genes is None else source.genes[number]
+                genes = None if source.genes is None else source.genes(number)
                 ground = None if maps is None else maps[place : place + 1]
                 told = {**about, **origin}
                 files += write_terrain(stem, heights, formats=formats, about=told, genes=genes, ground=ground)
@@ -119,7 +119,7 @@ def export(cfg: Export) -> list[Path]:
                 bar.update()
     files.append(folder / INDEX_FILE)
     write_atomically(files[-1], to_json({**source.named, "formats": formats, "elites": index, **origin}))
-    what = "elite" if cfg.pack is None else "terrain"
+    what = "elite" if cfg.pack is None and cfg.minimal is None else "terrain"
     print(f"{len(elites)} {what}{'s' * (len(elites) != 1)} as {', '.join(formats)}: {folder}")
     return files
 
@@ -149,17 +149,30 @@ def _of_archive(cfg: Export) -> _Source:
 
     found = find_archive(cfg.robot, cfg.run, space=cfg.space)
     archive, space = found.archive, found.space
+    minima = None if cfg.minimal is None else found.minima()
+    what = "elite" if minima is None else "minimal"
+
+    def genes(elite: int) -> NDArray[np.float32]:
+        return archive.genes[elite] if minima is None else minima.genes[elite]
+
+    def about(elite: int) -> dict[str, Any]:
+        known = {} if minima is None else {"minimal": minima.entry(elite)}
+        return {**about_elite(archive, elite), **known, "terrain": space.describe(genes(elite))}
+
     return _Source(
-        whose=found.run,
-        count=len(archive),
-        folder=folder_for(found.run, found.robot.name) / _FOLDER,
+        numbers=(
+            chosen_elites(cfg.elite, len(archive), found.run)
+            if minima is None
+            else minima.chosen(str(cfg.minimal), found.run)
+        ),
+        folder=folder_for(found.run, found.robot.name) / (_FOLDER if minima is None else f"{what}-{_FOLDER}"),
         origin={"run": str(found.run), "space": archive.space, "space_sha256": archive.space_sha256},
         named=archive.named(),
-        stem=lambda elite: f"elite-{elite}",
-        genes=archive.genes,
-        terrains=lambda numbers: terrains_of(archive.genes[numbers], space),
+        stem=lambda elite: f"{what}-{elite}",
+        genes=genes,
+        terrains=lambda numbers: terrains_of(np.stack([genes(elite) for elite in numbers]), space),
         ground=space.ground,
-        about=lambda elite: {**about_elite(archive, elite), "terrain": space.describe(archive.genes[elite])},
+        about=about,
     )
 
 
@@ -167,19 +180,20 @@ def _of_pack(cfg: Export, named: str) -> _Source:
     """The terrains of a pack."""
     from sim.robots.robot import robot_of
 
-    if cfg.run is not None or cfg.space is not None:
-        raise ValueError("a pack has its own terrains, got --run or --space beside --pack: leave one of them out")
+    if (cfg.run, cfg.space, cfg.minimal) != (None, None, None):
+        raise ValueError(
+            "a pack has its own terrains, got --run, --space or --minimal beside --pack: leave one of them out"
+        )
     folder = pack_folder(named)
     pack = read_pack(folder)
     robot = robot_of(pack.content, cfg.robot, folder / PACK_FILE, flag="pack")
     return _Source(
-        whose=folder,
-        count=len(pack),
+        numbers=chosen_elites(cfg.elite, len(pack), folder),
         folder=RUNS / f"{robot.name}-pack-{_FOLDER}",
         origin={"pack": folder.name, "terrains_sha256": pack.content["terrains_sha256"]},
         named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
         stem=lambda place: pack.terrains[place]["name"],
-        genes=pack.genes,
+        genes=None if pack.genes is None else pack.genes.__getitem__,
         terrains=lambda numbers: (pack.heights[numbers], None),
         about=lambda place: {"robot": robot.name, "place": place, **pack.terrains[place]},
     )
@@ -208,7 +222,7 @@ def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
 
 
 def _refuse_to_replace(folder: Path, stems: set[str]) -> None:
-    there = [file for file in (folder / INDEX_FILE, *folder.glob("elite-*")) if file.exists()]
+    there = [file for file in (folder / INDEX_FILE, *folder.glob("*-*")) if file.exists()]
     wanted = {INDEX_FILE, *stems}
     found = sorted({file.name for file in there if file.name == INDEX_FILE or file.stem in wanted})
     if found:

@@ -36,7 +36,7 @@ class Film(Who, OnDevice, Which, Mapped):
     episode has cost so far, each penalty in multiples of its scale. Yellow arrows are contact forces of the feet, red
     ones those beyond the robot's limit. The recording is kept beside the film, so that it can be filmed again
     elsewhere. Without --out a film is elite-<number>.mp4 in the run, or of a published one in runs/<robot>-published;
-    with another controller elite-<number>-<its name>.mp4.
+    with another controller elite-<number>-<its name>.mp4; of a minimal terrain minimal-<number>.mp4.
     """
 
     terrain: Path | None = None
@@ -48,7 +48,7 @@ class Film(Who, OnDevice, Which, Mapped):
     replicas: int = setting(20, least=1)
     """Episodes to run."""
     replica: int | None = setting(None, least=0)
-    """Which of them to film; of those that end as most do, the one in the middle by its penalties."""
+    """Which episode to film. If left out, of the episodes that end as most do, the one with the median penalties."""
     ghosts: int = setting(2, least=0)
     """How many others to show translucent."""
     seed: int = setting(0, least=0)
@@ -98,8 +98,9 @@ def make_films(cfg: Film) -> list[Path]:
         orders = _elite_orders(cfg)
     films = []
     for order in orders:
+        replaced = " (replaced)" if order.out.exists() else ""
         _film(order, cfg)
-        print(f"Film: {order.out}", flush=True)
+        print(f"Film: {order.out}{replaced}", flush=True)
         films.append(order.out)
     return films
 
@@ -110,21 +111,27 @@ def _elite_orders(cfg: Film) -> Iterator[Order]:
 
     found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot = found.archive, found.robot
-    elites = chosen_elites(cfg.elite, len(archive), found.run)
+    minima = None if cfg.minimal is None else found.minima()
+    if minima is None:
+        elites, what = chosen_elites(cfg.elite, len(archive), found.run), "elite"
+    else:
+        elites, what = minima.chosen(str(cfg.minimal), found.run), "minimal"
     policy = found.policy(cfg.policy)
     suffix = found.suffix(policy)
     if cfg.out is not None and len(elites) == 1 and not cfg.out.is_dir():
         outs = [cfg.out]
     else:
         folder = cfg.out or folder_for(found.run, robot.name)
-        outs = [folder / f"elite-{elite}{suffix}.mp4" for elite in elites]
+        outs = [folder / f"{what}-{elite}{suffix}.mp4" for elite in elites]
     device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
     prepare_output(outs[0])
+    whole = "elite" if minima is None else "minimal terrain of elite"
     wanted = [
         on_elite(
             archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed,
-            label=f"elite {elite} of {len(archive):,} of {found.folder}",
+            label=f"{whole} {elite} of {len(archive):,} of {found.folder}",
+            minimal=None if minima is None else minima.genes[elite],
         )
         for elite in elites
     ]  # fmt: skip

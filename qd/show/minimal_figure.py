@@ -23,7 +23,11 @@ _COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f
 
 
 def draw_minimal(
-    robot: str, numbers: dict[str, Any], genes: Mapping[int, NDArray[np.float32]], space: "TerrainSpace"
+    robot: str,
+    numbers: dict[str, Any],
+    genes: Mapping[int, NDArray[np.float32]],
+    space: "TerrainSpace",
+    most: int = _SHOWN,
 ) -> "Figure":
     """How many parts failures take, by the kind of the cause, and some minimal terrains from above.
 
@@ -34,9 +38,10 @@ def draw_minimal(
         numbers: At least one terrain, as ``minimal.json`` has them.
         genes: Of the minimal terrains by number of the elite, each of shape (num_genes,).
         space: What they mean.
+        most: Terrains of the gallery.
     """
     entries = numbers["elites"]
-    shown = _gallery(entries)
+    shown = _gallery(entries)[:most]
     rows = -(-len(shown) // _COLUMNS)
     figure = new_figure(13.0, 3.2 + 2.3 * rows)
     figure.suptitle(f"{robot}: {len(entries):,} minimal terrains")
@@ -55,14 +60,14 @@ def draw_minimal(
 
 
 def _gallery(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Some entries, the first of each kind of cause first."""
+    """The entries, the first of each kind of cause first."""
     seen: dict[str, int] = {}
     order = []
     for place, entry in enumerate(entries):
         kind = entry["cause"]["kind"] if entry["cause"] else ""
         seen[kind] = seen.get(kind, 0) + 1
         order.append((seen[kind], place))
-    return [entries[place] for _, place in sorted(order)[:_SHOWN]]
+    return [entries[place] for _, place in sorted(order)]
 
 
 def _draw_histogram(axes: "Axes", numbers: dict[str, Any]) -> None:

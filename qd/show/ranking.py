@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from qd.archive import Archive
 from qd.elites import Elites, elites_of
 from qd.families import families_of
-from qd.modes import Modes, find_modes
+from qd.modes import Mode, Modes, failure_modes
+from qd.show.figures import label_of
 
 if TYPE_CHECKING:
     from sim.space import TerrainSpace
@@ -30,13 +31,18 @@ ORDERS = {
 """Orders of elites, in words."""
 
 
+def mode_words(mode: Mode) -> str:
+    """A mode in a few words: how its crossings end, and the penalty that stands out."""
+    return f"{mode.ending} · {label_of(mode.marked_by)}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Ranking:
     """N elites, their failure modes and their families, in orders to show them in."""
 
     elites: Elites
     modes: Modes
-    """Groups of them by how the robot struggles."""
+    """Groups of those that fail, by how the robot struggles."""
     families: NDArray[np.int64]
     """Family of each, shape (N,), numbered from 1 by its worst member."""
 
@@ -74,6 +80,11 @@ class Ranking:
                 families.add(int(self.families[row]))
         return np.array([*first, *np.setdiff1d(severity, first, assume_unique=True)], dtype=np.int64)
 
+    def mode_of(self, place: int) -> Mode | None:
+        """The mode of the elite in a row; None of one that does not fail."""
+        number = int(self.modes.labels[place])
+        return self.modes.modes[number - 1] if number else None
+
     def leaders(self) -> list[int]:
         """Numbers of the terrains that stand for a way of failing, one for each mode in which terrains fail."""
         count = len(np.unique(self.modes.labels[self.elites.failing]))
@@ -96,4 +107,4 @@ def rank(archive: Archive, space: "TerrainSpace", *, judged: bool = False) -> Ra
     families = families_of(archive.genes[elites.numbers], space)
     places = {int(family): place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()]), start=1)}
     numbered = np.array([places[int(family)] for family in families], dtype=np.int64)
-    return Ranking(elites=elites, modes=find_modes(elites), families=numbered)
+    return Ranking(elites=elites, modes=failure_modes(elites), families=numbered)

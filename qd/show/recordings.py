@@ -1,4 +1,4 @@
-"""Recorded crossings, kept on disk: what is there is read, what is missing is crossed.
+"""Recorded crossings, kept on disk. Those that are missing are crossed.
 
 The name of a file is the hash of all that its crossings depend on: terrain, seed, number of episodes, controller, robot
 and code. So no file is ever out of date, and what one command recorded the others find.
@@ -64,9 +64,16 @@ class Wanted:
 
 
 def on_elite(
-    archive: Archive, number: int, *, policy: str, replicas: int, seed: int = 0, label: str | None = None
+    archive: Archive,
+    number: int,
+    *,
+    policy: str,
+    replicas: int,
+    seed: int = 0,
+    label: str | None = None,
+    minimal: NDArray[np.float32] | None = None,
 ) -> Wanted:
-    """The crossings of an elite that ``faultline replay`` shows.
+    """The crossings of an elite, or of its minimal terrain, that ``faultline replay`` shows.
 
     Args:
         archive: That it is of.
@@ -75,6 +82,7 @@ def on_elite(
         replicas: Episodes.
         seed: Other episodes for another seed.
         label: What the terrain is, in words.
+        minimal: Genes of its minimal terrain, which is crossed from the same starts.
 
     Raises:
         ValueError: If a number is out of range, or the terrain space is not at hand.
@@ -82,8 +90,8 @@ def on_elite(
     from sim.space import get_space
 
     return Wanted(
-        label=label or f"elite {number} of {archive.robot}",
-        terrain=archive.genes[number],
+        label=label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}",
+        terrain=archive.genes[number] if minimal is None else minimal,
         policy=policy,
         replicas=replicas,
         seed=seed,
@@ -124,6 +132,24 @@ class Simulation:
         self._robot, self._device = robot, device
         self._rollouts: dict[tuple[str, int, int, str, bool], Any] = {}
 
+    def prepare(self, first: Wanted, count: int = 1) -> Any:
+        """The rollout that crosses such terrains, so many at once; built if there is none yet.
+
+        Raises:
+            ValueError: If the controller cannot be loaded or does not fit the robot.
+        """
+        from sim.rollout import Rollout
+        from sim.space import load_space
+
+        has_ground = first.ground is not None
+        kind = (first.policy, count, first.replicas, first.space, has_ground)
+        if kind not in self._rollouts:
+            self._rollouts[kind] = Rollout(
+                self._robot, first.policy, num_terrains=count, num_replicas=first.replicas, device=self._device,
+                space=load_space(first.space), has_ground=has_ground,
+            )  # fmt: skip
+        return self._rollouts[kind]
+
     def __call__(self, wanted: Sequence[Wanted], progress: Callable[[float], None]) -> "list[Recording]":
         """Recordings of all, in their order.
 
@@ -132,20 +158,11 @@ class Simulation:
         """
         from sim.ground import GroundMaps
         from sim.recording.recorder import record
-        from sim.rollout import Rollout
-        from sim.space import load_space
 
         first = wanted[0]
-        has_ground = first.ground is not None
-        kind = (first.policy, len(wanted), first.replicas, first.space, has_ground)
-        if kind not in self._rollouts:
-            self._rollouts[kind] = Rollout(
-                self._robot, first.policy, num_terrains=kind[1], num_replicas=kind[2], device=self._device,
-                space=load_space(first.space), has_ground=has_ground,
-            )  # fmt: skip
         grounds = [one.ground for one in wanted if one.ground is not None]
         _, recording = record(
-            self._rollouts[kind],
+            self.prepare(first, len(wanted)),
             np.stack([one.terrain for one in wanted]),
             np.array([one.terrain_seed for one in wanted], np.uint32),
             policy=first.policy,
@@ -207,8 +224,13 @@ class Recordings:
                 return replace(recording, labels=(wanted.label,))
         return None
 
+    def may_keep(self, wanted: Wanted) -> bool:
+        """Whether a recording of these crossings would be found again, and there is no file of them yet."""
+        files = filter(None, (self.file_of(wanted), self.published_file(wanted)))
+        return controller_hash(wanted.policy) is not None and not any(file.exists() for file in files)
+
     def keep(self, wanted: Wanted, recording: "Recording") -> None:
-        """Keep a recording; where it cannot be written, that is said."""
+        """Keeps a recording; prints a warning if it cannot be written."""
         from sim.recording.file import write_recording
 
         self._last = (wanted, recording)

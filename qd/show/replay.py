@@ -17,16 +17,19 @@ from sim.files.intervals import rate_words
 from sim.policy.spec import ControllerSpec
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
+    from qd.show.minima import MinimalFound
     from sim.recording.recorder import Recording
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayElite(Who, OnDevice, Which):
-    """Print one elite of an archive and draw its terrain with the robots' paths.
+    """Print one elite of an archive, or its minimal terrain, and draw the terrain with the robots' paths.
 
-    Elites are numbered by descending fitness, the corrected one where all were evaluated again: 0 is the worst.
+    Elites are numbered by descending fitness: 0 is the worst. After fresh episodes their corrected fitness counts.
     """
 
     replicas: int = 20
@@ -37,7 +40,7 @@ class ReplayElite(Who, OnDevice, Which):
     """Name of a certifier: show its crossing of the elite that `faultline certify --record` kept, and cross nothing."""
     out: Path | None = None
     """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published; with
-    another controller or certifier elite-<number>-<its name>.png."""
+    another controller or certifier elite-<number>-<its name>.png. Of a minimal terrain minimal-<number>..."""
 
     def execute(self) -> None:
         """Prints the numbers and writes the figure."""
@@ -60,6 +63,14 @@ class Replay:
     fresh: Evaluation
     controller: str = ""
     """Who crossed it this time, if that is another controller than the search's."""
+    minimal: str = ""
+    """What is known of the minimal terrain, if that was crossed instead."""
+
+    @property
+    def genes(self) -> "NDArray[np.float32]":
+        """Of the terrain that was crossed, shape (num_genes,)."""
+        genes = self.recording.genes
+        return self.found.archive.genes[self.elite] if genes is None else genes[0]
 
 
 def replay(cfg: ReplayElite) -> Replay:
@@ -71,14 +82,19 @@ def replay(cfg: ReplayElite) -> Replay:
     """
     found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot = found.archive, found.robot
-    elite = found.one(cfg.elite)
+    if cfg.minimal is not None and cfg.certificate:
+        raise ValueError("certificates are of whole elites, got --certificate beside --minimal: leave one of them out")
+    minima = None if cfg.minimal is None else found.minima()
+    elite = found.one(cfg.elite) if minima is None else _one_of(minima, str(cfg.minimal), found)
     _, fitness = found.as_searched()
     policy = None if cfg.certificate else found.policy(cfg.policy)
     suffix = f"-{cfg.certificate}" if policy is None else found.suffix(policy)
-    out = cfg.out or folder_for(found.run, robot.name) / f"elite-{elite}{suffix}.png"
+    name = "elite" if minima is None else "minimal"
+    out = cfg.out or folder_for(found.run, robot.name) / f"{name}-{elite}{suffix}.png"
     if out.suffix != ".png":
         raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
-    recording = _kept(cfg, found, elite) if policy is None else _crossed(cfg, found, elite, policy, out)
+    genes = None if minima is None else minima.genes[elite]
+    recording = _kept(cfg, found, elite) if policy is None else _crossed(cfg, found, elite, policy, out, genes)
     return Replay(
         found=found,
         out=out,
@@ -86,7 +102,16 @@ def replay(cfg: ReplayElite) -> Replay:
         recording=recording,
         fresh=evaluation_of(recording.result(), archive.cells, fitness),
         controller=str(recording.origin["policy"] if policy is None else policy) if suffix else "",
+        minimal="" if minima is None else minima.words(elite),
     )
+
+
+def _one_of(minima: "MinimalFound", text: str, found: Found) -> int:
+    numbers = minima.chosen(text, found.run)
+    if len(numbers) != 1:
+        known = ", ".join(map(str, minima.genes))
+        raise ValueError(f"--minimal must name one elite here, got '{text}': give one of {known}")
+    return numbers[0]
 
 
 def _kept(cfg: ReplayElite, found: Found, elite: int) -> "Recording":
@@ -96,11 +121,13 @@ def _kept(cfg: ReplayElite, found: Found, elite: int) -> "Recording":
     return read_evidence(found.run, found.archive, elite, str(cfg.certificate))
 
 
-def _crossed(cfg: ReplayElite, found: Found, elite: int, policy: str, out: Path) -> "Recording":
+def _crossed(
+    cfg: ReplayElite, found: Found, elite: int, policy: str, out: Path, minimal: "NDArray[np.float32] | None"
+) -> "Recording":
     """Crossings by a controller, once all is known to be as it must be."""
     from qd.show.recordings import Recordings, on_elite
 
-    wanted = on_elite(found.archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
+    wanted = on_elite(found.archive, elite, policy=policy, replicas=cfg.replicas, seed=cfg.seed, minimal=minimal)
     device = resolve_device(cfg.device)
     check_policy(policy, found.robot, device)
     prepare_output(out)
@@ -116,6 +143,9 @@ def describe(replay: Replay) -> str:
     columns: list[tuple[str, Archive | Evaluation, int]] = [("found", archive, n), ("now", fresh, 0)]
     if archive.fresh is not None:
         columns.insert(1, ("corrected", archive.fresh, n))
+    if replay.minimal:
+        columns = [(f"whole elite, {label}", values, k) for label, values, k in columns[:-1]]
+        columns.append(("minimal, now", fresh, 0))
     rows = {
         "": [f"{label} ({values.episodes[k]} episodes)" for label, values, k in columns],
         "fitness": [f"{values.fitness[k]:.2f}" for _, values, k in columns],
@@ -125,7 +155,7 @@ def describe(replay: Replay) -> str:
             _penalty(values.penalty_mean[k, p], values.penalty_std[k, p], archive.scales[p], values.ratios[k, p])
             for _, values, k in columns
         ]
-    for label, name in (("base collision", "collision_rate"), ("goal reached", "goal_rate"), ("fallen", "fallen_rate")):
+    for label, name in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
         counted = [(getattr(values, name)[k], _counted(values, k)) for _, values, k in columns]
         rows[label] = [rate_words(round(rate * count) if count else 0, count) for rate, count in counted]
     again = (
@@ -133,17 +163,20 @@ def describe(replay: Replay) -> str:
     )
     if replay.controller:
         again = f"  Now it was crossed with {replay.controller}; all else is of the controller that was searched."
-    table = [f"  {label:22}" + "".join(f"{cell:>34}" for cell in row) for label, row in rows.items()]
+    wide = 44 if replay.minimal else 34
+    table = [f"  {label:22}" + "".join(f"{cell:>{wide}}" for cell in row) for label, row in rows.items()]
+    which = "minimal terrain of elite" if replay.minimal else "elite"
+    known = [f"Of the minimal terrain: {replay.minimal}."] if replay.minimal else [again.strip()]
+    known += elite_words(archive, n)
     return "\n".join(
         [
-            f"{replay.found.run}, elite {n} of {len(archive):,} of {archive.robot}, found in iteration "
+            f"{replay.found.run}, {which} {n} of {len(archive):,} of {archive.robot}, found in iteration "
             f"{archive.iteration[n]}, with ratios in {cells.describe(int(archive.cell[n]))}",
             *table,
             "  Its terrain:",
-            *(f"    {line}" for line in replay.found.space.describe(archive.genes[n]).splitlines()),
+            *(f"    {line}" for line in replay.found.space.describe(replay.genes).splitlines()),
             "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
-            again,
-            *(f"  {line}" for line in elite_words(archive, n)),
+            *(f"  {line}" for line in known),
         ]
     )
 
@@ -170,6 +203,8 @@ def draw(replay: Replay) -> "Figure":
         f"{archive.fitness[n]:.2f} as found, {corrected}"
         f"{replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
     )
+    if replay.minimal:
+        title = f"{archive.robot}, minimal terrain of elite {n} of {len(archive):,}: {replay.minimal}"
     if replay.controller:
         title += f"\nwith another controller than was searched: {ControllerSpec.parse(replay.controller).label}"
     return draw_paths(crossed_of(replay.recording, archive.penalties, archive.scales), title)

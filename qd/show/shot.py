@@ -25,6 +25,7 @@ _HOLD_S = 1.0  # of the last frame
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
 _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 _DPI = 100
+_NUMBERS = 52  # width of the running numbers behind the legend [pixels]
 _FUTURE = 0.25  # how much is left to see of what has not happened yet
 
 Image = NDArray[np.uint8]
@@ -79,7 +80,7 @@ def caption(shot: Shot) -> tuple[str, str]:
         f"{ending_of(recording.outcome[0, k]).words} after {recording.duration_s[0, k]:.1f} s"
     )
     crossed = crossed_of(recording, (), ())
-    shown = {"base collision": "base collision", "goal": ARRIVED, "fallen": "fallen"}
+    shown = {"goal": ARRIVED, "base collision": "base collision", "fallen": "fallen"}
     rates = [f"{name} {rate_words(*crossed.rates[words], short=True)}" for name, words in shown.items()]
     count, valid = recording.num_episodes, len(crossed.chosen)
     rates = rates if valid else ["none valid"]
@@ -186,13 +187,18 @@ class Panel:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
+        figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+        figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0 - _NUMBERS / width, 1.0))
         canvas = FigureCanvasAgg(figure)
         self._map, self._curves = figure.subplots(1, 2, width_ratios=(1.0, 1.6))
         _draw_map(self._map, shot)
-        _draw_curves(self._curves, shot)
+        self._penalties, self._dt = shot.penalties, shot.recording.dt
+        rows = _draw_curves(self._curves, shot)
         canvas.draw()
         self._image = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        boxes = [row.get_window_extent() for row in rows]
+        right = round(max((box.x1 for box in boxes), default=0.0)) + _NUMBERS
+        self._places = [(right, height - round(0.5 * (box.y0 + box.y1))) for box in boxes]
         self._faded = np.rint(255 - _FUTURE * (255.0 - self._image)).astype(np.uint8)
         self._inside = self._curves.get_window_extent()
 
@@ -217,7 +223,19 @@ class Panel:
         apart = np.hypot(row - (height - y), column - x)
         image[apart < 7.0] = 255
         image[apart < 5.0] = (213, 94, 0)
-        return image
+        return self._with_sums(image, time_s)
+
+    def _with_sums(self, image: Image, time_s: float) -> Image:
+        """What each penalty has come to by now, behind its name in the legend."""
+        from PIL import Image as Images
+        from PIL import ImageDraw, ImageFont
+
+        picture = Images.fromarray(image)
+        draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+        for place, values in zip(self._places, self._penalties.values(), strict=True):
+            frame = min(round(time_s / self._dt), len(values) - 1)
+            draw.text(place, f"{values[frame]:.1f}", fill="black", font=font, anchor="rm")
+        return np.asarray(picture)
 
 
 def _draw_map(axes: Any, shot: Shot) -> None:
@@ -237,15 +255,16 @@ def _draw_map(axes: Any, shot: Shot) -> None:
     axes.set_ylabel("y [m]")
 
 
-def _draw_curves(axes: Any, shot: Shot) -> None:
+def _draw_curves(axes: Any, shot: Shot) -> list[Any]:
+    """The curves; returns the names of the penalties in the legend."""
     times = shot.recording.times_s[: shot.num_frames]
     for name, values in shot.penalties.items():
-        label = f"{label_of(name)} {values[-1]:.1f}"
-        axes.plot(times, values, color=look_of(name).color, linewidth=1.8, label=label)
+        axes.plot(times, values, color=look_of(name).color, linewidth=1.8, label=label_of(name))
     axes.set_xlim(0.0, max(float(times[-1]), shot.recording.dt))
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")
     measured = set(shot.scales.values()) != {1.0}
     axes.set_ylabel(f"penalty so far,\n{'multiples of its scale' if measured else 'raw'}")
     axes.grid(alpha=0.3)
-    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
+    style: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.01, 0.5), "frameon": False, "fontsize": 9}
+    return axes.legend(**style).get_texts()

@@ -36,11 +36,11 @@ _DEFAULTS = {"wide": (18, 6), "paper": (150, 50), "small": (6, 2)}
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation(StudyFlags):
-    """Search with and without the standard deviations in the fitness, and see how repeatable the elites are.
+    """Search with and without the standard deviations in the fitness, and compare how repeatable the elites are.
 
-    Every so many iterations up to 200 elites of each search are drawn and cross 40 fresh episodes; the mean of their
-    standard deviations is compared. Both searches are ordinary runs, alpha_1 and alpha_0 in the study's folder. State
-    is saved after every iteration, and the same command goes on.
+    Every few iterations up to 200 elites of each search cross 40 fresh episodes. The command compares the means of
+    their standard deviations. Both searches are ordinary runs, alpha_1 and alpha_0 in the study's folder. State is
+    saved after every iteration, and the same command goes on.
     """
 
     run: Path | None = None

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import RUNS, published_or_newest
 from qd.run.progress import share_bar
-from qd.studies.kept import Kept
 from qd.workers.evaluator import (
     EvaluatorCfg,
     check_policy,
@@ -26,6 +25,7 @@ from qd.workers.evaluator import (
     resolve_device,
 )
 from qd.workers.invalid import refuse_all_invalid
+from qd.workers.kept import Kept
 from sim.files.command import InSpace, Where, Who, chosen_elites, naming_what_is_next, publish
 from sim.files.intervals import value_words
 from sim.files.settings import check, setting
@@ -57,11 +57,12 @@ _WORDS = {
 class Agreement(Who, InSpace, Where):
     """Measure how far rates at the search's settings lie from contact resolved and from MuJoCo C.
 
-    Hard-random terrains and elites, drawn at random and not by their rates, are crossed twice at the search's settings
-    (steps of 5 ms), from the second starts also with contact resolved (steps of 1 ms, a time constant of 3 ms), and
-    some of them in plain MuJoCo C at both. The bias is the mean rate of the first crossings minus that of the others.
+    The terrains are hard-random ones and elites, drawn at random and not by their rates. Robots cross them twice at the
+    search's settings (steps of 5 ms), from two sets of starts. From the second starts they cross them also with contact
+    resolved (steps of 1 ms, a time constant of 3 ms), and some of them in plain MuJoCo C at both settings. The bias is
+    the mean rate of the first crossings minus that of the others.
 
-    What was crossed is kept: the same command goes on after a stop.
+    Crossings are kept, so the same command goes on after a stop.
     """
 
     run: Path | None = None
@@ -91,7 +92,7 @@ class Agreement(Who, InSpace, Where):
 
         Raises:
             FileNotFoundError: If there is no run.
-            ValueError: If something asked for cannot be had.
+            ValueError: If a flag's value cannot be used.
             AllInvalidError: If no episode is valid.
             Interrupted: On Ctrl-C; what was crossed is kept.
             EvaluatorError: If a worker is lost; likewise.
@@ -103,7 +104,7 @@ class Agreement(Who, InSpace, Where):
         evaluator = _evaluator_of(self, terrains)
         out = self.out or RUNS / "agreement" / f"{terrains.robot.name}.json"
         digest = hashlib.sha256(terrains.genes.tobytes()).hexdigest()
-        kept = Kept(out, terrains.robot, evaluator, [self.seed, digest])
+        kept = Kept.beside(out, evaluator, [self.seed, digest])
 
         def measure() -> dict[str, Any]:
             print(_plan(self, terrains, evaluator), flush=True)
@@ -184,7 +185,7 @@ def drawn(cfg: Agreement) -> Drawn:
 
     Raises:
         FileNotFoundError: If there is no run.
-        ValueError: If terrains, robot or controller cannot be had, or MuJoCo does not read the robot.
+        ValueError: If terrains, robot or controller are not available, or MuJoCo cannot read the robot.
     """
     from sim.mujoco_c.model import crossing_model, refuse_softness
     from sim.robots.robot import get_robot
@@ -258,7 +259,7 @@ def _evaluator_of(cfg: Agreement, drawn: Drawn) -> EvaluatorCfg:
     """What crosses the terrains at the search's settings, with a controller that was tried.
 
     Raises:
-        ValueError: If device or workers cannot be had, or the controller does not fit the robot.
+        ValueError: If device or workers are not available, or the controller does not fit the robot.
     """
     device = resolve_device(cfg.device, cfg.workers)
     check_policy(drawn.policy, drawn.robot, device)
@@ -391,7 +392,7 @@ def report_of(drawn: Drawn, outcome: dict[str, NDArray[np.uint8]], seed: int) ->
         seed: Draws the resamples of intervals.
 
     Returns:
-        Of each set its comparisons with ``search`` (:func:`sim.agreement.agreement`), with ``both_resolved``, contact
+        Of each set its comparisons with ``search`` (:func:`sim.rates.agreement`), with ``both_resolved``, contact
         resolved here against contact resolved in MuJoCo C, and the ``rates`` of each terrain; None of a set that was
         not crossed. ``failing`` elites by the first crossings, and how many of them fail again by the second ones, at
         the search's settings (``failing_again``) and with contact resolved (``failing_resolved``); None without
@@ -410,7 +411,7 @@ def report_of(drawn: Drawn, outcome: dict[str, NDArray[np.uint8]], seed: int) ->
 
 
 def _compared(outcome: dict[str, NDArray[np.uint8]], seed: int) -> dict[str, Any]:
-    from sim.agreement import agreement
+    from sim.rates import agreement
 
     pairs = {way: ("search", way) for way in ("again", "resolved", *_PLAIN)}
     pairs["both_resolved"] = ("resolved", "mujoco_c_resolved")
@@ -419,7 +420,7 @@ def _compared(outcome: dict[str, NDArray[np.uint8]], seed: int) -> dict[str, Any
 
 def _rates(outcome: dict[str, NDArray[np.uint8]]) -> dict[str, dict[str, list[float | None]]]:
     """Rates of each terrain by way and kind, None where there is no valid episode."""
-    from sim.agreement import KINDS, crossing_rates
+    from sim.rates import KINDS, crossing_rates
 
     def listed(rates: NDArray[np.float64]) -> list[float | None]:
         return [None if np.isnan(rate) else round(rate, 6) for rate in rates.tolist()]
@@ -429,7 +430,7 @@ def _rates(outcome: dict[str, NDArray[np.uint8]]) -> dict[str, dict[str, list[fl
 
 def _failing(outcome: dict[str, NDArray[np.uint8]] | None) -> dict[str, int | None]:
     """Terrains that fail by the first crossings, and those of them that fail by others too; None without terrains."""
-    from sim.agreement import crossing_rates
+    from sim.rates import crossing_rates
 
     if outcome is None:
         return dict.fromkeys(("failing", "failing_again", "failing_resolved"))
@@ -440,7 +441,7 @@ def _failing(outcome: dict[str, NDArray[np.uint8]] | None) -> dict[str, int | No
 
 
 def _show(report: dict[str, Any]) -> None:
-    from sim.agreement import KINDS
+    from sim.rates import KINDS
 
     print("Rates at the search's settings minus those of other crossings (95 % interval), and their mean distance:")
     for name, title in _NAMES.items():

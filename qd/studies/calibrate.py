@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.studies.kept import Kept
 from qd.workers.invalid import tell_invalid
+from qd.workers.kept import Kept
 from sim.files.command import OnGround, Where, Who, naming_what_is_next, publish
 from sim.files.settings import check, setting
 from sim.robots.identity import identity
@@ -38,14 +38,14 @@ _FEW = 30
 class Calibrate(Who, OnGround, Where):
     """Measure the penalty scales of a robot with a controller, on hard-random terrains.
 
-    Writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped, where
-    every search reads them.
+    It writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped. Every
+    search reads them there.
     """
 
     terrains: int = setting(1_000, least=1)
-    """Hard-random terrains to begin with; as many again are drawn until 200 episodes did not reach the goal."""
+    """Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal."""
     most_terrains: int = setting(5_000, least=1)
-    """Terrains after which no more are drawn; a controller with fewer failing episodes is scaled by all episodes."""
+    """Largest number of terrains. With fewer failing episodes even then, all episodes give the scales."""
     replicas: int = setting(20, least=1)
     """Episodes a terrain."""
     space: str = "super_gaussian"
@@ -62,7 +62,7 @@ class Calibrate(Who, OnGround, Where):
             open_evaluator: Opens what crosses the terrains.
 
         Raises:
-            ValueError: If something asked for cannot be had; if a penalty never occurred, once the scales of the others
+            ValueError: If a flag's value cannot be used; if a penalty never occurred, once the scales of the others
                 are written.
             AllInvalidError: If no episode is valid.
             EvaluatorError: If a worker is lost; what was crossed is kept.
@@ -96,7 +96,7 @@ class Calibrate(Who, OnGround, Where):
         genes = space.hard_random(self._most, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self._most, np.uint32)
         out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
-        kept = Kept(out, robot, evaluator, [self.seed, self.terrains, self._most])
+        kept = Kept.beside(out, evaluator, [self.seed, self.terrains, self._most])
 
         def keep(crossed: Crossed) -> None:
             arrays = {name: getattr(crossed, name) for name in _KEPT}
@@ -290,8 +290,6 @@ def _measured(crossed: Crossed) -> dict[str, Any]:
         "scaled_by": "failing" if by_failing else "all",
         "scales": penalty_scales(crossed),
         "share_of_episodes_with": dict(zip(crossed.penalty_names, shares, strict=True)),
-        "mean_failing": _means(crossed, crossed.failing),
-        "mean_reached": _means(crossed, ~crossed.invalid & crossed.reached_goal),
     }
 
 

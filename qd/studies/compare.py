@@ -18,6 +18,7 @@ from qd.run.judge import Certify, Confirm, certifiers_of, certify_run, confirm_r
 from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
 from qd.studies.study import StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, parse_workers, resolve_device
+from qd.workers.kept_open import kept_open
 from sim.files.command import publish
 from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
 from sim.files.settings import check, setting
@@ -78,11 +79,11 @@ _NAME = re.compile(r"[a-zA-Z0-9_+.,:=-]{1,200}")  # what a folder can be called,
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(StudyFlags):
-    """Compare ways to search on the same number of terrains, several seeds each, crossed together.
+    """Compare search methods on the same number of terrains, with several seeds each.
 
     Every search is an ordinary run in its own folder METHOD-SEED. State is saved after every iteration: stop with
-    Ctrl-C whenever you like, and the same command goes on. Searches of other widths are compared by
-    mixed:emitters=80,groups=8: eight times the terrains an iteration, in an eighth of the iterations.
+    Ctrl-C whenever you like, and the same command goes on. mixed:emitters=80,groups=8 is a wider search: it has eight
+    times as many terrains in an iteration, and an eighth of the iterations.
     """
 
     methods: tuple[str, ...] = tuple(name for name in METHODS if name not in (GATED, "surrogate"))
@@ -91,21 +92,21 @@ class Compare(StudyFlags):
     others can cross); all but the last two. Settings of the search after a colon make another one of it:
     cma_mae:restart-rule=20,learning-rate=0.3. Of NAME@1 only the first seed is run."""
     certified_by: tuple[str, ...] = ()
-    """Certifiers of the method gated, FILE or NAME=FILE. It ends with as many episodes as the others have, those of the
-    certifiers included, and so after fewer iterations."""
+    """Certifiers of the method gated, FILE or NAME=FILE. This method ends after as many episodes as the others. The
+    certifiers' episodes count too, so it has fewer iterations."""
     certify_episodes: int = setting(10, least=1)
     """Episodes of each of them on a terrain that the controller does not cross."""
     certify: bool = False
     """Confirm and certify the elites of every run afterwards, and count the faults."""
     by: tuple[str, ...] = ()
-    """Who certifies them then, NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt."""
+    """Certifiers for --certify, NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt."""
     seeds: int = setting(3, least=1, most=MAX_T_VALUES)
     """Runs of each method, with seeds from --seed on."""
     seed: int = 0
     """The first seed."""
     iterations: int = 33
-    """Iterations of a run of the preset's size, and so the terrains of every run; more than before extend a comparison
-    that is there."""
+    """Iterations of a run of the preset's size. They set how many terrains every run has. A larger number later extends
+    a comparison."""
     reevaluate_every: int = setting(11, least=1)
     """Every so many iterations, and at the end, all elites cross 40 fresh episodes."""
 
@@ -141,10 +142,10 @@ class Compare(StudyFlags):
             found = run_study(study, open_evaluator)
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds[name]] for name in methods}
             report = report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()})
+            counts = self._judged(study.path, list(runs), robot.spec, judges, open_evaluator) if self.certify else {}
             for name in methods if self.certify else ():
-                folders = [study.path / f"{name}-{seed}" for seed in seeds[name]]
-                counts = [self._judged(folder, robot.spec, judges, open_evaluator) for folder in folders]
-                report["methods"][name] |= {key: _over_seeds([one[key] for one in counts]) for key in FAULTS}
+                own = [counts[f"{name}-{seed}"] for seed in seeds[name]]
+                report["methods"][name] |= {key: _over_seeds([one[key] for one in own]) for key in FAULTS}
             return {
                 **study.origin,
                 **identity(robot, study.evaluator.policy),
@@ -160,14 +161,26 @@ class Compare(StudyFlags):
 
         return publish(study.out, measure, _show, draw=lambda report: as_png(draw_comparison(report)))
 
-    def _judged(self, run: Path, robot: str, judges: dict[str, str], open_evaluator: Open) -> dict[str, Any]:
-        """What a run's elites are in fresh episodes, with contact resolved and to the judges; what is there is kept."""
-        where = {"robot": robot, "run": run, "device": self.device, "workers": self.workers, "num_envs": self.num_envs}
-        if RunDirectory(run).fresh_archive() is None:
-            reevaluate_run(Reevaluate(policy=self.policy, **where), open_evaluator=open_evaluator)
-        confirm_run(Confirm(policy=self.policy, **where), open_evaluator=open_evaluator)
-        by = tuple(f"{name}={policy}" for name, policy in judges.items())
-        return fault_numbers(certify_run(Certify(by=by, **where), open_evaluator=open_evaluator))
+    def _judged(
+        self, path: Path, names: Sequence[str], robot: str, judges: dict[str, str], open_evaluator: Open
+    ) -> dict[str, dict[str, Any]]:
+        """What the elites of runs are in fresh episodes, with contact resolved and to the judges, by name of the run.
+
+        What is there is kept. One step after the other, so that all runs are crossed by the same simulations.
+        """
+        shared = {"robot": robot, "device": self.device, "workers": self.workers, "num_envs": self.num_envs}
+        by, found = tuple(f"{name}={policy}" for name, policy in judges.items()), {}
+        with kept_open(open_evaluator) as opened:
+            for name in names:
+                if RunDirectory(path / name).fresh_archive() is None:
+                    again = Reevaluate(policy=self.policy, run=path / name, **shared)
+                    reevaluate_run(again, open_evaluator=opened)
+            for name in names:
+                confirm_run(Confirm(policy=self.policy, run=path / name, **shared), open_evaluator=opened)
+            for name in names:
+                certify = Certify(by=by, run=path / name, **shared)
+                found[name] = fault_numbers(certify_run(certify, open_evaluator=opened))
+        return found
 
     def _methods(self, shared: SearchCfg, certifiers: dict[str, str]) -> dict[str, SearchCfg]:
         """Settings of each method: different searches on the same number of terrains, or of episodes.

@@ -27,10 +27,10 @@ _CPU_ROBOTS = 32  # at once
 
 @dataclass(frozen=True, kw_only=True)
 class PenaltyRatios(Who):
-    """Measure each penalty's mean over crossings that miss the goal, over its mean over those that reach it.
+    """Compare each penalty's mean over crossings that miss the goal with its mean over those that reach it.
 
-    The terrains are hard-random ones. A ratio near 1 is a penalty that does not see failures. For yaw_rate, vel_x and
-    vel_y the ratio of absolute errors stands beside that of the squared ones.
+    The terrains are hard-random ones. A ratio near 1 means that the penalty does not see failures. The penalties
+    yaw_rate, vel_x and vel_y are squared errors; the ratios of absolute errors are shown beside theirs.
     """
 
     terrains: int = setting(2_000, least=1)
@@ -42,13 +42,13 @@ class PenaltyRatios(Who):
     device: str | None = None
     """Warp device, cuda:0 or cpu; the GPU if there is one."""
     out: Path | None = None
-    """Where to write; runs/<robot>-penalty-ratios.json."""
+    """File to write; runs/<robot>-penalty-ratios.json."""
 
     def execute(self) -> dict[str, Any]:
         """Crosses the terrains and publishes the ratios.
 
         Raises:
-            ValueError: If something asked for cannot be had.
+            ValueError: If a flag's value cannot be used.
             AllInvalidError: If no episode is valid.
         """
         from qd.run.directory import RUNS

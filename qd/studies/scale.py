@@ -68,7 +68,7 @@ def measure(args: Scale) -> dict[str, Any]:
     """Everything of ``scale.json``.
 
     Raises:
-        ValueError: If something asked for cannot be had.
+        ValueError: If a flag's value cannot be used.
     """
     from sim.robots.robot import get_robot
 

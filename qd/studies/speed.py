@@ -37,9 +37,9 @@ _PAPER_EPISODES = 4_000_000  # of the paper's search
 class Speed(OfRobot, OnDevice):
     """Time a preset's iteration, the bare physics of the same crossings, and episodes a second over env counts.
 
-    The bare rate is that of contacts and solver alone: `walking` in the crossings' own motion, replayed from recorded
-    states and joint targets, and `standing` holding the default pose at the start. `ground_step_ratio` is what such a
-    step costs on ground with friction and softness of its own over what it costs without.
+    The bare rate is that of contacts and solver alone. `walking` replays the crossings' own motion from recorded states
+    and joint targets. `standing` holds the default pose at the start. `ground_step_ratio` is what such a step costs on
+    ground with friction and softness of its own over what it costs without.
     """
 
     preset: str = "paper"
@@ -51,18 +51,18 @@ class Speed(OfRobot, OnDevice):
     steps: int = setting(1000, least=1)
     """Physics steps of the bare measurement."""
     curve: tuple[int, ...] = setting((1024, 2048, 4096, 8192, 16384, 32768), least=1)
-    """Numbers of robots of the curve, each of which runs 20 episodes; none to leave it out."""
+    """Numbers of robots of the curve. Each robot runs 20 episodes. Give none to leave the curve out."""
     kernels: tuple[int, ...] = setting((), least=1)
     """Numbers of robots with which every kernel of a control step is timed, on a GPU."""
     wide: Path | None = None
-    """Run of preset wide, made on this GPU, whose iterations are told of."""
+    """Run of preset wide, made on this GPU, whose iterations are reported too."""
     before: Path | None = None
-    """speed.json of another commit, made on this GPU, whose curve is kept beside this one's."""
+    """speed.json of another commit, made on this GPU. Its curve is written beside the new one."""
     train_speed: tuple[Path, ...] = ()
-    """Outputs of `faultline train-speed`, on one and on two GPUs, whose rates are taken over."""
+    """Outputs of `faultline train-speed`, on one and on two GPUs. Their rates are copied."""
     timeline: Path | None = None
-    """Draw which robot ran which episode when, with and without the queue, into this file, on elites of --run, or else
-    on hard-random terrains; nothing is timed."""
+    """Draw into this file which robot ran which episode when, with and without the queue. The terrains are elites of
+    --run, or else hard-random ones. Nothing is timed."""
     out: Path | None = None
     """Where to write; printed alone if left out."""
 
@@ -191,7 +191,7 @@ def measure(args: Speed) -> dict[str, Any]:
     """Everything of ``speed.json``.
 
     Raises:
-        ValueError: If something asked for cannot be had.
+        ValueError: If a flag's value cannot be used.
     """
     from sim.bench.physics import measure_bare_physics, measure_ground
     from sim.robots.robot import get_robot, robot_of

@@ -246,11 +246,11 @@ def _iterate(
     """Some iterations of some searches, each saved, until one of them has spent its episodes."""
     began = time.perf_counter()
     states = [(one.cfg, one.search) for one in active]
-    for iteration, results in crossed_iterations(states, left, evaluate, bar, gate):
+    for iteration, found in crossed_iterations(states, left, evaluate, bar, gate):
         rows = []
-        for one, result in zip(active, results, strict=True):
+        for one, crossed in zip(active, found, strict=True):
             one.found = archive_of(one.cfg, one.search, iteration)
-            rows.append(row_of(one.cfg, one.found, result, iteration))
+            rows.append(row_of(one.cfg, one.found, crossed, iteration))
         ending = [not one.episodes_left(row) for one, row in zip(active, rows, strict=True)]
         every = looks_again(active[0].cfg, iteration)
         chosen = [k for k, ends in enumerate(ending) if every or (ends and not sampled)]

@@ -345,19 +345,24 @@ class Pipeline(ABC):
             progress: Called now and then with the share that is done.
 
         Yields:
-            Which terrains a lot has, and its result. The next lot is under way meanwhile if there is room for two.
+            Which terrains a lot has, and its result. Those behind are under way meanwhile as far as there is room.
         """
         count = checked_count(terrains, seeds)
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-        ahead = max(1, min(2, self.num_terrains // size))
+        behind, num_taken = deque(lots), 0
+
+        def put_what_fits() -> None:
+            while behind and (behind[0].stop - num_taken <= self.num_terrains or behind[0].start == num_taken):
+                own = behind.popleft()
+                self.put(terrains[own], seeds[own])
+
         self.clear()
-        for own in lots[:ahead]:
-            self.put(terrains[own], seeds[own])
-        for number, own in enumerate(lots):
-            done, share = own.start / count, (own.stop - own.start) / count
-            result = self.take(None if progress is None else _share_of(progress, done, share))
-            for behind in lots[number + ahead : number + ahead + 1]:
-                self.put(terrains[behind], seeds[behind])
+        for own in lots:
+            put_what_fits()
+            share = (own.stop - own.start) / count
+            result = self.take(None if progress is None else _share_of(progress, own.start / count, share))
+            num_taken = own.stop
+            put_what_fits()  # before the result is looked at
             yield own, result
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.agreement import KINDS, agreement
 from sim.commands import SolverOptions
 from sim.files.intervals import value_words
 from sim.files.provenance import provenance
+from sim.rates import KINDS, agreement
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
@@ -55,7 +55,7 @@ def measure(cfg: SolverOptions) -> dict[str, Any]:
     """Everything of the results file.
 
     Raises:
-        ValueError: If something asked for cannot be had.
+        ValueError: If a flag's value cannot be used.
     """
     robot, device = get_robot(cfg.robot), resolve_device(cfg.device)
     policy = cfg.policy or robot.policy_file
@@ -108,13 +108,13 @@ def print_rows(report: dict[str, Any]) -> None:
     """Prints a row a choice."""
     names = list(report["rows"][0]["penalties"])
     head = f"{'step':>5} {'iterations':>10} {'search':>6} {'rows':>5} {'contacts':>8} {'wall s':>7} {'M steps/s':>9}"
-    print(f"{head} {'success':>7} {'goal':>6} {'invalid':>7} " + " ".join(f"{name:>13}" for name in names))
+    print(f"{head} {'goal':>6} {'no base collision':>17} {'invalid':>7} " + " ".join(f"{name:>13}" for name in names))
     for row in report["rows"]:
         print(
             f"{row['physics_dt']:>5g} {row['iterations']:>10} {row['ls_iterations']:>6} {row['njmax']:>5} "
             f"{row['nconmax']:>8} "
             f"{row['wall_s']:>7.2f} {row['world_steps_per_s'] / 1e6:>9.3f} "
-            f"{value_words(row['success_rate'], None, '.4f'):>7} {value_words(row['goal_rate'], None, '.4f'):>6} "
+            f"{value_words(row['goal_rate'], None, '.4f'):>6} {value_words(row['success_rate'], None, '.4f'):>17} "
             f"{row['invalid']:>7} "
             + " ".join(f"{value_words(row['penalties'][name], None, '.4f'):>13}" for name in names)
         )

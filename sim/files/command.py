@@ -9,15 +9,17 @@ import shlex
 import shutil
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.provenance import without_machine
 from sim.files.settings import check, setting
 
 _ALL = "all"
@@ -57,8 +59,8 @@ class Where(OnDevice):
     """Worker processes: a number of them on the CPU (one a core if left out), ray for one on every device of a Ray
     cluster, or ray:N for N of them. RAY_ADDRESS names a running cluster."""
     num_envs: int | None = setting(None, least=1)
-    """Robots at once over all workers, which take episode after episode; as many as the device is good for if left out.
-    It changes how long the work takes, and no result."""
+    """How many robots walk at once, over all workers. Each takes one episode after another. If left out, as many as
+    suit the device. It changes how long the work takes, and no result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,8 @@ class InSpace:
     """The option that names the terrain space of a run."""
 
     space: str | None = None
-    """Terrain space of the run, where it is one of your own: file.py:CLASS. What only the run names is not run."""
+    """Terrain space of the run, where it is one of your own: file.py:CLASS. A space that only the run names is not
+    loaded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +89,9 @@ class Which(InSpace):
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
     """Numbers of the elites, 0 the worst: one, several as in --elite "0 3", or all. replay and view take one."""
+    minimal: str | None = None
+    """Instead of whole elites, the minimal terrains that `faultline minimise` left of them: numbers of the elites, as
+    --elite has them; all are those that have one."""
 
 
 class UserError(Exception):
@@ -174,7 +180,18 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
         return 130
 
 
-def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:
+_COMPILER, _AGAIN_S = f"{os.sep}llvmlite{os.sep}", 0.1
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    while frame is not None:
+        if _COMPILER in frame.f_code.co_filename:
+            # Its C code calls Python back and drops what is raised there: the signal comes again until it is over.
+            later = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), signum))
+            later.daemon = True
+            later.start()
+            return
+        frame = frame.f_back
     raise KeyboardInterrupt
 
 
@@ -185,12 +202,17 @@ def command_line(name: str, **flags: object) -> str:
         name: The word that calls it.
         flags: Values by field name; None and False are left out, True is a bare flag.
     """
-    return shlex.join([*_program(), name, *_words(flags)])
+    return shlex.join([*_program(), *command_words(name, **flags)])
 
 
 def plain_command(name: str, **flags: object) -> str:
-    """:func:`command_line` for a file that others read: ``faultline`` without where it is installed here."""
-    return shlex.join(["faultline", name, *_words(flags)])
+    """:func:`command_line` for a file that others read, without where things lie on this machine."""
+    return shlex.join(["faultline", *map(without_machine, command_words(name, **flags))])
+
+
+def command_words(name: str, **flags: object) -> list[str]:
+    """The words of :func:`command_line` after ``faultline``."""
+    return [name, *_words(flags)]
 
 
 def _words(flags: Mapping[str, object]) -> Iterator[str]:
@@ -272,8 +294,9 @@ def publish(
     report = measure()
     show(report)
     for file, make in makers.items():
+        replaced = " (replaced)" if file.exists() else ""
         write_atomically(file, make(report))
-        print(f"written to {file}")
+        print(f"written to {file}{replaced}")
     return report
 
 

@@ -49,10 +49,11 @@ def _command() -> str:
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     module = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
     program = ["faultline"] if module == "faultline" else ["python", "-m", module]
-    return shlex.join([*program, *map(_without_machine, sys.argv[1:])])
+    return shlex.join([*program, *map(without_machine, sys.argv[1:])])
 
 
-def _without_machine(word: str) -> str:
+def without_machine(word: str) -> str:
+    """A word of a command line, or a path, without where on this machine it lies: an absolute path's last name."""
     here = f"{Path.cwd()}{os.sep}"
     return re.sub(r"(?<![\w.~-])/(?:[^/=:\s]+/)+(?=[^/])", "", word.replace(here, ""))
 

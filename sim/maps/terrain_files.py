@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files.atomic import to_json, write_atomically
+from sim.files.npz import npz_bytes
 from sim.ground import GroundMaps
 from sim.terrain import SPACING
 
@@ -100,12 +101,12 @@ def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None, ground: 
 
     With ground of its own also ``friction`` and ``time_constant_s``, float32 (4, 8), row along y.
     """
-    content: dict[str, Any] = {} if genes is None else {"genes": np.asarray(genes, dtype=np.float32)}
+    content = {"heights": np.asarray(heights, np.float32), "size_m": np.array(size_of(heights))}
+    if genes is not None:
+        content["genes"] = np.asarray(genes, np.float32)
     if ground is not None:
         content |= {"friction": ground.friction[0], "time_constant_s": ground.time_constant_s[0]}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, heights=np.float32(heights), size_m=np.array(size_of(heights)), **content)
-    return buffer.getvalue()
+    return npz_bytes(content)
 
 
 def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:

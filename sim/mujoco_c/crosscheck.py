@@ -12,7 +12,6 @@ from tqdm import tqdm
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.agreement import count_hits, crossing_rates
 from sim.bank import terrains_of
 from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
@@ -21,6 +20,7 @@ from sim.files.provenance import provenance
 from sim.ground import GroundMaps
 from sim.mujoco_c.crossing import cross_plain
 from sim.mujoco_c.model import crossing_model, refuse_softness
+from sim.rates import crossing_rates, hits_of
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
@@ -53,7 +53,7 @@ class Comparison:
         """Read and load everything.
 
         Raises:
-            ValueError: If something asked for cannot be had.
+            ValueError: If a flag's value cannot be used.
         """
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)
@@ -187,8 +187,8 @@ class Pair:
 
 
 def _hits(outcome: NDArray[np.uint8], kind: str) -> tuple[int, int]:
-    hits, count = count_hits(outcome, kind)
-    return int(hits), int(count)
+    hits, counted = hits_of(outcome, kind)
+    return int(hits.sum()), int(counted.sum())
 
 
 def _compare(pair: Pair, kind: str) -> dict[str, Any]:
@@ -247,19 +247,20 @@ def _settings(robot: RobotCfg, time_constant_s: float | None) -> dict[str, Any]:
 
 def print_comparison(report: dict[str, Any]) -> None:
     """Prints a row a terrain, and the means."""
-    print(f"{'terrain':>7} {'success: ours':>22} {'MuJoCo C':>9} {'':>8} {'goal: ours':>22} {'MuJoCo C':>9}")
+    words = {"goal": "goal", "success": "no base collision"}
+    print(" ".join([f"{'terrain':>7}", *(f"{f'{what}: ours':>24} {'MuJoCo C':>9} {'':>8}" for what in words.values())]))
     for row in report["terrains"]:
         cells = [f"{row['index']:>7}"]
-        for kind in ("success", "goal"):
+        for kind in words:
             ours = value_words(row[kind]["ours"], row[kind]["interval"], ".2f")
-            cells.append(f"{ours:>22} {row[kind]['mujoco_c']:>9.2f}")
+            cells.append(f"{ours:>24} {row[kind]['mujoco_c']:>9.2f}")
             cells.append("inside  " if row[kind]["inside"] else "outside ")
         print(" ".join(cells))
-    for kind in ("success", "goal"):
+    for kind, what in words.items():
         total = report[kind]
         bias = value_words(total["bias"], total["bias_interval"], "+.3f")
         print(
-            f"{kind}: {total['inside']} of {len(report['terrains'])} rates of MuJoCo C inside our interval; mean "
+            f"{what}: {total['inside']} of {len(report['terrains'])} rates of MuJoCo C inside our interval; mean "
             f"{total['ours']:.3f} against {total['mujoco_c']:.3f}, bias {bias}"
         )
     print(f"invalid episodes: {report['invalid']}")

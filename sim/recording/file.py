@@ -5,7 +5,6 @@ The file holds the fields of :class:`sim.recording.recorder.Recording` as arrays
 them again. Of a space of a user's own it holds both, so that reading runs no code.
 """
 
-import io
 import json
 import os
 from dataclasses import fields
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from kernels.episode import Invalidity, Outcome
 from sim.bank import heights_of
 from sim.files.atomic import write_atomically
-from sim.files.npz import array_names, read_arrays
+from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.ground import COLS, ROWS
 from sim.recording.recorder import FRAME_ARRAYS, Recording, space_in
 from sim.space import get_space, is_own
@@ -57,9 +56,8 @@ def write_recording(path: Path, recording: Recording) -> None:
         content["genes"] = recording.genes
         if not is_own(space_in(recording.origin)):
             del content["heights"]
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, format=FORMAT, origin=json.dumps(recording.origin), **content)
-    write_atomically(path, buffer.getvalue())
+    content |= {"format": np.array(FORMAT), "origin": np.array(json.dumps(recording.origin))}
+    write_atomically(path, npz_bytes(content))
 
 
 def read_recording(path: str | Path) -> Recording:

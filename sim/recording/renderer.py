@@ -1,6 +1,7 @@
 """Pictures of recorded poses by MuJoCo's renderer, without a screen: through EGL on Linux, on a GPU or in software."""
 
 import importlib
+import itertools
 import os
 import sys
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ _GHOST_OPACITY, _GHOST_PALENESS = 0.25, 0.6
 _ARROW = 0.8  # length of the arrow of a force at the robot's limit [m]
 _ARROW_WIDTH = 0.012
 _LEAST_FORCE = 5.0  # shown [N]
+_PATH_RADIUS = 0.009  # [m]
 _SUN_AWAY = 8.0  # from what one looks at [m]
 _CALM, _ALARMED = np.array([0.95, 0.80, 0.20, 0.9], np.float32), np.array([0.85, 0.10, 0.10, 0.9], np.float32)
 
@@ -49,7 +51,7 @@ def open_context(width: int, height: int) -> Any:
         height: Likewise.
 
     Raises:
-        ValueError: If there is none to be had.
+        ValueError: If there is none.
     """
     usual = {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
     name = os.environ.get("MUJOCO_GL", "").strip().lower() or usual
@@ -58,7 +60,7 @@ def open_context(width: int, height: int) -> Any:
         context.make_current()
     except Exception as error:  # a library that is not there fails with anything
         raise ValueError(
-            f"pictures need OpenGL without a screen, but '{name}' cannot be had here: {type(error).__name__}: {error}: "
+            f"pictures need OpenGL without a screen, but '{name}' does not work here: {type(error).__name__}: {error}: "
             "install it (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or name another way in MUJOCO_GL "
             "(egl, osmesa, glfw)"
         ) from None
@@ -125,6 +127,7 @@ class Renderer:
         *,
         ghosts: Sequence[NDArray[np.floating]] = (),
         foot_force: NDArray[np.floating] | None = None,
+        paths: Sequence[tuple[NDArray[np.floating], tuple[float, float, float, float]]] = (),
     ) -> NDArray[np.uint8]:
         """A picture of one pose.
 
@@ -133,6 +136,7 @@ class Renderer:
             camera: Where from.
             ghosts: Poses of others, shown translucent.
             foot_force: Contact force on each foot, world frame [N], shape (num_feet, 3), shown as arrows.
+            paths: Ways, each by its points [m], shape (num_points, 3), and its colour, RGBA 0 to 1.
 
         Returns:
             RGB, shape (height, width, 3).
@@ -151,6 +155,8 @@ class Renderer:
             for index, force in zip(self._feet, foot_force, strict=True):
                 if index >= 0:
                     self._add_arrow(data.geom_xpos[index], np.asarray(force, dtype=np.float64))
+        for points, color in paths:
+            self._add_path(points, np.array(color, np.float32))
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         return self._image[::-1].copy()  # OpenGL's lowest row is first
@@ -173,6 +179,16 @@ class Renderer:
             geom.rgba[:3] += _GHOST_PALENESS * (1.0 - geom.rgba[:3])
             geom.rgba[3] = _GHOST_OPACITY
             geom.transparent = 1
+
+    def _add_path(self, points: NDArray[np.floating], color: NDArray[np.float32]) -> None:
+        capsule = _mj.mjtGeom.mjGEOM_CAPSULE
+        for begin, end in itertools.pairwise(np.asarray(points, dtype=np.float64)):
+            if self._scene.ngeom >= self._scene.maxgeom:
+                return
+            geom = self._scene.geoms[self._scene.ngeom]
+            _mj.mjv_initGeom(geom, capsule.value, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
+            _mj.mjv_connector(geom, capsule.value, _PATH_RADIUS, begin, end)
+            self._scene.ngeom += 1
 
     def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:
         size, limit = float(np.linalg.norm(force)), self._robot.contact_force_limit

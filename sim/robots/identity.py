@@ -82,7 +82,7 @@ def identity(robot: "RobotCfg", policy: str | Path) -> dict[str, str | None]:
 def check_robot(there: Mapping[str, Any], robot: "RobotCfg", file: Path, remedy: str) -> None:
     """Refuses a record of a robot that has changed since.
 
-    A record that names no hash of its robot, as of versions before there was one, is taken; that is said.
+    A record without a hash of its robot, of an earlier version, is taken with a warning.
 
     Args:
         there: What the record names.

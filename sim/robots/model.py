@@ -24,7 +24,7 @@ def leaf_name(label: str) -> str:
 
 
 def joint_names(builder: newton.ModelBuilder) -> list[str]:
-    """Names of a robot's joints but for that of its base."""
+    """Names of a robot's joints without that of its base."""
     return [leaf_name(label) for label in builder.joint_label][1:]
 
 
@@ -290,7 +290,7 @@ def number_problems(builder: newton.ModelBuilder, bodies: Sequence[str], joints:
     Args:
         builder: The robot, of which every joint but the first has one degree of freedom.
         bodies: Names of its bodies.
-        joints: Names of its joints but for that of its base.
+        joints: Names of its joints without that of its base.
     """
     light = [name for name, mass in zip(bodies, builder.body_mass, strict=True) if not 0.0 < mass < np.inf]
     problems = (

@@ -34,14 +34,19 @@ class ModelFiles:
         return self.root.tag == "robot"
 
 
-def read_model_files(model_file: Path) -> ModelFiles:
+def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
     """Reads a model file and looks for the files that it names.
+
+    Args:
+        model_file: The MJCF or URDF.
+        visuals: Whether a URDF keeps what it shows of a link, where that is a primitive or a mesh that is there and
+            can be read; the simulation needs none of it.
 
     Raises:
         ValueError: If it is neither MJCF nor URDF, a xacro file, or files are missing; all of them are named.
     """
     lines: dict[ET.Element, int] = {}
-    root = _parse(model_file, lines)
+    root = _parse(model_file, lines, visuals=visuals)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
     _refuse_xacro(root, model_file, lines)
@@ -141,7 +146,7 @@ def _with_lines(file: Path, lines: dict[ET.Element, int]) -> ET.Element:
     return builder.close()
 
 
-def _parse(file: Path, lines: dict[ET.Element, int] | None = None) -> ET.Element:
+def _parse(file: Path, lines: dict[ET.Element, int] | None = None, *, visuals: bool = False) -> ET.Element:
     try:
         root = _with_lines(file, {} if lines is None else lines)
     except FileNotFoundError:
@@ -150,12 +155,29 @@ def _parse(file: Path, lines: dict[ET.Element, int] | None = None) -> ET.Element
         raise ValueError(f"{file} cannot be read as XML: {error}") from None
     for parent in list(root.iter()):
         for visual in parent.findall("visual") if root.tag == "robot" else ():
-            parent.remove(visual)  # nothing is drawn of it, and its meshes are often in formats that need more packages
+            if not (visuals and _can_be_shown(visual, file)):  # meshes are often in formats that need more packages
+                parent.remove(visual)
     return root
+
+
+def _can_be_shown(visual: ET.Element, model_file: Path) -> bool:
+    """Whether a URDF's visual is a primitive, or its mesh is there in a format that can be read."""
+    try:
+        meshes = [_mesh_path(mesh, model_file) for mesh in visual.iter("mesh")]
+    except ValueError:
+        return False
+    return all(path.suffix.lower() in _SUFFIXES and path.is_file() for path in meshes)
 
 
 def _take_urdf_mesh(mesh: ET.Element, model_file: Path) -> Path:
     """Makes the file name of a URDF's mesh absolute, and returns it."""
+    path = _mesh_path(mesh, model_file)
+    mesh.set("filename", str(path))
+    return path
+
+
+def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
+    """Where a URDF's mesh is to be."""
     name = mesh.get("filename", "").removeprefix("file://")
     path = model_file.parent / name
     if name.startswith(_PACKAGE):
@@ -169,9 +191,7 @@ def _take_urdf_mesh(mesh: ET.Element, model_file: Path) -> Path:
         path = holds[0] / rest
     elif "://" in name:
         raise ValueError(f"{model_file}: mesh {name} must be a file here: nothing is downloaded")
-    path = Path(os.path.abspath(path))
-    mesh.set("filename", str(path))
-    return path
+    return Path(os.path.abspath(path))
 
 
 def _mjcf_files(root: ET.Element, within: tuple[Path, ...], main_folder: Path) -> list[Path]:

@@ -18,7 +18,7 @@ from kernels.contact import Probes
 
 @dataclass(frozen=True, kw_only=True)
 class Strip:
-    """A row of equal spheres on one shape, straight but for meshes."""
+    """A row of equal spheres on one shape, straight except on meshes."""
 
     centres: np.ndarray
     """Centres in the shape's frame [m], shape (num_probes, 3), in order along the strip."""

@@ -16,19 +16,21 @@ from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
 
+_FIRST_HIDDEN_GROUP = 3  # MuJoCo shows groups 0 to 2
+
 
 def robot_spec(robot: RobotCfg) -> Any:
     """An ``MjSpec`` with the robot's joints in the robot's order behind that of its base.
 
     Shapes without a name are named as the simulation names them: those of a URDF by their link, those of an MJCF that
-    touch anything ``<body>_geom_<k>``.
+    touch anything ``<body>_geom_<k>``. A body with visual shapes shows those alone: what a URDF shows of a link, and
+    meshes of an MJCF that touch nothing.
 
     Raises:
         ValueError: If MuJoCo cannot read the file, or finds other joints.
     """
     try:
-        files = read_model_files(robot.model_file)
-        spec = _urdf_spec(files.root) if files.is_urdf else _mjcf_spec(robot)
+        spec = _urdf_spec(robot) if read_model_files(robot.model_file).is_urdf else _mjcf_spec(robot)
     except Exception as error:  # MuJoCo's own type has no name
         raise _not_shown(robot, error) from None
     found = tuple(joint.name for joint in spec.joints if joint.type != _mj.mjtJoint.mjJNT_FREE)
@@ -63,18 +65,37 @@ def _mjcf_spec(robot: RobotCfg) -> Any:
         touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
         for number, geom in enumerate(touching):
             geom.name = geom.name or f"{body.name}_geom_{number}"
+        if any(geom.type == _mj.mjtGeom.mjGEOM_MESH and geom not in touching for geom in body.geoms):
+            _hide(touching)
     return spec
 
 
-def _urdf_spec(root: ET.Element) -> Any:
+def _hide(geoms: list[Any]) -> None:
+    for geom in geoms:
+        geom.group = _FIRST_HIDDEN_GROUP
+
+
+def _urdf_spec(robot: RobotCfg) -> Any:
+    """With what it shows of its links, unless MuJoCo cannot read that."""
+    try:
+        spec = _imported_urdf(read_model_files(robot.model_file, visuals=True).root)
+        spec.copy().compile()
+    except Exception:  # such as a mesh of too many faces; MuJoCo's own type has no name
+        return _imported_urdf(read_model_files(robot.model_file).root)
+    return spec
+
+
+def _imported_urdf(root: ET.Element) -> Any:
     extension = ET.SubElement(root, "mujoco")
     ET.SubElement(extension, "compiler", strippath="false", fusestatic="false", discardvisual="false")
     spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     spec.worldbody.first_body().add_freejoint()
     for body in spec.bodies:
-        geoms = list(body.geoms)
-        for number, geom in enumerate(geoms):
-            geom.name = body.name if len(geoms) == 1 else f"{body.name}_{number}"
+        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+        for number, geom in enumerate(touching):
+            geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
+        if len(touching) < len(body.geoms):
+            _hide(touching)
     return spec
 
 
@@ -82,7 +103,6 @@ _KINDS = {
     int(getattr(_mj.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
     for kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 }
-_FIRST_HIDDEN_GROUP = 3
 _FREE_COORDINATES = 7  # position and quaternion of the base
 
 

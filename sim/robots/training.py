@@ -64,11 +64,6 @@ class PaceCfg:
     """KL divergence an update aims at."""
     entropy: float = setting(0.01, least=0)
     """Weight of the entropy bonus."""
-    final_share: float = setting(0.0, least=0, most=1)
-    """Share of the iterations, the last ones, with final_kl and final_entropy in place of desired_kl and entropy:
-    smaller steps and less noise."""
-    final_kl: float = setting(0.008, above=0)
-    final_entropy: float = setting(0.002, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -431,6 +431,17 @@ def test_which_elites_are_trained_on(places, judged):
     assert learnable.mix.success().tolist() == [0.1] * len(learnable.mix.genes)
 
 
+def test_all_elites_are_more_than_both_parts_of_a_split(places, monkeypatch):
+    """A split takes 750 and 300 of a large archive; here 4 and 2 of ten."""
+    monkeypatch.setattr("train.evaluate.sets.PAPER_TRAINING_ELITES", 4)
+    monkeypatch.setattr("train.evaluate.sets.PAPER_TERRAINS", {"anymal": 2})
+    archive = make_archive(10)
+    write_archive(places / "ten.npz", archive)
+    own = {"archive": (places / "ten.npz",), "run_dir": places / "none"}
+    marks = {held: marks_of(job_of(config(places, held_out=held, **own)).mix.genes) for held in (True, False)}
+    assert len(marks[True]) == 4 and sorted(marks[False]) == sorted(marks_of(archive.genes))
+
+
 def test_a_specialist_trains_on_what_nobody_crosses_from_along_the_way_and_goes_on(places, judged, capsys):
     run, (path, _) = places / "specialist", judged
     own = {"only": "uncertified", "held_out": False, "start_spread": 8.0, "draw": "learnable", "iterations": 2}

@@ -201,6 +201,13 @@ def test_a_training_that_is_cut_short_is_not_taken_for_whole(places, stubbed):
     assert job.is_tuned(tune)
 
 
+def test_its_searches_begin_with_other_terrains_than_those_that_controllers_are_tested_on(places):
+    job = hardening_of(config(places), open_evaluator=Crossings().open)
+    other = hardening_of(config(places, seed=1), open_evaluator=Crossings().open)
+    seeds = [stage.seed for stage in (*job.stages, *other.stages)]
+    assert seeds == [100, 101, 102, 200, 201, 202]  # plain searches have seeds 0, 1, ...
+
+
 def test_more_rounds_continue_a_finished_run(places, stubbed):
     harden(config(places, rounds=1), open_evaluator=Crossings().open)
     first = rounds_of(places)["rounds"]
@@ -254,6 +261,16 @@ def test_the_time_limit_stops_it_as_ctrl_c_does(places, monkeypatch, capsys):
     assert harden(replace(harden_once, max_seconds=3.0), open_evaluator=Crossings().open) == 0
     assert "The time is up. Stopped; what is finished is kept. Go on with:" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGALRM) == before
+
+
+def test_the_time_limit_holds_in_the_background_where_ctrl_c_is_ignored(places, monkeypatch, capsys):
+    monkeypatch.setattr(hardening, "_run", lambda job, stage: time.sleep(60))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert harden(config(places, max_seconds=0.5), open_evaluator=Crossings().open) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "The time is up. Stopped" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

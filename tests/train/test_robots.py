@@ -39,7 +39,7 @@ def test_cassies_settings():
     assert (cfg.soft_joint_limit, cfg.min_air_time_s, cfg.added_base_mass) == (0.95, 0.5, (0.0, 0.0))
     assert cfg.push_speed == 0.5
     ppo = PpoCfg.of(get_robot("cassie"))
-    assert (ppo.init_noise_std, ppo.desired_kl, ppo.entropy, ppo.final_share) == (0.5, 0.02, 0.005, 0.0)
+    assert (ppo.init_noise_std, ppo.desired_kl, ppo.entropy) == (0.5, 0.02, 0.005)
     assert PpoCfg.of(get_robot("anymal")) == PpoCfg()
 
 

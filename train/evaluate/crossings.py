@@ -1,13 +1,11 @@
 """Every controller on every set: crosses what is not kept yet, keeps it, and says how far it is.
 
-Crossings are kept on disk, so that a killed evaluation goes on. Every file carries in its name the hash of all that its
-numbers depend on: controller, terrains, seeds, episodes, kind of device, code and packages. Nothing in it can be out of
-date, whichever command asks for it.
+Crossings are kept on disk, so that a killed evaluation goes on. A file carries the hash of all that its numbers
+depend on: controller, terrains, seeds, episodes, kind of device, code and packages. So it is never out of date,
+whichever command asks for it.
 """
 
 import hashlib
-import io
-import json
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
@@ -20,20 +18,14 @@ from tqdm import tqdm
 from qd.fresh import Open
 from qd.workers.evaluator import Evaluate, EvaluatorCfg
 from qd.workers.invalid import tell_invalid
+from qd.workers.kept import Kept, key_of
 from qd.workers.shards import flaw_of
-from sim.files.atomic import check_zip, write_atomically
-from sim.files.provenance import code_fingerprint
-from sim.policy.spec import controller_hash
-from sim.robots.identity import robot_identity
-from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
-from sim.space import space_identity
 from train.evaluate.measures import terrain_rates
 from train.evaluate.sets import TerrainSet
 
 _MOST_TERRAINS = 2_000  # under way at once: 400 MB of height maps
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
-_ROOMS = ("kernels", "sim")
 _FIELDS = tuple(field.name for field in fields(RolloutResult))
 
 
@@ -44,64 +36,50 @@ def take_terrains(result: RolloutResult, places: np.ndarray) -> RolloutResult:
 
 
 class KeptCrossings:
-    """A folder of crossings.
+    """A folder of crossings, one file a controller and set.
 
     Args:
         folder: Where they are kept; made when the first is written.
-        evaluator: What crosses: its robot, episodes a terrain, kind of device and whether rewards are summed count.
-            Crossings of a CPU and of a GPU differ in their last bits.
+        evaluator: What crosses; its policy and terrains do not count.
     """
 
     def __init__(self, folder: Path, evaluator: EvaluatorCfg) -> None:
-        self.folder, self._episodes = folder, evaluator.num_replicas
-        robot = get_robot(evaluator.robot)
-        kind = "cuda" if evaluator.device.startswith("cuda") else "cpu"
-        unpaid = [] if evaluator.reward else ["without reward"]
-        self._common = [robot_identity(robot), self._episodes, kind, code_fingerprint(_ROOMS), *unpaid]
+        self.folder, self._evaluator = folder, evaluator
+
+    def _kept(self, policy: str, terrains: TerrainSet) -> Kept:
+        parts = [hashlib.sha256(part.tobytes()).hexdigest() for part in (terrains.terrains, terrains.seeds)]
+        key = key_of(replace(self._evaluator, policy=policy, space=terrains.space), parts)
+        return Kept(self.folder / f"{terrains.name}-{key[:24] if key else 'not-kept'}.npz", key)
 
     def file(self, policy: str, terrains: TerrainSet) -> Path:
         """Where the crossings of one controller on one set are kept."""
-        parts = [hashlib.sha256(part.tobytes()).hexdigest() for part in (terrains.terrains, terrains.seeds)]
-        unhashed = policy if controller_hash(policy) is None else None
-        of_genes = [space_identity(terrains.space)] if terrains.terrains.ndim == 2 else []
-        identity = [*self._common, unhashed, controller_hash(policy), *parts, *of_genes]
-        digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()
-        return self.folder / f"{terrains.name}-{digest[:24]}.npz"
+        return self._kept(policy, terrains).file
 
     def read(self, policy: str, terrains: TerrainSet) -> RolloutResult | None:
-        """Crossings that are kept; None if there are none, or their file is damaged, which is said."""
-        file = self.file(policy, terrains)
-        if not file.is_file():
+        """Crossings that are kept; None if there are none, or their file is damaged, which it prints."""
+        kept = self._kept(policy, terrains)
+        found: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in kept.read().items()}
+        if not found:
             return None
-        try:
-            check_zip(file)
-            with np.load(file, allow_pickle=False) as content:
-                found: dict[str, Any] = {name: content[name] for name in _FIELDS if name != "reward" or name in content}
-            found["penalty_names"] = tuple(found["penalty_names"].tolist())
-            numbers = {
-                name: value.item() for name, value in found.items() if isinstance(value, np.ndarray) and not value.ndim
-            }
-            result = RolloutResult(**found | numbers)
-            # Bits that flipped before they were written have no checksum.
-            if flaw := flaw_of(result, len(terrains), self._episodes):
-                raise ValueError(flaw)
-            return result
-        except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
-            print(f"{file} is damaged ({' '.join(str(error).split())}): its terrains are crossed again", flush=True)
+        if missing := set(_FIELDS) - {"reward"} - found.keys():
+            kept.damaged(f"no {', '.join(sorted(missing))}")
             return None
+        found["penalty_names"] = tuple(found["penalty_names"].tolist())
+        result = RolloutResult(**found)
+        # Bits that flipped before they were written have no checksum.
+        if flaw := flaw_of(result, len(terrains), self._evaluator.num_replicas):
+            kept.damaged(flaw)
+            return None
+        return result
 
     def write(self, policy: str, terrains: TerrainSet, result: RolloutResult) -> None:
-        """Keep crossings.
+        """Keeps crossings.
 
         Raises:
             OSError: If they cannot be written.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
-        buffer = io.BytesIO()
         values = {name: getattr(result, name) for name in _FIELDS}
-        content: dict[str, Any] = {name: np.asarray(value) for name, value in values.items() if value is not None}
-        np.savez_compressed(buffer, **content)
-        write_atomically(self.file(policy, terrains), buffer.getvalue())
+        self._kept(policy, terrains).write(**{name: np.asarray(v) for name, v in values.items() if v is not None})
 
 
 def cross_all(
@@ -183,6 +161,7 @@ def _cross(evaluate: Evaluate, terrains: TerrainSet, num_replicas: int, bar: tqd
 
 def _line(who: str, terrains: TerrainSet, result: RolloutResult) -> str:
     rates = {name: values[~np.isnan(values)] for name, values in terrain_rates(result).items()}
-    said = ", ".join(f"{name} {rates[name].mean():.3f}" for name in ("success", "goal") if len(rates[name]))
+    words = {"goal": "goal", "success": "no base collision"}
+    said = ", ".join(f"{what} {rates[name].mean():.3f}" for name, what in words.items() if len(rates[name]))
     size = f"{len(terrains)} terrains x {result.outcome.shape[1]} episodes in {result.wall_s:.0f} s"
     return f"{who} on {terrains.name}: {said or 'all terrains invalid'} ({size})"

@@ -10,10 +10,10 @@ from sim.files.settings import check, setting
 
 @dataclass(frozen=True, kw_only=True)
 class Distances(OfRobot, InSpace):
-    """Say how far test terrains lie from the nearest elite trained on: RMS of the heights' differences [m].
+    """Measure how far test terrains lie from the nearest elite trained on: RMS of the heights' differences [m].
 
     Elites of one archive descend from each other, and a held-out one may be a near copy of one that was trained on.
-    What a rate on held-out elites says of other terrains depends on that.
+    Then a rate on held-out elites says little of other terrains.
     """
 
     archive: Path | None = None

@@ -29,30 +29,31 @@ _SMALL = (24, 4)  # on a machine without a GPU
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Who, OnGround, Where):
-    """Rates of one controller by terrain type and level or on a pack, or the paper's tables of several.
+    """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
-    Rates say how often the controller gets through, and its velocity error on flat ground. With --policies, --archive
-    or --sets it makes tables: any controllers on the same hand-crafted, hard-random and held-out generated terrains,
-    with rewards, penalties and intervals. Tables that were killed go on by the same command. With --pack it says what
-    of a pack of faults a controller fails.
+    Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
+    --policies, --archive or --sets the command makes tables: any controllers on the same hand-crafted, hard-random and
+    held-out generated terrains, with rewards, penalties and intervals. After a kill the same command goes on. With
+    --pack it says which terrains of a pack of faults a controller fails.
     """
 
     pack: str | None = None
     """Pack of faults that the controller is tested on: a folder that `faultline pack` made, or anymal or cassie for the
     published one. --terrains takes the first of it; all on CUDA."""
     policies: tuple[str, ...] = ()
-    """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped; the first
-    is the one that the others are held against; base=shipped. C-G, C-G@1, C-G@2 are one kind of several seeds, whose
-    mean is shown too."""
+    """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped. The
+    others are compared with the first. base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind;
+    their mean is shown too."""
     archive: Path | None = None
     """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
     split_seed: int = setting(0, least=0)
-    """Which elites are held out: what the fine-tuning was told."""
+    """Which elites are held out. Give the number that the fine-tuning was given."""
     space: str | None = None
     """Terrain space of the hard-random terrains: super_gaussian, course, or file.py:CLASS; super_gaussian if left out.
-    An archive of a space of one's own needs that named here."""
+    If the archive is of a space of your own, name it here."""
     sets: tuple[str, ...] = ()
-    """Sets of the tables: hand_crafted, hard_random and, of an archive, generated and generated_far; all there are."""
+    """Sets of the tables: hand_crafted, hard_random and, with an archive, generated and generated_far. All of them if
+    left out."""
     terrains: int | None = setting(None, least=1)
     """Terrains a set; 300 on CUDA (tables of Cassie: 180), 24 on the CPU."""
     episodes: int | None = setting(None, least=1)
@@ -60,11 +61,11 @@ class Evaluate(Who, OnGround, Where):
     seed: int = setting(0, least=0)
     """Draws other test sets."""
     out: Path | None = None
-    """Where to write the numbers: runs/<robot>-rates.json, of another controller than the shipped
-    runs/<robot>-<its name>-rates.json, of a pack -pack.json, its figure beside as .png; tables RUN_DIR/tables.json,
-    their figure likewise."""
+    """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
+    runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables RUN_DIR/tables.json. A figure of a pack or
+    of tables is written beside it as .png."""
     run_dir: Path | None = None
-    """Where tables keep what is crossed, so that they can go on; runs/<robot>-tables."""
+    """Folder in which tables keep crossings, so that they can go on; runs/<robot>-tables."""
 
     @property
     def makes_tables(self) -> bool:
@@ -75,7 +76,7 @@ class Evaluate(Who, OnGround, Where):
         """Evaluates.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
         """
         if self.pack is not None:
             from train.evaluate.pack import evaluate_pack
@@ -135,7 +136,7 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     """Rates of one controller: print the table, write the file; returns its content.
 
     Raises:
-        ValueError: If something asked for cannot be had; raised before any long work.
+        ValueError: If a flag's value cannot be used; raised before any long work.
     """
     from sim.robots.robot import get_robot
     from train.evaluate.measures import VELOCITY_FROM_S, base_rates
@@ -165,7 +166,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
         open_evaluator: Opens what crosses terrains.
 
     Raises:
-        ValueError: If something asked for cannot be had; raised before any long work.
+        ValueError: If a flag's value cannot be used; raised before any long work.
         FileNotFoundError: If there is no archive; likewise.
         EvaluatorError: If a worker is lost; what was crossed is kept.
     """

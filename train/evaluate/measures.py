@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.fitness import MAX_INVALID_SHARE
 from qd.run.progress import share_bar
 from qd.workers.evaluator import Evaluate
 from qd.workers.invalid import tell_invalid
 from sim.files.intervals import bootstrap_interval
+from sim.rates import counted_episodes, terrain_means
 from sim.rollout import RolloutResult
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import CROSSING_TYPES
@@ -64,33 +64,14 @@ def invalid_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
             success = 1.0 - (counts["base_collision"] + count) / total
             lines.append(
                 f"{what}: {count} of {total} episodes are invalid ({count / total:.1%}) and left out; counted as "
-                f"failures, success would be {success:.3f}, goal {goal:.3f}"
+                f"failures, goal would be {goal:.3f}, no base collision {success:.3f}"
             )
     return lines
 
 
-def valid_episodes(result: RolloutResult) -> NDArray[np.bool_]:
-    """Episodes that count, shape (T, R): not invalid, and not on a terrain more than a quarter of whose are."""
-    valid = ~result.invalid
-    usable = valid.sum(axis=1) >= (1.0 - MAX_INVALID_SHARE) * valid.shape[1]
-    return valid & usable[:, None]
-
-
-def terrain_means(values: NDArray, counted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Mean over the episodes that count, shape (T,); NaN where there are none.
-
-    Args:
-        values: Of each episode, shape (T, R).
-        counted: Which episodes count, shape (T, R).
-    """
-    sums = np.where(counted, values, 0.0).sum(axis=1)
-    counts = counted.sum(axis=1)
-    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
-
-
 def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
     """``success`` (no base collision), ``goal`` and ``fallen`` rate of each terrain, shape (T,); NaN if invalid."""
-    counted = valid_episodes(result)
+    counted = counted_episodes(result.invalid)
     hits = {"success": ~result.base_collision, "goal": result.reached_goal, "fallen": result.fallen}
     return {name: terrain_means(hit, counted) for name, hit in hits.items()}
 
@@ -116,7 +97,7 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
         raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")
     if len(scales) != len(result.penalty_names):
         raise ValueError(f"scales must be one a penalty {result.penalty_names}, got {len(scales)}")
-    counted = valid_episodes(result)
+    counted = counted_episodes(result.invalid)
     names = zip(result.penalty_names, scales, strict=True)
     return Measured(
         values={**terrain_rates(result), "reward": terrain_means(result.reward, counted)},

@@ -41,21 +41,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class MakePack(Who, InSpace, Where):
-    """Make a pack of terrains from a run: faults and near-faults, on which any controller can be tested.
+    """Make a pack of terrains from a run: faults and near-faults, to test any controller on.
 
-    The terrains are spread over the ways in which the searched controller fails and over families of kin, faults first;
-    minimal terrains of the run are among them. Every controller crosses each of them. pack.npz has the terrains,
-    pack.json what is known of each and the rates, pack.png some of them. The run needs fresh episodes, confirmations
-    and certificates. What is crossed is kept, so the same command goes on after Ctrl-C.
+    The terrains are spread over the ways in which the searched controller fails and over families of kin. Faults come
+    first, and minimal terrains of the run are among them. Every controller crosses each terrain. pack.npz has the
+    terrains. pack.json has the rates and what is known of each terrain. pack.png shows some of them. The run needs
+    fresh episodes, confirmations and certificates. Crossings are kept, so the same command goes on after Ctrl-C.
     """
 
     run: Path | None = None
     """Run directory; the newest of the robot under runs/."""
     size: int = setting(100, least=1)
-    """Terrains; fewer where the run has fewer faults and near-faults."""
+    """How many terrains. There are fewer if the run has fewer faults and near-faults."""
     controllers: tuple[str, ...] = ()
-    """Who crosses them: NAME=FILE each, as --policy takes it. If left out, the shipped one as base and all of
-    results/<robot>/*.pt and its panel. The searched controller is always among them."""
+    """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base, all of
+    results/<robot>/*.pt, and the robot's panel. The searched controller is always among them."""
     episodes: int = setting(EPISODES, least=1)
     """Episodes on each terrain."""
     seed: int = setting(0, least=0)
@@ -252,15 +252,15 @@ def _tell_choice(candidates: Candidates, count: int, size: int, path: Path) -> N
     Raises:
         ValueError: If there is none.
     """
-    rest = f"{candidates.not_passable:,} more fail that nobody is known to cross"
+    rest = f"failing terrains that nobody is known to cross: {candidates.not_passable:,}"
     if not count:
         raise ValueError(
             f"{path} must have faults or near-faults to make a pack of, got none, and {rest}: let its search go on, or "
             "certify with more controllers (`faultline certify --by NAME=FILE`)"
         )
-    if count < size:
-        print(f"{path} has {count:,} faults and near-faults, {size:,} were asked for: the pack has {count:,}.")
-    print(f"{count:,} of {len(candidates.terrains):,} terrains are taken; {rest} and are left out.", flush=True)
+    told = f"Faults and near-faults in {path}: {len(candidates.terrains):,}, of which the pack has {count:,}"
+    print(f"{told}, {size:,} were asked for." if count < size else f"{told}.")
+    print(f"Left out, {rest}.", flush=True)
 
 
 def _kept(robot: "RobotCfg") -> Path:

@@ -7,8 +7,9 @@ import numpy as np
 
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.intervals import bootstrap_interval, wilson_interval
+from sim.rates import counted_episodes
 from sim.rollout import RolloutResult
-from train.evaluate.measures import terrain_rates, valid_episodes
+from train.evaluate.measures import terrain_rates
 
 GROUPS = ("verdict", "mode", "cause", "kind")
 """What terrains are grouped by."""
@@ -19,7 +20,7 @@ Row = dict[str, Any]
 
 def rows_of(result: RolloutResult) -> list[Row]:
     """What crossings say of each terrain: rates, the goal rate with its interval (Wilson), and valid episodes."""
-    counted, rates = valid_episodes(result), terrain_rates(result)
+    counted, rates = counted_episodes(result.invalid), terrain_rates(result)
     hits, valid = (result.reached_goal & counted).sum(axis=1).tolist(), counted.sum(axis=1).tolist()
     return [
         {f"{name}_rate": None if np.isnan(values[place]) else float(values[place]) for name, values in rates.items()}

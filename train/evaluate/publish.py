@@ -75,7 +75,7 @@ class Tables:
     results: Path = Path("results")
     """Where the results are."""
     page: Path = PAGE
-    """File that holds the lines `<!-- numbers: begin -->` and `<!-- numbers: end -->`; between them is replaced."""
+    """File with the lines `<!-- numbers: begin -->` and `<!-- numbers: end -->`. The text between them is replaced."""
     check: bool = False
     """Write nothing; fail if the file says something else than the results."""
 
@@ -179,12 +179,19 @@ def _tables(found: dict[str, Any], robot: str) -> str:
         count = found["terrains"].get(name)
         for who in firsts(found["success"].get(name, {})):
             kind = kind_of(who)
-            cells = [_rate(found, measure, name, who) for measure in ("success", "goal")]
+            cells = [_rate(found, measure, name, who) for measure in ("goal", "success")]
             reward = _rate(found, "reward", name, who, ".1f")
             theirs = [paper.get(measure, {}).get(name, {}).get(kind) for measure in ("success", "reward")]
             beside = _NONE if None in theirs else f"{theirs[0]:.3f}, {theirs[1]:.1f}"
             rows.append((f"{label} ({count})", kind, *cells, reward, beside))
-    header = ("terrains", "controller", "success (95 %)", "goal (95 %)", "reward (95 %)", "paper: success, reward")
+    header = (
+        "terrains",
+        "controller",
+        "goal (95 %)",
+        "no base collision (95 %)",
+        "reward (95 %)",
+        "paper: success, reward",
+    )
     about = found["archive"]
     where = f"; elites of the archive after {about['iterations']:,} iterations" if about else ""
     title = f"In brackets the terrains of a set; {found['episodes']} episodes each{where}."

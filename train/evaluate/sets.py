@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.families import rms_distances
+from qd.families import families_of, rms_distances
 from qd.run.directory import directory_of
 from sim.bank import heights_of
 from sim.files.atomic import read_json
@@ -77,6 +77,8 @@ class TerrainSet:
     """Level of each hand-crafted terrain, likewise."""
     space: str = SUPER_GAUSSIAN.name
     """Terrain space of genes, as :func:`sim.space.load_space` takes it."""
+    families: NDArray[np.int64] | None = None
+    """Number of each elite's family (:func:`qd.families.families_of`), shape (T,); None of independent terrains."""
 
     def __len__(self) -> int:
         """Number of terrains."""
@@ -163,11 +165,11 @@ def plain_set(name: str, count: int, seed: int, space: TerrainSpace = SUPER_GAUS
 def generated_set(archive: Archive, split: EliteSplit, count: int, seed: int) -> TerrainSet:
     """Held-out elites: the first ``count`` drawn, or all of them; ``seed`` is that of their episodes."""
     seeds = set_rng("generated", seed).integers(2**32, size=len(split.test), dtype=np.uint32)
-    rows = split.test[:count]
-    space = space_of(archive).name
+    rows, space = split.test[:count], space_of(archive)
     return TerrainSet(
-        name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows, space=space
-    )
+        name="generated", terrains=archive.genes[rows], seeds=seeds[: len(rows)], numbers=rows, space=space.name,
+        families=families_of(archive.genes[rows], space),
+    )  # fmt: skip
 
 
 def space_of(archive: Archive) -> TerrainSpace:
@@ -188,8 +190,9 @@ def far_part(distance: NDArray[np.float64]) -> NDArray[np.int64]:
 def part_of(whole: TerrainSet, places: NDArray[np.int64], name: str) -> TerrainSet:
     """Some of a set's terrains under a name of their own; their episodes are the same."""
     return replace(
-        whole, name=name, terrains=whole.terrains[places], seeds=whole.seeds[places], numbers=whole.numbers[places]
-    )
+        whole, name=name, terrains=whole.terrains[places], seeds=whole.seeds[places], numbers=whole.numbers[places],
+        families=None if whole.families is None else whole.families[places],
+    )  # fmt: skip
 
 
 def nearest_distance(

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_FORMS = {"success": ".3f", "goal": ".3f", "fallen": ".3f", "reward": ".1f"}
+_FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
+_WORDS = {"goal": "goal", "success": "no base collision", "fallen": "fallen", "reward": "reward"}
+"""Measures in words: no base collision is what the paper calls success."""
 SET_LABELS = {
     "hand_crafted": "hand-crafted",
     "hard_random": "hard-random",
@@ -30,8 +32,8 @@ SET_LABELS = {
 """Sets as axis labels."""
 
 _PANELS = {
-    "success": ("success: no base collision\n[% of episodes]", 100.0),
     "goal": ("goal reached\n[% of episodes]", 100.0),
+    "success": ("no base collision\n[% of episodes]", 100.0),
     "reward": ("training reward\n[sum over 20 s]", 1.0),
 }
 # Okabe and Ito's colours, apart for every kind of colour blindness; markers tell them apart in grey too.
@@ -44,16 +46,16 @@ _PAPER_LABEL = "of that name in the paper"
 
 def print_rates(report: dict[str, Any]) -> None:
     """Prints the rates of one controller, as ``base.json`` has them."""
-    print(f"{'':<24}{'success':>24}{'goal':>24}{'fallen':>8}{'terrains':>10}")
+    print(f"{'':<24}{'goal':>24}{_WORDS['success']:>24}{'fallen':>8}{'terrains':>10}")
     for name in ("hand_crafted", "hard_random"):
         rows = {name: report[name]}
         for group in ("by_type", "by_level"):
             prefix = "level " if group == "by_level" else ""
             rows |= {f"  {prefix}{key}": value for key, value in (report[name][group] or {}).items()}
         for label, row in rows.items():
-            success, goal = (value_words(row[f"{key}_rate"], row.get(f"{key}_interval")) for key in ("success", "goal"))
+            goal, success = (value_words(row[f"{key}_rate"], row.get(f"{key}_interval")) for key in ("goal", "success"))
             fallen = value_words(row["fallen_rate"], None)
-            print(f"{label:<24}{success:>24}{goal:>24}{fallen:>8}{row['terrains']:>10}")
+            print(f"{label:<24}{goal:>24}{success:>24}{fallen:>8}{row['terrains']:>10}")
     error = value_words(report["flat"]["vx_error_mean"], None)
     print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
     for line in invalid_lines({name: report[name]["outcomes"] for name in ("hand_crafted", "hard_random")}):
@@ -71,7 +73,7 @@ def print_tables(report: dict[str, Any]) -> None:
     for name in report["success"]:
         _print_set(report, name, wide)
     if report["paper"] is not None:
-        print("paper: its success rate and reward, where it has a controller of that name")
+        print("paper: its success rate, which is no base collision, and reward, where it has a controller of that name")
     _print_over_seeds(report["over_seeds"])
     _print_penalties(report, wide)
     _print_differences(report)
@@ -84,7 +86,7 @@ def print_tables(report: dict[str, Any]) -> None:
 
 def _print_set(report: dict[str, Any], name: str, wide: int) -> None:
     print(f"\n{name}: {report['terrains'][name]} terrains x {report['episodes']} episodes")
-    print(_row("", (*_FORMS, "paper"), wide, 24))
+    print(_row("", (*map(_WORDS.__getitem__, _FORMS), "paper"), wide, 24))
     for who in report["success"][name]:
         cells = [
             value_words(report[measure][name][who], report["intervals"][measure][name][who], form)
@@ -133,10 +135,10 @@ def _print_traversable(name: str, groups: dict[str, Any], wide: int) -> None:
         group = groups[key]
         print(f"\n{name}: {group['count']} terrains {label}")
         if group["count"]:
-            print(_row("", _FORMS, wide, 12))
+            print(_row("", map(_WORDS.__getitem__, _FORMS), wide, 18))
             for who in group["success"]:
                 cells = (value_words(group[measure][who], None, form) for measure, form in _FORMS.items())
-                print(_row(who, cells, wide, 12))
+                print(_row(who, cells, wide, 18))
 
 
 def _print_over_seeds(found: dict[str, Any]) -> None:
@@ -147,7 +149,10 @@ def _print_over_seeds(found: dict[str, Any]) -> None:
     for name in next(iter(found.values())):
         for kind in found[next(iter(found))][name]:
             each = {measure: rows[name][kind] for measure, rows in found.items()}
-            words = (f"{measure} {value_words(one['mean'], one['interval'])}" for measure, one in each.items())
+            words = (
+                f"{_WORDS.get(measure, measure)} {value_words(one['mean'], one['interval'])}"
+                for measure, one in each.items()
+            )
             print(f"  {name}, {kind}: " + ", ".join(words))
 
 
@@ -190,7 +195,7 @@ def print_pack_test(report: dict[str, Any], folder: Path) -> None:
 
 def _print_rates_of(rows: Mapping[str, dict[str, Any]]) -> None:
     wide = max(12, *(len(who) + 2 for who in rows))
-    print(f"{'':<{wide}}{'goal':>24}{'success':>24}{'fallen':>24}{'failed':>8}{'of':>5}")
+    print(f"{'':<{wide}}{'goal':>24}{_WORDS['success']:>24}{'fallen':>24}{'failed':>8}{'of':>5}")
     for who, row in rows.items():
         rates = (value_words(row[f"{name}_rate"], row[f"{name}_interval"]) for name in ("goal", "success", "fallen"))
         print(f"{who:<{wide}}{''.join(f'{words:>24}' for words in rates)}{row['failing']:>8}{row['terrains']:>5}")
@@ -245,7 +250,7 @@ def picture_of(report: dict[str, Any]) -> bytes:
 
 
 def draw_tables(report: dict[str, Any]) -> "Figure":
-    """Success, goal rate and reward of every controller by set with 95 % intervals, and what became of terrains."""
+    """Goal rate, no base collision and reward of controllers by set, with intervals, and what became of terrains."""
     pairs = _pairs_from_first(report)
     figure = new_figure(*((11.5, 8.0) if pairs else (13.0, 4.2)))
     panels = np.ravel(figure.subplots(2, 2) if pairs else figure.subplots(1, 3))
@@ -257,8 +262,8 @@ def draw_tables(report: dict[str, Any]) -> "Figure":
     sizes = "; ".join(f"{_on_one_line(name)}: {count}" for name, count in report["terrains"].items())
     title = f"{report['robot']}: {report['episodes']} episodes on each terrain, 95 % intervals over terrains"
     figure.suptitle(f"{title}\nterrains: {sizes}", fontsize=11)
-    handles, labels = panels[0].get_legend_handles_labels()
-    entries = dict(zip(labels, handles, strict=True))
+    found = [axes.get_legend_handles_labels() for axes in panels[: len(_PANELS)]]
+    entries = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}
     if _PAPER_LABEL in entries:  # once, and last
         entries[_PAPER_LABEL] = entries.pop(_PAPER_LABEL)
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=8, frameon=False)
@@ -323,7 +328,7 @@ def _draw_changes(axes: "Axes", report: dict[str, Any], pairs: Sequence[str]) ->
     axes.set_yticks(places, [pair.partition(" -> ")[2] for _, pair in rows], fontsize=8)
     axes.set_ylim(max(places) + 0.7, -0.7)
     axes.set_xlabel(
-        f"failed terrains, held against {first} [% of terrains]\n(under half of the episodes reach the goal)"
+        f"failed terrains, compared with {first} [% of terrains]\n(under half of the episodes reach the goal)"
     )
     axes.set_xlim(left=0)
     axes.legend(frameon=False, fontsize=8, loc="best")

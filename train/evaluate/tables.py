@@ -1,7 +1,7 @@
 """The tables of the paper: every controller on every set, with intervals, and what that says of the terrains.
 
 All numbers are means over the terrains of a set, each the mean over its valid episodes; intervals are 95 %, bootstrap
-over terrains, with the same resamples for every controller.
+over terrains, of elites over families of kin, with the same resamples for every controller.
 
 A controller *fails* a terrain if fewer than half of its valid episodes there reach the goal; an episode with a base
 collision does not. Of two controllers, a terrain is then *mended* (the first fails, the second does not), *still
@@ -45,20 +45,22 @@ def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCf
         (:func:`differences`); ``traversable`` by generated set (:func:`split_by_goal`); ``terrains``: set ->
         number of terrains; ``paper``: the paper's numbers likewise, None of a robot it has none of; ``reward_weights``.
     """
-    means = _statistics(crossed, _mean)
+    means, families = _statistics(crossed, lambda _, values: _mean(values)), _families(sets)
     return {
         **means,
         "over_seeds": over_seeds(means, MEASURES),
-        "intervals": _statistics(crossed, lambda values: _interval(values, seed)),
+        "intervals": _statistics(crossed, lambda name, values: _interval(values, seed, families[name])),
         "terrains": {name: len(chosen) for name, chosen in sets.items()},
         "outcomes": _by_controller(crossed, lambda one: one.outcomes),
         "invalid_terrains": _by_controller(crossed, lambda one: int((~one.valid).sum())),
         "differences": {
-            name: differences({who: row[who] for who in firsts(row)}, sets[name].numbers, seed)
+            name: differences({who: row[who] for who in firsts(row)}, sets[name].numbers, seed, families[name])
             for name, row in crossed.items()
         },
         "traversable": {
-            name: split_by_goal(row, sets[name].numbers, seed) for name, row in crossed.items() if name in FROM_ARCHIVE
+            name: split_by_goal(row, sets[name].numbers, seed, families[name])
+            for name, row in crossed.items()
+            if name in FROM_ARCHIVE
         },
         "paper": published(robot.name),
         "reward_weights": {
@@ -68,7 +70,16 @@ def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCf
     }
 
 
-def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed: int) -> dict[str, Any]:
+Families = NDArray[np.int64] | None
+
+
+def _families(sets: Mapping[str, TerrainSet]) -> dict[str, Families]:
+    return {name: chosen.families for name, chosen in sets.items()}
+
+
+def split_by_goal(
+    row: Mapping[str, Measured], numbers: NDArray[np.int64], seed: int, families: Families = None
+) -> dict[str, Any]:
     """Terrains that any of the controllers crossed, and those that none did: the search may ask for what nobody can.
 
     A terrain counts as crossed if at least one episode of one controller reached the goal. With more or better
@@ -78,6 +89,7 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
         row: What each controller made of T terrains.
         numbers: Number of each terrain, shape (T,).
         seed: Of the bootstrap over terrains.
+        families: Of terrains that are not independent, shape (T,).
 
     Returns:
         ``crossed`` and ``never_crossed``: their ``count``, ``share`` with ``interval``, numbers as ``terrains``, and
@@ -89,16 +101,19 @@ def split_by_goal(row: Mapping[str, Measured], numbers: NDArray[np.int64], seed:
     found = {}
     for name, member in (("crossed", ever & judged), ("never_crossed", ~ever & judged)):
         found[name] = {
-            **_counted(member, judged, numbers, seed),
+            **_counted(member, judged, numbers, seed, families),
             **{key: {who: _mean(one.values[key][member]) for who, one in row.items()} for key in MEASURES},
             "intervals": {
-                key: {who: _interval(one.values[key][member], seed) for who, one in row.items()} for key in MEASURES
+                key: {who: _interval(one.values[key][member], seed, _of(families, member)) for who, one in row.items()}
+                for key in MEASURES
             },
         }
     return found
 
 
-def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], seed: int) -> dict[str, Any]:
+def difference(
+    before: Measured, after: Measured, numbers: NDArray[np.int64], seed: int, families: Families = None
+) -> dict[str, Any]:
     """What became of each terrain from one controller to another, and what the second gains in the mean.
 
     Args:
@@ -106,6 +121,7 @@ def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], se
         after: What the second made of the same.
         numbers: Number of each terrain, shape (T,).
         seed: Of the bootstrap over terrains.
+        families: Of terrains that are not independent, shape (T,).
 
     Returns:
         As JSON values: ``compared`` terrains (valid for both); for each of :data:`KINDS` their ``count``, ``share``,
@@ -124,32 +140,39 @@ def difference(before: Measured, after: Measured, numbers: NDArray[np.int64], se
     apart = (limits[0][:, 1] < limits[1][:, 0]) | (limits[1][:, 1] < limits[0][:, 0])
     found: dict[str, Any] = {"compared": int(both.sum())}
     for kind, member in members.items():
-        found[kind] = _counted(member, both, numbers, seed)
+        found[kind] = _counted(member, both, numbers, seed, families)
         if kind in ("mended", "newly_broken"):
             found[kind]["clear"] = int((member & apart).sum())
     gains = {name: (after.values[name] - before.values[name])[both] for name in MEASURES}
     found["gain"] = {
-        name: {"mean": _mean(gain), "interval": bootstrap_interval(gain, seed)} for name, gain in gains.items()
+        name: {"mean": _mean(gain), "interval": _interval(gain, seed, _of(families, both))}
+        for name, gain in gains.items()
     }
     return found
 
 
-def differences(crossed: dict[str, Measured], numbers: NDArray[np.int64], seed: int) -> dict[str, Any]:
+def differences(
+    crossed: dict[str, Measured], numbers: NDArray[np.int64], seed: int, families: Families = None
+) -> dict[str, Any]:
     """:func:`difference` of every two controllers, the earlier named one first, under ``first -> second``."""
     return {
-        f"{first} -> {second}": difference(crossed[first], crossed[second], numbers, seed)
+        f"{first} -> {second}": difference(crossed[first], crossed[second], numbers, seed, families)
         for first, second in combinations(crossed, 2)
     }
 
 
 def _counted(
-    member: NDArray[np.bool_], among: NDArray[np.bool_], numbers: NDArray[np.int64], seed: int
+    member: NDArray[np.bool_],
+    among: NDArray[np.bool_],
+    numbers: NDArray[np.int64],
+    seed: int,
+    families: Families,
 ) -> dict[str, Any]:
     shares = member[among].astype(float)
     return {
         "count": int(member.sum()),
         "share": _mean(shares),
-        "interval": bootstrap_interval(shares, seed),
+        "interval": _interval(shares, seed, _of(families, among)),
         "terrains": np.sort(numbers[member]).tolist(),
     }
 
@@ -216,14 +239,16 @@ def _summary(values: list[float | None], *, is_rate: bool) -> dict[str, Any]:
     return {"mean": sum(numbers) / len(numbers), "interval": interval, "values": values}
 
 
-def _statistics(crossed: Crossed, of: Callable[[NDArray[np.float64]], Any]) -> dict[str, Any]:
-    """Each of the measures, and ``penalties``: set -> controller -> what ``of`` makes of the terrains' values."""
+def _statistics(crossed: Crossed, of: Callable[[str, NDArray[np.float64]], Any]) -> dict[str, Any]:
+    """Each of the measures, and ``penalties``: set -> controller -> what ``of`` makes of set and terrains' values."""
     tables: dict[str, Any] = {
-        name: _by_controller(crossed, lambda one, name=name: of(one.values[name])) for name in MEASURES
+        key: {name: {who: of(name, one.values[key]) for who, one in row.items()} for name, row in crossed.items()}
+        for key in MEASURES
     }
-    tables["penalties"] = _by_controller(
-        crossed, lambda one: {name: of(values) for name, values in one.penalties.items()}
-    )
+    tables["penalties"] = {
+        name: {who: {key: of(name, values) for key, values in one.penalties.items()} for who, one in row.items()}
+        for name, row in crossed.items()
+    }
     return tables
 
 
@@ -237,5 +262,10 @@ def _mean(values: NDArray[np.float64]) -> float | None:
     return float(kept.mean()) if len(kept) else None
 
 
-def _interval(values: NDArray[np.float64], seed: int) -> list[float] | None:
-    return bootstrap_interval(values[~np.isnan(values)], seed)
+def _of(families: Families, chosen: NDArray[np.bool_]) -> Families:
+    return None if families is None else families[chosen]
+
+
+def _interval(values: NDArray[np.float64], seed: int, families: Families) -> list[float] | None:
+    known = ~np.isnan(values)
+    return bootstrap_interval(values[known], seed, families=_of(families, known))

@@ -18,7 +18,7 @@ _ROBOT = "anymal"
 
 @dataclass(frozen=True, kw_only=True)
 class PpoCfg(PaceCfg):
-    """Settings of the learner; the defaults are legged_gym's but for the steps."""
+    """Settings of the learner; the defaults are legged_gym's, except the steps."""
 
     hidden_dims: tuple[int, ...] = setting((512, 256, 128), least=1)
     """Hidden layers (ELU) of actor and critic."""
@@ -63,8 +63,6 @@ def ppo_problems(cfg: PpoCfg, num_envs: int) -> list[str]:
             f"ppo.mini_batches must be at most half of the {num_envs} x {cfg.steps_per_env} transitions of an "
             f"iteration, got {cfg.mini_batches}"
         )
-    if cfg.final_share > 0.0 and cfg.final_kl > cfg.desired_kl:
-        found.append(f"ppo.final_kl must be at most ppo.desired_kl, {cfg.desired_kl}, got {cfg.final_kl}")
     return found
 
 
@@ -77,9 +75,9 @@ class TrainingFlags(OnDevice):
     robot: str = _ROBOT
     """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
     num_envs: int | None = setting(None, least=1)
-    """Robots trained at once, per process; left out, as many as suit robot and device."""
+    """Robots trained at once, per process. If left out, as many as suit robot and device."""
     iterations: int | None = setting(None, least=1)
-    """Iterations in all, those before a resume included; left out, as many as suit robot and device."""
+    """Iterations in all, with those before a resume. If left out, as many as suit robot and device."""
     max_seconds: float | None = setting(None, above=0.0)
     """Save and stop in time to be done this many seconds after the start."""
     run_dir: Path | None = None
@@ -94,7 +92,7 @@ class TrainingFlags(OnDevice):
     seed: int = setting(0, least=0)
     """Seed of everything drawn."""
     save_every_s: float = setting(60.0, least=0.0)
-    """A checkpoint every so often [s]."""
+    """Time between checkpoints [s]."""
     rows: int = setting(100, least=1)
     """Progress rows over the whole training."""
     ppo: PpoCfg = field(default_factory=PpoCfg)

@@ -162,15 +162,6 @@ class Learner:
             self.env.episode_length_buf = ages
         self._observations = self.env.get_observations()
 
-    def set_pace(self, iterations: int) -> None:
-        """Take the final settings once their share of all ``iterations`` begins; to be called before each."""
-        cfg = self.cfg
-        if cfg.final_share == 0.0:
-            return
-        final = self.iteration >= (1.0 - cfg.final_share) * iterations
-        desired_kl, entropy = (cfg.final_kl, cfg.final_entropy) if final else (cfg.desired_kl, cfg.entropy)
-        self.alg.set_pace(desired_kl, entropy)
-
     def iterate(self) -> Iteration:
         """Collect ``steps_per_env`` control steps of every environment, then update the networks.
 

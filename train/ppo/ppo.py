@@ -69,7 +69,6 @@ class CapturedPPO(PPO):
         on_cuda = torch.device(self.device).type == "cuda"
         self._lr = torch.tensor(float(self.learning_rate), device=self.device)
         self._actor_learns = torch.ones((), device=self.device)
-        self._kl, self._entropy_weight = self._lr.new_tensor(self.desired_kl), self._lr.new_tensor(self.entropy_coef)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=self._lr, fused=on_cuda or None, capturable=on_cuda)
         count = self.storage.num_envs * self.storage.num_transitions_per_env
@@ -79,11 +78,6 @@ class CapturedPPO(PPO):
         self._stream = torch.cuda.Stream(self.device) if on_cuda else None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._eager_steps = 0
-
-    def set_pace(self, desired_kl: float, entropy: float) -> None:
-        """From now on aim at another KL divergence, with another weight of the entropy bonus."""
-        self._kl.fill_(desired_kl)
-        self._entropy_weight.fill_(entropy)
 
     def let_actor_learn(self, learns: bool) -> None:
         """Whether updates change the actor; without, the critic alone learns, and the learning rate stays.
@@ -177,7 +171,7 @@ class CapturedPPO(PPO):
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
         value_loss = self._value_loss(observations)
-        actor_loss = surrogate_loss - self._entropy_weight * entropy
+        actor_loss = surrogate_loss - self.entropy_coef * entropy
         loss = self._actor_learns * actor_loss + self.value_loss_coef * value_loss
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -201,7 +195,7 @@ class CapturedPPO(PPO):
         if self.is_multi_gpu:
             torch.distributed.all_reduce(kl)
             kl = kl / self.gpu_world_size
-        lower = torch.where(kl > 2.0 * self._kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
+        lower = torch.where(kl > 2.0 * self.desired_kl, (self._lr / 1.5).clamp(min=1e-5), self._lr)
         higher = (self._lr * 1.5).clamp(max=1e-2)
-        adapted = torch.where((kl < 0.5 * self._kl) & (kl > 0.0), higher, lower)
+        adapted = torch.where((kl < 0.5 * self.desired_kl) & (kl > 0.0), higher, lower)
         self._lr.copy_(torch.where(self._actor_learns > 0.0, adapted, self._lr))

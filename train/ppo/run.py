@@ -260,7 +260,6 @@ class Training:
 
         while learner.ranks.all_want(wanted(), learner.env.device):
             self.before_iteration()
-            learner.set_pace(self.job.iterations)
             step = learner.iterate()
             if self.progress.warm:  # the first iteration compiles and is no measure
                 slowest = max(slowest, step.collection_s + step.learning_s)

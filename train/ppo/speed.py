@@ -34,7 +34,7 @@ class TrainSpeed(OfRobot, OnDevice):
         """Times what is asked for, prints it and writes the file.
 
         Raises:
-            ValueError: If something asked for cannot be had; raised before any long work.
+            ValueError: If a flag's value cannot be used; raised before any long work.
         """
         from sim.files.provenance import provenance
         from sim.robots.robot import get_robot

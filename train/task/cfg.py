@@ -46,7 +46,7 @@ class CurriculumCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskCfg(TrainingCfg):
-    """The task; the defaults are legged_gym's for ANYmal but for the start's yaw, which it leaves at 0."""
+    """The task; the defaults are legged_gym's for ANYmal, except the start's yaw, which is 0 there."""
 
     noise: NoiseCfg = field(default_factory=NoiseCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
@@ -57,7 +57,7 @@ class TaskCfg(TrainingCfg):
     """Where robots cross, they start up to so far along the way, uniformly [m]; the goal stays where it is."""
     episode_s: float = setting(20.0, above=0)
     command_interval_s: float = setting(10.0, above=0)
-    """A new command every so often."""
+    """Time between commands [s]."""
     lin_vel_x: tuple[float, float] = setting((-1.0, 1.0), rising=True)
     """Range of the commanded forward velocity [m/s]."""
     lin_vel_y: tuple[float, float] = setting((-1.0, 1.0), rising=True)
@@ -69,7 +69,7 @@ class TaskCfg(TrainingCfg):
     max_yaw_rate: float = setting(1.0, least=0)
     """Largest commanded yaw rate [rad/s]."""
     push_interval_s: float = setting(15.0, least=0)
-    """A push every so often; 0 for none."""
+    """Time between pushes [s]; 0 for none."""
     friction: tuple[float, float] = setting((0.5, 1.25), least=0, rising=True)
     """Range of the robots' friction coefficients."""
     start_position_range: float = setting(1.0, least=0)

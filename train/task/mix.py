@@ -31,8 +31,8 @@ class MixCfg:
     """The terrains of a fine-tuning."""
 
     mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
-    """What a controller is fine-tuned on, the paper's C-G, C-HR and C-HC: hand-crafted terrains and, but for the last,
-    half of the kind that it is named after."""
+    """What a controller is fine-tuned on, the paper's C-G, C-HR and C-HC: half hand-crafted terrains and half of the
+    kind that it is named after; the last has hand-crafted ones alone."""
     terrains: int = setting(500, least=1)
     """Terrains trained on at a time."""
     swap_every: int = setting(400, least=1)
@@ -66,7 +66,7 @@ class Mix:
 
     cfg: MixCfg
     genes: NDArray[np.float32]
-    """Elites to train on, shape (E, 64); none but for mix generated."""
+    """Elites to train on, shape (E, 64); none except with mix generated."""
     crosses: bool
     """Whether robots cross; else they are told velocities in the middle."""
     seed: int

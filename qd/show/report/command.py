@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from qd.run.directory import ROUNDS_FILE
 from qd.run.settings import own_policy
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.command import InSpace, OnDevice, Who, naming_what_is_next
+from sim.files.provenance import without_machine
 from sim.files.settings import check, setting
 from sim.policy.spec import spec_of
 
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 class Report(Who, OnDevice, InSpace):
     """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
 
-    Elites shown are crossed again for it, 20 times each. The crossings are kept under runs/recordings: the same
-    command, stopped or made again, goes on from there.
+    Robots cross the elites that it shows again, 20 times each. The crossings are kept under runs/recordings, so the
+    same command goes on after a stop.
     """
 
     run: Path | None = None
@@ -36,8 +37,11 @@ class Report(Who, OnDevice, InSpace):
     out: Path | None = None
     """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published; with another
     controller report-<its name>.html."""
+    format: Literal["html", "pdf"] = "html"
+    """pdf: a short form for print, *.pdf in place of *.html: what fails in which ways, and minimal terrains. A browser
+    prints it, Chromium or Chrome."""
     elites: int = setting(5, least=1, most=10)
-    """How many of the worst and of the most reproducible elites to show, beside one of each failure mode."""
+    """How many of the worst and of the most reproducible elites to show, with one of each failure mode."""
     episodes: int = setting(20, least=1, most=100)
     """Crossings of each elite shown."""
 
@@ -104,7 +108,7 @@ def _with_crossings(shown: "Shown", cross: "Cross | None") -> "Shown":
     try:
         changes = changes_of(material.tables, material.tables_file, material.robot)
     except ValueError as error:
-        return replace(shown, no_changes=str(error))
+        return replace(shown, no_changes=without_machine(str(error)))
     return replace(shown, changes=changes, pairs=_pairs(material, changes, recordings))
 
 
@@ -154,33 +158,49 @@ def _pairs(
     return dict(zip(changes.chosen, zip(found[::2], found[1::2], strict=True), strict=True))
 
 
-def _lead(material: "Material") -> str:
+def _lead(shown: "Shown") -> str:
     """What stands under the title; another controller than was searched is named here."""
-    lead = f"Made from {material.run} by faultline, which searches terrains that break a legged robot's controller."
+    from qd.show.report.search import lead_words
+
+    lead, material = lead_words(shown), shown.material
     if material.cfg.policy is not None:
-        return f"{lead} The crossings shown are of another controller than was searched: {material.policy}."
+        who = without_machine(material.policy)
+        return f"{lead} The crossings shown are of another controller than was searched: {who}."
     return lead
 
 
 def _write(shown: "Shown") -> Path:
     """Writes figures and page."""
     from qd.show.report import elites, evaluation, minimal, search
-    from qd.show.report.page import Section, publish_page
+    from qd.show.report.page import Section, publish_page, render
+    from qd.show.report.pdf import print_page
 
     material = shown.material
-    chapters = {
+    short = {
         ("What breaks the controller", "outcome"): search.outcome_section,
         ("The smallest terrains that still break it", "minimal"): minimal.minimal_section,
-        ("Terrains worth a look", "terrains"): elites.detail_section,
-        ("Modes", "modes"): elites.modes_section,
-        ("The search", "search"): search.curves_section,
-        ("The archive", "archive"): search.archive_section,
-        ("Shares against each other", "pairs"): search.pairs_section,
-        ("Controllers compared", "tables"): evaluation.tables_section,
-        ("The same terrain before and after", "before-after"): evaluation.before_after_section,
-        ("All elites", "all"): elites.all_section,
+        ("Failure modes", "modes"): elites.modes_section,
         ("Where this comes from", "origin"): search.origin_section,
     }
+    chapters = (
+        short
+        if material.cfg.format == "pdf"
+        else {
+            ("What breaks the controller", "outcome"): search.outcome_section,
+            ("The smallest terrains that still break it", "minimal"): minimal.minimal_section,
+            ("Terrains worth a look", "terrains"): elites.detail_section,
+            ("Failure modes", "modes"): elites.modes_section,
+            ("The search", "search"): search.curves_section,
+            ("The archive", "archive"): search.archive_section,
+            ("Controllers compared", "tables"): evaluation.tables_section,
+            ("All elites", "all"): elites.all_section,
+            ("Where this comes from", "origin"): search.origin_section,
+        }
+    )
     sections = [Section(*name, blocks) for name, make in chapters.items() if (blocks := make(shown))]
-    title = f"How {material.archive.robot} breaks: a search's report"
-    return publish_page(material.out, title, _lead(material), sections, remedy="show fewer --elites")
+    title = f"How {material.archive.robot} breaks"
+    if material.cfg.format == "pdf":
+        print_page(render(title, _lead(shown), sections), material.out)
+        print(f"Report: {material.out} (short form)")
+        return material.out
+    return publish_page(material.out, title, _lead(shown), sections, remedy="show fewer --elites")

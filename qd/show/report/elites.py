@@ -1,16 +1,21 @@
 """The page's chapters about elites: the failure modes, the worst and the steadiest one by one, and all in a table."""
 
+from collections.abc import Sequence
+
 from qd.elites import Elites
 from qd.faults import VERDICTS, elite_words
 from qd.modes import MAX_MODES, TOLERANCE, Mode
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
-from qd.show.crossing_figures import draw_crossing, draw_maps
+from qd.show.crossing_figures import draw_crossing
 from qd.show.figures import label_of, look_of
+from qd.show.ranking import mode_words
 from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
-from qd.show.report.page import Block, absent, counted, heading, paragraph, percent, picture, table
+from qd.show.report.page import Block, Cards, Folded, Picture, absent, counted, paragraph, percent, picture, table
 from sim.files.command import plain_command
 from sim.files.intervals import wilson_interval
+
+_MIN_PICTURED = 3  # terrains that the page begins with
 
 
 def anchor_of(number: int) -> str:
@@ -18,36 +23,85 @@ def anchor_of(number: int) -> str:
     return f"elite-{number}"
 
 
+def failures(shown: Shown) -> list[Block]:
+    """A picture of the worst terrain of each failure mode, and where these are few of some that are unlike them."""
+    elites, leaders = shown.elites, shown.ranking.leaders()
+    failing = [number for number in shown.worst if elites.failing[elites.place_of(number)]]
+    chosen = list(dict.fromkeys([*leaders, *failing]))[: max(_MIN_PICTURED, len(leaders))]
+    if not chosen:
+        return [paragraph("No elite fails: there is no failure mode to show.")]
+    labels = dict(zip(elites.numbers.tolist(), shown.modes.labels.tolist(), strict=True))
+    chosen.sort(key=lambda number: (number not in leaders, labels[number]))
+    cards, reason = [], shown.not_crossed
+    for number in chosen:
+        drawn, missing = _pictured(shown, number)
+        reason = reason or missing
+        cards.append((drawn, *_card_words(shown, number, more=number not in leaders), anchor_of(number)))
+    text = (
+        "The worst terrain of each failure mode, where the middle one of the robots that end as most do has ended; "
+        f"lines are the ways of all {shown.material.cfg.episodes}."
+    )
+    if reason:
+        text = f"The worst terrain of each failure mode from above. Where robots end on them is not shown. {reason}"
+    return [Cards(cards), paragraph(text)]
+
+
+def _pictured(shown: Shown, number: int) -> tuple[Picture, str]:
+    """A terrain with the robots on it if that can be had, else from above, and then why."""
+    from qd.show.report.rendered import rendered
+
+    material, crossed = shown.material, shown.crossed.get(number)
+    if crossed is not None and len(crossed.chosen):
+        scales = dict(zip(material.archive.penalties, material.archive.scales, strict=True))
+        shows = f"Elite {number} with the ways of {len(crossed.chosen)} robots"
+        try:
+            return Picture(f"failing-{number}.jpg", rendered(crossed, material.robot, scales), shows), ""
+        except ValueError as error:
+            return _relief(shown, number), str(error)
+    return _relief(shown, number), ""
+
+
+def _relief(shown: Shown, number: int) -> Picture:
+    content = shown.reliefs[shown.elites.place_of(number)]
+    return Picture(f"failing-{number}.jpg", content, f"Elite {number} from above, start left, goal right")
+
+
+def _card_words(shown: Shown, number: int, *, more: bool) -> tuple[str, str]:
+    """What stands below the picture of a failing terrain."""
+    elites, place = shown.elites, shown.elites.place_of(number)
+    mode = shown.ranking.mode_of(place)
+    assert mode is not None  # it fails
+    if more:
+        title, about = f"Mode {mode.number} too, another family", ""
+    else:
+        share = percent(mode.goal_rate)
+        title = f"Mode {mode.number}: {mode_words(mode)}"
+        about = f"{counted(len(mode.members), 'elite')} of {len(elites):,}; {share} of their robots reach the goal. "
+    crossed = shown.crossed.get(number)
+    if crossed is None or not len(crossed.chosen):
+        rate: object = Rate(elites.hits("goal_rate", place), int(elites.counted[place]))
+        ends = ""
+    else:
+        rate = crossed.rates[ARRIVED]
+        ends = "".join(f"; {label} {crossed.rates[label].hits}" for label in FAILED if crossed.rates[label].hits)
+    return title, f"{about}Elite {number}, {VERDICTS[int(elites.verdict[place])]}: goal reached {rate}{ends}."
+
+
 def modes_section(shown: Shown) -> list[Block]:
-    """The groups of elites, each with a typical terrain."""
+    """The groups of failing elites."""
     modes, elites = shown.modes, shown.elites
+    failing = int(elites.failing.sum())
+    if not modes.modes:
+        return [paragraph("No elite fails, so there is no failure mode.")]
     largest = max(modes.modes, key=lambda mode: len(mode.members))
     text = (
-        f"The {counted(len(elites), 'elite')} fall into {counted(len(modes.modes), 'mode')} by how the robot "
-        f"struggles and how its crossings end. The largest, mode {largest.number}, has {len(largest.members):,} "
-        f"({percent(len(largest.members) / len(elites))}): {_described(largest)}. "
-        f"{counted(sum(mode.failing for mode in modes.modes), 'mode is a failure mode', 'modes are failure modes')}: "
-        "under half of their robots reach the goal."
+        f"The {counted(failing, 'failing elite')} of {len(elites):,} fall into "
+        f"{counted(len(modes.modes), 'failure mode')} by how the robot struggles and how its crossings end. The "
+        f"largest, mode {largest.number}, has {len(largest.members):,} ({percent(len(largest.members) / failing)}): "
+        f"{_described(largest)}. {_how(shown)}"
     )
     shows = "Mean shares of the penalties and of the ends of crossings by group; silhouette by number of groups"
-    drawn = picture("modes", draw_modes(elites, modes), shows)
-    blocks = [paragraph(text), paragraph(_how(shown)), drawn, _modes_table(shown)]
-    typical = {
-        f"mode {mode.number}: elite {mode.typical}, {mode.ending}": shown.crossed[mode.typical]
-        for mode in modes.modes
-        if mode.typical in shown.crossed
-    }
-    if not typical:
-        return blocks
-    arrived = [shown.crossed[mode.typical].rates[ARRIVED] for mode in modes.modes]
-    reached = "; ".join(f"mode {mode.number}: {rate}" for mode, rate in zip(modes.modes, arrived, strict=True))
-    text = (
-        "A typical terrain of each, the elite nearest to all others of its mode, crossed again. Robots that reached "
-        f"the goal, with 95 % intervals: {reached}."
-    )
-    maps = draw_maps(typical, f"{shown.material.archive.robot}: a typical terrain of each mode")
-    shows = "Height map of a typical terrain of each mode with the robots' paths"
-    return [*blocks, paragraph(text), picture("modes-terrains", maps, shows)]
+    return [paragraph(text), picture("modes", draw_modes(elites, modes), shows), _modes_table(shown)]
 
 
 def _described(mode: Mode) -> str:
@@ -76,13 +130,14 @@ def _how(shown: Shown) -> str:
 
 
 def _modes_table(shown: Shown) -> str:
-    head = ["mode", "elites", "of all", "goal", "base collision", "neither", "fallen", "fitness",
+    head = ["mode", "elites", "of failing", "goal", "base collision", "neither", "fallen", "fitness",
             "share that stands out", "typical elite"]  # fmt: skip
+    failing = int(shown.elites.failing.sum())
     rows = [
         [
             f"{mode.number}: {mode.ending}",
             f"{len(mode.members):,}",
-            percent(len(mode.members) / len(shown.elites)),
+            percent(len(mode.members) / failing),
             *(percent(rate) for rate in (mode.goal_rate, mode.collision_rate, mode.other_rate, mode.fallen_rate)),
             f"{mode.fitness:.1f}",
             label_of(mode.marked_by),
@@ -90,12 +145,23 @@ def _modes_table(shown: Shown) -> str:
         ]
         for mode in shown.modes.modes
     ]
-    links = [anchor_of(mode.typical) if mode.typical in shown.crossed else "" for mode in shown.modes.modes]
-    return table(head, rows, links=links)
+    typical = [mode.typical for mode in shown.modes.modes]
+    links = [anchor_of(number) if number in shown.crossed else "" for number in typical]
+    return table(head, rows, links=links, opens=_opened(shown, typical))
+
+
+def _opened(shown: Shown, numbers: Sequence[int]) -> list[Picture]:
+    """What the rows of some elites open: their terrains from above."""
+    found = []
+    for number in numbers:
+        content = shown.reliefs[shown.elites.place_of(number)]
+        shows = f"Elite {number} from above, start yellow and goal green; blue is below the start's level, brown above."
+        found.append(Picture(f"elite-{number}.jpg", content, shows))
+    return found
 
 
 def detail_section(shown: Shown) -> list[Block]:
-    """The worst, the most reproducible and the typical elites, each with figure and numbers."""
+    """The worst and the most reproducible elites, each with figure and numbers."""
     if shown.not_crossed:
         return [absent(shown.not_crossed)]
     stubborn = sum(shown.crossed[number].rates[ARRIVED].hits == 0 for number in shown.worst)
@@ -105,7 +171,8 @@ def detail_section(shown: Shown) -> list[Block]:
         f"{stubborn} of the first {len(shown.worst)} no robot reached the goal. Scaled penalties: 1 is what a common "
         "one comes to on hard-random terrain."
     )
-    return [paragraph(text), *(block for number in shown.numbers for block in _elite(shown, number))]
+    first = shown.numbers[0]
+    return [paragraph(text), *(_elite(shown, number, opened=number == first) for number in shown.numbers)]
 
 
 def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
@@ -129,40 +196,40 @@ def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
     parts.append(
         f"terrains whose penalties vary least between episodes for their size, failed ones first ({_list(steady)})"
     )
-    return f"Shown are {'; '.join(parts)}; and a typical terrain of each mode."
+    return f"Shown are {'; '.join(parts)}."
 
 
 def _list(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers))
 
 
-def _elite(shown: Shown, number: int) -> list[Block]:
+def _elite(shown: Shown, number: int, *, opened: bool) -> Folded:
     """One elite: why it is shown, what became of it, figure and numbers."""
     crossed, archive = shown.crossed[number], shown.material.archive
     place = shown.elites.place_of(number)
-    failed = shown.elites.failing[place]
-    ranked = (("worst failed" if failed else "hard", shown.worst), ("most reproducible", shown.steady))
+    mode, verdict = shown.ranking.mode_of(place), VERDICTS[int(shown.elites.verdict[place])]
+    ranked = (("worst" if verdict else "hard", shown.worst), ("most reproducible", shown.steady))
     roles = [f"{what}, rank {numbers.index(number) + 1}" for what, numbers in ranked if number in numbers]
-    roles += [f"typical of mode {mode.number}" for mode in shown.modes.modes if mode.typical == number]
-    headed = heading(f"Elite {number}: {'; '.join(roles)}", anchor_of(number))
+    about = [verdict or "not failing", *([f"mode {mode.number}: {mode_words(mode)}"] if mode else [])]
+    words = f"Elite {number}: goal reached {crossed.rates[ARRIVED]}; {'; '.join([*about, *roles])}"
     if not len(crossed.chosen):
-        return [headed, absent("All its episodes were invalid this time: there is nothing to draw.")]
+        return Folded(words, [absent("All its episodes were invalid this time: there is nothing to draw.")])
     title = f"{archive.robot}, elite {number} of {len(archive):,}: {len(crossed.chosen)} crossings"
     drawn = picture(
         f"elite-{number}", draw_crossing(crossed, archive.penalties, title),
         f"Height map of elite {number} with the paths of {len(crossed.chosen)} robots, profile, and penalties",
     )  # fmt: skip
-    return [
-        headed,
-        paragraph(" ".join([_told(shown, crossed, place), *elite_words(archive, number)])),
-        paragraph(f"Its terrain: {'; '.join(shown.material.space.describe(archive.genes[number]).splitlines())}."),
+    blocks = [
+        paragraph(" ".join([_what_happened(shown, crossed, place), *elite_words(archive, number)])),
         drawn,
+        paragraph(f"Its terrain: {'; '.join(shown.material.space.describe(archive.genes[number]).splitlines())}."),
         _penalty_table(shown, crossed),
         _rate_table(crossed),
     ]
+    return Folded(words, blocks, anchor_of(number), opened)
 
 
-def _told(shown: Shown, crossed: Crossed, place: int) -> str:
+def _what_happened(shown: Shown, crossed: Crossed, place: int) -> str:
     """What became of the robots, in a sentence or two."""
     elites = shown.elites
     arrived = crossed.rates[ARRIVED]
@@ -225,17 +292,20 @@ def all_section(shown: Shown) -> list[Block]:
         judged = int(elites.verdict[k])
         shares, fitness, variation = elites.ratios[k].tolist(), elites.fitness[k], elites.variation[k]
         rows.append(
-            [f"{number}", goal, rate.limits, VERDICTS[judged], collision, fallen, f"{mode}", f"{family}",
+            [f"{number}", goal, rate.limits, VERDICTS[judged], collision, fallen, f"{mode or '-'}", f"{family}",
              f"{fitness:.2f}", f"{variation:.2f}", f"{found}", *(f"{100 * share:.0f}" for share in shares)]
         )  # fmt: skip
         low = wilson_interval(*rate)[0]
         values = [number, rates[0], low, judged, *rates[1:], mode, family, fitness, variation, found, *shares]
         keys.append([f"{value:.5g}" for value in values])
-    links = [anchor_of(number) if number in shown.crossed else "" for number in elites.numbers[order].tolist()]
+    numbers = elites.numbers[order].tolist()
+    links = [anchor_of(number) if number in shown.crossed else "" for number in numbers]
     again = plain_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
-    listed = table(head, rows, keys=keys, links=links, folded=f"Show {counted(len(rows), 'elite')}")
+    folded = f"Show {counted(len(rows), 'elite')}"
+    listed = table(head, rows, keys=keys, links=links, opens=_opened(shown, numbers), folded=folded)
     text = (
-        f"All {counted(len(rows), 'elite')}, faults first, then what fails most; a click on a heading sorts. Terrains "
-        f"of one family look alike. `{again}` crosses one again."
+        f"All {counted(len(rows), 'elite')}, faults first, then what fails most. A click on a heading sorts, one on a "
+        f"row opens a picture of the terrain, one on a number what is told of it above. Terrains of one family look "
+        f"alike. `{again}` crosses one again."
     )
     return [paragraph(text), listed]

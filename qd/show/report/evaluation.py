@@ -6,9 +6,10 @@ from typing import Any
 from qd.show.crossed import ARRIVED, FAILED, Crossed
 from qd.show.crossing_figures import draw_maps
 from qd.show.report.material import Shown
-from qd.show.report.page import Block, Picture, absent, counted, heading, paragraph, percent, picture, table
+from qd.show.report.page import Block, Folded, Picture, absent, counted, heading, paragraph, percent, picture, table
 from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, Change, Changes, by_kind
 from sim.files.command import plain_command
+from sim.files.provenance import without_machine
 
 _TRAINED_ON = {
     "C-HC": "hand-crafted terrains alone",
@@ -23,21 +24,23 @@ def tables_section(shown: Shown) -> list[Block]:
     """Controllers on the evaluation's sets."""
     tables = shown.material.tables
     if tables is None:
-        about = f"Left out: there are no evaluation tables at {shown.material.tables_file}. They are made by"
+        place = without_machine(str(shown.material.tables_file))
+        about = f"Left out: there are no evaluation tables at {place}. They are made by"
         return [absent(about, _command(shown))]
     kinds = by_kind(tables)
     return [
         paragraph(_told(tables, kinds)),
         *([paragraph(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
-        *_drawn(shown.material.tables_file.with_suffix(".png")),
         *(measure_table(kinds, measure) for measure in MEASURES),
-        *changes_tables(tables),
+        Folded("Show the figure", drawn) if (drawn := _drawn(shown.material.tables_file.with_suffix(".png"))) else "",
+        Folded("Show what became of terrains", changes) if (changes := changes_tables(tables)) else "",
+        *before_after(shown),
     ]
 
 
 def _drawn(figure: Path) -> list[Block]:
     """The figure that the evaluation drew beside its tables, if it is there."""
-    shows = "Success, goal rate and reward of every controller on every set, and what became of terrains"
+    shows = "Goal rate, no base collision and reward of every controller on every set, and what became of terrains"
     return [Picture("tables.png", figure.read_bytes(), shows)] if figure.exists() else []
 
 
@@ -106,8 +109,8 @@ def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     text += ", of several trainings that differ in their seed over these." if several else "."
     trained = [f"{who} on {what}" for who, what in _TRAINED_ON.items() if who in tables["controllers"]]
     text += (
-        " A robot that stands still or walks off has no base collision either: it may have 100 % there and never "
-        "reach the goal. Read the goal rate first."
+        " No base collision is what the paper calls success. A robot that stands still or walks off has none either: "
+        "it may have 100 % there and never reach the goal. Read the goal rate first."
     )
     return text + (f" By their names these are {first} trained further: {'; '.join(trained)}." if trained else "")
 
@@ -169,24 +172,27 @@ def changes_tables(tables: dict[str, Any]) -> list[Block]:
     return [*blocks, table(head, others, folded=f"Show {counted(len(others), 'other pair')}")] if others else blocks
 
 
-def before_after_section(shown: Shown) -> list[Block]:
+def before_after(shown: Shown) -> list[Block]:
     """Two controllers' paths on the same terrains; nothing without tables."""
     if shown.no_changes:
-        return [absent(f"Left out. {shown.no_changes} New tables are made by", _command(shown))]
+        told = f"The same terrain before and after is left out. {shown.no_changes} New tables are made by"
+        return [absent(told, _command(shown))]
     if shown.changes is None:
         return []
     introduced = paragraph(_introduced(shown, shown.changes))
-    return [introduced, *(block for pair in shown.pairs.items() for block in _change(shown, *pair))]
+    blocks = [introduced, *(block for pair in shown.pairs.items() for block in _change(shown, *pair))]
+    return [Folded("Show the same terrain before and after", blocks, "before-after")]
 
 
 def _introduced(shown: Shown, changes: Changes) -> str:
     """Who crosses what, and how to see it move."""
     change, policies = changes.chosen[0], changes.policies
-    files = " and ".join(f"{who} ({policy})" for who, policy in policies.items())
+    place = without_machine(str(changes.run))
+    files = " and ".join(f"{who} ({without_machine(policy)})" for who, policy in policies.items())
     view = plain_command("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
                         policies=[f"{who}={policy}" for who, policy in policies.items()])  # fmt: skip
     return (
-        f"{files} on elites held out of training, numbered as in {changes.run}: the worst of those mended, of those "
+        f"{files} on elites held out of training, numbered as in {place}: the worst of those mended, of those "
         f"newly broken and of those still failing, as far as there are such. `{view}` shows them walk."
     )
 

@@ -71,6 +71,11 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
 
 
 def _scatter(axes: "Axes", elites: Elites, modes: Modes, x: int, y: int) -> None:
+    if len(crossed := np.flatnonzero(modes.labels == 0)):
+        style = {"s": 8, "color": "0.75", "marker": ".", "linewidths": 0}
+        axes.scatter(
+            elites.ratios[crossed, x], elites.ratios[crossed, y], label=f"not failing ({len(crossed)})", **style
+        )
     for mode, (colour, marker) in zip(modes.modes, mode_looks(modes), strict=True):
         style = {"s": 12, "color": colour, "marker": marker, "alpha": 0.65, "linewidths": 0}
         label = f"{mode.number}: {mode.ending} ({len(mode.members)})"

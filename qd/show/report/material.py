@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +14,9 @@ from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
 from qd.show.elites import find_archive
 from qd.show.figures import summary
+from qd.show.minima import MinimalFound, read_minimal_numbers
 from qd.show.ranking import Ranking
-from qd.show.report.minimal import MinimalFound, read_minimal_numbers
+from qd.show.report.pdf import find_browser
 from qd.show.report.tables import Change, Changes, read_tables
 from sim.files.atomic import prepare_output
 from sim.files.command import command_line
@@ -107,9 +109,15 @@ class Shown:
 
     @property
     def numbers(self) -> list[int]:
-        """Elites to be shown in detail, each once: the worst, the steadiest, and the typical one of each mode."""
-        typical = [mode.typical for mode in self.modes.modes]
-        return list(dict.fromkeys([*self.ranking.leaders(), *self.worst, *self.steady, *typical]))
+        """Elites to be shown in detail, each once: the worst, one of each mode first, and the steadiest."""
+        return list(dict.fromkeys([*self.ranking.leaders(), *self.worst, *self.steady]))
+
+    @cached_property
+    def reliefs(self) -> list[bytes]:
+        """A small picture of each elite's terrain, by its row."""
+        from qd.show.report.relief import reliefs_of
+
+        return reliefs_of(self.material.archive.genes[self.elites.numbers], self.material.space)
 
 
 def gather(cfg: "Report") -> Material:
@@ -140,7 +148,7 @@ def gather(cfg: "Report") -> Material:
         cfg=cfg,
         robot=robot,
         run=run,
-        out=cfg.out or folder_for(run, robot.name) / f"report{suffix}.html",
+        out=cfg.out or folder_for(run, robot.name) / f"report{suffix}.{cfg.format}",
         archive=archive,
         metrics=_metrics_of(folder, archive, cfg),
         searched=searched,
@@ -152,7 +160,7 @@ def gather(cfg: "Report") -> Material:
         tables=read_tables(tables_file, robot) if has_tables else None,
         tables_file=tables_file,
     )
-    _check_out(material.out)
+    _check_out(material.out, cfg.format)
     return material
 
 
@@ -179,7 +187,10 @@ def _metrics_of(folder: RunDirectory, archive: Archive, cfg: "Report") -> Metric
     return rows[: archive.iterations]
 
 
-def _check_out(out: Path) -> None:
-    if out.suffix != ".html":
-        raise ValueError(f"out must be a file named *.html, got {out}: name for example {out / 'report.html'}")
+def _check_out(out: Path, ending: str) -> None:
+    if out.suffix != f".{ending}":
+        name = out / f"report.{ending}"
+        raise ValueError(f"out must be a file named *.{ending}, got {out}: name for example {name}")
+    if ending == "pdf":
+        find_browser()
     prepare_output(out)

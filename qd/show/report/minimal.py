@@ -1,73 +1,19 @@
-"""The page's chapter about minimal terrains, and what it reads: ``minimal.json`` and the genes in ``minimal.npz``."""
+"""The page's chapter about minimal terrains."""
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from qd.archive import Archive
-from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, read_minimal
+from qd.run.minimal_file import NUMBERS_FILE
 from qd.show.minimal_figure import draw_minimal
 from qd.show.report.page import Block, absent, counted, paragraph, percent, picture, table
-from sim.files.atomic import read_json
 from sim.files.command import plain_command
 
 if TYPE_CHECKING:
     from qd.show.report.material import Shown
 
-_ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "goal_interval", "cause", "margin_m")
 _ROWS = 12  # of a table that is not folded
-
-
-@dataclass(frozen=True, kw_only=True)
-class MinimalFound:
-    """Minimal terrains of elites that are in the archive."""
-
-    numbers: dict[str, Any]
-    """As ``minimal.json`` has them."""
-    genes: dict[int, NDArray[np.float32]]
-    """By number of the elite, each of shape (num_genes,)."""
-
-
-def read_minimal_numbers(folder: Path, archive: Archive) -> MinimalFound | None:
-    """The minimal terrains of a run; None where nobody looked for them, or of none of the archive's elites.
-
-    Args:
-        folder: Of the run.
-        archive: Its archive.
-
-    Raises:
-        ValueError: If a file is damaged, or the two are not of one another.
-    """
-    file = folder / NUMBERS_FILE
-    if not file.exists():
-        return None
-    numbers, genes = read_json(file), read_minimal(folder, archive).genes
-    entries = numbers.get("elites")
-    if not isinstance(entries, list) or not all(set(_ENTRY) <= set(entry) for entry in entries):
-        raise ValueError(f"{file} must hold minimal terrains, but it is damaged or another file: move it away")
-    if len(entries) != (0 if genes is None else len(genes)):
-        there = "no file" if genes is None else f"one of {len(genes)}"
-        raise ValueError(
-            f"{folder / MINIMAL_FILE} must hold the {counted(len(entries), 'minimal terrain')} of {NUMBERS_FILE}, got "
-            f"{there}: let `faultline minimise` write both again"
-        )
-    own = [place for place, entry in enumerate(entries) if _is_in(archive, entry)]
-    if not own or genes is None:
-        return None
-    kept = [entries[place] for place in own]
-    return MinimalFound(
-        numbers=numbers | {"elites": kept}, genes={entries[place]["elite"]: genes[place] for place in own}
-    )
-
-
-def _is_in(archive: Archive, entry: dict[str, Any]) -> bool:
-    """Whether an elite is still the one of that number; a search that went on may have found others."""
-    number = entry["elite"]
-    there = 0 <= number < len(archive)
-    return there and (archive.cell[number], archive.iteration[number]) == (entry["cell"], entry["iteration"])
+_PICTURED = 6  # terrains
 
 
 def minimal_section(shown: "Shown") -> list[Block]:
@@ -81,7 +27,7 @@ def minimal_section(shown: "Shown") -> list[Block]:
         return [absent(text, plain_command("minimise", robot=robot, run=run))]
     entries = found.numbers["elites"]
     shows = "How many parts failures take, by the kind of the cause, and minimal terrains from above"
-    drawn = draw_minimal(material.archive.robot, found.numbers, found.genes, material.space)
+    drawn = draw_minimal(material.archive.robot, found.numbers, found.genes, material.space, most=_PICTURED)
     return [paragraph(_told(entries)), picture("minimal", drawn, shows), _listed(entries)]
 
 

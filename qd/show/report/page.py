@@ -2,7 +2,7 @@
 
 import base64
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,16 +22,39 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 
 
 class Picture(NamedTuple):
-    """A figure: its PNG is in the page, and beside it under the same name."""
+    """A figure: it is in the page, and beside it under the same name."""
 
     name: str
-    png: bytes
+    """Of its file, *.png or *.jpg."""
+    content: bytes
     shows: str
     """What it shows, for who cannot see it."""
 
+    @property
+    def source(self) -> str:
+        """What an image of the page has as its source."""
+        kind = "jpeg" if self.name.endswith(".jpg") else "png"
+        return f"data:image/{kind};base64,{base64.b64encode(self.content).decode()}"
 
-Block = str | Picture
-"""A part of a section: HTML, in which what was put in is escaped, or a figure."""
+
+class Cards(NamedTuple):
+    """Pictures side by side, each with a title and a text below, and the anchor that the title leads to."""
+
+    cards: "Sequence[tuple[Picture, str, str, str]]"
+
+
+class Folded(NamedTuple):
+    """Blocks behind a line of text that opens them."""
+
+    summary: str
+    blocks: "Sequence[Block]"
+    anchor: str = ""
+    opened: bool = False
+    """Whether they are to be seen at first."""
+
+
+Block = str | Picture | Cards | Folded
+"""A part of a section: HTML, in which what was put in is escaped, or something with figures."""
 
 
 class Section(NamedTuple):
@@ -42,10 +65,10 @@ class Section(NamedTuple):
     blocks: Sequence[Block]
 
 
-def paragraph(text: str) -> str:
-    """A paragraph; what stands between backticks in it is a command."""
+def paragraph(text: str, *, kind: str = "") -> str:
+    """A paragraph, of a class of the style if one is named; what stands between backticks in it is a command."""
     words = re.sub(r"`([^`]*)`", r"<code>\1</code>", escape(text))
-    return f"<p>{words}</p>"
+    return f'<p class="{kind}">{words}</p>' if kind else f"<p>{words}</p>"
 
 
 def heading(text: str, anchor: str = "") -> str:
@@ -70,6 +93,7 @@ def table(
     *,
     keys: Sequence[Sequence[str]] | None = None,
     links: Sequence[str] | None = None,
+    opens: Sequence[Picture] | None = None,
     words: bool = False,
     folded: str = "",
 ) -> str:
@@ -80,23 +104,28 @@ def table(
         rows: Of cells.
         keys: What rows are sorted by at a click, cell by cell; without them they are not.
         links: Anchor that the first cell of each row leads to; empty: none.
+        opens: Picture that a click on each row opens below it; these have no files of their own.
         words: Whether cells are sentences and not numbers: they are broken into lines.
         folded: If any, what stands on the fold that hides it at first.
     """
     titles = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
     kind = ' class="sortable"' if keys else ' class="words"' if words else ""
-    body = "".join(_row(row, keys[k] if keys else None, links[k] if links else "") for k, row in enumerate(rows))
+    body = "".join(
+        _row(row, keys[k] if keys else None, links[k] if links else "", opens[k] if opens else None)
+        for k, row in enumerate(rows)
+    )
     text = f'<div class="scroll"><table{kind}><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table></div>'
     return f"<details><summary>{escape(folded)}</summary>{text}</details>" if folded else text
 
 
-def _row(row: Sequence[str], keys: Sequence[str] | None, link: str) -> str:
+def _row(row: Sequence[str], keys: Sequence[str] | None, link: str, opens: Picture | None) -> str:
     name, *cells = map(escape, row)
     if link:
         name = f'<a href="#{escape(link)}">{name}</a>'
     first, *others = [f' data-key="{escape(key)}"' for key in keys] if keys else [""] * len(row)
     data = "".join(f"<td{key}>{cell}</td>" for key, cell in zip(others, cells, strict=True))
-    return f'<tr><th scope="row"{first}>{name}</th>{data}</tr>'
+    shown = f' data-opens="{opens.source}" data-shows="{escape(opens.shows)}"' if opens else ""
+    return f'<tr{shown}><th scope="row"{first}>{name}</th>{data}</tr>'
 
 
 def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
@@ -118,7 +147,7 @@ def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
-        f"<h1>{escape(title)}</h1>\n<p>{escape(lead)}</p>\n<nav><ul>{links}</ul></nav>\n{body}</main>\n"
+        f"<nav><ul>{links}</ul></nav>\n<h1>{escape(title)}</h1>\n{paragraph(lead, kind='lead')}\n{body}</main>\n"
         f"<script>{script}</script>\n</body>\n</html>\n"
     )
     return text.encode("utf-8", errors="backslashreplace")  # a file's name may hold bytes that are no text
@@ -155,7 +184,16 @@ def counted(number: int, one: str, many: str = "") -> str:
 
 def pictures_of(sections: Sequence[Section]) -> list[Picture]:
     """All figures of a page, in order."""
-    return [block for section in sections for block in section.blocks if isinstance(block, Picture)]
+    return [picture for section in sections for block in section.blocks for picture in _pictures_in(block)]
+
+
+def _pictures_in(block: Block) -> Iterator[Picture]:
+    if isinstance(block, Picture):
+        yield block
+    elif isinstance(block, Cards):
+        yield from (picture for picture, *_ in block.cards)
+    elif isinstance(block, Folded):
+        yield from (picture for part in block.blocks for picture in _pictures_in(part))
 
 
 def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section], *, remedy: str) -> Path:
@@ -180,7 +218,7 @@ def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section], 
     figures = out.with_name(f"{out.stem}-figures")
     figures.mkdir(exist_ok=True)
     for one in pictures:
-        write_atomically(figures / one.name, one.png)
+        write_atomically(figures / one.name, one.content)
     write_atomically(out, page)
     print(f"{counted(len(pictures), 'figure')} under {figures}")
     print(f"Report: {out} ({len(page) / 1e6:.1f} MB; opens in a browser, without a network)")
@@ -201,7 +239,21 @@ def origin_table(origin: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _html(block: Block) -> str:
-    if isinstance(block, str):
-        return block
-    data = base64.b64encode(block.png).decode()
-    return f'<figure><img alt="{escape(block.shows)}" src="data:image/png;base64,{data}"></figure>'
+    if isinstance(block, Picture):
+        return f"<figure>{_image(block)}</figure>"
+    if isinstance(block, Cards):
+        cards = (
+            f'<figure>{_image(shown)}<figcaption><a href="#{escape(link)}"><b>{escape(title)}</b></a>{paragraph(text)}'
+            "</figcaption></figure>"
+            for shown, title, text, link in block.cards
+        )
+        return f'<div class="cards">{"".join(cards)}</div>'
+    if isinstance(block, Folded):
+        anchor = f' id="{escape(block.anchor)}"' if block.anchor else ""
+        inner = "".join(map(_html, block.blocks))
+        return f"<details{anchor}{' open' * block.opened}><summary>{escape(block.summary)}</summary>{inner}</details>"
+    return block
+
+
+def _image(picture: Picture) -> str:
+    return f'<img alt="{escape(picture.shows)}" src="{picture.source}">'

@@ -23,6 +23,7 @@ from qd.show.report.tables import LABELS, MEASURES, by_kind, unreadable
 from sim.files.atomic import prepare_output, read_json
 from sim.files.command import plain_command
 from sim.files.figures import new_figure
+from sim.files.provenance import without_machine
 from sim.robots.robot import get_robot
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def rounds_report(run: Path, robot: str | None, out: Path | None) -> Path:
         Section("What became of terrains", "changes", _changes(content)),
         Section("Where this comes from", "origin", _origin(content, run)),
     ]
-    lead = f"Made from {run} by faultline: a search for what breaks a controller, a training on it, and again."
+    place = without_machine(str(run))
+    lead = f"Made from {place} by faultline: a search for what breaks a controller, a training on it, and again."
     title = f"{content['robot']} hardened: {counted(len(content['rounds']) - 1, 'round')} of search and training"
     return publish_page(out, title, lead, sections, remedy=f"move files out of {run}")
 
@@ -167,7 +169,7 @@ def _rates(content: dict[str, Any]) -> list[Block]:
         "chosen because the controller of their own search struggled there: against that one another looks better "
         "by chance too."
     )
-    shows = "Goal rate and success of every controller on every set with intervals"
+    shows = "Goal rate and rate without a base collision of every controller on every set with intervals"
     drawn = picture("rates", draw_rates(content), shows)
     return [paragraph(text), drawn, *(measure_table(tables, measure) for measure in MEASURES)]
 

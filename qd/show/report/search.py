@@ -6,18 +6,18 @@ import numpy as np
 
 from qd.archive import Archive
 from qd.elites import Elites
-from qd.faults import VERDICTS, any_of, fault_numbers, fault_words
+from qd.faults import any_of, fault_numbers, fault_words
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
 from qd.run.progress import clock
-from qd.show.crossed import ARRIVED
-from qd.show.crossing_figures import draw_maps
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
+from qd.show.report.elites import failures
 from qd.show.report.evaluation import most_mended
 from qd.show.report.figures import draw_pairs
 from qd.show.report.material import Shown
 from qd.show.report.page import (
     Block,
+    Folded,
     absent,
     at_a_glance,
     counted,
@@ -30,15 +30,34 @@ from qd.show.report.page import (
 )
 from sim.files.command import plain_command
 from sim.files.intervals import bootstrap_interval
+from sim.files.provenance import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec
 
 _AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes
-_MIN_PICTURED = 4  # terrains that the page begins with
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
+def lead_words(shown: Shown) -> str:
+    """What the page leads with: faults where they are known, how many terrains fail, and in which ways."""
+    elites, archive = shown.elites, shown.material.archive
+    failing = int(elites.failing.sum())
+    faults, count = archive.faults, fault_numbers(archive)["faults"]
+    told = ""
+    if faults is not None and count is not None:
+        what = "fault: a terrain" if count == 1 else "faults: terrains"
+        told = f"{count:,} {what} that {any_of(faults.certifiers)} crosses and this controller of {archive.robot} not. "
+    told += f"The controller fails on {failing:,} of {counted(len(elites), 'elite')}"
+    most_first = sorted(shown.modes.modes, key=lambda mode: -len(mode.members))
+    if not most_first:
+        return f"{told}."
+    ways = "; ".join(
+        f"{mode.deed} ({len(mode.members):,}, marked by {label_of(mode.marked_by)})" for mode in most_first
+    )
+    return f"{told}, in {counted(len(most_first), 'way')}. The robot {ways}."
+
+
 def outcome_section(shown: Shown) -> list[Block]:
-    """What was searched, at what cost, and in how many ways the controller breaks how often."""
+    """In how many ways the controller breaks how often, a picture of each, and what was searched at what cost."""
     elites, archive = shown.elites, shown.material.archive
     failing, ways = int(elites.failing.sum()), elites.failing_cells
     basis = (
@@ -51,34 +70,24 @@ def outcome_section(shown: Shown) -> list[Block]:
     facts = at_a_glance(
         [
             *_faults_at_a_glance(archive),
-            ("terrains, the hardest of each cell, that under half of the robots cross", f"{failing:,}"),
-            ("different ways of failing: cells that these fall into", f"{ways:,}"),
-            ("failure modes: kinds of these ways", f"{sum(mode.failing for mode in shown.modes.modes)}"),
+            ("elites that under half of the robots cross", f"{failing:,} of {len(elites):,}"),
+            ("failure modes: kinds of these", f"{len(shown.modes.modes)}"),
+            ("cells that these fall into: different shares of what goes wrong", f"{ways:,}"),
             ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
             ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
             *([mended] if mended else []),
         ]
     )
     text = (
-        f"The controller fails on {failing:,} of {counted(len(elites), 'elite')} judged ({basis}): there under half of "
-        f"the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
-    )
-    if failing:
-        they = "It falls" if failing == 1 else "They fall"
-        text += f"{they} into {counted(ways, 'cell')}: so many different ways of failing were found. "
-    text += (
+        f"The controller fails on {failing:,} of {counted(len(elites), 'elite')} judged ({basis}): there under "
+        f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
         f"Over all elites {_rate(elites.goal_rate)} of the robots reach the goal, the base of "
-        f"{_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen."
-    )
-    explained = (
-        f"A cell is a combination of shares of the penalties, each in {archive.intervals} intervals; terrains in "
-        "different cells make the robot struggle differently. A terrain counts as failed if under "
-        f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal. The rates are means over terrains"
-        f"{' with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
+        f"{_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen: means over terrains"
+        f"{', with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
     known = fault_words(archive)
-    about = [paragraph(" ".join([*known, text]))] if known else [paragraph(text), _no_faults(shown)]
-    return [_searched(shown), facts, *about, paragraph(_common(shown)), *_pictured(shown), paragraph(explained)]
+    about = [paragraph(" ".join([*known, text]))] if known else [_no_faults(shown), paragraph(text)]
+    return [facts, *failures(shown), *about, _searched(shown)]
 
 
 def _no_faults(shown: Shown) -> Block:
@@ -89,36 +98,12 @@ def _no_faults(shown: Shown) -> Block:
     return absent(text, plain_command(word, robot=material.robot.spec, run=material.run))
 
 
-def _pictured(shown: Shown) -> list[Block]:
-    """The worst terrain of each way of failing, and where these are few some more that are unlike them."""
-    elites, modes, leaders = shown.elites, shown.modes, shown.ranking.leaders()
-    failing = [number for number in shown.worst if elites.failing[elites.place_of(number)]]
-    drawn, told = {}, []
-    for number in list(dict.fromkeys([*leaders, *failing]))[: max(_MIN_PICTURED, len(leaders))]:
-        place = elites.place_of(number)
-        mode = modes.modes[int(modes.labels[place]) - 1]
-        verdict = VERDICTS[int(elites.verdict[place])]
-        if number in shown.crossed and len(shown.crossed[number].chosen):
-            arrived = shown.crossed[number].rates[ARRIVED]
-            drawn[f"mode {mode.number}: elite {number}, {verdict}, goal {arrived.hits} of {arrived.count}"] = (
-                shown.crossed[number]
-            )
-            told.append(f"mode {mode.number}, the robot {mode.deed}: elite {number} ({verdict}), goal {arrived}")
-    if not drawn:
-        return []
-    more = " and others unlike these," * (len(told) > len(leaders))
-    text = f"The worst terrain of each way of failing,{more} crossed again, with 95 % intervals: {'; '.join(told)}."
-    shows = "Height map of a terrain of each way of failing with the robots' paths"
-    figure = draw_maps(drawn, f"{shown.material.archive.robot}: terrains that are not crossed")
-    return [paragraph(text), picture("failing", figure, shows)]
-
-
 def _faults_at_a_glance(archive: Archive) -> list[tuple[str, str]]:
     """The number of faults, where other controllers crossed what fails."""
     faults, count = archive.faults, fault_numbers(archive)["faults"]
     if faults is None or count is None:
         return []
-    return [(f"faults: terrains that {any_of(faults.certifiers)} crosses and this controller does not", f"{count:,}")]
+    return [(f"faults: elites that {any_of(faults.certifiers)} crosses and this controller does not", f"{count:,}")]
 
 
 def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
@@ -126,16 +111,6 @@ def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
     tables, archive = shown.material.tables, shown.material.archive
     about = (tables or {}).get("archive") or {}
     return tables if (about.get("elites"), about.get("iterations")) == (len(archive), archive.iterations) else None
-
-
-def _common(shown: Shown) -> str:
-    """What happens to the robot on how many elites: what fails before what does not, the most common first."""
-    modes = sorted(shown.modes.modes, key=lambda mode: (not mode.failing, -len(mode.members)))
-    told = [
-        f"{mode.deed} on {counted(len(mode.members), 'elite')} (mode {mode.number}; goal {percent(mode.goal_rate)})"
-        for mode in modes
-    ]
-    return f"The robot {'; '.join(told)}. The chapters Terrains worth a look and Modes show where and how."
 
 
 def _rate(rates: np.ndarray) -> str:
@@ -220,19 +195,27 @@ def archive_section(shown: Shown) -> list[Block]:
     return [
         paragraph(lines),
         picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
-        paragraph(spread_text),
-        picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
+        Folded(
+            "Show the elites by interval of each share, and every two shares against each other",
+            [
+                paragraph(spread_text),
+                picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
+                *_pairs(shown),
+            ],
+        ),
     ]
 
 
-def pairs_section(shown: Shown) -> list[Block]:
+def _pairs(shown: Shown) -> list[Block]:
     """Every two shares against each other."""
     elites = shown.elites
     if len(elites) < 3:
         too_few = f"The projections are left out: they need 3 elites, and there are {len(elites)}."
         longer = plain_command("archive", resume=shown.material.run, iterations="N")
         return [absent(f"{too_few} A longer search finds more:", longer)]
-    text = f"Each point is one of {counted(len(elites), 'elite')}, in the look of its mode (chapter Modes)."
+    text = (
+        f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode; grey ones do not fail."
+    )
     text += _related(elites)
     shows = "Scatter plots of every two shares of the penalties, by failure mode"
     return [paragraph(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]
@@ -263,5 +246,5 @@ def origin_section(shown: Shown) -> list[Block]:
     rows = origin_table(origin)
     again = shown.material.reproduced_by
     rows += [[f"fresh episodes: {name}", str(again[name])] for name in _AGAIN if name in again]
-    text = f"The archive read is {shown.material.run}. Its search began with:"
+    text = f"The archive read is {without_machine(str(shown.material.run))}. Its search began with:"
     return [paragraph(text), table(["", ""], rows, words=True)]

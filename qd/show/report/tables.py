@@ -16,7 +16,7 @@ from sim.robots.robot import RobotCfg
 
 MEASURES = {
     "goal": "goal reached",
-    "success": "no base collision (the paper's success)",
+    "success": "no base collision",
     "reward": "training reward",
 }
 """Measures shown, in words; the first two are fractions."""

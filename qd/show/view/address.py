@@ -15,6 +15,8 @@ _ANSWER_S = 5.0
 _POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"
 """Viser's own: its page starts with that camera."""
 
+_MINIMAL = "minimal"
+
 Point = tuple[float, float, float]
 
 
@@ -26,6 +28,8 @@ class Address:
     controller: str | None = None
     ghost: str | None = None
     """The controller that crosses beside it."""
+    minimal: bool = False
+    """Whether it is the elite's minimal terrain."""
     episode: int | None = None
     """Counted from 1."""
     time_s: float | None = None
@@ -41,6 +45,8 @@ class Address:
         named = (("elite", self.elite), ("controller", self.controller), ("ghost", self.ghost),
                  ("episode", self.episode))  # fmt: skip
         said += [(name, str(value)) for name, value in named if value is not None]
+        if self.minimal:
+            said.insert(len(self.others) + 1, ("terrain", _MINIMAL))
         if self.time_s is not None:
             said.append(("t", f"{self.time_s:.2f}".rstrip("0").rstrip(".")))
         if self.follow:
@@ -62,7 +68,7 @@ def read_address(query: str) -> tuple[Address, list[str]]:
     """
     pairs = parse_qsl(query.removeprefix("?"), keep_blank_values=True)
     said, refused = dict(pairs), []
-    ours = {"elite", "controller", "ghost", "episode", "t", "follow", _POSITION, _LOOK_AT}
+    ours = {"elite", "controller", "ghost", "terrain", "episode", "t", "follow", _POSITION, _LOOK_AT}
 
     def number(name: str, words: str) -> float | None:
         if name not in said:
@@ -82,6 +88,7 @@ def read_address(query: str) -> tuple[Address, list[str]]:
         elite=None if elite is None else int(elite),
         controller=said.get("controller"),
         ghost=said.get("ghost"),
+        minimal=said.get("terrain") == _MINIMAL,
         episode=None if episode is None else int(episode),
         time_s=time_s,
         follow=said.get("follow") == "1",
@@ -123,8 +130,17 @@ def show_query(client: viser.ClientHandle, query: str) -> None:
 
 def copy_link(client: viser.ClientHandle) -> None:
     """Have a browser copy its address; where it may not, it shows the link to be copied by hand."""
-    run_script(client, "const link = location.href, ask = () => window.prompt('Copy this link', link);"
-         "navigator.clipboard ? navigator.clipboard.writeText(link).catch(ask) : ask();")  # fmt: skip
+    _copy(client, "location.href", "Copy this link")
+
+
+def copy_text(client: viser.ClientHandle, text: str) -> None:
+    """Have a browser copy a text, likewise."""
+    _copy(client, json.dumps(text), "Copy this")
+
+
+def _copy(client: viser.ClientHandle, source: str, asked: str) -> None:
+    run_script(client, f"const text = {source}, ask = () => window.prompt({json.dumps(asked)}, text);"
+         "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();")  # fmt: skip
 
 
 def keep_keys(client: viser.ClientHandle, names: Sequence[str]) -> None:

@@ -7,9 +7,10 @@ from typing import Any
 
 import viser
 
-from qd.show.recordings import Recordings
+from qd.show.recordings import Recordings, on_elite
 from qd.show.view.address import ask_query, read_address
 from qd.show.view.command import Show
+from qd.show.view.errands import Errands
 from qd.show.view.recorder import Recorder, Report
 from qd.show.view.scene import first_view_of, shapes_of
 from qd.show.view.tab import Common, Tab
@@ -55,6 +56,8 @@ class App:
             shapes=shapes_of(skeleton, show.robot),
             recordings=recordings,
             record=lambda wanted, tab: self._recorder.record(wanted, tab=tab),
+            record_ahead=lambda wanted, tab: self._recorder.record_ahead(wanted, tab=tab),
+            errands=Errands(),
             post=self.post,
         )
         self._recorder = Recorder(show.robot, lambda report: self.post(self.show_report, report))
@@ -105,12 +108,16 @@ class App:
             tab.show_report(report)
 
     def close(self) -> None:
-        """End the recording processes and the page."""
+        """End the recording processes, films that are made, and the page."""
         self._recorder.stop()
+        self._common.errands.stop()
         self.page.stop()
 
     def run(self) -> None:
         """Serve until interrupted."""
+        show = self._common.show
+        for policy in list(show.controllers.values())[:1]:  # ready by the time that somebody has chosen an elite
+            self._recorder.warm(on_elite(show.found.archive, 0, policy=policy, replicas=show.cfg.replicas))
         last = time.perf_counter()
         while True:
             self.do_asked(wait_s=_FRAME_S if self._playing else _IDLE_S)

@@ -18,6 +18,7 @@ from sim.files.settings import check, setting
 from sim.policy.spec import ControllerSpec, controller_hash
 
 if TYPE_CHECKING:
+    from qd.show.minima import MinimalFound
     from qd.show.view.plots import Axes
     from sim.robots.robot import RobotCfg
 
@@ -29,15 +30,17 @@ SEARCHED = "as searched"
 class View(OfRobot, Which):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
-    Left, the archive on parallel axes; a click on a line of the plot or of the list under "Elites" shows that terrain.
-    The list begins with one terrain of each way of failing, and can be sorted and narrowed. Under "Ranges" drag the
-    ends of an axis: elites outside turn grey and leave the list. Right, its crossing: play, pause, drag the time, go
-    from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are contact forces (1 m is
-    1,000 N), the green one over the robot is its command; curves are what it is penalised for. Crossings that were not
-    recorded before are run on the CPU, which takes seconds, and are kept under --cache.
+    On the left is the archive on parallel axes. A click on a line of the plot, or of the list under "Elites", shows
+    that terrain. The list begins with one terrain of each way of failing. It can be sorted and narrowed. Under "Ranges"
+    you drag the ends of an axis: elites outside turn grey and leave the list. On the right is the crossing: play,
+    pause, drag the time, go from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are
+    contact forces (1 m is 1,000 N). The green arrow over the robot is its command. The curves are its penalties.
+    Crossings that are not recorded yet run on the CPU, which takes seconds. They are kept under --cache. Those of the
+    neighbours in the list are recorded ahead. Buttons make a film, files of the terrain, and the command that replays
+    what is shown.
 
-    Every tab of a browser is on its own, and its address holds what it shows: ?elite=12&controller=C-G&t=8.4 opens
-    just that.
+    Browser tabs do not affect each other. The address of a tab holds what it shows: ?elite=12&controller=C-G&t=8.4
+    opens just that.
 
     Ctrl-C ends it. No GPU and no screen are needed: over ssh, forward the port (ssh -L 8080:localhost:8080 HOST) and
     open the page at home.
@@ -76,13 +79,16 @@ class Show:
     """What each controller is loaded from, by its name; empty if that of the search is lost."""
     note: str
     """Why there is no controller; empty if there is one."""
+    minima: "MinimalFound | None" = None
+    """Minimal terrains of the elites, if there are some."""
 
     @cached_property
     def axes(self) -> "Axes":
         """All elites, and the orders to list them in."""
         from qd.show.view.plots import axes_of
 
-        return axes_of(self.found.archive, self.found.space)
+        minimal = () if self.minima is None else tuple(self.minima.genes)
+        return axes_of(self.found.archive, self.found.space, minimal)
 
     @cached_property
     def _certifiers(self) -> dict[str, int]:
@@ -145,14 +151,19 @@ def show_of(cfg: View) -> Show:
         FileNotFoundError: If there is no archive.
         ValueError: If robot, archive, controllers or a number are not as they must be.
     """
+    from qd.show.minima import read_minimal_numbers
+
     check(cfg)
     found = find_archive(cfg.robot, cfg.run, space=cfg.space)
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: {found.go_on}, or give another --run")
     elite = found.one(cfg.elite) if cfg.elite else None
+    minima = read_minimal_numbers(found.folder, found.archive) if cfg.minimal is None else found.minima()
+    if minima is not None and cfg.minimal is not None:
+        elite = minima.chosen(cfg.minimal, found.run)[0]
     controllers, note = _controllers_of(cfg, found)
     prepare_output(cfg.cache / "recording.npz")
-    return Show(cfg=cfg, found=found, elite=elite, controllers=controllers, note=note)
+    return Show(cfg=cfg, found=found, elite=elite, controllers=controllers, note=note, minima=minima)
 
 
 def _controllers_of(cfg: View, found: Found) -> tuple[dict[str, str], str]:

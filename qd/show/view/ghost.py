@@ -10,6 +10,9 @@ from qd.show.view.recorder import Report
 from sim.recording.recorder import Recording
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from qd.show.view.tab import Common
 
 CERTIFYING, NOBODY = "who certifies it", "none"
@@ -41,12 +44,13 @@ class Ghost:
         """What can be chosen."""
         return (CERTIFYING, NOBODY, *self._common.show.controllers)
 
-    def load(self, elite: int, beside: str | None) -> str:
+    def load(self, elite: int, beside: str | None, minimal: "NDArray[np.float32] | None" = None) -> str:
         """Take another elite or controller; what is not recorded is asked for.
 
         Args:
             elite: Number of the elite.
             beside: The controller that is shown already, which can be no ghost of itself.
+            minimal: Genes of the elite's minimal terrain, if that is shown.
 
         Returns:
             What to say of it, as HTML.
@@ -57,7 +61,7 @@ class Ghost:
         self.name = chosen if chosen in show.controllers and chosen != beside else None
         if self.name is not None:
             archive, policy = show.found.archive, show.controllers[self.name]
-            self._wanted = on_elite(archive, elite, policy=policy, replicas=show.cfg.replicas)
+            self._wanted = on_elite(archive, elite, policy=policy, replicas=show.cfg.replicas, minimal=minimal)
             self.recording = self._common.recordings.read(self._wanted)
         missing = self._wanted if self.recording is None else None
         if missing is not None or self._asked:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from qd.show.ranking import ORDERS
 from qd.show.view.legend import legend_html
 from qd.show.view.plots import FITNESS_WORDS, Axes, Choice, axes_svg
-from qd.show.view.scene import first_view_of
+from qd.show.view.scene import PHONE, first_view_of
 
 if TYPE_CHECKING:
     from qd.show.view.tab import Tab
@@ -28,6 +28,7 @@ STEP_S = 0.1
 _WIDTH, _NARROW_WIDTH = 380, 300  # of a panel [pixels]
 _WIDE = 1200  # a window from here on has room for two wide panels; in another the archive is folded at first [pixels]
 _PICKED, _OTHER = (213, 94, 0), (73, 80, 87)
+_TERRAINS = ("whole", "minimal")
 _CONTROL_DT = 0.02  # step of the time slider [s]
 
 
@@ -273,13 +274,16 @@ class CrossingPanel:
             tab: Does what a visitor asks for.
         """
         gui, self._post = client.gui, tab.common.post
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(_WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH)
+        if client.camera.image_width >= PHONE:  # else viser makes a sheet of it
+            gui.main_panel.dock_right()
+            gui.main_panel.set_width(_WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH)
         self._details = gui.add_markdown("")
         self._controller = gui.add_dropdown("Controller", tuple(controllers) or ("none",), disabled=not controllers)
         _on_visit(self._controller, lambda name: self._post(tab.choose_controller, str(name)))
         self._ghost: Any = gui.add_dropdown("Ghost", tab.ghost.choices, disabled=not controllers)
         _on_visit(self._ghost, lambda name: self._post(tab.choose_ghost, str(name)))
+        self._terrain: Any = gui.add_dropdown("Terrain", _TERRAINS, visible=False)
+        _on_visit(self._terrain, lambda name: self._post(tab.choose_terrain, str(name) == _TERRAINS[1]))
         self._groups: Any = gui.add_dropdown("Episodes", ("none",), disabled=True)
         _on_visit(self._groups, lambda name: self._post(tab.choose_group, str(name)))
         self._episode: Any = gui.add_dropdown("Episode", ("none",), disabled=True)
@@ -297,8 +301,12 @@ class CrossingPanel:
         self._curves = gui.add_html("")
         self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 x")
         _on_visit(self._speed, lambda value: self._post(tab.set_speed, SPEEDS[value]))
-        views = {"overview": (tab.overview,), "near": (tab.look, first_view_of), "copy link": (tab.copy_link,)}
+        views = {"overview": (tab.overview,), "near": (tab.look, first_view_of)}
         _add_choices(gui, "View", views, lambda asked: self._post(*asked))
+        copies = {"copy link": (tab.taking.link,), "copy command": (tab.taking.command,)}
+        _add_choices(gui, "Share", copies, lambda asked: self._post(*asked))
+        files = {"film this": (tab.taking.film,), "export this": (tab.taking.files,)}
+        _add_choices(gui, "Files", files, lambda asked: self._post(*asked))
         self._follow = self._add_switch(gui, "Follow", tab.set_follow, False)
         self._add_switch(gui, "Foot forces", tab.set_forces, True)
         self._add_switch(gui, "All paths", tab.scene.set_show_paths, True)
@@ -317,6 +325,11 @@ class CrossingPanel:
     def show_elite(self, details: str) -> None:
         """Say what the archive knows of the picked elite, as Markdown."""
         self._details.content = details
+
+    def show_terrain(self, has_minimal: bool, minimal: bool) -> None:
+        """Say which terrain of the elite is shown, where it has two."""
+        self._terrain.visible = has_minimal
+        self._terrain.value = _TERRAINS[minimal]
 
     def show_controller(self, name: str | None) -> None:
         """Say whose crossings are shown."""

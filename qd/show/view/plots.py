@@ -13,14 +13,14 @@ from qd.elites import Elites
 from qd.faults import VERDICTS, elite_words
 from qd.show.crossed import ARRIVED, Rate
 from qd.show.figures import label_of, look_of
-from qd.show.ranking import ORDERS, Ranking, rank
+from qd.show.ranking import ORDERS, Ranking, mode_words, rank
 from sim.files.intervals import rate_words
 from sim.space import TerrainSpace
 
 _SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites in the list's order, the first darkest
 _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"
 _WIDTH, _HEIGHT = 460, 350
-_TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 16
+_TOP, _BOTTOM, _LEFT, _RIGHT = 16, 116, 58, 32
 _CURVES_HEIGHT, _MARGIN, _MARK_ROW = 170, 24, 14
 _RATES = {"goal_rate": "goal reached", "collision_rate": "base collision", "fallen_rate": "fallen"}
 _CROSSED = {**_RATES, "goal_rate": ARRIVED}  # as recordings name them
@@ -30,6 +30,7 @@ FITNESS_WORDS = (
     "episode alike. It does not say that the robot fails: read the goal rate for that."
 )
 """What fitness is, and what it is not."""
+_FITNESS_SHORT = "what the search looks for, costly in every episode alike; whether the robot fails says the goal rate"
 KINDS = {
     "all": VERDICTS,
     "faults": ("fault",),
@@ -39,6 +40,8 @@ KINDS = {
     "not failing": ("",),
 }
 """Kinds of elites to choose from: the verdicts that each has."""
+MINIMAL = "with a minimal terrain"
+"""One more kind, where there are some."""
 _RATE_STEP, _FITNESS_STEP = 0.01, 0.1
 
 
@@ -71,7 +74,7 @@ class Choice:
     kind: str = "all"
     """One of the :data:`KINDS`."""
     mode: int | None = None
-    """Number of the failure mode; None for all of them."""
+    """Number of the failure mode; None for all elites."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +84,8 @@ class Axes:
     archive: Archive
     ranking: Ranking
     axes: tuple[Axis, ...]
+    minimal: tuple[int, ...] = ()
+    """Numbers of the elites that have a minimal terrain."""
 
     @property
     def elites(self) -> Elites:
@@ -108,17 +113,20 @@ class Axes:
         return order[kept[order]]
 
     def _of_kind(self, kind: str) -> NDArray[np.bool_]:
+        if kind == MINIMAL:
+            return np.isin(self.elites.numbers, self.minimal)
         return np.isin(self.elites.verdict, [VERDICTS.index(verdict) for verdict in KINDS[kind]])
 
     def kinds(self) -> dict[str, str]:
         """Kinds of elites by what they are called in words, with how many there are."""
-        return {f"{kind} ({int(self._of_kind(kind).sum()):,})": kind for kind in KINDS}
+        kinds = [*KINDS, MINIMAL] if self.minimal else [*KINDS]
+        return {f"{kind} ({int(self._of_kind(kind).sum()):,})": kind for kind in kinds}
 
     def modes(self) -> dict[str, int | None]:
         """Failure modes by what they are called in words, with how many elites are in each."""
         found: dict[str, int | None] = {"all modes": None}
         for mode in self.ranking.modes.modes:
-            found[f"{mode.number}: {mode.ending} ({len(mode.members):,})"] = mode.number
+            found[f"{mode.number}: {mode_words(mode)} ({len(mode.members):,})"] = mode.number
         return found
 
     def rate_text(self, name: str, number: int) -> str:
@@ -151,7 +159,8 @@ class Axes:
         archive, elites, ranking = self.archive, self.elites, self.ranking
         count, verdict = int(elites.counted[number]), self.verdict(number)
         of = f"{count} fresh episodes" if elites.fresh[number] else f"the {count} episodes that found it"
-        mode = ranking.modes.modes[int(ranking.modes.labels[number]) - 1]
+        mode = ranking.mode_of(number)
+        struggles = "not failing" if mode is None else f"failure mode {mode.number}: {mode_words(mode)}"
         family = int((ranking.families == ranking.families[number]).sum())
         alike = f"{family - 1} other elite{'s' * (family != 2)} like it" if family > 1 else "no other elite like it"
         heads = ["95 % intervals", f"as searched, {of}"]
@@ -164,25 +173,25 @@ class Axes:
             for name, label in _RATES.items()
         ]
         lines = [
-            f"**Elite {number}** of {len(elites):,}{f' · **{verdict}**' * bool(verdict)} · mode {mode.number}: "
-            f"{mode.ending} · {alike}",
+            f"**Elite {number}** of {len(elites):,}{f' · **{verdict}**' * bool(verdict)} · {struggles} · {alike}",
             "",
             *(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)),
             "",
             *elite_words(archive, number),
             "",
             f"Fitness **{elites.fitness[number]:.2f}** ({archive.fitness[number]:.2f} as found in iteration "
-            f"{archive.iteration[number]}). {FITNESS_WORDS}",
+            f"{archive.iteration[number]}): {_FITNESS_SHORT}.",
         ]
         return "\n".join(lines)
 
 
-def axes_of(archive: Archive, space: TerrainSpace) -> Axes:
+def axes_of(archive: Archive, space: TerrainSpace, minimal: Sequence[int] = ()) -> Axes:
     """The axes of an archive that has elites.
 
     Args:
         archive: The archive.
         space: Of its genes.
+        minimal: Numbers of the elites that have a minimal terrain.
     """
     ranking = rank(archive, space)
     elites = ranking.elites
@@ -190,7 +199,7 @@ def axes_of(archive: Archive, space: TerrainSpace) -> Axes:
     axes.append(_axis_of("fitness", "fitness", elites.fitness, _FITNESS_STEP))
     rates = {name: np.asarray(getattr(elites, name)) for name in _RATES}
     axes += [_axis_of(name, label, rates[name], _RATE_STEP) for name, label in _RATES.items()]
-    return Axes(archive=archive, ranking=ranking, axes=tuple(axes))
+    return Axes(archive=archive, ranking=ranking, axes=tuple(axes), minimal=tuple(minimal))
 
 
 def _axis_of(name: str, label: str, values: NDArray[np.float64], step: float) -> Axis:

@@ -2,8 +2,9 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from qd.show.recordings import Simulation, Wanted
 from qd.workers.process import EvaluatorError, WorkerProcess
 
 if TYPE_CHECKING:
+    from multiprocessing.synchronize import Event
+
     from sim.recording.recorder import Recording
     from sim.robots.robot import RobotCfg
 
@@ -36,32 +39,53 @@ class Report:
     """Whether there will be none."""
 
 
-class _Recording:
-    """What a recording process has: the simulation of a controller."""
+class _DroppedError(Exception):
+    """What is under way is wanted no more."""
 
-    def __init__(self, robot: "RobotCfg", first: Wanted) -> None:
-        self._simulation, self._first = Simulation(robot, "cpu"), first
+
+class _Recording:
+    """What a recording process has: the simulation of a controller, ready to cross."""
+
+    def __init__(self, robot: "RobotCfg", first: Wanted, drop: "Event") -> None:
+        self._simulation, self._first, self._drop = Simulation(robot, "cpu"), first, drop
+        self._simulation.prepare(first)
         self._wanted: deque[Wanted] = deque()
 
     def put(self, terrains: NDArray, seeds: NDArray) -> None:
         """Keeps one terrain, to be crossed as the first one was."""
         self._wanted.append(replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0])))
 
-    def take(self, progress: Callable[[float], None]) -> "Recording":
-        """The recording of the terrain that was put in first, crossed now."""
-        return self._simulation([self._wanted.popleft()], progress)[0]
+    def take(self, progress: Callable[[float], None]) -> "Recording | None":
+        """The recording of the terrain that was put in first, crossed now; None if it is dropped meanwhile."""
+
+        def tell(share: float) -> None:
+            progress(share)
+            if self._drop.is_set():
+                raise _DroppedError
+
+        try:
+            return self._simulation([self._wanted.popleft()], tell)[0]
+        except _DroppedError:
+            return None
 
 
-def build_recording(cfg: "tuple[RobotCfg, Wanted]", num_terrains: int) -> Any:
+Cfg = tuple["RobotCfg", Wanted, "Event"]
+"""Of a recording process: the robot, what it crosses at first, and what is set when its work is wanted no more."""
+
+
+def build_recording(cfg: Cfg, num_terrains: int) -> Any:
     """What a recording process works with, called in it."""
     return _Recording(*cfg)
 
 
-Build = Callable[["tuple[RobotCfg, Wanted]", int], Any]
+Build = Callable[[Cfg, int], Any]
 
 
 class Recorder:
-    """Records the crossings that each tab asked for last; what it asked for before and is not begun is dropped."""
+    """Records the crossings that each tab asked for last; what it asked for before and is not begun is dropped.
+
+    While nobody waits it records ahead what a tab may ask for next, and drops that when somebody asks for another one.
+    """
 
     def __init__(self, robot: "RobotCfg", report: Callable[[Report], None], *, build: Build = build_recording) -> None:
         """Start to wait for work.
@@ -74,6 +98,11 @@ class Recorder:
         self._robot, self._report, self._build = robot, report, build
         self._workers: dict[str, WorkerProcess] = {}  # by controller, the one used last at the end
         self._wishes: dict[Hashable, Wanted] = {}  # by tab, the oldest first
+        self._ahead: dict[Hashable, list[Wanted]] = {}  # by tab, the likeliest first
+        self._warm: Wanted | None = None
+        self._at: Wanted | None = None  # what is recorded now
+        self._ahead_now = False  # whether nobody waits for it
+        self._drop = get_context("spawn").Event()
         self._stopped = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -85,6 +114,24 @@ class Recorder:
             self._wishes.pop(tab, None)
             if wanted is not None:
                 self._wishes[tab] = wanted
+                if self._ahead_now and wanted == self._at:
+                    self._ahead_now = False  # now somebody waits for it
+                elif self._ahead_now:
+                    self._drop.set()
+            self._changed.notify()
+
+    def record_ahead(self, wanted: Sequence[Wanted], *, tab: Hashable = 0) -> None:
+        """Record these while nobody waits for others, the first ones first; of a tab the last ones asked for count."""
+        with self._changed:
+            self._ahead.pop(tab, None)
+            if wanted:
+                self._ahead[tab] = list(wanted)
+            self._changed.notify()
+
+    def warm(self, wanted: Wanted) -> None:
+        """Have the process ready that records such crossings, before anybody asks."""
+        with self._changed:
+            self._warm = wanted
             self._changed.notify()
 
     def stop(self) -> None:
@@ -99,41 +146,70 @@ class Recorder:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopped or bool(self._wishes))
+                self._changed.wait_for(lambda: self._stopped or bool(self._wishes or self._ahead or self._warm))
                 if self._stopped:
                     return
-                wanted = self._wishes.pop(next(iter(self._wishes)))
+                wanted, only_warm = self._next()
             try:
+                if only_warm:
+                    self._worker(wanted)
+                    continue
                 report = self._recorded(wanted)
                 with self._changed:  # others may have asked for the same meanwhile
-                    self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
-                self._report(report)
+                    self._at, self._ahead_now = None, False
+                    self._drop.clear()
+                    if report is not None:
+                        self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
+                if report is not None:
+                    self._report(report)
             except (ValueError, EvaluatorError, OSError) as error:
                 if self._stopped:
                     return
+                with self._changed:
+                    told = not (only_warm or self._ahead_now)
+                    self._at, self._ahead_now = None, False
                 self._dismiss(wanted.policy)
-                self._report(Report(wanted=wanted, text=str(error), failed=True))
+                if told:
+                    self._report(Report(wanted=wanted, text=str(error), failed=True))
 
-    def _recorded(self, wanted: Wanted) -> Report:
+    def _next(self) -> tuple[Wanted, bool]:
+        """What to do next, and whether it is only to have its process ready."""
+        self._ahead_now = False
+        if self._wishes:
+            self._at = self._wishes.pop(next(iter(self._wishes)))
+        elif self._warm is not None:
+            warm, self._warm = self._warm, None
+            return warm, True
+        else:
+            tab = next(iter(self._ahead))
+            self._at, self._ahead_now = self._ahead[tab].pop(0), True
+            if not self._ahead[tab]:
+                del self._ahead[tab]
+        return self._at, False
+
+    def _recorded(self, wanted: Wanted) -> Report | None:
+        """What became of it; None if it was recorded ahead and is dropped."""
         worker = self._worker(wanted)
         worker.send(wanted.terrain[None], np.array([wanted.terrain_seed], np.uint32))
         while True:
             message, value = worker.receive()
             if message == "result":
-                return Report(wanted=wanted, text="recorded", share=1.0, recording=value)
-            self._report(Report(wanted=wanted, text="crossing", share=float(value)))
+                return None if value is None else Report(wanted=wanted, text="recorded", share=1.0, recording=value)
+            if not self._ahead_now:
+                self._report(Report(wanted=wanted, text="crossing", share=float(value)))
 
     def _worker(self, wanted: Wanted) -> WorkerProcess:
         """The process of a controller, built if there is none; the one longest unused makes room."""
         worker = self._workers.pop(wanted.policy, None)
         if worker is None:
-            self._report(Report(wanted=wanted, text=_PREPARING))
+            if not self._ahead_now:
+                self._report(Report(wanted=wanted, text=_PREPARING))
             while len(self._workers) >= MAX_PROCESSES:
                 self._dismiss(next(iter(self._workers)))
             with self._changed:
                 if self._stopped:
                     raise EvaluatorError("the viewer is stopping")
-                worker = self._workers[wanted.policy] = WorkerProcess(1, self._build, (self._robot, wanted))
+                worker = self._workers[wanted.policy] = WorkerProcess(1, self._build, (self._robot, wanted, self._drop))
             worker.receive()  # that it is ready
         else:
             self._workers[wanted.policy] = worker

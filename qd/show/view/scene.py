@@ -25,7 +25,7 @@ GHOST_COLOR = (0, 114, 178)
 _START_COLOR, _GOAL_COLOR = (240, 200, 60), (0, 158, 115)
 _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
-_PHONE = 576
+PHONE = 576
 """Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
 _PATH_RADIUS, _PATH_OPACITY = 0.008, 0.35
 _WAY_LIFT = 0.03  # over the ground [m]
@@ -45,7 +45,7 @@ def overview_of(width: int, height: int) -> View:
         width: Of the picture [pixels].
         height: Of the picture [pixels].
     """
-    if width < _PHONE:
+    if width < PHONE:
         return (-9.0, 4.0, 9.0), (-2.4, 4.0, 0.0)
     if width < height:  # the terrain's length goes up the picture
         return (-2.6, 4.0, 9.6), (6.6, 4.0, 0.0)
@@ -59,7 +59,7 @@ def first_view_of(width: int, height: int) -> View:
         width: Of the picture [pixels].
         height: Of the picture [pixels].
     """
-    if width < _PHONE:
+    if width < PHONE:
         return (-3.0, 3.4, 4.2), (0.3, 3.7, 0.0)
     return (-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)
 

@@ -1,7 +1,7 @@
 """A browser tab: what it shows, and what happens when its visitor does something. No tab knows of another."""
 
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
@@ -10,7 +10,8 @@ import viser
 
 from qd.show.crossed import crossed_of
 from qd.show.recordings import Recordings, Wanted, on_elite
-from qd.show.view.address import Address, copy_link, keep_keys, show_query
+from qd.show.view.address import Address, keep_keys, show_query
+from qd.show.view.errands import Errands
 from qd.show.view.ghost import CERTIFYING, Ghost
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection, add_keys
 from qd.show.view.playing import (
@@ -27,12 +28,16 @@ from qd.show.view.plots import Axes, Curves
 from qd.show.view.pointing import let_point
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, Shapes, View, first_view_of, overview_of
+from qd.show.view.taking import Taking
 from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from qd.show.view.command import Show
 
 _NUMBERS_S = 0.2
@@ -53,6 +58,9 @@ class Common:
     recordings: Recordings
     record: Callable[[Wanted | None, Hashable], None]
     """Asks for crossings on behalf of a tab or of its ghost; of each the last ones count."""
+    record_ahead: Callable[[Sequence[Wanted], Hashable], None]
+    """Has crossings recorded while nobody waits for others; of a tab the last ones asked for count."""
+    errands: Errands
     post: Callable[..., None]
     """Has something done by the loop, with arguments; of what has equal ``only_last``, the last."""
 
@@ -74,6 +82,7 @@ class Tab:
         self._archive, self._others = show.found.archive, address.others
         self._selection, self._clock = Selection(common.axes), Clock()
         self._controller = next(iter(show.controllers), None)
+        self._minimal = False  # whether the elite's minimal terrain is wanted, where it has one
         self._replica = 0
         self._begin_s = address.time_s or 0.0  # of the next crossing to be shown
         self._recording: Recording | None = None
@@ -83,6 +92,7 @@ class Tab:
         self._curves: Curves | None = None
         self._query, self._told, self._addressed = "", 0.0, time.perf_counter()
         self.ghost = Ghost(common, client.client_id)
+        self.taking = Taking(self)
         self.scene = Scene(client, common.shapes, CrossingCfg())
         title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
         self._list = ArchivePanel(client, common.axes, self._selection, title, self)
@@ -107,12 +117,15 @@ class Tab:
             self.ghost.choice = address.ghost
         elif address.ghost is not None:
             refused.append(self._no_controller(address.ghost))
+        self._minimal = address.minimal or (address.elite is None and show.cfg.minimal is not None)
+        if address.minimal and (show.minima is None or elite not in show.minima.genes):
+            refused.append(f"Elite {elite} has no minimal terrain here.")
         if address.episode is not None and not 1 <= address.episode <= episodes:
             refused.append(f"There is no episode {address.episode} here: there are 1 to {episodes}.")
         elif address.episode is not None:
             self._replica = address.episode - 1
         for words in refused:
-            self._refuse(words)
+            self.refuse(words)
         if address.camera is None:
             self.look(first_view_of)
         self._selection.pick(elite)
@@ -148,6 +161,7 @@ class Tab:
             elite=self._selection.picked,
             controller=self._controller,
             ghost=None if self.ghost.choice == CERTIFYING else self.ghost.choice,
+            minimal=self.genes is not None,
             episode=self._replica + 1,
             time_s=self._clock.time_s if self._crossing is not None else self._begin_s,
             follow=self.scene.follow,
@@ -159,13 +173,35 @@ class Tab:
             self._query = query
             show_query(self.client, query)
 
-    def copy_link(self) -> None:
-        """Copy the link to what the tab shows."""
-        self.show_address()
-        copy_link(self.client)
-        self.client.add_notification("Link copied", "It opens what this tab shows.", auto_close_seconds=3.0)
+    @property
+    def elite(self) -> int:
+        """Number of the elite that is shown."""
+        return self._selection.picked
 
-    def _refuse(self, words: str) -> None:
+    @property
+    def genes(self) -> "NDArray[np.float32] | None":
+        """Of the minimal terrain that is shown; None of a whole elite."""
+        minima = self.common.show.minima
+        return None if minima is None or not self._minimal else minima.genes.get(self.elite)
+
+    @property
+    def controller(self) -> str | None:
+        """Name of the controller whose crossing is shown; None without one."""
+        return self._controller
+
+    @property
+    def filmed(self) -> tuple[Recording, int] | None:
+        """The crossings that are shown, and which of them, counted from 0; None while there are none."""
+        return None if self._recording is None else (self._recording, self._replica)
+
+    def choose_terrain(self, minimal: bool) -> None:
+        """Show the elite's minimal terrain, or the whole one."""
+        if minimal != self._minimal:
+            self._minimal, self._begin_s = minimal, 0.0
+            self._show_elite()
+
+    def refuse(self, words: str) -> None:
+        """Say at the top of the page what is not to be had."""
         self.client.add_notification("Not here", words, color="red", auto_close_seconds=12.0)
 
     def _no_elite(self, number: object) -> str:
@@ -201,7 +237,7 @@ class Tab:
         if number < len(self._archive) and number >= 0:
             self.pick(number)
         else:
-            self._refuse(self._no_elite(f"'{text}'"))
+            self.refuse(self._no_elite(f"'{text}'"))
             self._list.show()
 
     def pick(self, number: int) -> None:
@@ -244,7 +280,7 @@ class Tab:
     def choose_replica(self, replica: int) -> None:
         """Show another episode, counted from 0."""
         if not 0 <= replica < self.common.show.cfg.replicas:
-            self._refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.cfg.replicas}.")
+            self.refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.cfg.replicas}.")
             return
         self._replica, self._begin_s = replica, 0.0
         if self._recording is not None:
@@ -319,6 +355,7 @@ class Tab:
         """Ask for nothing more; the browser is gone."""
         self._clock.playing = False
         self.common.record(None, self.client.client_id)
+        self.common.record_ahead([], self.client.client_id)
         self.ghost.leave()
 
     def _wanted(self) -> Wanted | None:
@@ -327,11 +364,23 @@ class Tab:
         if self._controller is None:
             return None
         policy, replicas = show.controllers[self._controller], show.cfg.replicas
-        return on_elite(self._archive, self._selection.picked, policy=policy, replicas=replicas)
+        return on_elite(self._archive, self._selection.picked, policy=policy, replicas=replicas, minimal=self.genes)
+
+    def _record_ahead(self) -> None:
+        """Have the crossings of the neighbours in the list recorded while nobody waits."""
+        show, wanted = self.common.show, []
+        if self._controller is not None and self._recording is not None:
+            near = dict.fromkeys(self._selection.step(by) for by in (1, -1))
+            policy, replicas = show.controllers[self._controller], show.cfg.replicas
+            there = [on_elite(self._archive, number, policy=policy, replicas=replicas) for number in near]
+            wanted = [one for one in there if self.common.recordings.may_keep(one)]
+        self.common.record_ahead(wanted, self.client.client_id)
 
     def _show_elite(self) -> None:
-        elite = self._selection.picked
-        heights, ground = terrains_of(self._archive.genes[elite : elite + 1], self.common.show.found.space)
+        show, elite, genes = self.common.show, self._selection.picked, self.genes
+        self._panel.show_terrain(show.minima is not None and elite in show.minima.genes, genes is not None)
+        shown = self._archive.genes[elite] if genes is None else genes
+        heights, ground = terrains_of(shown[None], show.found.space)
         self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
 
@@ -344,11 +393,15 @@ class Tab:
             for name, recording, what in shown
             if recording is not None
         }
-        self._panel.show_elite(self.common.axes.details(self._selection.picked, rates))
+        details, minima = self.common.axes.details(self._selection.picked, rates), self.common.show.minima
+        if minima is not None and self._selection.picked in minima.genes:
+            which = "It is shown." if self.genes is not None else "Terrain: minimal shows it."
+            details += f"\n\n**Minimal terrain**: {minima.words(self._selection.picked)}. {which}"
+        self._panel.show_elite(details)
 
     def _load_ghost(self) -> None:
         """Take the ghost of the elite and the controller that are shown."""
-        words = self.ghost.load(self._selection.picked, self._controller)
+        words = self.ghost.load(self._selection.picked, self._controller, self.genes)
         self._panel.show_ghost(self.ghost.choice, words)
         self._show_details()
 
@@ -390,6 +443,7 @@ class Tab:
         self._show_details()
         self.scene.set_paths(paths_of(recording))
         self._show_episode()
+        self._record_ahead()
 
     def _show_episodes(self) -> None:
         """Offer the episodes to choose from, and say which is shown."""

@@ -131,7 +131,7 @@ def test_mistakes_are_named_before_anything_is_crossed(run, capsys, monkeypatch)
     assert "no such file" in failed("--policy", "none.pt")
     assert not list(run.glob("*.mp4")) and not list(run.glob("*.recording.npz"))
     monkeypatch.setenv("MUJOCO_GL", "no_such_way")
-    assert "pictures need OpenGL without a screen, but 'no_such_way' cannot be had here" in failed()
+    assert "pictures need OpenGL without a screen, but 'no_such_way' does not work here" in failed()
 
 
 def test_elites_are_exported_as_the_simulation_has_them(run, capsys):

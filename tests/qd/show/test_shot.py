@@ -69,14 +69,14 @@ def test_the_caption_says_what_is_shown_and_how_all_ended(recording):
     first, second = caption(shot_of(dataclasses.replace(recording, replicas=np.int32([7, 8, 9, 10, 11]))))
     assert first == "anymal on a hill: episode 9, out of time after 1.0 s"
     # Wilson, z^2 = 3.8415, of 1 of 5: (.2 + .3841 +- 1.96 sqrt(.032 + .0384)) / 1.7683 = .3303 +- .2941
-    both = "base collision 20% (4 to 62%), goal 20% (4 to 62%), fallen 20% (4 to 62%)"
+    both = "goal 20% (4 to 62%), base collision 20% (4 to 62%), fallen 20% (4 to 62%)"
     assert second == f"5 episodes: {both}; in brackets 95 % intervals"
     named = dataclasses.replace(recording, origin={"policy": "runs/tuned/C-G.pt"})
-    assert caption(shot_of(named))[1].startswith("5 episodes with C-G.pt: base collision")
+    assert caption(shot_of(named))[1].startswith("5 episodes with C-G.pt: goal 20%")
     outcome = recording.outcome.copy()
     outcome[0, 4] = Outcome.INVALID
     _, second = caption(shot_of(dataclasses.replace(recording, outcome=outcome)))
-    assert second.startswith("5 episodes, 1 invalid: base collision 0% (0 to 49%), goal 25% (5 to 70%), fallen 0%")
+    assert second.startswith("5 episodes, 1 invalid: goal 25% (5 to 70%), base collision 0% (0 to 49%), fallen 0%")
     everything = dataclasses.replace(recording, outcome=np.full((1, 5), Outcome.INVALID, np.uint8))
     assert caption(shot_of(everything))[1].startswith("5 episodes, 5 invalid: none valid")
 
@@ -113,6 +113,16 @@ def test_the_panel_has_a_cursor_at_the_time_and_a_dot_at_the_place(recording):
     # Between the two moments the curves are faded early and as strong as they are late, or further back.
     between = slice(round(left + 0.35 * (right - left)), round(left + 0.65 * (right - left)))
     assert early[20:180, between].min() > 150 and late[20:180, between].min() < 120
+
+
+def test_the_numbers_of_the_legend_run_with_the_film(recording):
+    panel, here = Panel(shot_of(recording), WIDTH, PANEL_HEIGHT), np.array([3.0, 4.0, 0.5])
+    first, half, last = (panel.at(time_s, here)[:, -60:] for time_s in (0.0, 0.5, 1.0))
+    assert (panel._image[:, -50:] > 250).all()  # nothing else stands there
+    assert len(panel._places) == 2 and all(place[0] < WIDTH for place in panel._places)
+    for image in (first, half, last):
+        assert (image < 100).any()
+    assert (first != half).any() and (half != last).any()
 
 
 def test_the_panel_says_whether_penalties_are_scaled(recording):

@@ -120,6 +120,13 @@ def test_lots_come_one_by_one_while_the_next_is_under_way():
     assert [part.stop for part, _ in evaluator._Here(Crosser(CFG, 6), 6).in_lots(GENES, SEEDS, 6)] == [6, 12, 15]
 
 
+def test_a_small_last_lot_waits_for_nobody_where_there_is_room():
+    crosser = Crosser(CFG, 15)
+    for part, result in evaluator._Here(crosser, 15).in_lots(GENES, SEEDS, 10):
+        assert same(result, stand_in.evaluate(GENES[part], SEEDS[part], 4))
+        assert len(crosser.lots) == (15 - part.stop) // 5  # 10 and 5 are put in together
+
+
 def test_contact_is_resolved_at_the_same_control_rate():
     robot = get_robot("anymal")
     cfg = EvaluatorCfg(robot=robot, policy=str(robot.policy_file), num_terrains=1, num_replicas=4, resolved=True)

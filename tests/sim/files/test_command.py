@@ -1,6 +1,9 @@
 """How commands start, fail and end, and the command lines that are printed."""
 
+import os
+import signal
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,6 +67,31 @@ def test_errors_become_one_line_and_an_exit_status(capsys, how, status, message)
 
 def test_a_command_returns_its_status():
     assert (run(), run("--status", "1")) == (0, 1)
+
+
+def test_sigterm_in_the_midst_of_compiling_is_not_lost(monkeypatch):
+    """What a handler raises in a call from llvmlite's C code is printed and dropped."""
+    there = {"kill": lambda: os.kill(os.getpid(), signal.SIGTERM), "reached": []}
+    exec(
+        compile("def called_from_c():\n kill()\n reached.append(1)", "/x/llvmlite/binding/executionengine.py", "exec"),
+        there,
+    )
+
+    @dataclass(frozen=True, kw_only=True)
+    class Compiles:
+        """Compiles."""
+
+        def execute(self) -> None:
+            """Compiles, and then waits."""
+            there["called_from_c"]()
+            time.sleep(30)
+
+    began, before = time.monotonic(), signal.getsignal(signal.SIGTERM)
+    try:
+        assert run_command(Compiles, [], name="compiles") == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert there["reached"] and time.monotonic() - began < 20
 
 
 def test_a_bug_keeps_its_traceback_and_so_does_every_error_for_debugging(monkeypatch):

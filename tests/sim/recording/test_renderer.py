@@ -172,5 +172,20 @@ def test_what_cannot_be_shown_is_named(anymal, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"has joints  for MuJoCo, expected a free base and LF_HAA, "):
         scene_model(bare, np.zeros((NUM_ROWS, NUM_COLS)), width=8, height=8)
     monkeypatch.setenv("MUJOCO_GL", "no_such_way")
-    with pytest.raises(ValueError, match=r"'no_such_way' cannot be had here: ModuleNotFoundError.*libegl1"):
+    with pytest.raises(ValueError, match=r"'no_such_way' does not work here: ModuleNotFoundError.*libegl1"):
         open_context(8, 8)
+
+
+def test_paths_are_drawn_where_they_run(opengl):
+    robot, heights = get_robot("anymal"), np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    points = np.array([[4.0, 4.0, 0.5], [8.0, 4.0, 0.5], [12.0, 4.0, 0.5]])
+    camera = Camera(target=(8.0, 4.0, 0.5), distance=9.0, azimuth=90.0, elevation=-89.0)
+    with Renderer(robot, heights, width=640, height=320, shadows=False) as renderer:
+        pose = standing(robot, 2.0, 1.0, 0.0)
+        bare, drawn = (
+            renderer.render(pose, camera, paths=p).astype(int) for p in ((), [(points, (1.0, 0.0, 0.0, 1.0))])
+        )
+    rows, columns = np.nonzero(np.abs(drawn - bare).sum(axis=2) > 60)
+    assert abs(rows.mean() - 160) < 3 and np.ptp(rows) < 8  # level across the middle of the picture
+    assert abs(columns.mean() - 320) < 5 and np.ptp(columns) > 200
+    assert (drawn[160, 320] - bare[160, 320])[0] > (drawn[160, 320] - bare[160, 320])[2]  # it is red

@@ -114,3 +114,23 @@ def test_a_file_that_cannot_be_shown_is_named(robot, tmp_path):
     file.write_text("no xml")
     with pytest.raises(ValueError, match=r"bad\.xml cannot be shown"):
         Skeleton(dataclasses.replace(robot, model_file=file))
+
+
+def test_visual_shapes_are_shown_alone_on_bodies_that_have_some(tmp_path):
+    """A URDF's visuals where they can be read, and meshes of an MJCF that touch nothing; names are the simulation's."""
+    shown = '<visual><geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
+    file = write_dog(tmp_path, **KINDS["urdf"])
+    model = next(tmp_path.glob("*.urdf"))
+    model.write_text(model.read_text().replace('<link name="FL_thigh">', f'<link name="FL_thigh">{shown}'))
+    dog = Skeleton(get_robot(str(file)))
+    kinds = {name: {geom.kind for geom in dog.geoms if geom.body == k} for k, name in enumerate(dog.body_names)}
+    assert kinds["FL_thigh"] == {"box"} and kinds["FR_thigh"] == {"capsule"}
+    assert dog.geom("FL_thigh").kind == "capsule"  # what touches is known all the same
+    cover = '<geom type="mesh" mesh="trunk" contype="0" conaffinity="0"/><geom name="trunk"'
+    file = with_mesh(tmp_path / "more", "mjcf")
+    model = next(file.parent.glob("*.xml"))
+    text = model.read_text().replace('<geom name="trunk" type="mesh" mesh="trunk"', f'{cover} size="0.1"', 1)
+    model.write_text(text)
+    dog = Skeleton(get_robot(str(file)))
+    assert [geom.kind for geom in dog.geoms if geom.body == 0] == ["mesh"] and dog.geom("trunk").kind == "sphere"
+    assert any(geom.kind != "mesh" for geom in dog.geoms)

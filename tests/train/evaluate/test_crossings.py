@@ -59,7 +59,7 @@ def test_whatever_changes_the_numbers_is_looked_at(tmp_path, policy, monkeypatch
     assert keeper(tmp_path).read(policy, fresh_seeds) is None
     assert keeper(tmp_path).read(policy, other_terrains) is None
     with monkeypatch.context() as patch:
-        patch.setattr("train.evaluate.crossings.code_fingerprint", lambda rooms: "other code")
+        patch.setattr("qd.workers.kept.code_fingerprint", lambda rooms: "other code")
         assert keeper(tmp_path).read(policy, TERRAINS) is None
     with open(policy, "wb") as file:
         file.write(b"other weights")

@@ -92,7 +92,7 @@ def test_the_tables_from_end_to_end(tmp_path, archive, capsys):
     assert crossings.sets == [(STANDER, 4)] * 3 + [(PROTOTYPE, 4)] * 3 and len(crossings.opened) == 2
     assert all(cfg.reward for cfg in crossings.opened)
     said = capsys.readouterr().out
-    assert "base on hand_crafted: success 1.000" in said and "written to" in said
+    assert "base on hand_crafted: goal " in said and "no base collision 1.000" in said and "written to" in said
 
 
 def test_all_controllers_meet_the_same_terrains_and_starts(tmp_path, archive):

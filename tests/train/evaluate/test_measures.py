@@ -61,8 +61,8 @@ def test_invalid_episodes_may_be_failures():
     counts = {"goal": 880, "base_collision": 77, "time_out": 0, "invalid": 43}
     (line,) = invalid_lines({"hard_random": counts, "flat": {"goal": 5, "base_collision": 1, "invalid": 0}})
     assert line == (
-        "hard_random: 43 of 1000 episodes are invalid (4.3%) and left out; counted as failures, success would be "
-        "0.880, goal 0.880"
+        "hard_random: 43 of 1000 episodes are invalid (4.3%) and left out; counted as failures, goal would be "
+        "0.880, no base collision 0.880"
     )
 
 

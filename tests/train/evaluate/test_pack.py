@@ -117,7 +117,7 @@ def test_a_pack_from_end_to_end(made, home, capsys):
     for key in ("command", "commit", "device", "versions", "seed", "date", "robot_sha256", "policy_sha256"):
         assert key in content, key
     count = len(verdicts)
-    assert f"{count} faults and near-faults, 100 were asked for: the pack has {count}." in capsys.readouterr().out
+    assert f"of which the pack has {count}, 100 were asked for." in capsys.readouterr().out
     few = packed(made, size=3, out=Path("few"))  # the first of the same
     assert [about["name"] for about in few["terrains"]] == [about["name"] for about in content["terrains"][:3]]
 
@@ -159,7 +159,7 @@ def test_a_pack_is_exported(made, home):
     assert [one["verdict"] for one in index["elites"]] == ["fault", "fault"] and index["pack"] == "pack"
     with pytest.raises(ValueError, match="holds an export already"):
         export(Export(pack="pack", formats=("npz",), out=Path("files")))
-    with pytest.raises(ValueError, match="got --run or --space beside --pack"):
+    with pytest.raises(ValueError, match="got --run, --space or --minimal beside --pack"):
         export(Export(pack="pack", run=made / "judged"))
 
 
@@ -169,6 +169,10 @@ def test_what_is_no_pack_to_be_made_of_is_refused(made, home, tmp_path):
     half = Path(shutil.copytree(made / "fresh", tmp_path / "half"))
     confirm_run(Confirm(run=half, **HERE), open_evaluator=judges)
     with pytest.raises(ValueError, match=r"run `.*certify --robot anymal --run .*half` first"):
+        packed(made, run=half)
+    one = str(np.flatnonzero(read_archive(half).failing)[0])
+    certify_run(Certify(run=half, by=(OTHER,), elite=one, **HERE), open_evaluator=judges)
+    with pytest.raises(ValueError, match=r"which says what is a fault, got 1 of them: run `.*certify"):
         packed(made, run=half)
     with pytest.raises(ValueError, match="give that robot or another --run"):
         packed(made, robot="cassie")

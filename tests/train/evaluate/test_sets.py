@@ -146,6 +146,17 @@ def test_generated_terrains_are_those_held_out():
     assert len(np.unique(many.seeds)) == 12
 
 
+def test_generated_terrains_have_the_families_of_their_kin():
+    archive = make_archive(10)
+    genes = archive.genes.copy()
+    split = split_elites(archive, "anymal")
+    genes[split.test[1]] = genes[split.test[0]]  # the two that are held out are one terrain
+    kin = replace(archive, genes=genes)
+    assert generated_set(archive, split, 300, 0).families.tolist() == [0, 1]
+    assert generated_set(kin, split, 300, 0).families.tolist() == [0, 0]
+    assert plain_set("hard_random", 3, 0).families is None
+
+
 def test_the_far_third_is_the_farthest():
     training = SUPER_GAUSSIAN.hard_random(4, 0)
     genes = SUPER_GAUSSIAN.hard_random(7, 1)

@@ -5,7 +5,6 @@ import math
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -86,16 +85,6 @@ def test_a_full_size_checkpoint_is_small(shared_task, tmp_path):
     learner.iterate()
     learner.save(tmp_path / "c.pt", {})
     assert (tmp_path / "c.pt").stat().st_size < 8e6
-
-
-def test_the_last_share_of_the_iterations_has_its_own_pace(shared_task, monkeypatch):
-    cfg = replace(CFG, final_share=0.26, final_kl=0.004, final_entropy=0.0)
-    learner = Learner(CommandVecEnv(shared_task), cfg, seed=0)
-    paces = []
-    monkeypatch.setattr(learner.alg, "set_pace", lambda *pace: paces.append(pace))
-    for learner.iteration in range(100):
-        learner.set_pace(100)
-    assert paces == [(cfg.desired_kl, cfg.entropy)] * 74 + [(0.004, 0.0)] * 26
 
 
 def test_losses_that_are_not_finite_stop_training(learner, monkeypatch):

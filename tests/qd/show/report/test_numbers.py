@@ -7,7 +7,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.elites import elites_of
-from qd.modes import MAX_MODES, find_modes
+from qd.modes import MAX_MODES, failure_modes, find_modes
 from qd.show.crossed import crossed_of, penalties_by_place
 from qd.show.ranking import rank
 from qd.show.report.elites import choice_told
@@ -92,7 +92,7 @@ def test_which_elites_are_shown_is_told_truly(goal_rates, chosen, told):
     assert (ranking.worst(len(chosen[0])), elites.most_reproducible(1)) == chosen
     sentence = choice_told(elites, *chosen)
     assert told in sentence
-    assert sentence.endswith(f"failed ones first ({chosen[1][0]}); and a typical terrain of each mode.")
+    assert sentence.endswith(f"failed ones first ({chosen[1][0]}).")
 
 
 def test_modes_are_the_kinds_that_were_made():
@@ -123,6 +123,18 @@ def test_few_elites_are_one_mode(archive):
     found = find_modes(elites_of(archive))
     assert len(found.modes) == 1 and not found.silhouettes
     assert found.modes[0].members.tolist() == list(range(len(archive)))
+
+
+def test_failure_modes_are_of_failing_elites_alone():
+    archive, kinds = grouped_archive()
+    found = failure_modes(elites_of(archive))
+    assert sorted(mode.ending for mode in found.modes) == ["gets stuck", "strikes the terrain"]
+    assert {tuple(sorted(set(kinds[mode.members]))) for mode in found.modes} == {(0,), (1,)}
+    assert (found.labels[kinds == 2] == 0).all() and (found.labels[kinds != 2] > 0).all()
+    for mode in found.modes:
+        assert mode.typical in mode.members and (found.labels[mode.members] == mode.number).all()
+    crossed = dataclasses.replace(archive, goal_rate=np.ones(len(kinds)))
+    assert failure_modes(elites_of(crossed)).modes == []
 
 
 def test_equal_elites_are_one_mode():

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import matplotlib.image
@@ -17,7 +18,7 @@ from qd.run.minimal_file import write_minimal
 from qd.run.settings import as_settings, preset
 from qd.show.figures import summary
 from qd.show.ranking import rank
-from qd.show.report import command
+from qd.show.report import command, pdf
 from qd.show.report import page as page_module
 from qd.show.report.command import Report
 from qd.show.report.material import gather
@@ -109,7 +110,8 @@ def run(tmp_path):
 
 @pytest.fixture
 def reported(run, monkeypatch):
-    """Makes reports whose figures are a dot: drawing takes most of the time."""
+    """Makes reports whose figures are a dot, without rendered pictures: drawing takes most of the time."""
+    monkeypatch.setenv("MUJOCO_GL", "nothing")
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(DOT))
     return reporter(run, monkeypatch)
 
@@ -121,15 +123,16 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
     content = out.read_bytes()
     page = Page(content)
     assert page.open == [] and len(content) < MAX_BYTES
-    assert page.resources and all(resource.startswith("data:image/png;base64,") for resource in page.resources)
+    assert page.resources and all(re.match("data:image/(png|jpeg);base64,", source) for source in page.resources)
     assert all(link.startswith("#") and link[1:] in page.ids for link in page.links)
     assert len(page.ids) == len(set(page.ids))
-    outside = re.sub(rb"data:image/png;base64,[A-Za-z0-9+/=]+", b"", content)
+    outside = re.sub(rb"data:image/(png|jpeg);base64,[A-Za-z0-9+/=]+", b"", content)
     assert not re.search(rb"https?://|url\(|@import|<link|<iframe|fetch\(", outside)
     assert b"default-src 'none'" in content
     figures = sorted(path.name for path in (run / "report-figures").iterdir())
     assert len(figures) == len(page.resources)
     assert {"curves.png", "archive.png", "spread.png", "pairs.png", "modes.png", "elite-0.png"} <= set(figures)
+    assert sum(name.startswith("failing-") for name in figures) == 2
     for name in figures:
         assert matplotlib.image.imread(run / "report-figures" / name).std() > 0.01  # something is drawn
     assert len(crossed) == len(set(crossed)) == sum(name.startswith("elite-") for name in figures)
@@ -146,7 +149,7 @@ def test_the_sentences_have_the_numbers_of_the_files(whole):
     assert "(40 min of walking, simulated)" in text  # 160 episodes of 15 s
     assert "the archive grew from 5 to 20 elites, half of them found by iteration 2" in text
     assert "QD score, the sum of fitness above -20, rose from 20 to 80" in text
-    assert "The 20 elites fall into 3 modes" in text
+    assert f"The {failing} failing elites of 20 fall into 2 failure modes" in text
     assert f"{int(archive.collided.sum())} of 20 elites had a base collision" in text
     # of elite 0 four made-up crossings end each in its own way, at x = 6, 8.7, 11.3 and 14, the first at the goal
     at = np.median(np.linspace(6.0, 14.0, 4)[1:])
@@ -172,10 +175,15 @@ def test_the_first_chapter_says_what_breaks_the_controller_and_in_how_many_ways(
     write_archive(run / "archive.npz", dataclasses.replace(archive, iterations=4, fresh=fresh))
     text = Page(reported()[0].read_bytes()).text
     first = text[: text.index("From iteration 1")]
-    assert "The controller fails on 15 of 20 elites" in first and "They fall into 3 cells" in first
-    assert "different ways of failing: cells that these fall into 3 failure modes: kinds of these ways 2" in first
-    told = ("strikes the terrain with its base on 9 elites", "gets stuck on 6 elites", "reaches the goal on 5 elites")
-    assert [first.index(part) for part in told] == sorted(first.index(part) for part in told)
+    assert (
+        "The controller fails on 15 of 20 elites, in 2 ways. The robot strikes the terrain with its base (9, marked"
+        in first
+    )
+    assert "; gets stuck (6, marked by yaw-rate error)." in first and "reaches the goal (" not in first
+    assert (
+        "15 of 20 failure modes: kinds of these 2 cells that these fall into: different shares of what goes wrong 3"
+        in first
+    )
 
 
 def test_without_fresh_episodes_those_of_the_search_are_named(reported, run):
@@ -387,18 +395,60 @@ def test_minimal_files_that_do_not_belong_together_are_refused(reported, run):
         reported()
 
 
+def test_a_terrain_that_is_crossed_is_in_no_failure_mode(reported, run):
+    archive = read_archive(run)
+    again = dataclasses.replace(archive.fresh, goal_rate=np.ones(20), collision_rate=np.zeros(20))
+    write_archive(run / "archive.npz", dataclasses.replace(archive, fresh=again))
+    text = Page(reported()[0].read_bytes()).text
+    assert "The controller fails on 0 of 20 elites." in text and "No elite fails, so there is no failure mode." in text
+
+
+def test_every_row_of_all_elites_opens_a_picture(whole):
+    content = whole[0].read_text()
+    rows = content[content.index('id="all"') :]
+    pictures = re.findall(
+        r'<tr data-opens="data:image/jpeg;base64,([A-Za-z0-9+/=]+)" data-shows="Elite (\d+) from', rows
+    )
+    assert sorted(int(number) for _, number in pictures) == list(range(20))
+    assert len({picture for picture, _ in pictures}) == 20
+
+
+def test_without_opengl_terrains_are_shown_from_above(reported, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "nothing")
+    out = reported()[0]
+    assert "Where robots end on them is not shown. pictures need OpenGL" in Page(out.read_bytes()).text
+    assert len(list(out.with_name("report-figures").glob("failing-*.jpg"))) == 2
+
+
+def test_paths_of_the_machine_are_left_out(whole):
+    assert str(whole[0].parent.parent) not in whole[0].read_text()
+
+
+@pytest.mark.slow
+def test_a_short_form_is_printed_as_a_pdf(reported, run, monkeypatch):
+    monkeypatch.setattr(pdf.shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match=r"a PDF is printed by a browser, and none of chromium, .* install one"):
+        reported(format="pdf")
+    monkeypatch.undo()
+    if not any(map(shutil.which, pdf._BROWSERS)):
+        pytest.skip("there is no browser: apt-get install chromium")
+    monkeypatch.chdir(run.parent)
+    with pytest.raises(ValueError, match=r"out must be a file named \*\.pdf, got"):
+        reporter(run, monkeypatch)(format="pdf", out=run / "x.html")
+    out, _ = reporter(run, monkeypatch)(format="pdf")
+    assert out == run / "report.pdf" and out.read_bytes().startswith(b"%PDF-") and out.stat().st_size > 20_000
+
+
 def test_the_page_leads_with_what_fails_one_terrain_a_mode(whole):
     page = whole[0].read_bytes()
     text = Page(page).text
     first = text[: text.index("The smallest terrains that still break it", text.index("judged (by"))]
-    assert re.search(
-        "The worst terrain of each way of failing,( and others unlike these,)? crossed again, with 95 %", first
-    )
+    assert page.index(b'class="cards"') < page.index(b"judged (by")
     assert "Which of these are faults, terrains that another controller crosses, is not known yet." in first
     assert page.index(b'id="outcome"') < page.index(b'id="minimal"') < page.index(b'id="terrains"')
     archive = gather(Report(run=whole[0].parent)).archive
     for number in rank(archive, SUPER_GAUSSIAN, judged=True).leaders():
-        assert re.search(rf"elite {number} \(failing\), goal \d of 4", first)
+        assert re.search(rf"Elite {number}, failing: goal reached \d of 4", first)
 
 
 def test_faults_are_told_where_other_controllers_crossed_what_fails(run, reported, whole):
@@ -414,6 +464,7 @@ def test_faults_are_told_where_other_controllers_crossed_what_fails(run, reporte
     count, failing = int(archive.failing[:10].sum()), int(archive.failing.sum())
     assert 0 < count < failing
     text = Page(reported()[0].read_bytes()).text
-    assert f"faults: terrains that C-G crosses and this controller does not {count}" in text
+    assert f"faults: elites that C-G crosses and this controller does not {count}" in text
+    assert f"{count} faults: terrains that C-G crosses and this controller of anymal not. The controller fails" in text
     assert f"{failing - count} failing elites are not known to be passable." in text
     assert len(re.findall(r"(?<=\s)fault(?=\s)", text)) >= count  # a row each in the table of all elites

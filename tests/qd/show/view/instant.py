@@ -4,12 +4,15 @@ import time
 
 
 class Instant:
-    """A simulation that names what it would cross; elite 13 breaks it, and policy `slow` takes its time."""
+    """A simulation that names what it would cross; elite 13 breaks it, and policy `slow` takes its time.
 
-    def __init__(self, policy):
+    Policy `droppable` takes long and can be dropped.
+    """
+
+    def __init__(self, policy, drop):
         if policy == "refused":
             raise ValueError("no such controller")
-        self.policy, self.terrains = policy, []
+        self.policy, self.terrains, self.drop = policy, [], drop
 
     def put(self, terrains, seeds):
         self.terrains.append(terrains[0, 0])
@@ -21,9 +24,11 @@ class Instant:
         progress(0.5)
         if self.policy == "slow":
             time.sleep(1.0)
+        if self.policy == "droppable" and self.drop.wait(1.0):
+            return None
         return f"{self.policy} on {terrain:.0f}"
 
 
 def build(cfg, num_terrains):
-    _, first = cfg
-    return Instant(first.policy)
+    _, first, drop = cfg
+    return Instant(first.policy, drop)

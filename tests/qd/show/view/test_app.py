@@ -3,8 +3,10 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +14,11 @@ import pytest
 from kernels.episode import Outcome
 from qd.archive import read_archive
 from qd.run.directory import RESULTS
+from qd.show.minima import MinimalFound
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
 from qd.show.view.command import View, show_of
+from qd.show.view.errands import Made
 from qd.show.view.recorder import Report
 from qd.show.view.scene import first_view_of
 from qd.show.view.tab import Tab
@@ -44,7 +48,9 @@ class Shown:
     def __init__(self, show, recordings, query=""):
         self.app = App(show, recordings)
         self.asked = []
+        self.ahead = []
         self.app._recorder.record = lambda wanted, tab=0: self.asked.append(wanted)
+        self.app._recorder.record_ahead = lambda wanted, tab=0: self.ahead.append([one.label for one in wanted])
         self.visitors = []
         self.tab = self.come(query)
 
@@ -156,7 +162,7 @@ def test_a_link_opens_what_it_was_copied_from(shown):
         (shown.tab.choose_controller, "other"),
         (shown.tab.seek, 1.25),
         (shown.tab.set_follow, True),
-        (shown.tab.copy_link,),
+        (shown.tab.taking.link,),
     )
     query = shown.tab._query
     assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
@@ -377,6 +383,60 @@ def test_another_controller_has_its_own_crossing(shown):
 
 def rows_of(details):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in details.splitlines() if "|" in line]
+
+
+def test_the_neighbours_in_the_list_are_recorded_ahead(shown):
+    tab = shown.tab
+    near = [tab._selection.step(by) for by in (1, -1)]
+    assert shown.ahead[-1] == [f"elite {number} of anymal" for number in dict.fromkeys(near) if number != 0]
+    shown.do((tab.leave,))
+    assert shown.ahead[-1] == []
+
+
+def test_what_is_shown_can_be_taken_along(shown):
+    tab = shown.tab
+    shown.do((tab.taking.command,))
+    (command,) = notes(shown, 1)
+    assert "replay --robot anymal --run" in command and "--elite 0 " in command and command.endswith("--replicas 20")
+    assert any(command.split("--robot")[1] in script for script in shown.visitors[0].scripts)
+    asked = []
+    tab.common.errands.run = lambda tab, words, made, done: asked.append((words, done)) or True
+    shown.do((tab.choose_replica, 16), (tab.taking.film,), (tab.taking.files,))
+    (film, filmed), (export, _) = asked
+    assert export(Path("there"))[-2:] == ["--out", "there/files"] and export(Path("x"))[0] == "export"
+    with tempfile.TemporaryDirectory() as folder:
+        words = film(Path(folder))
+        assert words[0] == "film" and words[words.index("--replica") + 1] == "16"
+        assert Path(words[words.index("--recording") + 1]).stat().st_size > 100_000
+    filmed(Made(b"", "no OpenGL"))
+    shown.app.do_asked(wait_s=0.2)
+    assert notes(shown, 4)[-1] == "elite-0-episode-17.mp4 was not made: no OpenGL"
+
+
+def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
+    genes = show.found.archive.genes[0].copy()
+    genes[:8] = 0.0
+    entry = {"elite": 0, "bumps": [1], "of": 8, "goal_rate": 0.1, "goal_interval": [0.03, 0.25], "cause": None,
+             "margin_m": None}  # fmt: skip
+    minima = MinimalFound(numbers={"elites": [entry]}, genes={0: genes})
+    recordings = Recordings(show.robot, folder=tmp_path)
+    recordings.keep(*worst_crossed)
+    shown = Shown(dataclasses.replace(show, minima=minima), recordings)
+    tab = shown.tab
+    try:
+        assert tab._panel._terrain.visible and tab._panel._terrain.value == "whole"
+        assert "**Minimal terrain**: 1 of 8 parts; goal reached 10% (3 to 25%)" in tab._panel._details.content
+        shown.do((tab.choose_terrain, True))
+        assert shown.asked[-1].label == "minimal terrain of elite 0 of anymal" and not tab.scene._robot.visible
+        np.testing.assert_array_equal(shown.asked[-1].terrain, genes)
+        tab.show_address()
+        assert "terrain=minimal" in tab._query and shown.come(f"?{tab._query}").genes is genes
+        shown.do((tab.pick, 7))
+        assert tab.genes is None and not tab._panel._terrain.visible
+        shown.come("?elite=7&terrain=minimal")
+        assert notes(shown, 1, visitor=2) == ["Elite 7 has no minimal terrain here."]
+    finally:
+        shown.close()
 
 
 def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):

@@ -1,25 +1,19 @@
 """The page in a real browser: chromium without a screen, driven by playwright."""
 
 import re
-import shutil
 import signal
-import time
-from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
 from tests.builders import free_port
+from tests.qd.show.view.browser import BROWSER, LIMIT_MS, click_another, open_chromium, said, see, wait_until
 from tests.qd.show.view.visitor import serve, view_command
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None, reason="there is no browser: apt-get install chromium"),
 ]
-LIMIT_MS = 120_000
-"""From a click to what it shows, on a busy machine that draws without a GPU."""
-WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +45,8 @@ def address(tmp_path_factory, published):
 
 @pytest.fixture(scope="module")
 def chromium():
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=BROWSER, args=WITHOUT_GPU)
+    with open_chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture
@@ -75,33 +67,6 @@ def opened(chromium, address):
     yield open_tab
     context.close()
     assert errors == []
-
-
-def said(page):
-    """What the page's address says."""
-    return {name: values[0] for name, values in parse_qs(urlsplit(page.url).query).items()}
-
-
-def wait_until(page, true):
-    """Waits until something is true of what the address says."""
-    until = time.perf_counter() + LIMIT_MS / 1000
-    while not true(said(page)):
-        assert time.perf_counter() < until, page.url
-        page.wait_for_timeout(100)
-
-
-def see(page, text):
-    page.get_by_text(re.compile(text)).first.wait_for()
-
-
-def click_another(page, shown):
-    """Clicks a line of the list that is not the one shown; returns its number."""
-    for line in page.get_by_role("button", name=re.compile(r"^\d+: .*goal")).all():
-        number = line.inner_text().split(":")[0]
-        if number != shown:
-            line.click()
-            return number
-    raise AssertionError("the list has no other elite")
 
 
 def test_an_elite_is_chosen_and_the_address_says_so(opened):
@@ -234,3 +199,17 @@ def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
         panel = page.get_by_text("faultline", exact=True).first
         panel.click()  # folds the rest
         page.get_by_role("button", name="Play").wait_for(state="hidden")
+
+
+def test_command_and_files_are_taken_along(opened):
+    page = opened("?elite=0")
+    see(page, "^Episode 1: ")
+    page.get_by_role("button", name="copy command").click()
+    see(page, "^Command copied$")
+    assert "replay --robot anymal" in page.evaluate("navigator.clipboard.readText()")
+    with page.expect_download(timeout=LIMIT_MS) as download:
+        page.get_by_role("button", name="export this").click()
+        see(page, "is ready$")
+        if page.get_by_role("link", name="elite-0.zip").count():  # where it asks first
+            page.get_by_role("link", name="elite-0.zip").first.click()
+    assert download.value.suggested_filename == "elite-0.zip"

@@ -88,6 +88,26 @@ def test_each_tab_has_a_wish_of_its_own(recorder, reports):
     assert reports.empty()
 
 
+def test_what_may_be_asked_for_next_is_recorded_ahead_and_makes_room(recorder, reports):
+    recorder.warm(wish(0, "droppable"))
+    recorder.record_ahead([wish(1, "droppable"), wish(2, "droppable")])
+    time.sleep(0.5)  # it may be at the first
+    recorder.record(wish(7, "droppable"))
+    found = last_of(reports)  # of what nobody waits for nothing is told but the end
+    assert found[-1].recording == "droppable on 7" and {report.wanted.terrain_seed for report in found} <= {0, 1, 7}
+    later = last_of(reports)[-1].recording
+    assert later in ("droppable on 1", "droppable on 2")  # the other one is dropped, or done before
+    recorder.record_ahead([wish(8, "slow")], tab=1)
+    while not recorder._at:
+        time.sleep(0.01)
+    recorder.record(wish(8, "slow"), tab=2)  # somebody asks for just that: it goes on
+    assert last_of(reports)[-1].recording == "slow on 8"
+    recorder.record_ahead([wish(13)])  # it breaks, and nobody waits for it
+    recorder.record(None)
+    time.sleep(0.3)
+    assert reports.empty()
+
+
 def iter_now(reports):
     while not reports.empty():
         yield reports.get()

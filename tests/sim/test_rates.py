@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from sim.agreement import agreement, count_hits, crossing_rates
+from sim.rates import agreement, counted_episodes, crossing_rates, hits_of
 
 GOAL, HIT, LATE = Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT
 INVALID, RUNNING = Outcome.INVALID, Outcome.RUNNING
@@ -16,7 +16,15 @@ THEIRS = np.uint8([[GOAL, LATE, LATE, LATE], [GOAL, HIT, HIT, HIT], [GOAL] * 4, 
 def test_rates_are_of_valid_episodes():
     np.testing.assert_array_equal(crossing_rates(OURS, "success"), [0.75, 0.0, np.nan, 1.0])
     np.testing.assert_array_equal(crossing_rates(OURS, "goal"), [0.5, 0.0, np.nan, 1.0])
-    assert count_hits(OURS[1], "success") == (0, 3) and count_hits(THEIRS[3], "goal") == (0, 0)
+    hits, counted = hits_of(OURS[1], "success")
+    assert (hits.sum(), counted.sum()) == (0, 3) and not hits_of(THEIRS[3], "goal")[1].any()
+
+
+def test_no_episode_counts_where_more_than_a_quarter_are_invalid():
+    invalid = np.array([[True, False, False, False], [True, True, False, False]])
+    assert counted_episodes(invalid).tolist() == [[False, True, True, True], [False] * 4]
+    rates = crossing_rates(np.uint8([[INVALID, GOAL, GOAL, HIT], [INVALID, INVALID, GOAL, GOAL]]), "goal")
+    np.testing.assert_array_equal(rates, [2 / 3, np.nan])
 
 
 def test_bias_and_distance_are_of_terrains_that_both_have():

@@ -1,0 +1,59 @@
+"""Small pictures of terrains from above, one for every elite of a page."""
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.crossing import CrossingCfg
+from sim.terrain import SPACING
+
+if TYPE_CHECKING:
+    from sim.space import TerrainSpace
+
+_AT_ONCE = 50  # height maps that are made at once
+_FEW = 1_000  # terrains, up to which pictures are large
+_WIDTHS = (256, 160)  # of pictures of few terrains and of many [pixels]
+_QUALITY = 72  # of the JPEG
+_SUN = np.array([-0.45, 0.35])  # where the light comes from: how much slopes along x and y gain by it
+_MARK = 3  # half side of the marks of start and goal [nodes]
+_START, _GOAL = (240, 200, 60), (0, 158, 115)
+
+
+def reliefs_of(genes: NDArray[np.float32], space: "TerrainSpace") -> list[bytes]:
+    """A picture of each terrain, as JPEG: blue below the start's level, brown above, slopes lit from one side.
+
+    Args:
+        genes: Shape (N, num_genes).
+        space: What they mean.
+    """
+    from sim.bank import heights_of
+
+    width = _WIDTHS[len(genes) > _FEW]
+    lots = (genes[first : first + _AT_ONCE] for first in range(0, len(genes), _AT_ONCE))
+    return [relief(heights, width) for lot in lots for heights in heights_of(lot, space)]
+
+
+def relief(heights: NDArray[np.floating], width: int = _WIDTHS[0]) -> bytes:
+    """A picture of a terrain, with the start yellow and the goal green.
+
+    Args:
+        heights: [m], shape (nrow, ncol).
+        width: Of the picture [pixels].
+    """
+    from PIL import Image
+
+    from sim.recording.scene import height_colors
+
+    rise_y, rise_x = np.gradient(heights, SPACING)
+    light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
+    pixels = np.clip(255.0 * height_colors(heights) * light[..., None], 0.0, 255.0).astype(np.uint8)
+    for (x, y), color in ((CrossingCfg.start, _START), (CrossingCfg.goal, _GOAL)):
+        row, column = round(y / SPACING), round(x / SPACING)
+        pixels[row - _MARK : row + _MARK + 1, column - _MARK : column + _MARK + 1] = color
+    nrow, ncol = heights.shape
+    image = Image.fromarray(pixels[::-1]).resize((width, round(width * nrow / ncol)), Image.Resampling.LANCZOS)
+    content = io.BytesIO()
+    image.save(content, "JPEG", quality=_QUALITY)
+    return content.getvalue()

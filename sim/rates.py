@@ -1,0 +1,85 @@
+"""Rates of terrains: which episodes count, and how far rates lie from those of other settings or simulators."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.files.intervals import bootstrap_interval
+
+KINDS = ("success", "goal")
+"""The two rates: episodes without base collision, and episodes that reached the goal."""
+MAX_INVALID_SHARE = 0.25
+"""A terrain with more than this share of invalid episodes is invalid."""
+
+
+def counted_episodes(invalid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Episodes that count: the valid ones of terrains that are not invalid.
+
+    Args:
+        invalid: Which episodes are invalid, shape (..., num_episodes).
+
+    Returns:
+        Of the same shape.
+    """
+    usable = invalid.sum(axis=-1, keepdims=True) <= MAX_INVALID_SHARE * invalid.shape[-1]
+    return ~invalid & usable
+
+
+def terrain_means(values: NDArray, counted: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Mean over the episodes that count, shape (...); NaN where there are none.
+
+    Args:
+        values: Of each episode, shape (..., num_episodes).
+        counted: Which episodes count, likewise.
+    """
+    sums, counts = np.where(counted, values, 0.0).sum(axis=-1), counted.sum(axis=-1)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+def hits_of(outcome: NDArray[np.uint8], kind: str) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which episodes count as a hit, and which count at all.
+
+    Args:
+        outcome: :class:`kernels.episode.Outcome`, shape (..., num_episodes); one that still runs does not count.
+        kind: One of :data:`KINDS`.
+
+    Returns:
+        Both of the same shape.
+    """
+    from kernels.episode import Outcome  # which imports Warp: not for `--help`
+
+    counted = counted_episodes((outcome == Outcome.INVALID) | (outcome == Outcome.RUNNING))
+    hit = outcome != Outcome.BASE_COLLISION if kind == "success" else outcome == Outcome.GOAL
+    return hit & counted, counted
+
+
+def crossing_rates(outcome: NDArray[np.uint8], kind: str) -> NDArray[np.float64]:
+    """Rate of each terrain, shape (...), NaN on an invalid one; arguments as of :func:`hits_of`."""
+    return terrain_means(*hits_of(outcome, kind))
+
+
+def agreement(ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int) -> dict[str, Any]:
+    """How far rates of terrains lie from those of other crossings of the same terrains.
+
+    Args:
+        ours: Outcomes, shape (num_terrains, num_episodes).
+        theirs: Outcomes of the other crossings, shape (num_terrains, any number of episodes).
+        seed: Draws the resamples.
+
+    Returns:
+        ``terrains``, those that are valid in both; of each kind the mean of our rate minus theirs
+        (``success_bias``) with its 95 % bootstrap interval over terrains (``success_bias_interval``), and the mean of
+        its size (``success_difference``), None without terrains.
+    """
+    found: dict[str, Any] = {}
+    for kind in KINDS:
+        apart = crossing_rates(ours, kind) - crossing_rates(theirs, kind)
+        apart = apart[np.isfinite(apart)]
+        found |= {
+            "terrains": len(apart),
+            f"{kind}_bias": float(apart.mean()) if len(apart) else None,
+            f"{kind}_bias_interval": bootstrap_interval(apart, seed),
+            f"{kind}_difference": float(np.abs(apart).mean()) if len(apart) else None,
+        }
+    return found

@@ -1,0 +1,119 @@
+"""The pictures of the viewer and the report in docs/: ``python -m tests.qd.show.view.screenshots [--run RUN]``.
+
+It serves the archive, drives a browser as the tests of the page do, and writes the report of the same archive if it is
+not there yet. Pictures are JPEGs of docs/pictures.
+"""
+
+import argparse
+import io
+import itertools
+import signal
+from pathlib import Path
+
+from PIL import Image
+
+from qd.show.elites import find_archive
+from qd.show.recordings import Recordings, on_elite
+from qd.show.report.command import Report, html_report
+from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode
+from sim.recording.renderer import Renderer
+from tests.builders import free_port
+from tests.qd.show.view.browser import LIMIT_MS, open_chromium, see
+from tests.qd.show.view.visitor import ROOT, serve, view_command
+
+FOLDER = ROOT / "docs" / "pictures"
+WIDE, NARROW = (1400, 900), (390, 844)
+QUALITY = 80
+FRAME = 5  # of the film [s]
+SETTLE_MS = 3000  # for the last frames of a browser that draws without a GPU
+
+
+def take(page, name: str) -> None:
+    """Writes what a page shows."""
+    for note in page.get_by_role("button", name="Close").all():  # such as that there is no GPU
+        if note.is_visible():
+            note.click()
+    for close in page.locator(".mantine-Notification-closeButton").all():
+        close.click()
+    page.wait_for_timeout(SETTLE_MS)
+    picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    FOLDER.mkdir(exist_ok=True)
+    picture.save(FOLDER / f"{name}.jpg", quality=QUALITY)
+    print(FOLDER / f"{name}.jpg", flush=True)
+
+
+def viewer_pictures(browser, address: str, elite: int) -> None:
+    """The viewer at a desk, along with the robot, with one failure mode listed, and on a phone."""
+    query = f"?elite={elite}&episode=1"
+
+    def opened(size, more: str = ""):
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        page.set_default_timeout(LIMIT_MS)
+        page.goto(f"{address}{query}{more}")
+        see(page, "^Episode 1: ")
+        page.wait_for_timeout(SETTLE_MS)
+        return page
+
+    page = opened(WIDE)
+    page.keyboard.press("m")
+    take(page, "viewer")
+    page.keyboard.press("f")
+    take(page, "viewer-follow")
+    page.keyboard.press("f")
+    page.keyboard.press("o")
+    page.get_by_role("combobox", name="Mode").click()
+    page.get_by_role("option").nth(1).click()
+    take(page, "viewer-mode")
+    page.close()
+    page = opened(NARROW)
+    take(page, "viewer-phone")
+    page.close()
+
+
+def report_picture(browser, file: Path) -> None:
+    """The top of a report."""
+    page = browser.new_page(viewport={"width": WIDE[0], "height": WIDE[1]})
+    page.goto(file.absolute().as_uri())
+    height = page.evaluate("document.documentElement.scrollHeight")
+    print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, {height:,} pixels high")
+    take(page, "report")
+    page.close()
+
+
+def film_picture(run: Path, elite: int) -> None:
+    """A frame of the film of an elite that the viewer has recorded."""
+    found = find_archive(None, run)
+    archive, robot = found.archive, found.robot
+    wanted = on_elite(archive, elite, policy=found.policy(None), replicas=20)
+    (recording,) = Recordings(robot).all_of([wanted])
+    scales = dict(zip(archive.penalties, archive.scales, strict=True))
+    shot = Shot(recording=recording, episode=typical_episode(recording, scales), ghosts=(0, 1), scales=scales)
+    cameras = follow(shot, 4.6 * robot.default_base_height)
+    with Renderer(robot, recording.heights[0], width=WIDTH, height=VIEW_HEIGHT) as renderer:
+        pictures = list(itertools.islice(frames_of(shot, renderer, cameras, fps=1), FRAME + 1))
+    Image.fromarray(pictures[-1]).save(FOLDER / "film.jpg", quality=QUALITY)
+    print(FOLDER / "film.jpg")
+
+
+def main() -> None:
+    """Takes all pictures."""
+    flags = argparse.ArgumentParser(description=__doc__)
+    flags.add_argument("--run", type=Path, default=Path("results/anymal/archive"))
+    flags.add_argument("--elite", type=int, default=0)
+    flags.add_argument("--report", type=Path, default=Path("runs/anymal-published/report.html"))
+    args = flags.parse_args()
+    report = args.report if args.report.exists() else html_report(Report(run=args.run, out=args.report, device="cpu"))
+    port = free_port()
+    process, _ = serve(view_command("--run", str(args.run), "--port", str(port)))
+    try:
+        with open_chromium() as browser:
+            viewer_pictures(browser, f"http://127.0.0.1:{port}/", args.elite)
+            report_picture(browser, report)
+        film_picture(args.run, args.elite)
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+
+
+if __name__ == "__main__":
+    main()
