@@ -11,16 +11,16 @@ Only the Hessian of a contact on the side of its cone is put together in another
 so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu, ``find_direction``).
 """
 
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from string import Template
 from typing import Any
 
 import warp as wp
-from mujoco_warp._src import types
 
 _WARP = 32
-_BLOCK_FLOATS = 12 * 1024  # what a block may have without asking: 48 KiB
+_BLOCK_WORDS = 12 * 1024  # what a block may have without asking: 48 KiB
 _REGISTERS = 96  # a thread, so that 20 robots find room on a multiprocessor
 _CHUNK = 16
 """Rows of constraints whose part of the Hessian is summed at once."""
@@ -31,7 +31,7 @@ _SOURCE = Template(Path(__file__).with_suffix(".cu").read_text())
 
 @wp.struct
 class Problem:
-    """What mujoco_warp's model and data hold of every world's contact problem, under the names of solver.cu."""
+    """Every world's contact problem, in the solver's arrays; world first, then rows or dofs."""
 
     most_iterations: int
     most_line_iterations: int
@@ -60,7 +60,7 @@ class Problem:
     frictionloss: wp.array2d[float]
     num_contacts: wp.array[int]
     """Of all worlds, shape (1,)."""
-    friction: wp.array[types.vec5]
+    friction: wp.array[wp.types.vector(5, float)]
     condim: wp.array[int]
     address: wp.array2d[int]
     """First row of each contact in its world, in column 0; -1 where it found no room."""
@@ -74,44 +74,39 @@ class Problem:
     overflow: wp.array[int]
 
 
-def _problem(m: Any, d: Any) -> Problem:
-    problem = Problem()
-    problem.most_iterations, problem.most_line_iterations = m.opt.iterations, m.opt.ls_iterations
-    problem.tolerance, problem.ls_tolerance = m.opt.tolerance, m.opt.ls_tolerance
-    problem.impratio_invsqrt = m.opt.impratio_invsqrt
-    problem.tri_row, problem.tri_col = m.dof_tri_row, m.dof_tri_col
-    problem.inertia_row, problem.inertia_col, problem.inertia = m.M_hinit_i, m.M_colind, d.M
-    problem.qacc_warmstart, problem.qacc_smooth, problem.qfrc_smooth = d.qacc_warmstart, d.qacc_smooth, d.qfrc_smooth
-    problem.num_equalities, problem.num_losses, problem.num_rows = d.ne, d.nf, d.nefc
-    problem.row_type, problem.row_id, problem.jacobian = d.efc.type, d.efc.id, d.efc.J
-    problem.stiffness, problem.aref, problem.frictionloss = d.efc.D, d.efc.aref, d.efc.frictionloss
-    problem.num_contacts, problem.friction, problem.condim = d.nacon, d.contact.friction, d.contact.dim
-    problem.address = d.contact.efc_address
-    problem.qacc, problem.momentum, problem.qfrc_constraint = d.qacc, d.efc.Ma, d.qfrc_constraint
-    problem.force, problem.state = d.efc.force, d.efc.state
-    problem.iterations, problem.overflow = d.solver_niter, d.overflow
-    return problem
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """What a model's kernel is made for."""
+
+    dofs: int
+    rows: int
+    """Most rows of constraints of a world."""
+    dimensions: int
+    """Most rows of a contact."""
+    inertia: int
+    """Numbers kept of an inertia."""
+
+    @property
+    def words(self) -> int:
+        """Words of memory that a robot needs."""
+        stride = self.dofs | 1
+        matrices = 2 * self.dofs * stride + _CHUNK * (stride + self.dimensions)
+        return matrices + 5 * self.rows + 5 * self.dofs
+
+    @property
+    def fits(self) -> bool:
+        """Whether a robot finds room in a block's shared memory."""
+        return 0 < self.words <= _BLOCK_WORDS
 
 
 @cache
-def _kernel(nv: int, rows: int, dim: int, inertia: int) -> tuple[Any, int]:
+def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> tuple[Any, int]:
     """The kernel for models of these sizes, and how many robots a block of threads has."""
-    floats = _floats(nv, rows, dim)
-    robots = min(4, _BLOCK_FLOATS // floats)
+    robots = min(4, _BLOCK_WORDS // sizes.words)
     snippet = _SOURCE.substitute(
-        nv=nv,
-        rows=rows,
-        dim=dim,
-        inertia=inertia,
-        chunk=_CHUNK,
-        floats=floats,
-        robots=robots,
-        minval=types.MJ_MINVAL,
-        elliptic=int(types.ConstraintType.CONTACT_ELLIPTIC),
-        too_many=int(types.OverflowType.ITERATIONS),
-        too_many_on_line=int(types.OverflowType.LS_ITERATIONS),
-        **{state.name.lower(): state.value for state in types.ConstraintState},
-    )
+        nv=sizes.dofs, rows=sizes.rows, dim=sizes.dimensions, inertia=sizes.inertia, chunk=_CHUNK, words=sizes.words,
+        robots=robots, **dict(codes),
+    )  # fmt: skip
 
     @wp.func_native(snippet=snippet)
     def solve_one(problem: Problem, thread: int): ...
@@ -126,42 +121,17 @@ def _kernel(nv: int, rows: int, dim: int, inertia: int) -> tuple[Any, int]:
     return solve_all, robots
 
 
-def _floats(nv: int, rows: int, dim: int) -> int:
-    """Words of memory that a robot needs."""
-    stride = nv | 1
-    return 2 * nv * stride + _CHUNK * (stride + dim) + 5 * rows + 5 * nv
-
-
-def _dim(m: Any) -> int:
-    return max(3, int(m.nmaxcondim))
-
-
-def fits(m: Any, d: Any) -> bool:
-    """Whether :func:`solve_contacts` solves problems of this model: dense, elliptic cones, by Newton, and small."""
-    return (
-        m.opt.solver == types.SolverType.NEWTON
-        and m.opt.cone == types.ConeType.ELLIPTIC
-        and m.opt.integrator != types.IntegratorType.DISCRETE
-        and not m.opt.enableflags & types.EnableBit.SLEEP
-        and not m.opt.disableflags & types.DisableBit.WARMSTART
-        and not m.is_sparse
-        and m.opt.noslip_iterations == 0
-        and m.opt.iterations > 0
-        and m.nv > 0
-        and d.njmax > 0
-        and _floats(m.nv, d.njmax, _dim(m)) <= _BLOCK_FLOATS
-    )
-
-
-def solve_contacts(m: Any, d: Any) -> None:
-    """Joint accelerations and constraint forces of every world, from a warm start, in place of ``mujoco_warp``'s solve.
+def solve_contacts(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
+    """Joint accelerations and constraint forces of every world, from a warm start.
 
     Args:
-        m: mujoco_warp's model, one that :func:`fits`.
-        d: Its data. Read are inertia, smooth forces and accelerations, warm start, contacts and constraint rows;
-            written ``qacc``, ``qfrc_constraint``, ``efc.Ma``, ``efc.force``, ``efc.state``, ``solver_niter`` and the
-            bits of the two caps on iterations in ``overflow``.
+        problem: Its arrays are read, and from ``qacc`` on written: of ``overflow`` the bits of the two caps are added.
+        sizes: Sizes of the model, that :attr:`~Sizes.fits`.
+        codes: The solver's own numbers, by their names in solver.cu: of constraint states, of an elliptic contact's
+            rows, of the bits in ``overflow``, and the least divisor.
     """
-    kernel, robots = _kernel(m.nv, d.njmax, _dim(m), m.M_colind.shape[0])
-    lanes = 1 if d.qacc.device.is_cpu else _WARP
-    wp.launch(kernel, dim=d.nworld * lanes, inputs=[_problem(m, d)], block_dim=robots * _WARP, device=d.qacc.device)
+    device = problem.qacc.device
+    kernel, robots = _kernel(sizes, tuple(codes.items()))
+    lanes = 1 if device.is_cpu else _WARP
+    num_worlds = problem.qacc.shape[0]
+    wp.launch(kernel, dim=num_worlds * lanes, inputs=[problem], block_dim=robots * _WARP, device=device)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.solver import fits, solve_contacts
-from sim.solver import solve_theirs, use_own_solver
+from sim.solver import fits, solve_contacts, solve_theirs, use_own_solver
 
 Mujoco: Any = mujoco  # it names its types at run time
 EVERYTHING = """
