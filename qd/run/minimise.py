@@ -343,6 +343,7 @@ def _case_of(
         parts=tuple(sorted(parts, key=lambda part: (*effects.way(part, half_width), part))),
         how=how or ("exhaustive" if on_gpu and len(parts) <= MOST_PARTS else "greedy"),
         scalable=space.scaled(archive.genes[number][None], 0.5) is not None,
+        flat=tuple(part for part in parts if np.abs(effects.heights[part]).max() <= _LEAST_EFFECT),
         counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
     )
 

@@ -2,18 +2,23 @@
 
 import json
 import signal
+from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from qd.archive import read_archive
+from qd.archive import read_archive, write_archive
 from qd.causes import effects_of
+from qd.run.minimise import Minimise, minimise_run
 from qd.show import figures
 from qd.show.crossed import crossed_of
 from qd.show.crossing_figures import draw_paths
 from qd.show.elites import find_archive
 from qd.show.export import Export, export
 from qd.show.recordings import Recordings, on_elite, on_heights
+from qd.show.replay import ReplayElite, draw, replay
+from qd.show.report.relief import reliefs_of
 from qd.show.view.meshes import terrain_mesh
 from sim.bank import terrains_of
 from sim.ground import GroundMaps
@@ -24,6 +29,7 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import CrossingCfg, Rollout
 from sim.space import get_space
 from sim.terrain import NUM_COLS, NUM_ROWS
+from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.recordings import NAMES
 from tests.qd.test_own_space import TINY, search
@@ -98,6 +104,53 @@ def test_exported_ground_is_read_back(searched, capsys):
         export(Export(run=searched, elite="0", formats=("stl",), overwrite=True))
 
 
+@contextmanager
+def nobody_crosses_ice(cfg):
+    """Who steps on a slippery patch 11, in the middle of the way, falls; all others arrive."""
+
+    def evaluate(genes, seeds, progress=None):
+        fails = np.repeat(genes[:, 64 + 11, None] < 0.0, cfg.num_replicas, axis=1)
+        return stand_in.make_result(np.ones((*fails.shape, 6)), base_collision=fails)
+
+    yield evaluate
+
+
+@pytest.fixture
+def minimised(searched):
+    """The run with an elite 0 that fails for one slippery patch, and the minimal terrain of it."""
+    archive = read_archive(searched)
+    archive.genes[0, 64:96], archive.genes[0, 96:] = -1.0, 1.0  # slippery and soft everywhere
+    fresh = replace(fresh_values(archive), goal_rate=np.zeros(len(archive)))
+    write_archive(searched / "archive.npz", archive.corrected_by(fresh))
+    number = int(np.flatnonzero((read_archive(searched).genes == archive.genes[0]).all(axis=1))[0])
+    args = Minimise(run=searched, elite=str(number), device="cpu", workers="1", how="greedy")
+    return searched, number, minimise_run(args, open_evaluator=nobody_crosses_ice)
+
+
+def test_a_minimal_terrain_may_be_a_patch(minimised, tmp_path):
+    run, number, numbers = minimised
+    (entry,) = numbers["elites"]
+    assert entry["bumps"] == [8 + 11] and entry["of"] >= 64 and entry["cause"]["kind"] == "slippery ground"
+    assert entry["words"] == ["friction 0.15 at x = 6 to 8 m, y = 2 to 4 m"]
+    assert (entry["height_m"], entry["scale"], entry["margin_m"], entry["scales"]) == (0.0, None, None, [])
+    export(Export(run=run, minimal="all", formats=("npz",)))
+    found = read_heightmap(run / f"minimal-terrains/minimal-{number}.npz")
+    slippery = np.ones((1, 4, 8), np.float32)
+    slippery[0, 1, 3] = 0.15
+    assert not found.heights.any()
+    np.testing.assert_allclose(found.ground.friction, slippery, rtol=1e-6)
+    assert not found.ground.time_constant_s.any()
+
+
+def test_a_minimal_terrain_is_replayed_with_its_ground(minimised):
+    run, number, _ = minimised
+    done = replay(ReplayElite(run=run, minimal=str(number), device="cpu", replicas=1, policy="shipped"))
+    assert done.recording.ground.friction[0, 1, 3] == pytest.approx(0.15)
+    assert np.count_nonzero(done.recording.ground.friction < 1.0) == 1 and not done.recording.heights.any()
+    labels = [text.get_text() for text in draw(done).legends[0].get_texts()]
+    assert "slippery" in labels and "soft" not in labels
+
+
 def test_a_map_with_ground_must_have_the_size_of_a_terrain(tmp_path):
     file = tmp_path / "hill.npz"
     np.savez(file, heights=np.zeros((20, 20)), size_m=(4.0, 4.0), friction=np.ones((4, 8)))
@@ -147,6 +200,11 @@ def test_slippery_and_soft_patches_are_tinted():
     changed = np.argwhere((bare != other).any(axis=2))
     assert changed.min(axis=0).tolist() == [40, 80] and changed.max(axis=0).tolist() == [119, 239]
     painted = ground_paint(np.pad(FLAT, 40), ground).astype(int) - ground_paint(np.pad(FLAT, 40))
+    genes = np.zeros((2, 128), np.float32)
+    genes[:, :64], genes[:, 64:96], genes[:, 96:] = 1e-9, 1.0, -1.0
+    genes[1, 64] = -1.0
+    plain_relief, tinted_relief = reliefs_of(genes, get_space(SPACE))
+    assert plain_relief != tinted_relief
     row, col = 4 * (40 + 60), 4 * (40 + 100)  # at y = 3 m and x = 5 m
     assert painted[row + 2, col + 2, 0] < -10 and not painted[: 4 * 79].any()
 
