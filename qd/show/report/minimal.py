@@ -12,7 +12,7 @@ from sim.files.command import plain_command
 if TYPE_CHECKING:
     from qd.show.report.material import Shown
 
-_ROWS = 12  # of a table that is not folded
+_ROWS = 5  # of a table that is not folded
 _PICTURED = 6  # terrains
 
 

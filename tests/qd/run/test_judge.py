@@ -146,7 +146,7 @@ def test_a_search_confirms_at_its_end(tmp_path, capsys):
     archive = run_search(make_job(tmp_path / "run", reproduce=True, confirm=True, iterations=6), open_evaluator=opened)
     assert numbers_in(tmp_path / "run")["confirmed"] == archive.confirmed.sum() > 0
     assert archive.faults.resolved_outcomes.any(axis=1).sum() == archive.failing.sum()
-    assert "fail there too and are confirmed" in capsys.readouterr().out
+    assert "crossed with contact resolved" in capsys.readouterr().out
     with pytest.raises(Interrupted, match=r"what was crossed is kept\. Go on with:  faultline confirm --run"):
         run_search(
             make_job(tmp_path / "stopped", reproduce=True, confirm=True, iterations=6),

@@ -117,7 +117,7 @@ def test_the_figure_shows_the_tables(report):
     figure = draw_tables(report)
     goal, success, reward, changes = figure.axes
     assert "%" in success.get_ylabel() and "%" in goal.get_ylabel() and "20 s" in reward.get_ylabel()
-    assert "held against base" in changes.get_xlabel()
+    assert "compared with base" in changes.get_xlabel()
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["base", "C-G", "of that name in the paper"]
     points = next(line for line in reward.lines if line.get_marker() == "s")

@@ -78,9 +78,18 @@ class Shown:
 
 @pytest.fixture(scope="module")
 def worst_crossed(show):
-    """What is asked for of the worst elite, and its published recording, in which one episode ended otherwise."""
+    """What is asked for of the worst elite, and a recording: a published episode of 20 s, 20 times, one cut short."""
     (file,) = (RESULTS.resolve() / "anymal" / "view").glob("*.npz")
     recording = read_recording(file)
+    places = [recording.penalty_names.index(name) for name in ("stumble", "collision")]
+    happened = (recording.penalties[0, :, -1][:, places] > 0.0).all(axis=1)
+    longest = int(np.argmax(recording.num_frames[0] * happened))
+    same = {
+        field.name: np.repeat(value[:, longest : longest + 1], recording.outcome.size, axis=1)
+        for field in dataclasses.fields(recording)
+        if getattr(value := getattr(recording, field.name), "shape", ())[:2] == recording.outcome.shape
+    }
+    recording = dataclasses.replace(recording, **same)
     outcome, frames = np.full_like(recording.outcome, Outcome.TIME_OUT), recording.num_frames.copy()
     outcome[0, 16], frames[0, 16] = Outcome.BASE_COLLISION, round(5.3 / recording.dt)
     duration_s = np.where(outcome == Outcome.TIME_OUT, recording.duration_s, 5.3).astype(np.float32)
