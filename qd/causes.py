@@ -1,13 +1,14 @@
 """The shape of a part of a terrain, as a robot that walks straight to the goal meets it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
+from sim.ground import COLS, PATCH, ROWS
 from sim.terrain import SPACING
 
 if TYPE_CHECKING:
@@ -52,19 +53,64 @@ class Shape:
     """How far to the right [m]; negative where it lies to the left alone."""
 
 
-def fields_of(genes: NDArray[np.float32], parts: Sequence[int], space: "TerrainSpace") -> NDArray[np.float32]:
-    """Heights [m] that parts of a terrain add to the others, shape (len(parts), nrow, ncol).
+@dataclass(frozen=True, kw_only=True)
+class Effects:
+    """What each of some parts of a terrain does."""
+
+    heights: NDArray[np.float32]
+    """Heights that it adds to the others [m], shape (num_parts, nrow, ncol)."""
+    slippery: NDArray[np.bool_]
+    """Patches that it makes slippery, shape (num_parts, 4, 8)."""
+    soft: NDArray[np.bool_]
+    """Patches that it makes soft, likewise."""
+
+    @property
+    def patches(self) -> NDArray[np.bool_]:
+        """Patches whose ground it changes."""
+        return self.slippery | self.soft
+
+    def changes(self, least: float) -> NDArray[np.bool_]:
+        """Which parts change the ground, or heights by more than ``least`` [m]; shape (num_parts,)."""
+        return (np.abs(self.heights).max(axis=(1, 2)) > least) | (self.patches.sum(axis=(1, 2)) > 0)
+
+    def way(self, part: int, half_width: float) -> tuple[float, bool]:
+        """Largest height or depth [m] of a part under a robot on its way, and whether it changes the ground there."""
+        rows = _places((-half_width, half_width), CrossingCfg.start[1], ROWS)
+        columns = _places((0.0, CrossingCfg.goal[0] - CrossingCfg.start[0]), CrossingCfg.start[0], COLS)
+        return on_the_way(self.heights[part], half_width), bool(self.patches[part][rows, columns].any())
+
+    def shape(self, part: int, half_width: float) -> Shape:
+        """The shape of a part; of one that changes the ground alone, its kind and nothing else."""
+        if not self.patches[part].any():
+            return shape_of(self.heights[part], half_width)
+        kind = "slippery ground" if self.slippery[part].any() else "soft ground"
+        return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
+
+
+def _places(span: tuple[float, float], origin: float, count: int) -> slice:
+    """Patches along one axis between two distances [m] from a place [m]."""
+    first, last = (min(max(int((origin + end) // PATCH), 0), count - 1) for end in span)
+    return slice(first, last + 1)
+
+
+def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: "TerrainSpace") -> Effects:
+    """What parts of a terrain do, each beside all others.
 
     Args:
         genes: Of one terrain, shape (num_genes,).
         parts: Their numbers.
         space: What the genes mean.
     """
-    from sim.bank import heights_of  # with Warp: not for `--help`
+    from sim.bank import terrains_of  # with Warp: not for `--help`
 
     rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
-    heights = heights_of(np.concatenate(rows), space)
-    return heights[0] - heights[1:]
+    heights, ground = terrains_of(np.concatenate(rows), space)
+    nothing = np.zeros((len(parts), ROWS, COLS), bool)
+    return Effects(
+        heights=heights[0] - heights[1:],
+        slippery=nothing if ground is None else ground.friction[0] != ground.friction[1:],
+        soft=nothing if ground is None else ground.time_constant_s[0] != ground.time_constant_s[1:],
+    )
 
 
 def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:

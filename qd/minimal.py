@@ -77,6 +77,8 @@ class Case:
     """Exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time."""
     scalable: bool
     """Whether its heights can be scaled."""
+    flat: Parts = ()
+    """Parts that change no height, such as slippery patches. Where they alone are left, nothing is scaled."""
     counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)
     """Episodes by :data:`qd.archive.OUTCOMES`, shape (4,), of what was crossed. The fresh episodes of all parts
     together, which are those of the elite, are there from the beginning."""
@@ -92,6 +94,10 @@ class Case:
             if trial in self.counts:
                 return fails(self.counts[trial])
         return None
+
+    def scales(self, parts: Parts) -> bool:
+        """Whether scaling changes what is left of its terrain."""
+        return self.scalable and not set(parts) <= set(self.flat)
 
     def wanted(self) -> list[Trial]:
         """What is to be crossed next; nothing when the minimal terrain and its least scale are known."""
@@ -110,7 +116,7 @@ class Case:
             parts=parts,
             counts=self.counts[Trial(parts, fresh=True)],
             without={part: self._best_known(rest) for part, rest in removed.items()},
-            scale=scale if self.scalable and parts else None,
+            scale=scale if self.scales(parts) else None,
             passing_scale=passing,
             scales={
                 trial.scale: counts
@@ -135,7 +141,7 @@ class Minimal:
     without: dict[int, NDArray[np.int64]]
     """Episodes without one of the parts, by its number."""
     scale: float | None
-    """Least scale of the heights that was crossed and fails; None if heights cannot be scaled."""
+    """Least scale of the heights that was crossed and fails; None if there are none, or they cannot be scaled."""
     passing_scale: float | None
     """Largest scale below it that was crossed and does not fail; None if none was."""
     scales: dict[float, NDArray[np.int64]]
@@ -190,7 +196,7 @@ def _greedy(case: Case) -> tuple[list[Trial], Parts | None]:
 def _scaling(case: Case, parts: Parts) -> tuple[list[Trial], float, float | None]:
     """What to cross next, the least scale that is known to fail, and the largest below it that is known not to."""
     passing, failing = 0.0, 1.0
-    for _ in range(SCALE_STEPS if case.scalable and parts else 0):
+    for _ in range(SCALE_STEPS if case.scales(parts) else 0):
         trial = Trial(parts, scale=(passing + failing) / 2)
         if trial not in case.counts:
             return [trial], failing, passing or None

@@ -3,7 +3,9 @@
 import numpy as np
 import warp as wp
 
+from kernels.ground import FIRM, Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+from sim.ground import GroundMaps
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
@@ -16,7 +18,15 @@ class TerrainBank:
     Terrains are replaced in place, so that captured graphs go on reading them.
     """
 
-    def __init__(self, num_terrains: int, *, device: str, nrow: int = NUM_ROWS, ncol: int = NUM_COLS) -> None:
+    def __init__(
+        self,
+        num_terrains: int,
+        *,
+        device: str,
+        nrow: int = NUM_ROWS,
+        ncol: int = NUM_COLS,
+        has_ground: bool = False,
+    ) -> None:
         """Make flat terrains.
 
         Args:
@@ -24,6 +34,7 @@ class TerrainBank:
             device: Warp device name.
             nrow: Nodes along y.
             ncol: Nodes along x.
+            has_ground: Whether they have maps of friction and softness, which contacts then pay for.
 
         Raises:
             ValueError: If there is no terrain or a grid has no cell.
@@ -34,6 +45,7 @@ class TerrainBank:
         self.terrain.heights = wp.zeros((num_terrains, nrow, ncol), dtype=float, device=device)
         self.terrain.ceilings = wp.zeros(ceiling_shape(num_terrains, nrow, ncol), dtype=float, device=device)
         self.terrain.spacing = SPACING
+        self.ground: Ground | None = make_ground(num_terrains, device) if has_ground else None
         self.device = device
 
     @property
@@ -46,15 +58,16 @@ class TerrainBank:
         """Node heights [m] on the device, shape (num_terrains, nrow, ncol)."""
         return self.terrain.heights
 
-    def set_heights(self, heights: np.ndarray, slots: slice = _ALL) -> None:
+    def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:
         """Replace terrains by height grids [m].
 
         Args:
             heights: Shape (number of slots, nrow, ncol).
             slots: Which are replaced; all if left out.
+            ground: Their friction and softness; ground that changes nothing if left out.
 
         Raises:
-            ValueError: If the shape differs or a height is not finite.
+            ValueError: If the shape differs, a height is not finite, or the bank has no maps for the ground.
         """
         replaced = self.heights[slots]
         expected = tuple(replaced.shape)
@@ -62,8 +75,29 @@ class TerrainBank:
             raise ValueError(f"heights must have shape {expected} [terrain, row, col], got {heights.shape}")
         if not np.isfinite(heights).all():
             raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
+        if ground is not None and len(ground) != len(heights):
+            raise ValueError(f"ground must be of {len(heights)} terrains, got {len(ground)}")
         replaced.assign(heights.astype(np.float32))
         max_blocks(replaced, self.terrain.ceilings[slots])
+        maps = self._maps_of(slots, wanted=ground is not None)
+        if maps is not None:
+            ground = ground or GroundMaps.plain(len(heights))
+            maps.friction.assign(np.float32(ground.friction))
+            maps.time_constant.assign(np.float32(ground.time_constant_s))
+
+    def _maps_of(self, slots: slice, *, wanted: bool) -> "Ground | None":
+        """The maps of some slots, None of a bank without any.
+
+        Raises:
+            ValueError: If they are wanted there.
+        """
+        if self.ground is None:
+            if wanted:
+                raise ValueError("terrains have friction or softness, got a bank without maps: give has_ground=True")
+            return None
+        maps = Ground()
+        maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
+        return maps
 
     def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
         """Replace terrains by those of genes of a space.
@@ -74,13 +108,27 @@ class TerrainBank:
             slots: Which are replaced; all if left out.
 
         Raises:
-            ValueError: If the shape differs or a gene is not finite.
+            ValueError: If the shape differs, a gene is not finite, or the bank has no maps for the ground.
         """
         valid, replaced = space.validate(genes), self.heights[slots]
         if len(valid) != len(replaced):
             raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
-        space.rasterise(wp.array(valid, dtype=float, device=self.device), SPACING, replaced)
+        maps = self._maps_of(slots, wanted=bool(space.ground))
+        on_device = wp.array(valid, dtype=float, device=self.device)
+        space.rasterise(on_device, SPACING, replaced)
         max_blocks(replaced, self.terrain.ceilings[slots])
+        if maps is not None:
+            maps.friction.fill_(1.0)
+            maps.time_constant.fill_(FIRM)
+            space.lay_ground(on_device, maps)
+
+    def ground_maps(self) -> GroundMaps | None:
+        """The maps of all terrains on the host; None of a bank without any."""
+        if self.ground is None:
+            return None
+        return GroundMaps(
+            friction=np.array(self.ground.friction.numpy()), time_constant_s=np.array(self.ground.time_constant.numpy())
+        )
 
 
 def host_device() -> str:
@@ -102,8 +150,19 @@ def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, devic
     Raises:
         ValueError: If the shape differs or a gene is not finite.
     """
+    return terrains_of(genes, space, device=device)[0]
+
+
+def terrains_of(
+    genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str | None = None
+) -> tuple[np.ndarray, GroundMaps | None]:
+    """Height grids [m] of genes and their ground, if the space has any; arguments and errors of :func:`heights_of`.
+
+    Returns:
+        Float32, shape (num_terrains, NUM_ROWS, NUM_COLS), and maps.
+    """
     device = device or host_device()
-    bank = TerrainBank(len(genes), device=device)
+    bank = TerrainBank(len(genes), device=device, has_ground=bool(space.ground))
     with wp.ScopedDevice(device):
         bank.set_genes(genes, space)
-        return np.array(bank.heights.numpy())
+        return np.array(bank.heights.numpy()), bank.ground_maps()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sim.files.command import OfRobot, OnDevice, Who, command_line, publish
+from sim.files.command import OfRobot, OnDevice, OnGround, Who, command_line, publish
 from sim.files.settings import setting
 
 
@@ -67,7 +67,7 @@ class ExportPolicy(Who):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Crosscheck(Who, OnDevice):
+class Crosscheck(Who, OnGround, OnDevice):
     """Compare the crossings of the parallel simulation with the same crossings in plain MuJoCo C.
 
     Of a pool of terrains it takes those on which 30 to 90 % of a first set of episodes succeed, or those named by

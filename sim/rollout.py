@@ -20,6 +20,7 @@ from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.bank import TerrainBank
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, make_start_ranges, make_task
+from sim.ground import GroundMaps
 from sim.policy.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.policy.runner import Memory, PolicyRunner
 from sim.reward import Reward
@@ -147,6 +148,7 @@ class Rollout:
         cfg: CrossingCfg | None = None,
         solver: SolverCfg | None = None,
         space: TerrainSpace = SUPER_GAUSSIAN,
+        has_ground: bool = False,
     ) -> None:
         """Load the policy, build the simulation and capture the control step.
 
@@ -160,6 +162,7 @@ class Rollout:
             cfg: The crossing.
             solver: Solver options.
             space: What the genes of terrains mean.
+            has_ground: Whether heights may come with friction and softness; with genes the space decides.
 
         Raises:
             ValueError: If the policy does not fit the robot, a number is not positive, or memory is too small.
@@ -169,19 +172,17 @@ class Rollout:
                 "num_terrains, num_replicas and num_envs must be positive, "
                 f"got {num_terrains}, {num_replicas} and {num_envs}"
             )
-        self.robot = robot
-        self.cfg = cfg or CrossingCfg()
-        self.num_terrains = num_terrains
-        self.num_replicas = num_replicas
+        self.robot, self.cfg = robot, cfg or CrossingCfg()
+        self.num_terrains, self.num_replicas = num_terrains, num_replicas
         self.num_envs = min(num_envs or num_terrains * num_replicas, num_terrains * num_replicas)
-        self.space = space
+        self.space, self._has_ground = space, has_ground or bool(space.ground)
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         with _saying_what_does_not_fit(self.num_envs, num_terrains, device):
             self._build(loaded, solver, device)
 
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
-        bank = TerrainBank(self.num_terrains, device=device)
+        bank = TerrainBank(self.num_terrains, device=device, has_ground=self._has_ground)
         self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
         self._lots: deque[_Lot] = deque()
         self._first_free = self._waiting = 0  # the ring's next slot, and episodes that no robot may take yet
@@ -278,6 +279,7 @@ class Rollout:
         terrains: np.ndarray,
         seeds: np.ndarray,
         *,
+        ground: GroundMaps | None = None,
         watcher: Watcher | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> RolloutResult:
@@ -287,6 +289,7 @@ class Rollout:
             terrains: Genes, shape (count, num_genes), or heights [m], shape (count, nrow, ncol); at most
                 ``num_terrains`` of them.
             seeds: One seed a terrain, shape (count,), uint32.
+            ground: Friction and softness of terrains that are given by heights.
             watcher: Looks on.
             progress: Called now and then with the share that is done.
 
@@ -295,7 +298,7 @@ class Rollout:
         """
         self.clear()
         try:
-            self.put(terrains, seeds)
+            self.put(terrains, seeds, ground)
             return self.take(progress, watcher=watcher)
         except BaseException:
             self.clear()
@@ -312,12 +315,13 @@ class Rollout:
         self._queue.episode_of_env.fill_(-1)
         self._queue.counts.zero_()
 
-    def put(self, terrains: np.ndarray, seeds: np.ndarray) -> None:
+    def put(self, terrains: np.ndarray, seeds: np.ndarray, ground: GroundMaps | None = None) -> None:
         """Let every replica on some terrains be crossed, behind what is under way; waits for nothing.
 
         Args:
-            terrains: As of :meth:`evaluate`; at most :attr:`num_free` of them.
-            seeds: One seed a terrain.
+            terrains: As of :meth:`evaluate`, seeds and ground too; at most :attr:`num_free` of them.
+            seeds: One a terrain.
+            ground: Of heights.
 
         Raises:
             ValueError: As of :meth:`evaluate`.
@@ -329,7 +333,7 @@ class Rollout:
             raise ValueError(f"terrains must be 1 to {self.num_free} at once here, got {count}")
         first = 0 if idle else self._first_free
         slots = ring_slices(first, count, self.num_terrains)
-        self._write_terrains(terrains, seeds, slots)
+        self._write_terrains(terrains, seeds, slots, ground)
         num_episodes = count * self.num_replicas
         most_steps = self._most * -(-num_episodes // self.num_envs)
         self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._steps))
@@ -343,13 +347,13 @@ class Rollout:
         if idle or self._policy.memory is not Memory.WHOLE:
             self._release(begin=idle)
 
-    def _write_terrains(self, terrains: np.ndarray, seeds: np.ndarray, slots: Sequence[slice]) -> None:
+    def _write_terrains(self, terrains: Any, seeds: Any, slots: Sequence[slice], ground: GroundMaps | None) -> None:
         done = 0
         with wp.ScopedDevice(self.sim.device):
             for own in slots:
                 part = slice(done, done + own.stop - own.start)
                 if terrains.ndim == 3:
-                    self.sim.bank.set_heights(terrains[part], own)
+                    self.sim.bank.set_heights(terrains[part], own, ground=None if ground is None else ground[part])
                 else:
                     self.sim.bank.set_genes(terrains[part], self.space, own)
                 self._queue.seed[own].assign(seeds[part].astype(np.uint32))
@@ -398,7 +402,7 @@ class Rollout:
             watcher: Looks on.
 
         Returns:
-            What came of their episodes. What else is under way goes on meanwhile: on a GPU without waiting.
+            What came of their episodes. On a GPU what else is under way goes on without waiting.
 
         Raises:
             RuntimeError: If nothing is under way.
@@ -436,8 +440,7 @@ class Rollout:
             return values.reshape(-1, self.num_replicas, *values.shape[1:])
 
         outcome, steps, pose = of(queue.outcome).astype(np.uint8), of(queue.steps), of(queue.final_pose)
-        columns = [PENALTIES.index(name) for name in robot.penalties]
-        penalties = of(queue.penalty_sums).astype(np.float64)[..., columns]
+        penalties = of(queue.penalty_sums).astype(np.float64)[..., [PENALTIES.index(name) for name in robot.penalties]]
         penalties[outcome == Outcome.INVALID] = np.nan
         reward = None
         if self._reward is not None:

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from kernels.contact import ContactBuffer, Layout, collide_strips
+from kernels.ground import GroundRecords, make_bodies, tell_contacts
 from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.restart import clear_rows
@@ -215,19 +216,41 @@ class Simulation:
         self.probes = make_probes(builder)
         self.contact_capacity = self.num_envs * self.robot.nconmax
         self._contacts = newton.Contacts(
-            rigid_contact_max=self.contact_capacity, soft_contact_max=0, device=self.device
+            rigid_contact_max=self.contact_capacity,
+            soft_contact_max=0,
+            device=self.device,
+            per_contact_shape_properties=self.bank.ground is not None,
         )
         self.contact_count = self._contacts.rigid_contact_count
         self.contact_records = ContactBuffer()
         for field in ContactBuffer.vars:
             setattr(self.contact_records, field, getattr(self._contacts, f"rigid_contact_{field}"))
         geom_of_shape = self.solver.newton_shape_to_mjc_geom.numpy()
+        if self.bank.ground is not None:
+            self._build_ground(geom_of_shape[first_shape:].reshape(self.num_envs, -1))
         column_of_geom = np.full(self.solver.mjw_model.ngeom, -1)
         for shape, name in enumerate(geom_names(builder)):
             if name in self.robot.geom_names:  # a mesh of several parts is several shapes of one name
                 column_of_geom[geom_of_shape[first_shape + shape]] = self.robot.geom_names.index(name)
         self.column_of_geom = wp.array(column_of_geom, dtype=int)
         self.geom_role = wp.array([self.robot.role_of(name) for name in self.robot.geom_names], dtype=int)
+
+    def _build_ground(self, geoms: np.ndarray) -> None:
+        """What contacts need to know of the robots' shapes, whose solver geoms are ``geoms``, (num_envs, shapes)."""
+        model, envs = self.solver.mjw_model, np.arange(self.num_envs)[:, None]
+        inverse_weight, solref, solimp = (
+            np.broadcast_to(array.numpy(), (self.num_envs, *array.numpy().shape[1:]))
+            for array in (model.body_invweight0, model.geom_solref, model.geom_solimp)
+        )
+        self._bodies = make_bodies(
+            inverse_weight[envs, model.geom_bodyid.numpy()[geoms], 0].ravel(),
+            solimp[envs, geoms, 1].ravel(),
+            solref[envs, geoms, 0].ravel(),
+            self.device,
+        )
+        self._ground_records = GroundRecords()
+        for field in GroundRecords.vars:
+            setattr(self._ground_records, field, getattr(self._contacts, f"rigid_contact_{field}"))
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
@@ -260,6 +283,11 @@ class Simulation:
         collide_strips(
             self.body_q, self.terrain_of_env, self.bank.terrain, self.probes, self.layout, self.contact_records
         )
+        if self.bank.ground is not None:
+            tell_contacts(
+                self.terrain_of_env, self.bank.ground, self._bodies, self.layout, self.contact_records,
+                self._ground_records,
+            )  # fmt: skip
 
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place."""

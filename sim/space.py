@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels import super_gaussian
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
+from sim.ground import check_kinds, joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.spaces.base import Seed as Seed
 from sim.spaces.base import TerrainSpace as TerrainSpace
 from sim.spaces.base import clipped as clipped
 from sim.spaces.course import COURSE
+from sim.spaces.ground import OnGround
 
 _HEIGHT = PARAMETERS.index("w")
 _SIDED = [PARAMETERS.index(name) for name in ("mu_y", "theta")]  # their ranges are as wide to the left as to the right
@@ -104,7 +106,8 @@ _named: list[TerrainSpace] = []
 
 def is_own(name: str) -> bool:
     """Whether a space is code of a user's own."""
-    return name not in SPACES and ControllerSpec.parse(name).runs_code
+    base, _ = split_name(name)
+    return base not in SPACES and ControllerSpec.parse(base).runs_code
 
 
 def to_be_named(name: str) -> str | None:
@@ -113,30 +116,69 @@ def to_be_named(name: str) -> str | None:
 
 
 def space_identity(name: str) -> str:
-    """What the terrains of a space depend on: its name, or the hash of its code where it has one."""
-    return (controller_hash(name) if is_own(name) else None) or name
+    """What the terrains of a space depend on: its name, or the hash of its code where it has one, and its ground."""
+    base, _ = split_name(name)
+    return recorded_identity(name, controller_hash(base) if is_own(name) else None)
+
+
+def recorded_identity(name: str, sha256: str | None) -> str:
+    """:func:`space_identity` of a space that a record names, with the hash of its code there."""
+    base, kinds = split_name(name)
+    return joined_name(sha256 or base, kinds)
+
+
+def on_ground(named: str | None, kinds: Sequence[str] | None) -> str | None:
+    """The name of a space with the ground that a command line asks for; None if it names neither.
+
+    Args:
+        named: As of :func:`load_space`; the paper's if None.
+        kinds: Some of :data:`sim.ground.GROUND_KINDS`; those of the name if None.
+
+    Raises:
+        ValueError: If a kind is unknown, or the name has another ground already.
+    """
+    if kinds is None:
+        return named
+    (base, there), wanted = split_name(named or SUPER_GAUSSIAN.name), check_kinds(kinds)
+    if there and there != wanted:
+        raise ValueError(
+            f"the space {named} has ground of its own, {' and '.join(there)}, got --ground {' '.join(wanted)}: leave "
+            "one of them out"
+        )
+    return joined_name(base, wanted)
 
 
 def load_space(named: str) -> TerrainSpace:
     """A space that the command line names; one of a user's own is run, and :func:`get_space` finds it from then on.
 
     Args:
-        named: A shipped space's name, ``file.py:Space`` or ``module:Space``.
+        named: A shipped space's name, ``file.py:Space`` or ``module:Space``, and behind it the maps of its ground, as
+            in ``course+friction+softness``.
 
     Raises:
         ValueError: If there is no such space, or it does not work.
     """
-    if not is_own(named):
+    base, kinds = split_name(named)
+    if not is_own(base):
         return get_space(named)
     from sim.spaces.own import load_own  # with torch
 
-    digest = controller_hash(named)
+    digest = controller_hash(base)
     for space in _named:
-        if space.name == named and space.sha256 == digest and digest is not None:
-            return space
-    space = load_own(named)
+        if space.name == base and space.sha256 == digest and digest is not None:
+            return _with_ground(space, kinds)
+    space = load_own(base)
     _named.insert(0, space)
-    return space
+    return _with_ground(space, kinds)
+
+
+def _with_ground(space: TerrainSpace, kinds: tuple[str, ...]) -> TerrainSpace:
+    if kinds and space.ground:
+        raise ValueError(
+            f"the space {space.name} has {' and '.join(space.ground)} of its own, got --ground {' '.join(kinds)}: "
+            "leave --ground out"
+        )
+    return OnGround(inner=space, kinds=kinds) if kinds else space
 
 
 def get_space(name: str, sha256: str | None = None, *, file: Path | None = None) -> TerrainSpace:
@@ -150,6 +192,12 @@ def get_space(name: str, sha256: str | None = None, *, file: Path | None = None)
     Raises:
         ValueError: If there is no such space, the command line did not name it, or it has changed since.
     """
+    base, kinds = split_name(name)
+    return _with_ground(_get_base(base, sha256, file), kinds)
+
+
+def _get_base(name: str, sha256: str | None, file: Path | None) -> TerrainSpace:
+    """:func:`get_space` without ground."""
     if name in SPACES:
         return SPACES[name]
     where = "" if file is None else f"{file}: "

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from sim.files.command import OnGround
 from sim.files.settings import setting
 from sim.robots.training import RewardCfg
 from train.ppo.cfg import PpoCfg, TrainingFlags
@@ -29,7 +30,7 @@ def archive_paths(settings: dict[str, Any]) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finetune(TrainingFlags):
+class Finetune(OnGround, TrainingFlags):
     """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
 
     On CUDA the sizes are the paper's, on the CPU small ones, enough to see that it runs. Ctrl-C or --max-seconds saves

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sim.files.command import OfRobot, Where
+from sim.files.command import OfRobot, OnGround, Where
 from sim.files.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class Harden(OfRobot, Where):
+class Harden(OfRobot, OnGround, Where):
     """Search for what breaks a controller, train it on all that was found, and search again, for some rounds.
 
     Each search counts the faults: terrains that a controller of the panel crosses and this one does not. Each training

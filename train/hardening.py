@@ -28,7 +28,7 @@ from sim.files.settings import check
 from sim.policy.spec import controller_hash, controllers_of, is_same
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, to_be_named
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, to_be_named
 from train.evaluate.crossings import cross_all
 from train.evaluate.evaluate import Evaluate, evaluator_of
 from train.evaluate.measures import measure
@@ -207,6 +207,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     policy = flags.policy or robot.policy_file
     read_start(policy, robot)
     check_policy(str(policy), robot, device)
+    flags = replace(flags, space=on_ground(flags.space, flags.ground), ground=None)
     space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
     on_cuda = device.startswith("cuda")
     sizes = {name: getattr(flags, name) for name in ("emitters", "batch_size", "replicas")}

@@ -13,7 +13,7 @@ from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, recorded_space, to_be_named
+from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, recorded_space, to_be_named
 from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, space_of, split_elites
 from train.finetune import Finetune, archive_paths
 from train.ppo.learner import Start, read_start
@@ -217,8 +217,10 @@ def _elites(flags: Finetune, robot: RobotCfg) -> _Elites:
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
         if flags.only != "all" or not flags.held_out:
             raise ValueError(f"mix {flags.mix} has no elites: leave --only and --no-held-out out, or use mix generated")
-        space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
+        space = load_space(on_ground(flags.space, flags.ground) or SUPER_GAUSSIAN.name)
         return _Elites(np.zeros((0, space.num_genes), np.float32), space)
+    if flags.ground is not None:
+        raise ValueError("mix generated takes the ground of its archives, got --ground: leave it out")
     paths = flags.archive or (_usual_archive(flags, robot),)
     archives = [_read_archive(flags, robot, path) for path in paths]
     spaces = {(one.space, one.space_sha256): path for one, path in zip(archives, paths, strict=True)}

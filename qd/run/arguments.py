@@ -25,7 +25,7 @@ from qd.run.settings import (
 )
 from qd.workers.evaluator import EvaluatorCfg, check_policy, origin_of, parse_workers, resolve_device
 from sim.files.atomic import is_leftover
-from sim.files.command import Where, Who, command_line
+from sim.files.command import OnGround, Where, Who, command_line
 from sim.policy.spec import ControllerSpec, certifier_hash, controller_hash, controllers_of, named_file
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Archive(Who, Where):
+class Archive(Who, OnGround, Where):
     """Search the terrains on which a controller fails, each in its own way.
 
     Every iteration asks CMA-MAE and MAP-Elites for terrains, lets robots cross them, and files each terrain by the
@@ -109,7 +109,9 @@ NOT_ON_RAY = (
     "a search for certified failures runs in this process or in processes of this machine, not on Ray, whose workers "
     "have one controller each"
 )
-_NOT_SETTINGS = ("device", "workers", "num_envs", "robot", "resume", "run_dir", "without", "reproduce", "confirm")
+_NOT_SETTINGS = (
+    "device", "workers", "num_envs", "robot", "resume", "run_dir", "without", "reproduce", "confirm", "ground",
+)  # fmt: skip
 _SESSION = ("command", "commit", "device")
 
 
@@ -224,9 +226,12 @@ def _space_of(args: Archive, there: SearchCfg | None) -> "tuple[TerrainSpace, di
     Raises:
         ValueError: If there is none of that name, it does not work, or the run's own is not named or has changed.
     """
-    from sim.space import SUPER_GAUSSIAN, get_space, load_space
+    from sim.ground import split_name
+    from sim.space import SUPER_GAUSSIAN, get_space, load_space, on_ground
 
-    given = None if args.space is None else load_space(args.space)
+    base = args.space if there is None or args.space else split_name(there.space)[0]
+    named = args.space if args.ground is None else on_ground(base, args.ground)
+    given = None if named is None else load_space(named)
     if there is None:
         space = given or SUPER_GAUSSIAN
         sigma0 = space.sigma0 if args.sigma0 is None else args.sigma0

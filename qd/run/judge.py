@@ -187,6 +187,11 @@ def confirm_run(args: Confirm, *, open_evaluator: Open = open_evaluator) -> Arch
     """
     path, cfg, robot = config_of(args, args.run, args.space)
     policy = searched_policy(path, cfg, robot, args.policy, "confirmed")
+    if args.mujoco_c:
+        from sim.mujoco_c.model import refuse_softness  # with MuJoCo: not for `--help`
+        from sim.space import get_space
+
+        refuse_softness(get_space(cfg.space, cfg.space_sha256))
     device = resolve_device(args.device, args.workers)
     evaluator = evaluator_of(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
     with judged_run(path, cfg, robot, args.elite) as judged:

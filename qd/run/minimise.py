@@ -129,11 +129,10 @@ class MinimalTerrains:
 
     def shapes(self, number: int, minimal: Minimal) -> dict[int, "Shape"]:
         """Shapes of the parts of a minimal terrain, by their numbers."""
-        from qd.causes import fields_of, shape_of  # with Warp: not for `--help`
+        from qd.causes import effects_of  # with Warp: not for `--help`
 
-        fields = fields_of(self.genes(number, minimal), minimal.parts, self.space)
-        shapes = (shape_of(field, self.half_width) for field in fields)
-        return dict(zip(minimal.parts, shapes, strict=True))
+        effects = effects_of(self.genes(number, minimal), minimal.parts, self.space)
+        return {part: effects.shape(place, self.half_width) for place, part in enumerate(minimal.parts)}
 
     def margin(self, number: int, minimal: Minimal) -> tuple[float, float | None]:
         """Largest height or depth of a minimal terrain, and how far it moves to the least scale that fails [m]."""
@@ -325,7 +324,7 @@ def _case_of(
     Raises:
         ValueError: If its terrain has no parts, or too many for all subsets.
     """
-    from qd.causes import fields_of, on_the_way  # with Warp: not for `--help`
+    from qd.causes import effects_of  # with Warp: not for `--help`
 
     count = len(space.parts(archive.genes[number]))
     if not count:
@@ -333,17 +332,18 @@ def _case_of(
             f"terrains of the space {space.name} have no parts that can be taken away, expected some: give the space "
             "parts(genes) and without(genes, parts) (docs/own-space.md)"
         )
-    fields = fields_of(archive.genes[number], range(count), space)
-    parts = [part for part in range(count) if np.abs(fields[part]).max() > _LEAST_EFFECT]
+    effects = effects_of(archive.genes[number], range(count), space)
+    parts = np.flatnonzero(effects.changes(_LEAST_EFFECT)).tolist()
     if how == "exhaustive" and len(parts) > MOST_PARTS:
         raise ValueError(
             f"elite {number} must have at most {MOST_PARTS} parts to cross all its subsets, got {len(parts)}: give "
             "--how greedy"
         )
     return Case(
-        parts=tuple(sorted(parts, key=lambda part: (on_the_way(fields[part], half_width), part))),
+        parts=tuple(sorted(parts, key=lambda part: (*effects.way(part, half_width), part))),
         how=how or ("exhaustive" if on_gpu and len(parts) <= MOST_PARTS else "greedy"),
         scalable=space.scaled(archive.genes[number][None], 0.5) is not None,
+        flat=tuple(part for part in parts if np.abs(effects.heights[part]).max() <= _LEAST_EFFECT),
         counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
     )
 

@@ -22,6 +22,7 @@ from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.show.crossed import Crossed
+    from sim.ground import GroundMaps
     from sim.robots.robot import RobotCfg
 
 OWN_FOLDER = RUNS / "terrains"
@@ -79,6 +80,8 @@ class OwnTerrain(NamedTuple):
     """The file's name."""
     fitted: str
     """What became of the map, in words."""
+    ground: "GroundMaps | None" = None
+    """Friction and softness that the file has."""
 
 
 def read_own_terrain(path: Path, args: Mapped) -> OwnTerrain:
@@ -91,7 +94,7 @@ def read_own_terrain(path: Path, args: Mapped) -> OwnTerrain:
     from sim.maps.heightmap import as_terrain, fitted, read_heightmap
 
     heightmap = read_heightmap(path, size_m=_size_of(args.size), scale_m=args.scale, offset_m=args.offset)
-    return OwnTerrain(heights=as_terrain(heightmap), label=path.name, fitted=fitted(heightmap))
+    return OwnTerrain(as_terrain(heightmap), path.name, fitted(heightmap), heightmap.ground)
 
 
 def _size_of(words: Sequence[str]) -> tuple[float, ...] | None:
@@ -121,7 +124,9 @@ def cross(cfg: Cross) -> dict[str, Any]:
     robot = robot_named(cfg.robot)
     terrain = read_own_terrain(cfg.terrain, cfg)
     policy = cfg.policy or str(robot.policy_file)
-    wanted = on_heights(terrain.heights, label=terrain.label, policy=policy, replicas=cfg.episodes, seed=cfg.seed)
+    wanted = on_heights(
+        terrain.heights, label=terrain.label, policy=policy, replicas=cfg.episodes, seed=cfg.seed, ground=terrain.ground
+    )
     device = resolve_device(cfg.device)
     check_policy(policy, robot, device)
     who = who_crossed(robot, policy)

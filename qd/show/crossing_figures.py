@@ -8,7 +8,7 @@ import numpy as np
 from qd.show.crossed import ENDINGS, Crossed, penalties_by_place
 from qd.show.figures import look_of
 from sim.files.figures import new_figure
-from sim.maps.picture import GOAL, LENGTH, START, draw_heights
+from sim.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,7 +68,7 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
         crossed: The crossings.
         limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
     """
-    image = draw_heights(axes, crossed.recording.heights[0], limits)
+    image = draw_heights(axes, crossed.recording.heights[0], limits, crossed.recording.ground)
     for outcome, end in ENDINGS.items():
         chosen = np.flatnonzero(crossed.outcome == outcome)
         for k in chosen:
@@ -82,15 +82,22 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
 def _legend(drawn: Sequence[Crossed]) -> list[Any]:
     """Marks of the ends there are, with the lines of the paths to them, of start and goal; counts of a single map."""
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
-    handles = []
+    handles: list[Any] = []
     for outcome, end in ENDINGS.items():
         count = sum(int((crossed.outcome == outcome).sum()) for crossed in drawn)
         if count:
             label = f"{end.words} ({count})" if len(drawn) == 1 else end.words
             looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line, "label": label}
             handles.append(Line2D([], [], **looks, markeredgecolor="white", markersize=9))
-    return handles + [Line2D([], [], **look) for look in (START, GOAL)]
+    handles += [Line2D([], [], **look) for look in (START, GOAL)]
+    grounds = [crossed.recording.ground for crossed in drawn if crossed.recording.ground is not None]
+    if any((ground.friction < 1.0).any() for ground in grounds):
+        handles.append(Patch(color=SLIPPERY, alpha=0.5, label="slippery"))
+    if any(ground.time_constant_s.any() for ground in grounds):
+        handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
+    return handles
 
 
 def _x_limits(drawn: Sequence[Crossed]) -> tuple[float, float]:

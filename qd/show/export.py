@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OfRobot, Which, chosen_elites, split_words
 from sim.files.provenance import provenance
 
+if TYPE_CHECKING:
+    from sim.ground import GroundMaps
+
 INDEX_FILE = "index.json"
 """What was exported, in the folder of the files."""
 _FOLDER = "terrains"
@@ -29,10 +32,10 @@ _AT_ONCE = 32  # terrains rasterised
 class Export(OfRobot, Which):
     """Write elites of an archive, or terrains of a pack, as files that other programs read.
 
-    For each elite it writes `elite-N.npz` (heights in m, rows along y; genes), `elite-N.png` (16-bit grayscale seen
-    from above; scale and offset in `elite-N.json`), `elite-N.xml` (MJCF: a scene of the terrain alone, whose surface is
-    the simulation's, between the nodes too) and `elite-N.stl` (a closed block). `faultline cross --terrain
-    elite-N.npz`, or with the .png, crosses it again.
+    For each elite it writes `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground
+    has them), `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml`
+    (MJCF: a scene of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a
+    closed block). `faultline cross --terrain elite-N.npz`, or with the .png, crosses it again.
     """
 
     pack: str | None = None
@@ -67,10 +70,12 @@ class _Source:
     """Name of a terrain's files."""
     genes: Callable[[int], NDArray[np.float32]] | None
     """Of a terrain, shape (num_genes,)."""
-    heights: Callable[[list[int]], NDArray[np.float32]]
-    """Of some terrains [m], shape (number of them, nrow, ncol)."""
+    terrains: "Callable[[list[int]], tuple[NDArray[np.float32], GroundMaps | None]]"
+    """Heights of some terrains [m], shape (number of them, nrow, ncol), and their ground, if it is not as always."""
     about: Callable[[int], dict[str, Any]]
     """What is known of a terrain."""
+    ground: tuple[str, ...] = ()
+    """What its terrains have maps of beside heights."""
 
 
 def export(cfg: Export) -> list[Path]:
@@ -91,6 +96,7 @@ def export(cfg: Export) -> list[Path]:
     elites = source.numbers
     formats = list(dict.fromkeys(split_words(cfg.formats)))
     check_formats(formats)
+    _tell_of_ground(source, formats)
     folder = cfg.out or source.folder
     if not cfg.overwrite:
         _refuse_to_replace(folder, {source.stem(elite) for elite in elites})
@@ -102,10 +108,13 @@ def export(cfg: Export) -> list[Path]:
     with tqdm(total=len(elites), desc="exporting", unit="terrain", file=sys.stderr, disable=None) as bar:
         for first in range(0, len(elites), _AT_ONCE):
             numbers = elites[first : first + _AT_ONCE]
-            for number, heights in zip(numbers, source.heights(numbers), strict=True):
+            grids, maps = source.terrains(numbers)
+            for place, (number, heights) in enumerate(zip(numbers, grids, strict=True)):
                 about, stem = source.about(number), folder / source.stem(number)
                 genes = None if source.genes is None else source.genes(number)
-                files += write_terrain(stem, heights, formats=formats, about={**about, **origin}, genes=genes)
+                ground = None if maps is None else maps[place : place + 1]
+                told = {**about, **origin}
+                files += write_terrain(stem, heights, formats=formats, about=told, genes=genes, ground=ground)
                 index.append({**about, "files": stem.name})
                 bar.update()
     files.append(folder / INDEX_FILE)
@@ -115,9 +124,28 @@ def export(cfg: Export) -> list[Path]:
     return files
 
 
+def _tell_of_ground(source: _Source, formats: list[str]) -> None:
+    """Says which files hold friction and softness.
+
+    Raises:
+        ValueError: If none would.
+    """
+    if not source.ground:
+        return
+    others = ", ".join(ending for ending in formats if ending != "npz")
+    alone = f"{others} hold{'s' * (',' not in others)} heights alone"
+    if "npz" not in formats:
+        raise ValueError(
+            f"terrains have {' and '.join(source.ground)} of their own, which only npz holds, got --formats "
+            f"{' '.join(formats)}: add npz"
+        )
+    if others:
+        print(f"{' and '.join(source.ground).capitalize()} of the ground: in the npz; {alone}.")
+
+
 def _of_archive(cfg: Export) -> _Source:
     """The elites of an archive."""
-    from sim.bank import heights_of
+    from sim.bank import terrains_of
 
     found = find_archive(cfg.robot, cfg.run, space=cfg.space)
     archive, space = found.archive, found.space
@@ -142,7 +170,8 @@ def _of_archive(cfg: Export) -> _Source:
         named=archive.named(),
         stem=lambda elite: f"{what}-{elite}",
         genes=genes,
-        heights=lambda numbers: heights_of(np.stack([genes(elite) for elite in numbers]), space),
+        terrains=lambda numbers: terrains_of(np.stack([genes(elite) for elite in numbers]), space),
+        ground=space.ground,
         about=about,
     )
 
@@ -165,7 +194,7 @@ def _of_pack(cfg: Export, named: str) -> _Source:
         named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
         stem=lambda place: pack.terrains[place]["name"],
         genes=None if pack.genes is None else pack.genes.__getitem__,
-        heights=lambda numbers: pack.heights[numbers],
+        terrains=lambda numbers: (pack.heights[numbers], None),
         about=lambda place: {"robot": robot.name, "place": place, **pack.terrains[place]},
     )
 

@@ -154,7 +154,9 @@ def _own_order(cfg: Film, path: Path) -> Order:
     check_policy(policy, robot, device)
     out = cfg.out or OWN_FOLDER / f"{name_of_map(path)}-{who_crossed(robot, policy)}.mp4"
     prepare_output(out)
-    wanted = on_heights(terrain.heights, label=terrain.label, policy=policy, replicas=cfg.replicas, seed=cfg.seed)
+    wanted = on_heights(
+        terrain.heights, label=terrain.label, policy=policy, replicas=cfg.replicas, seed=cfg.seed, ground=terrain.ground
+    )
     (recording,) = Recordings(robot, device=device).all_of([wanted])
     order = Order(recording, robot, out, _scales_of(robot, cfg.policy))
     _keep(order)
@@ -210,7 +212,9 @@ def _film(order: Order, cfg: Film) -> None:
     heights = recording.heights[0]
     total = num_pictures(shot, cfg.fps)
     with (
-        Renderer(robot, heights, width=WIDTH, height=VIEW_HEIGHT, shadows=cfg.shadows) as renderer,
+        Renderer(
+            robot, heights, width=WIDTH, height=VIEW_HEIGHT, shadows=cfg.shadows, ground=recording.ground
+        ) as renderer,
         tqdm(total=total, desc=f"filming {recording.labels[0]}", unit="picture", file=sys.stderr, disable=None) as bar,
     ):
         pictures = frames_of(shot, renderer, cameras, cfg.fps)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.bank import heights_of
+from sim.bank import terrains_of
 from sim.files.figures import new_figure
 from sim.maps.picture import draw_heights
 
@@ -47,11 +47,11 @@ def draw_minimal(
     figure.suptitle(f"{robot}: {len(entries):,} minimal terrains")
     grid = figure.add_gridspec(rows + 1, _COLUMNS, height_ratios=(1.3, *[1.0] * rows))
     _draw_histogram(figure.add_subplot(grid[0, :]), numbers)
-    heights = heights_of(np.array([genes[entry["elite"]] for entry in shown]), space)
+    heights, maps = terrains_of(np.array([genes[entry["elite"]] for entry in shown]), space)
     limits = (float(heights.min()), float(heights.max()))
     panels = [figure.add_subplot(grid[1 + place // _COLUMNS, place % _COLUMNS]) for place in range(len(shown))]
-    for axes, entry, ground in zip(panels, shown, heights, strict=True):
-        image = draw_heights(axes, ground, limits)
+    for place, (axes, entry) in enumerate(zip(panels, shown, strict=True)):
+        image = draw_heights(axes, heights[place], limits, None if maps is None else maps[place : place + 1])
         kind = entry["cause"]["kind"] if entry["cause"] else "no part"
         parts = f"{len(entry['bumps'])} of {entry['of']} parts"
         axes.set_title(f"elite {entry['elite']}: {parts}, {kind}, {entry['goal_rate']:.0%} arrive", fontsize=9)

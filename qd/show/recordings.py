@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from sim.policy.spec import controller_hash
 from sim.robots.identity import robot_identity
 
 if TYPE_CHECKING:
+    from sim.ground import GroundMaps
     from sim.recording.recorder import Recording
     from sim.robots.robot import RobotCfg
 
@@ -53,6 +55,8 @@ class Wanted:
     """Seed of the terrain's episodes."""
     space: str = "super_gaussian"
     """Terrain space of genes, as :func:`sim.space.load_space` takes it."""
+    ground: "GroundMaps | None" = field(default=None, compare=False)
+    """Friction and softness beside heights."""
 
     def __post_init__(self) -> None:
         if self.replicas < 1 or self.seed < 0:
@@ -96,10 +100,20 @@ def on_elite(
     )
 
 
-def on_heights(heights: NDArray[np.float32], *, label: str, policy: str, replicas: int, seed: int) -> Wanted:
-    """Crossings of a user's own terrain; arguments and errors as of :func:`on_elite`."""
+def on_heights(
+    heights: NDArray[np.float32],
+    *,
+    label: str,
+    policy: str,
+    replicas: int,
+    seed: int,
+    ground: "GroundMaps | None" = None,
+) -> Wanted:
+    """Crossings of a user's own terrain, with its ground; arguments and errors as of :func:`on_elite`."""
     drawn = int(episode_seeds(max(seed, 0), 0, 1, stream=_OWN_STREAM)[0])
-    return Wanted(label=label, terrain=heights, policy=policy, replicas=replicas, seed=seed, terrain_seed=drawn)
+    return Wanted(
+        label=label, terrain=heights, policy=policy, replicas=replicas, seed=seed, terrain_seed=drawn, ground=ground
+    )
 
 
 Cross = Callable[[Sequence[Wanted], Callable[[float], None]], "list[Recording]"]
@@ -116,7 +130,7 @@ class Simulation:
 
     def __init__(self, robot: "RobotCfg", device: str) -> None:
         self._robot, self._device = robot, device
-        self._rollouts: dict[tuple[str, int, int, str], Any] = {}
+        self._rollouts: dict[tuple[str, int, int, str, bool], Any] = {}
 
     def prepare(self, first: Wanted, count: int = 1) -> Any:
         """The rollout that crosses such terrains, so many at once; built if there is none yet.
@@ -127,11 +141,12 @@ class Simulation:
         from sim.rollout import Rollout
         from sim.space import load_space
 
-        kind = (first.policy, count, first.replicas, first.space)
+        has_ground = first.ground is not None
+        kind = (first.policy, count, first.replicas, first.space, has_ground)
         if kind not in self._rollouts:
             self._rollouts[kind] = Rollout(
                 self._robot, first.policy, num_terrains=count, num_replicas=first.replicas, device=self._device,
-                space=load_space(first.space),
+                space=load_space(first.space), has_ground=has_ground,
             )  # fmt: skip
         return self._rollouts[kind]
 
@@ -141,14 +156,17 @@ class Simulation:
         Raises:
             ValueError: If the controller cannot be loaded or does not fit the robot.
         """
+        from sim.ground import GroundMaps
         from sim.recording.recorder import record
 
         first = wanted[0]
+        grounds = [one.ground for one in wanted if one.ground is not None]
         _, recording = record(
             self.prepare(first, len(wanted)),
             np.stack([one.terrain for one in wanted]),
             np.array([one.terrain_seed for one in wanted], np.uint32),
             policy=first.policy,
+            ground=reduce(GroundMaps.joined, grounds) if grounds else None,
             labels=[one.label for one in wanted],
             seed=first.seed,
             progress=progress,
@@ -193,7 +211,7 @@ class Recordings:
 
         if self._last is not None:
             last, recording = self._last
-            if last == wanted and np.array_equal(last.terrain, wanted.terrain):
+            if last == wanted and last.ground == wanted.ground and np.array_equal(last.terrain, wanted.terrain):
                 return recording
         if controller_hash(wanted.policy) is None:
             return None
@@ -254,7 +272,8 @@ class Recordings:
         alike: dict[Any, list[int]] = {}
         for k in missing:
             one = wanted[k]
-            alike.setdefault((one.policy, one.replicas, one.seed, one.space, one.terrain.shape), []).append(k)
+            kind = (one.policy, one.replicas, one.seed, one.space, one.terrain.shape, one.ground is None)
+            alike.setdefault(kind, []).append(k)
         for numbers in alike.values():
             yield from (numbers[k : k + self._at_once] for k in range(0, len(numbers), self._at_once))
 
@@ -271,6 +290,8 @@ class Recordings:
 
         identity: list[Any] = [self._about, controller_hash(wanted.policy), [wanted.terrain_seed]]
         identity += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), code]
+        if wanted.ground is not None:
+            identity += [wanted.ground.friction.tobytes().hex(), wanted.ground.time_constant_s.tobytes().hex()]
         if wanted.space != SUPER_GAUSSIAN.name:  # the only one at first, which no name says
             identity.append(space_identity(wanted.space))
         return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:_KEY_LENGTH]
@@ -278,16 +299,25 @@ class Recordings:
     def _is(self, recording: "Recording", wanted: Wanted) -> bool:
         """Whether a recording is of just these crossings; a file may have been renamed."""
         from sim.recording.recorder import space_in
-        from sim.space import space_identity
+        from sim.space import recorded_identity, space_identity
 
+        origin = recording.origin
         terrain = recording.heights if recording.genes is None else recording.genes
         return (
             recording.robot == self._robot.name
             and self._about.items() <= recording.origin.items()
             and recording.joint_names == self._robot.joint_names
             and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
-            and (recording.origin.get("space_sha256") or space_in(recording.origin)) == space_identity(wanted.space)
+            and recorded_identity(space_in(origin), origin.get("space_sha256")) == space_identity(wanted.space)
             and np.array_equal(terrain, wanted.terrain[None])
+            and (wanted.ground is None or _same_ground(recording.ground, wanted.ground))
             and recording.seeds.tolist() == [wanted.terrain_seed]
             and np.array_equal(recording.replicas, np.arange(wanted.replicas))
         )
+
+
+def _same_ground(there: "GroundMaps | None", wanted: "GroundMaps") -> bool:
+    if there is None:
+        return False
+    alike = np.array_equal(there.friction, wanted.friction)
+    return alike and np.array_equal(there.time_constant_s, wanted.time_constant_s)

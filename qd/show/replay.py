@@ -204,7 +204,7 @@ def draw(replay: Replay) -> "Figure":
         f"{replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
     )
     if replay.minimal:
-        title = f"{archive.robot}, minimal terrain of elite {n} of {len(archive):,}: {replay.minimal}"
+        title = f"{archive.robot}, minimal terrain of elite {n} of {len(archive):,}:\n{replay.minimal}"
     if replay.controller:
         title += f"\nwith another controller than was searched: {ControllerSpec.parse(replay.controller).label}"
     return draw_paths(crossed_of(replay.recording, archive.penalties, archive.scales), title)

@@ -187,7 +187,7 @@ def drawn(cfg: Agreement) -> Drawn:
         FileNotFoundError: If there is no run.
         ValueError: If terrains, robot or controller are not available, or MuJoCo cannot read the robot.
     """
-    from sim.mujoco_c.model import crossing_model
+    from sim.mujoco_c.model import crossing_model, refuse_softness
     from sim.robots.robot import get_robot
     from sim.space import SUPER_GAUSSIAN, read_pool
 
@@ -211,6 +211,7 @@ def drawn(cfg: Agreement) -> Drawn:
     if cfg.mujoco_c:
         try:
             crossing_model(robot, np.zeros((2, 2)))
+            refuse_softness(space)
         except ValueError as error:
             raise ValueError(f"{error}, or leave MuJoCo C out with --mujoco-c 0") from None
     return Drawn(
@@ -353,7 +354,7 @@ class Crossings:
                 self._kept.write(**self.outcome)
 
     def _cross_plain(self, name: str, *, resolved: bool) -> None:
-        from sim.bank import heights_of, host_device
+        from sim.bank import host_device, terrains_of
         from sim.mujoco_c.crossing import cross_plain
         from sim.simulation import SolverCfg
         from sim.simulation import resolved as with_contact_resolved
@@ -367,15 +368,17 @@ class Crossings:
             self.outcome[name][left[terrain]] = crossings.outcome
             self._kept.write(**self.outcome)
 
+        heights, ground = terrains_of(drawn.genes[left], drawn.space)
         cross_plain(
             robot,
             drawn.policy,
-            heights_of(drawn.genes[left], drawn.space),
+            heights,
             drawn.seeds(name)[left],
             num_episodes=self._evaluator.num_replicas,
             device=host_device(),
             processes=parse_workers(self._evaluator.workers).num_processes,
             time_constant_s=solver.time_constant_s,
+            ground=ground,
             crossed=crossed,
         )
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from qd.workers.invalid import tell_invalid
 from qd.workers.kept import Kept
-from sim.files.command import Where, Who, naming_what_is_next, publish
+from sim.files.command import OnGround, Where, Who, naming_what_is_next, publish
 from sim.files.settings import check, setting
 from sim.robots.identity import identity
 
@@ -35,7 +35,7 @@ _FEW = 30
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(Who, Where):
+class Calibrate(Who, OnGround, Where):
     """Measure the penalty scales of a robot with a controller, on hard-random terrains.
 
     It writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped. Every
@@ -70,7 +70,7 @@ class Calibrate(Who, Where):
         from qd.workers import evaluator as workers
         from sim.crossing import CrossingCfg
         from sim.robots.robot import get_robot
-        from sim.space import load_space
+        from sim.space import load_space, on_ground
 
         check(self)
         robot = get_robot(self.robot or "anymal")
@@ -79,6 +79,7 @@ class Calibrate(Who, Where):
                 "the scales kept with a robot are those of its shipped controller, got another one (--policy): "
                 "name a file for its scales with --out"
             )
+        space = load_space(on_ground(self.space, self.ground) or self.space)
         device, policy = workers.resolve_device(self.device, self.workers), self.policy or str(robot.policy_file)
         workers.check_policy(policy, robot, device)
         evaluator = workers.EvaluatorCfg(
@@ -89,10 +90,10 @@ class Calibrate(Who, Where):
             device=device,
             workers=self.workers,
             num_envs=self.num_envs,
-            space=self.space,
+            space=space.name,
         )
         # Both are drawn row by row: of 5,000 the first 1,000 are those that 1,000 would be.
-        genes = load_space(self.space).hard_random(self._most, self.seed)
+        genes = space.hard_random(self._most, self.seed)
         seeds = np.random.SeedSequence(self.seed).generate_state(self._most, np.uint32)
         out, opened = self.out or robot.scales_file, open_evaluator or workers.open_evaluator
         kept = Kept.beside(out, evaluator, [self.seed, self.terrains, self._most])
@@ -120,7 +121,7 @@ class Calibrate(Who, Where):
             return {
                 **workers.origin_of(device, self.seed, self.workers),
                 **identity(robot, policy),
-                "space": self.space,
+                "space": space.name,
                 "crossing": asdict(CrossingCfg()),
                 **_measured(crossed),
             }

@@ -38,7 +38,8 @@ class Speed(OfRobot, OnDevice):
     """Time a preset's iteration, the bare physics of the same crossings, and episodes a second over env counts.
 
     The bare rate is that of contacts and solver alone. `walking` replays the crossings' own motion from recorded states
-    and joint targets. `standing` holds the default pose at the start.
+    and joint targets. `standing` holds the default pose at the start. `ground_step_ratio` is what such a step costs on
+    ground with friction and softness of its own over what it costs without.
     """
 
     preset: str = "paper"
@@ -192,7 +193,7 @@ def measure(args: Speed) -> dict[str, Any]:
     Raises:
         ValueError: If a flag's value cannot be used.
     """
-    from sim.bench.physics import measure_bare_physics
+    from sim.bench.physics import measure_bare_physics, measure_ground
     from sim.robots.robot import get_robot, robot_of
 
     check(args)
@@ -219,6 +220,7 @@ def measure(args: Speed) -> dict[str, Any]:
     rollout: Any = build_rollout(replace(evaluator, num_envs=num_envs), evaluator.num_terrains)
     seeds = episode_seeds(cfg.seed, cfg.iterations, len(terrains))
     bare = measure_bare_physics(rollout, terrains, seeds, steps=args.steps)
+    ground = measure_ground(rollout, terrains, seeds, steps=args.steps)
     del rollout
     rates = [row["robot_steps"] / row["wall_s"] for row in metrics]
     running = [(1.0 - row["idle_share"]) * rate for row, rate in zip(metrics, rates, strict=True)]
@@ -236,6 +238,7 @@ def measure(args: Speed) -> dict[str, Any]:
         "running_world_steps_per_s": float(np.median(running)),
         "bare_world_steps_per_s": bare.walking,
         "bare_world_steps_per_s_standing": bare.standing,
+        "ground_step_ratio": ground,
         **training,
         "envs_curve": time_curve(evaluator, terrains, args.curve) or None,
         "before": before,

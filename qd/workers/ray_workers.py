@@ -76,9 +76,10 @@ def _packed_robot(robot: Any) -> Any:
 
 
 def _packed_space(space: str) -> Controller | str:
+    from sim.ground import split_name
     from sim.space import is_own
 
-    return Controller.of(space) if is_own(space) else space
+    return Controller.of(split_name(space)[0]) if is_own(space) else space
 
 
 _ray: Any = ray  # its annotations leave out what it documents
@@ -126,10 +127,15 @@ class RayWorker:
         # The process may be killed at any time, so the folder must not live as long as it does.
         with tempfile.TemporaryDirectory(prefix="faultline-") as folder:
             robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(Path(folder) / "robot")
-            space = self._space if isinstance(self._space, str) else self._space.unpacked(tempfile.mkdtemp(dir=folder))
+            space = self._space if isinstance(self._space, str) else self._unpacked(self._space, folder)
             cfg = replace(self._cfg, policy=self._controller.unpacked(folder), robot=robot, space=space)
             self._crosser = self._build(cfg, num_terrains)
         self._num_terrains = num_terrains
+
+    def _unpacked(self, space: Controller, folder: str) -> str:
+        from sim.ground import joined_name, split_name
+
+        return joined_name(space.unpacked(tempfile.mkdtemp(dir=folder)), split_name(self._cfg.space)[1])
 
     def cross(self, terrains: NDArray, seeds: NDArray, num_terrains: int) -> tuple["RolloutResult", float]:
         """Crosses up to ``num_terrains`` terrains.

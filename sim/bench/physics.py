@@ -73,6 +73,26 @@ def measure_bare_physics(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarr
     return BareRates(walking=walking, standing=sim.num_envs * launches * robot.decimation / seconds)
 
 
+def measure_ground(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray, *, steps: int = 1000) -> float:
+    """What a physics step costs on ground with maps of friction and softness, over what it costs without.
+
+    The maps change nothing, so that both simulations make the same motion.
+
+    Args:
+        rollout: As of :func:`measure_bare_physics`, of a space without ground of its own.
+        terrains: Likewise.
+        seeds: Likewise.
+        steps: Physics steps of each that are timed at least.
+    """
+    sim, segments = rollout.sim, record_segments(rollout, terrains, seeds)
+    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, has_ground=True)
+    bank.set_heights(sim.bank.heights.numpy())
+    mapped = Simulation(sim.robot, bank, sim.terrain_of_env.numpy())
+    motions = [Motion(sim, segments), Motion(mapped, segments)]
+    without, with_maps = replay_rates(motions, rounds=-(-steps // motions[0].physics_steps))
+    return without / with_maps
+
+
 def profile_kernels(rollout: Rollout) -> list[dict[str, Any]]:
     """Name and share of the GPU's time of each kernel, the most first, over a second of crossings that are under way.
 

@@ -23,6 +23,7 @@ from PIL import Image
 
 from sim.files.atomic import read_json
 from sim.files.npz import array_names, read_arrays
+from sim.ground import GroundMaps
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 MIN_SIDE_M = 1.0
@@ -31,6 +32,8 @@ MAX_HEIGHT_M = 10.0
 """Largest height, above or below 0."""
 _MAX_NODES = 10_000  # along one side
 _MAX_BYTES = 8 * _MAX_NODES**2 + 1024  # of as many float64, and a header
+_GROUND = ("friction", "time_constant_s")
+_WHOLE = (SPACING * (NUM_COLS - 1), SPACING * (NUM_ROWS - 1))
 _GRAY_MODES = ("L", "I", "I;16", "I;16B", "I;16L", "I;16N")
 
 
@@ -42,6 +45,8 @@ class Heightmap:
     """[m], shape (nrow, ncol): row along y from the lowest, column along x."""
     size_m: tuple[float, float]
     """Along x and along y, from the first node to the last."""
+    ground: GroundMaps | None = None
+    """Friction and softness, of a map that has the size of a terrain."""
 
 
 def read_heightmap(
@@ -53,7 +58,8 @@ def read_heightmap(
 ) -> Heightmap:
     """A heightmap from a file: data only, nothing in it can run.
 
-    An ``.npz`` holds ``heights`` (nrow, ncol), floats in metres, row along y, and may hold ``size_m``. A ``.png`` is
+    An ``.npz`` holds ``heights`` (nrow, ncol), floats in metres, row along y, and may hold ``size_m``; of the size of a
+    terrain also ``friction`` and ``time_constant_s`` (4, 8), as :class:`sim.ground.GroundMaps` has them. A ``.png`` is
     8 or 16-bit grayscale seen from above, x to the right and y up; height = offset + scale * gray level. What is not
     given here is taken from the npz, or from the keys ``size_m``, ``scale_m`` and ``offset_m`` of a JSON of the same
     name beside the image; without an offset it is 0.
@@ -72,9 +78,10 @@ def read_heightmap(
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise FileNotFoundError(f"no heightmap at {path}: expected an .npz or a .png file")
     given = {"size_m": size_m, "scale_m": scale_m, "offset_m": offset_m}
-    kind = path.suffix.lower()
+    kind, ground = path.suffix.lower(), None
     if kind == ".npz":
         heights, inside = _read_npz(path)
+        ground = inside.pop("ground")
     elif kind == ".png":
         heights = _read_png(path)
         beside = path.with_suffix(".json")
@@ -90,13 +97,19 @@ def read_heightmap(
     scale, offset = (_checked_number(path, name, known.get(name, at)) for name, at in (("scale_m", 1), ("offset_m", 0)))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is named below
         heights = heights * scale + offset
-    return Heightmap(heights=_checked(path, heights), size_m=size)
+    if ground is not None and not np.allclose(size, _WHOLE, rtol=0.0, atol=1e-6):
+        raise ValueError(
+            f"{path}: a map with friction or softness must be {_WHOLE[0]:g} m x {_WHOLE[1]:g} m, got {size[0]:g} m x "
+            f"{size[1]:g} m: they are of patches of a whole terrain"
+        )
+    return Heightmap(heights=_checked(path, heights), size_m=size, ground=ground)
 
 
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
     try:
         found = sorted(array_names(path))
-        arrays = read_arrays(path, [name for name in ("heights", "size_m") if name in found], max_bytes=_MAX_BYTES)
+        wanted = [name for name in ("heights", "size_m", *_GROUND) if name in found]
+        arrays = read_arrays(path, wanted, max_bytes=_MAX_BYTES)
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
         raise ValueError(f"{path} must be an .npz file of arrays, but it is damaged or another file: {error}") from None
     if "heights" not in arrays:
@@ -106,9 +119,22 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
         raise ValueError(
             f"{path}: heights must be floats [m] of shape (nrow, ncol), got {heights.dtype} of shape {heights.shape}"
         )
-    inside = {"size_m": arrays["size_m"].ravel().tolist()} if "size_m" in arrays else {}
+    inside: dict[str, Any] = {"size_m": arrays["size_m"].ravel().tolist()} if "size_m" in arrays else {}
+    inside["ground"] = _ground_in(path, arrays)
     with np.errstate(invalid="ignore"):  # what is not finite is named later
         return heights.astype(np.float64), inside
+
+
+def _ground_in(path: Path, arrays: dict[str, NDArray[Any]]) -> GroundMaps | None:
+    if not any(name in arrays for name in _GROUND):
+        return None
+    plain = GroundMaps.plain(1)
+    try:
+        maps = (np.asarray(arrays.get(name, getattr(plain, name)[0]), dtype=np.float32)[None] for name in _GROUND)
+        friction, time_constant_s = maps
+        return GroundMaps(friction=friction, time_constant_s=time_constant_s)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _read_png(path: Path) -> NDArray[np.float64]:
@@ -172,8 +198,7 @@ def as_terrain(heightmap: Heightmap) -> NDArray[np.float32]:
         Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
     """
     heights, (size_x, size_y) = heightmap.heights, heightmap.size_m
-    whole = (SPACING * (NUM_COLS - 1), SPACING * (NUM_ROWS - 1))
-    if heights.shape == (NUM_ROWS, NUM_COLS) and np.allclose(heightmap.size_m, whole, rtol=0.0, atol=1e-6):
+    if heights.shape == (NUM_ROWS, NUM_COLS) and np.allclose(heightmap.size_m, _WHOLE, rtol=0.0, atol=1e-6):
         return heights.astype(np.float32)
     along_y = _weights(heights.shape[0], size_y, NUM_ROWS)
     along_x = _weights(heights.shape[1], size_x, NUM_COLS)
@@ -194,10 +219,10 @@ def fitted(heightmap: Heightmap) -> str:
     rows, columns = heightmap.heights.shape
     said = f"{columns} x {rows} nodes over {heightmap.size_m[0]:g} x {heightmap.size_m[1]:g} m"
     said += f", heights {heightmap.heights.min():.2f} to {heightmap.heights.max():.2f} m"
-    sides = zip("xy", heightmap.size_m, (SPACING * (NUM_COLS - 1), SPACING * (NUM_ROWS - 1)), strict=True)
+    sides = zip("xy", heightmap.size_m, _WHOLE, strict=True)
     for axis, side, whole in sides:
         if side > whole + 1e-6:
             said += f", cut to its middle {whole:g} m along {axis}"
         elif side < whole - 1e-6:
             said += f", continued by the height of its edge to {whole:g} m along {axis}"
-    return said
+    return said if heightmap.ground is None else f"{said}, with friction or softness of its own"

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
+from sim.ground import COLS, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCH, ROWS, GroundMaps
+from sim.terrain import SPACING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,14 +19,50 @@ START: dict[str, Any] = {"marker": ">", "markersize": 11, "label": "start", **_W
 GOAL: dict[str, Any] = {"marker": "*", "markersize": 16, "label": "goal", **_WHITE}
 """How start and goal are marked."""
 
+SLIPPERY, SOFT = (0.0, 0.68, 0.68), (0.55, 0.25, 0.75)
+"""RGB (0 to 1) that slippery and soft patches are tinted with."""
+_TINT = 0.5  # share of the tint where a patch is as slippery or soft as can be
 
-def draw_heights(axes: "Axes", heights: NDArray[np.float32], limits: tuple[float, float] | None = None) -> Any:
+
+def ground_tint(ground: GroundMaps) -> NDArray[np.float64]:
+    """Tint of the patches of one terrain, the stronger the more slippery or soft they are; RGBA, shape (4, 8, 4)."""
+    slippery = (1.0 - ground.friction[0].astype(np.float64)) / (1.0 - LEAST_FRICTION)
+    tau = np.maximum(ground.time_constant_s[0].astype(np.float64), LEAST_TIME_CONSTANT_S)
+    soft = np.log(tau / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S)
+    both = np.stack([slippery, soft], axis=-1)
+    share = both / np.maximum(both.sum(axis=-1, keepdims=True), 1e-9)
+    return np.concatenate([share @ np.array([SLIPPERY, SOFT]), _TINT * both.max(axis=-1, keepdims=True)], axis=-1)
+
+
+def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> NDArray[np.float64]:
+    """Colours of the nodes or cells of one terrain with the tint of its ground.
+
+    Args:
+        colors: RGB (0 to 1), shape (rows, columns, 3).
+        ground: Of the terrain.
+        margin: Nodes of them on each side that are not of the terrain.
+    """
+    row, col = (
+        np.clip((np.arange(count) - margin) * SPACING // PATCH, 0, most - 1).astype(int)
+        for count, most in zip(colors.shape[:2], (ROWS, COLS), strict=True)
+    )
+    tint = ground_tint(ground)[row[:, None], col]
+    return colors + tint[..., 3:] * (tint[..., :3] - colors)
+
+
+def draw_heights(
+    axes: "Axes",
+    heights: NDArray[np.float32],
+    limits: tuple[float, float] | None = None,
+    ground: GroundMaps | None = None,
+) -> Any:
     """A height map from above with start and goal; returns the image.
 
     Args:
         axes: Where.
         heights: Of a terrain [m], shape (nrow, ncol).
         limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
+        ground: Its friction and softness, which tint it.
     """
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -33,6 +71,8 @@ def draw_heights(axes: "Axes", heights: NDArray[np.float32], limits: tuple[float
     image = axes.imshow(
         heights, origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
     )
+    if ground is not None:
+        axes.imshow(ground_tint(ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH), interpolation="nearest")
     for place, look in ((CrossingCfg.start, START), (CrossingCfg.goal, GOAL)):
         axes.plot(*place, **look)
     axes.set_ylabel("y [m]")

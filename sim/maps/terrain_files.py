@@ -21,6 +21,7 @@ from PIL import Image
 
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
+from sim.ground import GroundMaps
 from sim.terrain import SPACING
 
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
@@ -41,22 +42,27 @@ class Hfield:
     """Of the geom, w x y z: its x axis is the grid's y, its y axis the grid's -x."""
 
 
-def as_hfield(heights: NDArray[np.floating], *, margin: int = 0, thickness: float = 1.0) -> Hfield:
+Margins = tuple[tuple[int, int], tuple[int, int]]
+"""Nodes to add at low y and high y, and at low x and high x."""
+
+
+def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0, thickness: float = 1.0) -> Hfield:
     """A height grid as a heightfield with the same surface.
 
     Args:
         heights: [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`; node (0, 0) stands at x = y = 0.
-        margin: Nodes of edge height to add on every side.
+        margin: Nodes of edge height to add, on every side or on each.
         thickness: Of the ground below its lowest point [m].
     """
-    grid = np.pad(np.asarray(heights, dtype=np.float64), margin, mode="edge")
+    margins = ((margin, margin),) * 2 if isinstance(margin, int) else margin
+    grid = np.pad(np.asarray(heights, dtype=np.float64), margins, mode="edge")
     lowest, extent = float(grid.min()), float(np.ptp(grid)) or _LEAST_EXTENT
     half_y, half_x = (0.5 * SPACING * (count - 1) for count in grid.shape)
-    centre_y, centre_x = (0.5 * SPACING * (count - 1) for count in heights.shape)
+    (low_y, _), (low_x, _) = margins
     return Hfield(
         data=((grid - lowest) / extent).T[::-1],
         size=(half_y, half_x, extent, thickness),
-        position=(centre_x, centre_y, lowest),
+        position=(half_x - SPACING * low_x, half_y - SPACING * low_y, lowest),
     )
 
 
@@ -90,10 +96,17 @@ def png_of(heights: Heights) -> bytes:
     return buffer.getvalue()
 
 
-def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None) -> bytes:
-    """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``."""
+def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None, ground: GroundMaps | None = None) -> bytes:
+    """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``.
+
+    With ground of its own also ``friction`` and ``time_constant_s``, float32 (4, 8), row along y.
+    """
     content = {"heights": np.asarray(heights, np.float32), "size_m": np.array(size_of(heights))}
-    return npz_bytes(content if genes is None else content | {"genes": np.asarray(genes, dtype=np.float32)})
+    if genes is not None:
+        content["genes"] = np.asarray(genes, np.float32)
+    if ground is not None:
+        content |= {"friction": ground.friction[0], "time_constant_s": ground.time_constant_s[0]}
+    return npz_bytes(content)
 
 
 def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:
@@ -166,6 +179,7 @@ def write_terrain(
     formats: Sequence[str],
     about: dict[str, Any],
     genes: NDArray[np.floating] | None = None,
+    ground: GroundMaps | None = None,
 ) -> list[Path]:
     """Writes a terrain as ``<stem>.<format>``, and as ``<stem>.json`` what the files mean; each atomically.
 
@@ -174,7 +188,8 @@ def write_terrain(
         heights: Height grid [m], shape (nrow, ncol).
         formats: Some of :data:`FORMATS`.
         about: Further keys of the JSON.
-        genes: The terrain's genes, shape (64,), for the npz.
+        genes: The terrain's genes, shape (num_genes,), for the npz.
+        ground: Its friction and softness, for the npz.
 
     Returns:
         The files.
@@ -196,7 +211,7 @@ def write_terrain(
     }
     files = {stem.with_name(f"{stem.name}.{ending}"): ending for ending in formats}
     for path, ending in files.items():
-        write_atomically(path, npz_of(heights, genes) if ending == "npz" else FORMATS[ending](heights))
+        write_atomically(path, npz_of(heights, genes, ground) if ending == "npz" else FORMATS[ending](heights))
     description = stem.with_name(f"{stem.name}.json")
     write_atomically(description, to_json(meaning))
     return [*files, description]

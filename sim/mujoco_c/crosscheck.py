@@ -12,19 +12,21 @@ from tqdm import tqdm
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.bank import heights_of
+from sim.bank import terrains_of
 from sim.commands import Crosscheck
 from sim.files.command import chosen_elites
 from sim.files.intervals import bootstrap_interval, value_words, wilson_interval
 from sim.files.provenance import provenance
+from sim.ground import GroundMaps
 from sim.mujoco_c.crossing import cross_plain
-from sim.mujoco_c.model import crossing_model
+from sim.mujoco_c.model import crossing_model, refuse_softness
 from sim.rates import crossing_rates, hits_of
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout
 from sim.simulation import SolverCfg, resolve_device, resolved
-from sim.space import SUPER_GAUSSIAN, load_space, read_pool
+from sim.space import SUPER_GAUSSIAN, load_space, on_ground, read_pool
+from sim.terrain import NUM_COLS, NUM_ROWS
 
 _KEY = 20250605  # with the seed, the entropy of everything drawn here
 _MAX_POOL = 6000  # a good controller leaves few that are neither easy nor hopeless
@@ -55,12 +57,16 @@ class Comparison:
         """
         self.cfg = cfg
         self.robot = get_robot(cfg.robot)
-        crossing_model(self.robot, np.zeros((2, 2)))  # MuJoCo must read it too
         self.device = resolve_device(cfg.device)
         self.policy = cfg.policy or self.robot.policy_file
         self.rng = np.random.default_rng([_KEY, cfg.seed])
-        named = SUPER_GAUSSIAN if cfg.space is None else load_space(cfg.space)
+        if cfg.genes is not None and cfg.ground is not None:
+            raise ValueError("a pool has ground of its own or none, got --ground beside --genes: leave --ground out")
+        named = load_space(on_ground(cfg.space, cfg.ground) or SUPER_GAUSSIAN.name)
         self._pool, self.space = (None, named) if cfg.genes is None else read_pool(cfg.genes)
+        refuse_softness(self.space)
+        ground = GroundMaps.plain(1) if self.space.ground else None
+        crossing_model(self.robot, np.zeros((NUM_ROWS, NUM_COLS)), ground=ground)  # MuJoCo must read it too
         self._named: list[int] | None = None
         if cfg.elite is not None:
             if self._pool is None:
@@ -130,15 +136,17 @@ class Comparison:
         robot, time_constant_s = self._resolved(cfg.fine == "both")
         ours = self._rollout(robot, len(genes), time_constant_s).evaluate(genes, seeds)
         simulated, plain_time_constant_s = self._resolved(cfg.fine != "neither")
+        heights, ground = terrains_of(genes, self.space, device=self.device)
         plain = cross_plain(
             simulated,
             str(self.policy),
-            heights_of(genes, self.space, device=self.device),
+            heights,
             seeds,
             num_episodes=cfg.plain_episodes,
             device=self.device,
             processes=cfg.workers or os.cpu_count() or 1,
             time_constant_s=plain_time_constant_s,
+            ground=ground,
         )
         plain_penalties = np.concatenate([crossings.penalties for crossings in plain])
         pairs = [

@@ -26,6 +26,7 @@ from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_start_ranges
+from sim.ground import GroundMaps
 from sim.mujoco_c.model import (
     Array,
     Starts,
@@ -162,6 +163,7 @@ def cross(
     cfg: CrossingCfg | None = None,
     *,
     time_constant_s: float | None = None,
+    ground: GroundMaps | None = None,
 ) -> PlainCrossings:
     """Run one crossing from each start in plain MuJoCo C.
 
@@ -172,9 +174,11 @@ def cross(
         starts: Initial states.
         cfg: The crossing.
         time_constant_s: Contact time constant [s]; that of the robot's file if None.
+        ground: Friction and softness of the terrain.
     """
     cfg = cfg or CrossingCfg()
-    episodes = _Episodes(robot, crossing_model(robot, heights, time_constant_s=time_constant_s), starts)
+    model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
+    episodes = _Episodes(robot, model, starts)
     count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
     default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
@@ -233,8 +237,11 @@ def _start_worker(robot: RobotCfg, policy: str, parent: int) -> None:
     _worker.update(robot=robot, policy=load_policy(policy, robot, "cpu"))
 
 
-def _cross_chunk(heights: NDArray[np.float32], starts: Starts, time_constant_s: float | None) -> PlainCrossings:
-    return cross(_worker["robot"], _worker["policy"], heights, starts, time_constant_s=time_constant_s)
+def _cross_chunk(
+    heights: NDArray[np.float32], ground: GroundMaps | None, starts: Starts, time_constant_s: float | None
+) -> PlainCrossings:
+    robot, policy = _worker["robot"], _worker["policy"]
+    return cross(robot, policy, heights, starts, time_constant_s=time_constant_s, ground=ground)
 
 
 def _chunks(rows: Array) -> list[Array]:
@@ -249,6 +256,7 @@ def run_plain(
     *,
     processes: int,
     time_constant_s: float | None = None,
+    ground: GroundMaps | None = None,
     crossed: Callable[[int, PlainCrossings], None] | None = None,
 ) -> list[PlainCrossings]:
     """Cross every terrain from its starts in plain MuJoCo, shared out over processes.
@@ -260,11 +268,13 @@ def run_plain(
         starts: Of each terrain.
         processes: How many at once.
         time_constant_s: Contact time constant [s]; that of the robot's file if None.
+        ground: Friction and softness of the terrains.
         crossed: Called with the number of a terrain and its crossings once it has been crossed from all its starts.
 
     Raises:
         OSError: If a process dies.
     """
+    grounds = [None if ground is None else ground[k : k + 1] for k in range(len(heights))]
     context = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(
@@ -273,10 +283,10 @@ def run_plain(
     try:
         parts = [
             [
-                pool.submit(_cross_chunk, grid, Starts(qpos=qpos, qvel=qvel), time_constant_s)
+                pool.submit(_cross_chunk, grid, own, Starts(qpos=qpos, qvel=qvel), time_constant_s)
                 for qpos, qvel in zip(_chunks(start.qpos), _chunks(start.qvel), strict=True)
             ]
-            for grid, start in zip(heights, starts, strict=True)
+            for grid, own, start in zip(heights, grounds, starts, strict=True)
         ]
         terrain_of = {part: number for number, terrain in enumerate(parts) for part in terrain}
         with tqdm(desc="plain MuJoCo", total=sum(len(s.qpos) for s in starts), unit="episode", disable=None) as bar:
@@ -306,6 +316,7 @@ def cross_plain(
     device: str,
     processes: int,
     time_constant_s: float | None = None,
+    ground: GroundMaps | None = None,
     crossed: Callable[[int, PlainCrossings], None] | None = None,
 ) -> list[PlainCrossings]:
     """Cross terrains in plain MuJoCo from the starts that a rollout of the same seeds has (:func:`run_plain`).
@@ -319,6 +330,7 @@ def cross_plain(
         device: Warp device that draws the starts.
         processes: How many at once.
         time_constant_s: Contact time constant [s]; that of the robot's file if None.
+        ground: Friction and softness of the terrains.
         crossed: As of :func:`run_plain`.
 
     Raises:
@@ -328,5 +340,6 @@ def cross_plain(
         draw_starts(robot, grid, int(seed), num_episodes, device) for grid, seed in zip(heights, seeds, strict=True)
     ]
     return run_plain(
-        robot, policy, heights, starts, processes=processes, time_constant_s=time_constant_s, crossed=crossed
-    )
+        robot, policy, heights, starts, processes=processes, time_constant_s=time_constant_s, ground=ground,
+        crossed=crossed,
+    )  # fmt: skip

@@ -14,11 +14,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.ground import COLS, PATCH, ROWS
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
-from sim.maps.terrain_files import as_hfield
+from sim.ground import GroundMaps
+from sim.maps.terrain_files import Margins, as_hfield
 from sim.robots.robot import RobotCfg
 from sim.simulation import GROUND_FRICTION
+from sim.space import TerrainSpace
 from sim.terrain import SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
@@ -59,21 +62,30 @@ def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[A
     return Starts(qpos=qpos, qvel=qvel)
 
 
-def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_constant_s: float | None = None) -> Any:
+def crossing_model(
+    robot: RobotCfg,
+    heights: NDArray[np.floating],
+    *,
+    time_constant_s: float | None = None,
+    ground: GroundMaps | None = None,
+) -> Any:
     """The robot's own file on MuJoCo's heightfield, with a sensor of the net contact force on each geom with a role.
 
     The solver may take as many iterations as it needs: the caps of the parallel simulation are themselves in question.
+    Ground with maps is a geom a patch, whose friction and softness have priority over those of the robot: a box where
+    the patch is level, else a heightfield.
 
     Args:
         robot: Robot settings.
         heights: Height grid [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`.
         time_constant_s: Contact time constant of all geoms [s], critically damped; the file's if None.
+        ground: Friction and softness of this one terrain.
 
     Raises:
-        ValueError: If the robot is more than its MJCF says, or MuJoCo does not read it.
+        ValueError: If the robot is more than its MJCF says, MuJoCo does not read it, its geoms differ in friction or
+            stiffness, or ground is soft and not level.
     """
     root = _root_of(robot)
-    field = as_hfield(heights, margin=_MARGIN_NODES)
     ET.SubElement(root, "size", memory=_MEMORY)
     option = root.find("option")
     option = ET.SubElement(root, "option") if option is None else option
@@ -81,27 +93,125 @@ def crossing_model(robot: RobotCfg, heights: NDArray[np.floating], *, time_const
     option.set("iterations", "100")
     option.set("ls_iterations", "50")
     ET.SubElement(option, "flag", autoreset="disable")  # or a state that blows up would begin anew unseen
-    rows, columns = map(str, field.data.shape)
-    size = " ".join(map(repr, field.size))
-    ET.SubElement(ET.SubElement(root, "asset"), "hfield", name="grid", nrow=rows, ncol=columns, size=size)
-    world = root.find("worldbody")
-    if world is None:
+    if root.find("worldbody") is None:
         raise ValueError(f"robot '{robot.name}': {robot.model_file} has no <worldbody>")
-    # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
-    # solmix 0: the stiffness of a contact is the robot's.
-    ground = {"name": "ground", "type": "hfield", "hfield": "grid", "friction": str(GROUND_FRICTION)}
-    ground |= {"pos": " ".join(map(repr, field.position)), "quat": " ".join(map(repr, field.quaternion))}
-    ET.SubElement(world, "geom", ground | {"conaffinity": "1", "solmix": "0"})
+    data = _add_field(root, heights, 0) if ground is None else _add_patches(root, heights, ground)
     sensors = ET.SubElement(root, "sensor")
     for name in robot.geom_names:
         ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")
     model = _mj.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-    model.hfield_data[:] = field.data.ravel()
+    model.hfield_data[:] = data
+    of_ground = np.flatnonzero([model.geom(k).name.startswith(_GROUND) for k in range(model.ngeom)])
     model.geom_conaffinity[:] = 0  # a robot does not touch itself
-    model.geom("ground").conaffinity[:] = 1
+    model.geom_conaffinity[of_ground] = 1
     if time_constant_s is not None:
         model.geom_solref[:] = time_constant_s, 1.0
+    if ground is not None:
+        _lay_ground(model, robot, of_ground, ground)
     return model
+
+
+_NO_SOFTNESS = (
+    "plain MuJoCo cannot have soft ground that is not level, since a foot that sinks into its heightfield is pushed "
+    "aside by the facets beside it: leave MuJoCo C out, or softness (--ground friction)"
+)
+
+
+def refuse_softness(space: TerrainSpace) -> None:
+    """Refuses terrains of a space that plain MuJoCo would not have as they are, before any work.
+
+    Raises:
+        ValueError: If some are soft.
+    """
+    if "softness" in space.ground:
+        raise ValueError(_NO_SOFTNESS)
+
+
+_GROUND = "ground"
+_PATCH_CELLS = round(PATCH / SPACING)
+_DEPTH = 2.0  # of a level patch [m]
+
+
+def _add_field(
+    root: ET.Element, heights: NDArray[np.floating], number: int, low: tuple[float, float] = (0.0, 0.0),
+    margin: int | Margins = _MARGIN_NODES,
+) -> Array:  # fmt: skip
+    """Adds a heightfield whose first node stands at ``low`` [m]; returns its data."""
+    field, name = as_hfield(heights, margin=margin), f"{_GROUND}-{number}" if number else _GROUND
+    rows, columns = map(str, field.data.shape)
+    size = " ".join(map(repr, field.size))
+    assets = root.find("asset")
+    assets = ET.SubElement(root, "asset") if assets is None else assets
+    ET.SubElement(assets, "hfield", name=name, nrow=rows, ncol=columns, size=size)
+    x, y, z = field.position
+    geom = {"type": "hfield", "hfield": name, "quat": " ".join(map(repr, field.quaternion))}
+    _add_geom(root, name, (x + low[0], y + low[1], z), geom)
+    return field.data.ravel()
+
+
+def _add_geom(root: ET.Element, name: str, position: tuple[float, float, float], looks: dict[str, str]) -> None:
+    """Adds ground."""
+    # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
+    # solmix 0: the stiffness of a contact is the robot's.
+    geom = {"name": name, "friction": str(GROUND_FRICTION), "pos": " ".join(map(repr, position)), **looks}
+    world = root.find("worldbody")
+    assert world is not None
+    ET.SubElement(world, "geom", geom | {"conaffinity": "1", "solmix": "0"})
+
+
+def _add_patches(root: ET.Element, heights: NDArray[np.floating], ground: GroundMaps) -> Array:
+    """Adds a geom a patch, a box where it is level and else a heightfield; returns the data of these.
+
+    Raises:
+        ValueError: If a patch is soft and not level.
+    """
+    data = [np.zeros(0)]
+    for number, (row, col) in enumerate(np.ndindex(ROWS, COLS)):
+        rows, cols = (slice(k * _PATCH_CELLS, (k + 1) * _PATCH_CELLS + 1) for k in (row, col))
+        part, margin = heights[rows, cols], (_margin(row, ROWS), _margin(col, COLS))
+        if np.ptp(part) > 0.0:
+            if ground.time_constant_s[0, row, col]:
+                raise ValueError(_NO_SOFTNESS)
+            data.append(_add_field(root, part, number, (PATCH * col, PATCH * row), margin))
+            continue
+        (y, half_y), (x, half_x) = (
+            (PATCH * (k + 0.5) + SPACING * (high - low) / 2, PATCH / 2 + SPACING * (high + low) / 2)
+            for k, (low, high) in zip((row, col), margin, strict=True)
+        )
+        box = {"type": "box", "size": f"{half_x!r} {half_y!r} {_DEPTH / 2}"}
+        name = f"{_GROUND}-{number}" if number else _GROUND
+        _add_geom(root, name, (x, y, float(part[0, 0]) - _DEPTH / 2), box)
+    return np.concatenate(data)
+
+
+def _margin(place: int, count: int) -> tuple[int, int]:
+    """Nodes to add before and behind a patch: those at the edge go on beyond it."""
+    return _MARGIN_NODES * (place == 0), _MARGIN_NODES * (place == count - 1)
+
+
+def _lay_ground(model: Any, robot: RobotCfg, patches: NDArray[np.intp], ground: GroundMaps) -> None:
+    """Gives the geoms of the patches their contacts' friction and softness.
+
+    Raises:
+        ValueError: If the robot's geoms differ in these, so that a patch cannot have one of each.
+    """
+    own = (model.geom_contype != 0) & (model.geom_bodyid > 0)
+    for name in ("friction", "solref", "solimp"):
+        if np.ptp(getattr(model, f"geom_{name}")[own], axis=0).any():
+            raise ValueError(
+                f"robot '{robot.name}': plain MuJoCo needs one {name} of all its geoms on ground with friction or "
+                "softness of its own, got several: leave --ground out"
+            )
+    first = int(np.flatnonzero(own)[0])
+    model.geom_friction[patches] = model.geom_friction[first]
+    model.geom_friction[patches, 0] *= ground.friction[0].ravel()
+    model.geom_solref[patches], model.geom_solimp[patches] = model.geom_solref[first], model.geom_solimp[first]
+    time_constant = ground.time_constant_s[0].ravel()
+    soft = time_constant > model.geom_solref[first, 0]
+    impedance = model.geom_solimp[first, 1]
+    model.geom_solref[patches[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
+    model.geom_solimp[patches[soft]] = impedance, impedance, 0.001, 1.0, 0.5
+    model.geom_priority[patches] = 1
 
 
 def _root_of(robot: RobotCfg) -> ET.Element:

@@ -18,6 +18,7 @@ from kernels.episode import Invalidity, Outcome
 from sim.bank import heights_of
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.ground import COLS, ROWS
 from sim.recording.recorder import FRAME_ARRAYS, Recording, space_in
 from sim.space import get_space, is_own
 
@@ -91,7 +92,7 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     if version != FORMAT:
         raise ValueError(f"its format must be '{FORMAT}', got {version}")
     absent = {"genes", "heights"} - {*found} if {"genes", "heights"} & {*found} else set()
-    late = {"invalidity", "geom_names", "touching"} - {*found}  # the first recordings have none
+    late = {"invalidity", "geom_names", "touching", "friction", "time_constant_s"} - {*found}  # the first have none
     content = read_arrays(path, [name for name in _NAMES if name not in absent | late])
     made = {"invalidity": np.zeros(content["outcome"].shape, np.uint8), "geom_names": np.array((), str)}
     return content | {name: made[name] for name in late & made.keys()}
@@ -127,6 +128,9 @@ def _check_shapes(content: dict[str, NDArray[Any]]) -> None:
     for name, shape in expected.items():
         if content[name].shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {content[name].shape}")
+    for name in ("friction", "time_constant_s"):
+        if name in content and content[name].shape != (terrains, ROWS, COLS):
+            raise ValueError(f"{name} must have shape {(terrains, ROWS, COLS)}, got {content[name].shape}")
     for name, num_axes in (("genes", 2), ("heights", 3)):
         if name in content and (content[name].ndim != num_axes or len(content[name]) != terrains):
             raise ValueError(f"{name} must have {num_axes} axes and {terrains} terrains, got {content[name].shape}")
@@ -170,6 +174,9 @@ def _check_values(recording: Recording) -> None:
             raise ValueError(f"{name} must be finite in the frames that an episode has, and NaN after them")
         if np.nanmax(np.abs(values), initial=0.0) > _LIMITS.get(name, np.inf):
             raise ValueError(f"{name} must be at most {_LIMITS[name]:g}")
+    if (recording.friction is None) != (recording.time_constant_s is None):
+        raise ValueError("friction and time_constant_s must be there both, or neither")
+    _ = recording.ground  # checks their values
     if recording.touching is not None and recording.touching[~there].any():
         raise ValueError("touching must be False after the frames that an episode has")
     length = np.linalg.norm(recording.base_quaternion[there], axis=1)

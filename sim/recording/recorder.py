@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from kernels.episode import Outcome
 from kernels.penalties import COLLISION_FORCE, PENALTIES
 from sim.files.provenance import provenance
+from sim.ground import GroundMaps
 from sim.robots.identity import identity
 
 if TYPE_CHECKING:  # who reads a recording has no simulation to wait for
@@ -83,6 +84,10 @@ class Recording:
     """Where it comes from: :func:`sim.robots.identity.identity`, command, commit, device, versions, seed, date."""
     geom_names: tuple[str, ...] = ()
     """Of the G geoms whose touch is known: base, limbs and feet; none in the first files."""
+    friction: NDArray[np.float32] | None = None
+    """Of the patches of each terrain, shape (T, 4, 8); None where the ground is as always, as in the first files."""
+    time_constant_s: NDArray[np.float32] | None = None
+    """Softness of the patches, with and without as ``friction`` (:class:`sim.ground.GroundMaps`)."""
     touching: NDArray[np.bool_] | None = None
     """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also
     where its collision ended the episode, whenever in the last control step that was. False from ``num_frames`` on,
@@ -103,6 +108,13 @@ class Recording:
         """Time of each frame since the start [s], shape (F,)."""
         return self.dt * np.arange(self.base_position.shape[2])
 
+    @property
+    def ground(self) -> GroundMaps | None:
+        """Friction and softness of the terrains."""
+        if self.friction is None or self.time_constant_s is None:
+            return None
+        return GroundMaps(friction=self.friction, time_constant_s=self.time_constant_s)
+
     def of_terrain(self, terrain: int) -> "Recording":
         """The recording of one of the terrains alone.
 
@@ -113,9 +125,11 @@ class Recording:
         cut = {name: getattr(self, name)[terrain : terrain + 1, :, : num_frames.max()] for name in FRAME_ARRAYS}
         each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s")
         cut |= {name: getattr(self, name)[terrain : terrain + 1] for name in each}
-        genes = None if self.genes is None else self.genes[terrain : terrain + 1]
+        for name in ("genes", "friction", "time_constant_s"):
+            whole = getattr(self, name)
+            cut[name] = None if whole is None else whole[terrain : terrain + 1]
         touching = None if self.touching is None else self.touching[terrain : terrain + 1, :, : num_frames.max()]
-        return replace(self, num_frames=num_frames, genes=genes, touching=touching, **cut)
+        return replace(self, num_frames=num_frames, touching=touching, **cut)
 
     def of_episode(self, episode: int) -> "Recording":
         """The recording of one of the episodes alone, on every terrain.
@@ -247,6 +261,7 @@ def record(
     seeds: NDArray[Any],
     *,
     policy: str | Path,
+    ground: GroundMaps | None = None,
     labels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
@@ -260,6 +275,7 @@ def record(
         terrains: Genes, shape (T, num_genes), or heights [m], shape (T, nrow, ncol).
         seeds: One a terrain, shape (T,), uint32.
         policy: What the rollout's controller was loaded from, to name and hash it.
+        ground: As of ``rollout.evaluate``.
         labels: What each terrain is, in words.
         seed: What the seeds were drawn with, for the record.
         progress: As of ``rollout.evaluate``.
@@ -271,29 +287,35 @@ def record(
         ValueError: If a shape does not fit.
     """
     frames = _Frames(rollout, len(terrains))
-    result = rollout.evaluate(terrains, seeds, watcher=frames, progress=progress)
+    result = rollout.evaluate(terrains, seeds, ground=ground, watcher=frames, progress=progress)
+    maps = rollout.sim.bank.ground_maps()
     heights: Any = rollout.sim.bank.heights[: len(terrains)].numpy()
     device = rollout.sim.device
     robot = rollout.robot
-    return result, Recording(
-        robot=robot.name,
-        joint_names=robot.joint_names,
-        foot_names=robot.foot_geoms,
-        penalty_names=robot.penalties,
-        geom_names=robot.geom_names,
-        dt=robot.control_dt,
-        labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
-        heights=heights.copy(),  # on the CPU numpy() is a view
-        genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
-        seeds=seeds.astype(np.uint32),
-        replicas=np.arange(rollout.num_replicas, dtype=np.int32),
-        origin={
-            **identity(robot, str(policy)),
-            "policy": str(policy),
-            "space": rollout.space.name,
-            "space_sha256": rollout.space.sha256,
-            **provenance(device, seed),
-        },
-        **{name: getattr(result, name) for name in ("outcome", "invalidity", "fallen", "duration_s")},
-        **frames.stacked(),
+    return (
+        result,
+        Recording(
+            robot=robot.name,
+            joint_names=robot.joint_names,
+            foot_names=robot.foot_geoms,
+            penalty_names=robot.penalties,
+            geom_names=robot.geom_names,
+            dt=robot.control_dt,
+            labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
+            heights=heights.copy(),  # on the CPU numpy() is a view
+            friction=None if maps is None else maps.friction[: len(terrains)],
+            time_constant_s=None if maps is None else maps.time_constant_s[: len(terrains)],
+            genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
+            seeds=seeds.astype(np.uint32),
+            replicas=np.arange(rollout.num_replicas, dtype=np.int32),
+            origin={
+                **identity(robot, str(policy)),
+                "policy": str(policy),
+                "space": rollout.space.name,
+                "space_sha256": rollout.space.sha256,
+                **provenance(device, seed),
+            },
+            **{name: getattr(result, name) for name in ("outcome", "invalidity", "fallen", "duration_s")},
+            **frames.stacked(),
+        ),
     )

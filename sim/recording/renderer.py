@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
+from sim.ground import GroundMaps
 from sim.recording.scene import scene_model
 from sim.robots.robot import RobotCfg
 
@@ -78,6 +79,7 @@ class Renderer:
         height: int = 480,
         shadows: bool = True,
         cfg: CrossingCfg | None = None,
+        ground: GroundMaps | None = None,
     ) -> None:
         """Build the scene and open OpenGL.
 
@@ -88,11 +90,12 @@ class Renderer:
             height: Likewise.
             shadows: Whether the sun casts them; in software they take as long as all the rest.
             cfg: The crossing, for its goal.
+            ground: Friction and softness of the terrain.
 
         Raises:
             ValueError: If there is no OpenGL, or the robot's file cannot be shown.
         """
-        self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg)
+        self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg, ground=ground)
         self._context = open_context(width, height)
         self._robot = robot
         geom = _mj.mjtObj.mjOBJ_GEOM.value

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
+from sim.ground import GroundMaps
+from sim.maps.picture import tinted
 from sim.maps.terrain_files import as_hfield
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, robot_spec
@@ -35,17 +37,19 @@ def height_colors(heights: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.where(share < 0, _LEVEL + (_LEVEL - _LOW) * share, _LEVEL + (_HIGH - _LEVEL) * share)
 
 
-def ground_paint(heights: NDArray[np.floating]) -> NDArray[np.uint8]:
+def ground_paint(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> NDArray[np.uint8]:
     """Colours of a height grid: blue below 0, brown above, a line every metre, steep ground darker.
 
     Args:
         heights: [m], shape (nrow, ncol), margins included; node (0, 0) stands on a whole metre.
+        ground: Friction and softness, which tint it.
 
     Returns:
         RGB, shape (4 (nrow - 1), 4 (ncol - 1), 3), row along y.
     """
     cells = 0.25 * (heights[:-1, :-1] + heights[1:, :-1] + heights[:-1, 1:] + heights[1:, 1:])
     color = height_colors(cells)
+    color = color if ground is None else tinted(color, ground, MARGIN_NODES)
     rise_y, rise_x = np.gradient(cells, SPACING)
     color *= (0.75 + 0.25 / np.sqrt(1.0 + rise_x**2 + rise_y**2))[..., None]
     paint = color.repeat(_PIXELS, axis=0).repeat(_PIXELS, axis=1)
@@ -57,7 +61,13 @@ def ground_paint(heights: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def scene_model(
-    robot: RobotCfg, heights: NDArray[np.floating], *, width: int, height: int, cfg: CrossingCfg | None = None
+    robot: RobotCfg,
+    heights: NDArray[np.floating],
+    *,
+    width: int,
+    height: int,
+    cfg: CrossingCfg | None = None,
+    ground: GroundMaps | None = None,
 ) -> Any:
     """The model of a scene: the robot's own file and its terrain, in world-local coordinates.
 
@@ -67,6 +77,7 @@ def scene_model(
         width: Largest image to be rendered [pixels].
         height: Likewise.
         cfg: The crossing, for its goal.
+        ground: Friction and softness of the terrain.
 
     Raises:
         ValueError: If MuJoCo cannot read the robot's file, or finds other joints in it.
@@ -76,7 +87,7 @@ def scene_model(
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
     if not len(spec.meshes):
         _dress(spec, robot)
-    paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"))
+    paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"), ground)
     _add_ground(spec, heights, paint.shape)
     _add_goal(spec, heights, cfg or CrossingCfg())
     _add_light(spec)

@@ -6,6 +6,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kernels.ground import Ground
+
 Seed = int | np.random.Generator
 """What random terrains are drawn from. A Generator gives other terrains on each call, an int the same ones."""
 DEFAULT_SIGMA0 = 2.0
@@ -45,6 +47,11 @@ class TerrainSpace(Protocol):
         """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
         return None
 
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """What its terrains have maps of beside heights, some of :data:`sim.ground.GROUND_KINDS`."""
+        return ()
+
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device.
 
@@ -54,6 +61,15 @@ class TerrainSpace(Protocol):
             heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
         """
         ...
+
+    def lay_ground(self, genes: Any, ground_out: Ground) -> None:
+        """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are.
+
+        Args:
+            genes: As of :meth:`rasterise`.
+            ground_out: Maps of these terrains.
+        """
+        return None
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""

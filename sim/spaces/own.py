@@ -9,6 +9,8 @@ import torch
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from kernels.ground import COLS, PATCH, ROWS, Ground
+from sim.ground import GROUND_KINDS, check_friction, check_time_constant
 from sim.policy.spec import ControllerSpec, controller_hash, find_named, in_one_line
 from sim.spaces.base import DEFAULT_SIGMA0, Seed, TerrainSpace, clipped
 
@@ -24,7 +26,8 @@ class OwnSpace(TerrainSpace):
         spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
         own: What is found there. It has ``num_genes`` and ``rasterise(genes, x, y)``, and may have ``hard_random(count,
             rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``, ``scaled(genes,
-            scale)``, ``mirrored(genes)``, ``genes_per_part``, and ``sigma0``.
+            scale)``, ``mirrored(genes)``, ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``, and
+            ``sigma0``.
 
     Raises:
         ValueError: If it lacks something, or what it has is not as it must be.
@@ -77,37 +80,70 @@ class OwnSpace(TerrainSpace):
         """Genes of a part that can be exchanged for that of another terrain; None if it names no number."""
         return self._genes_per_part
 
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """What it has methods for beside ``rasterise``."""
+        return tuple(kind for kind in GROUND_KINDS if callable(getattr(self._own, kind, None)))
+
+    def lay_ground(self, genes: Any, ground_out: Ground) -> None:
+        """Turns genes into maps, as tensors on the device that the arrays are on.
+
+        Raises:
+            ValueError: If a method of the user's fails, or returns anything but a map in range.
+        """
+        rows, stream = self._on_device(genes)
+        with torch.no_grad(), torch.cuda.stream(stream):  # pyright: ignore[reportArgumentType] - None: nothing to do
+            middles = (PATCH * (torch.arange(count, device=rows.device) + 0.5) for count in (ROWS, COLS))
+            y, x = torch.meshgrid(*middles, indexing="ij")
+            for kind in self.ground:
+                target, check = {
+                    "friction": (ground_out.friction, check_friction),
+                    "softness": (ground_out.time_constant, check_time_constant),
+                }[kind]
+                out = wp.to_torch(target)
+                found = self._values(kind, self._call(kind, rows, x, y), tuple(out.shape), rows.device)
+                try:
+                    check(found.cpu().numpy())
+                except ValueError as error:
+                    raise self._wrong(kind, f"must return a map: {error}") from None
+                out.copy_(found)
+
+    def _on_device(self, genes: Any) -> tuple[torch.Tensor, Any]:
+        """Clipped genes as a tensor, and the stream that the device works on; None on the CPU."""
+        rows = wp.to_torch(genes).clamp(-1.0, 1.0)
+        return rows, None if rows.device.type == "cpu" else wp.stream_to_torch(wp.get_stream(genes.device))
+
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights, as tensors on the device that the arrays are on.
 
         Raises:
             ValueError: If the user's method fails, or returns anything but finite heights of the right shape.
         """
-        rows, out = wp.to_torch(genes).clamp(-1.0, 1.0), wp.to_torch(heights_out)
-        stream = None if rows.device.type == "cpu" else wp.stream_to_torch(wp.get_stream(genes.device))
+        (rows, stream), out = self._on_device(genes), wp.to_torch(heights_out)
         with torch.no_grad(), torch.cuda.stream(stream):  # pyright: ignore[reportArgumentType] - None: nothing to do
             nodes = (spacing * torch.arange(count, device=rows.device) for count in out.shape[1:])
             y, x = torch.meshgrid(*nodes, indexing="ij")
             found = self._call("rasterise", rows, x, y)
-            out.copy_(self._heights(found, tuple(out.shape), rows.device))
+            out.copy_(self._values("rasterise", found, tuple(out.shape), rows.device))
 
-    def _heights(self, found: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    def _values(self, method: str, found: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
+        what, unit, place = ("heights", " [m]", "node") if method == "rasterise" else (method, "", "patch")
         if isinstance(found, np.ndarray) and found.dtype.kind in "fiu":
             found = torch.from_numpy(np.ascontiguousarray(found, dtype=np.float32)).to(device)
         if not isinstance(found, torch.Tensor) or found.is_complex():
             kind = f"an array of {found.dtype}" if isinstance(found, np.ndarray) else type(found).__name__
-            raise self._wrong("rasterise", f"must return a tensor of heights [m], got {kind}")
+            raise self._wrong(method, f"must return a tensor of {what}{unit}, got {kind}")
         if tuple(found.shape) != shape:
             raise self._wrong(
-                "rasterise",
-                f"must return heights of shape {shape} (terrains, y, x), got {tuple(found.shape)}: make them of "
-                "genes[:, k, None, None] and of x and y, which have a value a node",
+                method,
+                f"must return {what} of shape {shape} (terrains, y, x), got {tuple(found.shape)}: make them of "
+                f"genes[:, k, None, None] and of x and y, which have a value a {place}",
             )
         finite = torch.isfinite(found).reshape(len(found), -1).all(dim=1)
         if not bool(finite.all()):
             terrain = int(torch.argmin(finite.int()))
             raise self._wrong(
-                "rasterise", f"must return finite heights, got NaN or infinity in terrain {terrain} of {len(found)}"
+                method, f"must return finite {what}, got NaN or infinity in terrain {terrain} of {len(found)}"
             )
         return found.to(device=device, dtype=torch.float32)
 
@@ -197,7 +233,7 @@ def load_own(spec: str) -> OwnSpace:
     Raises:
         ValueError: If it cannot be loaded or does not work.
     """
-    from sim.bank import heights_of  # it needs the spaces
+    from sim.bank import terrains_of  # it needs the spaces
 
     named = ControllerSpec.parse(spec)
     assert named.place is not None and named.name is not None
@@ -208,7 +244,7 @@ def load_own(spec: str) -> OwnSpace:
         raise ValueError(f"space '{spec}' cannot be loaded: {in_one_line(error)}; {_PAGE}") from error
     space = OwnSpace(spec, own)
     hard = space.hard_random(_TRIED, 0)
-    heights_of(np.concatenate([np.zeros((1, space.num_genes), np.float32), hard]), space)
+    terrains_of(np.concatenate([np.zeros((1, space.num_genes), np.float32), hard]), space)
     space.without(hard, range(len(space.parts(hard[0]))))
     space.scaled(hard, 0.5)
     space.mirrored(hard)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qd.causes import fields_of, on_the_way, shape_of
+from qd.causes import effects_of, on_the_way, shape_of
 from sim.bank import heights_of
 from sim.space import SUPER_GAUSSIAN
 from sim.spaces.course import COURSE
@@ -63,7 +63,7 @@ def test_the_angle_to_the_way_is_that_of_the_slope():
 
 def test_parts_are_told_from_the_rest():
     genes = SUPER_GAUSSIAN.hard_random(1, 5)
-    fields = fields_of(genes[0], [0, 3, 7], SUPER_GAUSSIAN)
+    fields = effects_of(genes[0], [0, 3, 7], SUPER_GAUSSIAN).heights
     others = heights_of(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
     np.testing.assert_allclose(fields.sum(axis=0), others, atol=1e-6)
     assert on_the_way(fields[0], HALF_WIDTH) == np.abs(fields[0, 72:89, 40:281]).max()
@@ -73,8 +73,8 @@ def test_elements_of_a_course():
     genes = course(
         element("kerb", size=0.2, turn=1), element("ditch", size=0.4, length=6), element("kerb", size=0.1, turn=-1)
     )[0]
-    fields = fields_of(genes, [0, 1, 2], COURSE)
+    fields = effects_of(genes, [0, 1, 2], COURSE).heights
     assert [shape_of(field, HALF_WIDTH).kind for field in fields] == ["rise", "ditch", "drop"]
     slope = element("cross_slope", size=0.3, length=40, turn=1)
-    shape = shape_of(fields_of(course(slope)[0], [0], COURSE)[0], HALF_WIDTH)
+    shape = shape_of(effects_of(course(slope)[0], [0], COURSE).heights[0], HALF_WIDTH)
     assert shape.oblique_deg > 45 and shape.slope_deg == pytest.approx(np.rad2deg(np.arctan(0.3)), abs=2)

@@ -137,7 +137,7 @@ def test_a_name_is_of_one_controller_and_a_controller_of_one_name(failing, certi
 def test_more_in_mujoco_c_are_the_same_and_others(failing, monkeypatch):
     asked = []
 
-    def run_plain(robot, policy, heights, starts, *, processes, time_constant_s, crossed):
+    def run_plain(robot, policy, heights, starts, *, processes, time_constant_s, ground, crossed):
         asked.append((robot.physics_dt, time_constant_s, len(heights), [len(start.qpos) for start in starts]))
         outcome = np.array([Outcome.GOAL] * 3 + [Outcome.TIME_OUT] * 15 + [Outcome.INVALID] + [Outcome.BASE_COLLISION])
         nothing = np.zeros((EPISODES, 6))

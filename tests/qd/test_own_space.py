@@ -45,7 +45,7 @@ def open_rasterising(cfg):
         heights = heights_of(genes, space).astype(float)
         steep = np.abs(np.diff(heights, axis=2)).mean(axis=(1, 2))
         rough = np.stack(
-            [heights.max(axis=(1, 2)), 9 * steep, *(heights[:, 80, col] for col in (90, 120, 160, 200))], 1
+            [heights.max(axis=(1, 2)), 9 * steep, *(np.abs(heights[:, 80, col]) for col in (90, 120, 160, 200))], 1
         )
         noise = np.stack([np.random.default_rng(int(seed)).uniform(0.9, 1.1, (cfg.num_replicas, 6)) for seed in seeds])
         return stand_in.make_result((0.1 + rough[:, None]) * noise)

@@ -13,7 +13,7 @@ from qd.fresh import Open
 from qd.run.directory import newest_or_published, read_archive_of
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
-from sim.files.command import Where, Who, naming_what_is_next, publish, split_words
+from sim.files.command import OnGround, Where, Who, naming_what_is_next, publish, split_words
 from sim.files.settings import check, setting
 from sim.policy.spec import controller_hash, controllers_of, who_crossed
 from sim.robots.identity import identity, robot_identity
@@ -28,7 +28,7 @@ _SMALL = (24, 4)  # on a machine without a GPU
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Who, Where):
+class Evaluate(Who, OnGround, Where):
     """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
     Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
@@ -127,9 +127,9 @@ def space_named(flags: Evaluate) -> "TerrainSpace":
     Raises:
         ValueError: If there is no such space, or it does not work.
     """
-    from sim.space import SUPER_GAUSSIAN, load_space
+    from sim.space import SUPER_GAUSSIAN, load_space, on_ground
 
-    return SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
+    return load_space(on_ground(flags.space, flags.ground) or SUPER_GAUSSIAN.name)
 
 
 def evaluate_rates(flags: Evaluate) -> dict[str, Any]:

@@ -103,6 +103,11 @@ def make_pack(args: MakePack, *, open_evaluator: Open = open_evaluator) -> dict[
     chosen = choose(candidates.terrains, args.size)
     _tell_choice(candidates, len(chosen), args.size, path)
     space = get_space(cfg.space, cfg.space_sha256)
+    if space.ground:
+        raise ValueError(
+            f"a pack holds heights alone, got terrains of {space.name} with {' and '.join(space.ground)} of their own: "
+            "give a run without --ground"
+        )
     heights = rounded(heights_of(np.array([one.genes for one in chosen]), space))
     own = evaluator_of_run(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
     evaluator = replace(own, num_replicas=args.episodes, num_terrains=len(chosen), lots=1)
@@ -174,10 +179,10 @@ def evaluate_pack(flags: "Evaluate", *, open_evaluator: Open = open_evaluator) -
     from train.evaluate.show import picture_of_pack, print_pack_test
 
     assert flags.pack is not None
-    if flags.makes_tables or flags.space is not None:
+    if flags.makes_tables or flags.space is not None or flags.ground is not None:
         raise ValueError(
             "a pack is crossed by one controller and has its own terrains, got another flag of tables or terrains "
-            "beside --pack: leave out --policies, --archive, --sets and --space, and give --policy"
+            "beside --pack: leave out --policies, --archive, --sets, --space and --ground, and give --policy"
         )
     folder = pack_folder(flags.pack)
     pack = read_pack(folder)

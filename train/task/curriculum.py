@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.ground import GroundMaps
 from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, TILE_TYPES, crossing_terrain, training_tiles
 from train.task.cfg import CurriculumCfg
 
@@ -16,6 +17,8 @@ class Tiles:
     """Heights [m] float32, shape (num_levels * num_columns, NUM_ROWS, NUM_COLS); the robot starts at (8, 4)."""
     type_of_column: tuple[str, ...]
     """Terrain type of each column."""
+    ground: GroundMaps | None = None
+    """Friction and softness of each terrain; None where no terrain has any."""
 
     @property
     def num_columns(self) -> int:

@@ -6,8 +6,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.bank import TerrainBank
+from sim.bank import terrains_of
 from sim.files.settings import check, setting
+from sim.ground import GroundMaps
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import (
     CROSSING_TYPES,
@@ -111,10 +112,12 @@ class Mix:
         if self.cfg.mix != "hand-crafted":
             count = self.cfg.terrains - self.cfg.hand_crafted
             genes = self.genes[self.rows] if self.cfg.mix == "generated" else self.space.hard_random(count, rng)
-            bank = TerrainBank(count, device=self.device)
-            bank.set_genes(genes, self.space)
-            heights = np.concatenate([heights, bank.heights.numpy()])
+            others, ground = terrains_of(genes, self.space, device=self.device)
+            heights = np.concatenate([heights, others])
             types += (self.cfg.mix,) * count
+            if ground is not None:
+                ground = GroundMaps.plain(self.cfg.hand_crafted).joined(ground)
+            return Tiles(heights=heights, type_of_column=types, ground=ground)
         return Tiles(heights=heights, type_of_column=types)
 
     def state(self, counts: dict[str, NDArray[Any]]) -> dict[str, Any]:

@@ -106,8 +106,9 @@ class CommandTask:
         self.restart_all(torch.from_numpy(levels))
 
     def _build_simulation(self, terrain_of_env: np.ndarray, rng: np.random.Generator) -> Simulation:
-        bank = TerrainBank(len(self.tiles.heights), device=self.device)
-        bank.set_heights(self.tiles.heights)
+        tiles = self.tiles
+        bank = TerrainBank(len(tiles.heights), device=self.device, has_ground=tiles.ground is not None)
+        bank.set_heights(tiles.heights, ground=tiles.ground)
         return Simulation(
             self.robot,
             bank,
@@ -157,7 +158,7 @@ class CommandTask:
         Raises:
             ValueError: If they are of another number, or a height is not finite.
         """
-        self.sim.bank.set_heights(tiles.heights)
+        self.sim.bank.set_heights(tiles.heights, ground=tiles.ground)
         self.tiles = tiles
         self._restart_on(torch.zeros_like(self.levels))
         torch.neg(self._statistics, out=self._counted)  # what read_statistics has yet to tell is of the terrains before

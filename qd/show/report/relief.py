@@ -10,6 +10,7 @@ from sim.crossing import CrossingCfg
 from sim.terrain import SPACING
 
 if TYPE_CHECKING:
+    from sim.ground import GroundMaps
     from sim.space import TerrainSpace
 
 _AT_ONCE = 50  # height maps that are made at once
@@ -24,31 +25,41 @@ _START, _GOAL = (240, 200, 60), (0, 158, 115)
 def reliefs_of(genes: NDArray[np.float32], space: "TerrainSpace") -> list[bytes]:
     """A picture of each terrain, as JPEG: blue below the start's level, brown above, slopes lit from one side.
 
+    Slippery and soft patches are tinted.
+
     Args:
         genes: Shape (N, num_genes).
         space: What they mean.
     """
-    from sim.bank import heights_of
+    from sim.bank import terrains_of
 
     width = _WIDTHS[len(genes) > _FEW]
     lots = (genes[first : first + _AT_ONCE] for first in range(0, len(genes), _AT_ONCE))
-    return [relief(heights, width) for lot in lots for heights in heights_of(lot, space)]
+    pictures = []
+    for lot in lots:
+        grids, maps = terrains_of(lot, space)
+        grounds = [None if maps is None else maps[place : place + 1] for place in range(len(lot))]
+        pictures += [relief(heights, width, ground) for heights, ground in zip(grids, grounds, strict=True)]
+    return pictures
 
 
-def relief(heights: NDArray[np.floating], width: int = _WIDTHS[0]) -> bytes:
+def relief(heights: NDArray[np.floating], width: int = _WIDTHS[0], ground: "GroundMaps | None" = None) -> bytes:
     """A picture of a terrain, with the start yellow and the goal green.
 
     Args:
         heights: [m], shape (nrow, ncol).
         width: Of the picture [pixels].
+        ground: Its friction and softness, which tint it.
     """
     from PIL import Image
 
+    from sim.maps.picture import tinted
     from sim.recording.scene import height_colors
 
     rise_y, rise_x = np.gradient(heights, SPACING)
     light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
-    pixels = np.clip(255.0 * height_colors(heights) * light[..., None], 0.0, 255.0).astype(np.uint8)
+    colors = height_colors(heights) if ground is None else tinted(height_colors(heights), ground)
+    pixels = np.clip(255.0 * colors * light[..., None], 0.0, 255.0).astype(np.uint8)
     for (x, y), color in ((CrossingCfg.start, _START), (CrossingCfg.goal, _GOAL)):
         row, column = round(y / SPACING), round(x / SPACING)
         pixels[row - _MARK : row + _MARK + 1, column - _MARK : column + _MARK + 1] = color

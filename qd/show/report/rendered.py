@@ -49,7 +49,8 @@ def rendered(crossed: Crossed, robot: "RobotCfg", scales: dict[str, float]) -> b
     episode = typical_episode(recording, scales)
     poses = recording.qpos(0, episode)
     before = [len(poses) - 1 - round(k * _EVERY_S / recording.dt) for k in range(1, _GHOSTS + 1)]
-    with Renderer(robot, recording.heights[0], width=WIDTH, height=HEIGHT, shadows=False) as renderer:
+    look = {"width": WIDTH, "height": HEIGHT, "shadows": False, "ground": recording.ground}
+    with Renderer(robot, recording.heights[0], **look) as renderer:
         pixels = renderer.render(
             poses[-1],
             _camera(poses[-1, :3], robot.default_base_height),

@@ -8,6 +8,7 @@ import numpy as np
 from qd.show.crossed import ENDINGS
 from qd.show.view.meshes import Color
 from qd.show.view.scene import COMMAND_COLOR, FOOT_TOUCH_COLOR, FORCE_COLOR, GHOST_COLOR, TOUCH_COLOR
+from sim.maps.picture import SLIPPERY, SOFT
 from sim.recording.scene import height_colors
 
 
@@ -40,6 +41,11 @@ def _hex(color: Color) -> str:
     return "#{:02x}{:02x}{:02x}".format(*color)
 
 
+def _of_shares(color: Sequence[float]) -> str:
+    red, green, blue = (round(255 * share) for share in color)
+    return _hex((red, green, blue))
+
+
 def _swatch(color: str, words: str) -> str:
     box = f'<span style="display:inline-block;width:0.8em;height:0.8em;background:{color};border-radius:2px"></span>'
     return f'<span style="white-space:nowrap;margin-right:0.6em">{box} {escape(words)}</span>'
@@ -52,4 +58,5 @@ def _heights() -> str:
     bar = (
         f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(90deg, {stops})"></span>'
     )
-    return f"low {bar} high; grey is the level of the start, and a line stands every metre"
+    tints = " ".join(_swatch(_of_shares(color), words) for color, words in ((SLIPPERY, "slippery"), (SOFT, "soft")))
+    return f"low {bar} high; grey is the level of the start, and a line stands every metre; {tints}"

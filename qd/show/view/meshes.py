@@ -7,6 +7,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from sim.ground import GroundMaps
+from sim.maps.picture import tinted
 from sim.recording.scene import height_colors
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Geom, Skeleton
@@ -29,11 +31,12 @@ def in_linear_light(colors: NDArray[np.integer]) -> NDArray[np.uint8]:
     return np.rint(255.0 * linear).astype(np.uint8)
 
 
-def terrain_mesh(heights: NDArray[np.floating]) -> trimesh.Trimesh:
+def terrain_mesh(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> trimesh.Trimesh:
     """The surface that the robot walks on, triangle by triangle: blue below 0, brown above, a darker line every metre.
 
     Args:
         heights: Height grid [m], shape (nrow, ncol), row along y, column along x.
+        ground: Friction and softness, which tint it.
     """
     nrow, ncol = heights.shape
     y, x = np.meshgrid(SPACING * np.arange(nrow), SPACING * np.arange(ncol), indexing="ij")
@@ -41,7 +44,8 @@ def terrain_mesh(heights: NDArray[np.floating]) -> trimesh.Trimesh:
     # Each cell is cut from its (low x, high y) to its (high x, low y) corner, as the physics has it.
     lower = np.stack([near, near + 1, near + ncol], axis=1)
     upper = np.stack([near + 1, near + ncol + 1, near + ncol], axis=1)
-    color = 255.0 * height_colors(heights)
+    color = height_colors(heights)
+    color = 255.0 * (color if ground is None else tinted(color, ground))
     every = round(_LINE_EVERY / SPACING)
     color[::every] *= _LINE_DARKNESS
     color[:, ::every] *= _LINE_DARKNESS

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from qd.show.view.meshes import Color, arrow_mesh, arrow_pose, body_meshes, path_mesh, terrain_mesh, touch_mesh
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
+from sim.ground import GroundMaps
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
 from sim.terrain import SPACING
@@ -122,15 +123,16 @@ class Scene:
         self.show_names = False
         """Whether the feet have their names on them."""
 
-    def set_terrain(self, heights: NDArray[np.floating]) -> None:
+    def set_terrain(self, heights: NDArray[np.floating], ground: GroundMaps | None = None) -> None:
         """Show another terrain, and no crossing on it yet.
 
         Args:
             heights: Height grid [m], shape (nrow, ncol).
+            ground: Its friction and softness.
         """
         with self._client.atomic():
             self.hide_crossing()
-            mesh = terrain_mesh(heights)
+            mesh = terrain_mesh(heights, ground)
             self._client.scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=False)
             self._mark(
                 "start",

@@ -29,7 +29,7 @@ from qd.show.view.pointing import let_point
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, Shapes, View, first_view_of, overview_of
 from qd.show.view.taking import Taking
-from sim.bank import heights_of
+from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
@@ -380,7 +380,8 @@ class Tab:
         show, elite, genes = self.common.show, self._selection.picked, self.genes
         self._panel.show_terrain(show.minima is not None and elite in show.minima.genes, genes is not None)
         shown = self._archive.genes[elite] if genes is None else genes
-        self.scene.set_terrain(heights_of(shown[None], show.found.space)[0])
+        heights, ground = terrains_of(shown[None], show.found.space)
+        self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
 
     def _show_details(self) -> None:

@@ -94,7 +94,7 @@ def opener(calls, change=lambda result, call: result):
 def in_plain_mujoco(asked, stop_after=99):
     """Stands for MuJoCo C: nobody arrives. Notes step, time constant, seeds and number of terrains."""
 
-    def cross(robot, policy, heights, seeds, *, num_episodes, device, processes, time_constant_s, crossed):
+    def cross(robot, policy, heights, seeds, *, num_episodes, device, processes, time_constant_s, ground, crossed):
         asked.append((robot.physics_dt, time_constant_s, len(heights), seeds.tolist(), processes))
         for terrain in range(len(heights)):
             if terrain == stop_after:

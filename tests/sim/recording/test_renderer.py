@@ -179,7 +179,7 @@ def test_what_cannot_be_shown_is_named(anymal, tmp_path, monkeypatch):
 def test_paths_are_drawn_where_they_run(opengl):
     robot, heights = get_robot("anymal"), np.zeros((NUM_ROWS, NUM_COLS), np.float32)
     points = np.array([[4.0, 4.0, 0.5], [8.0, 4.0, 0.5], [12.0, 4.0, 0.5]])
-    camera = Camera(target=(8.0, 4.0, 0.5), distance=9.0, azimuth=90.0, elevation=-89.0)
+    camera = Camera(target=(8.0, 4.0, 0.5), distance=5.0, azimuth=90.0, elevation=-89.0)  # 1.3 cm a pixel
     with Renderer(robot, heights, width=640, height=320, shadows=False) as renderer:
         pose = standing(robot, 2.0, 1.0, 0.0)
         bare, drawn = (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.bank import TerrainBank
-from sim.space import SUPER_GAUSSIAN
+from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.course import COURSE
 from sim.terrain import CROSSING_TYPES, TILE_TYPES
 from train.task.mix import Mix, MixCfg
@@ -197,3 +197,15 @@ def test_a_state_of_something_else_is_refused(damage):
 def test_bad_settings_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         make_mix(**changes)
+
+
+def test_elites_bring_their_ground():
+    space = get_space("super_gaussian+friction")
+    genes = space.hard_random(4, 1)
+    mix = Mix(
+        cfg=MixCfg(terrains=4, swap_every=2), genes=genes, space=space, crosses=True, seed=0, device="cpu"
+    )  # fmt: skip
+    tiles = mix.next()
+    assert tiles.ground is not None and (tiles.ground.friction[:2] == 1.0).all()
+    np.testing.assert_array_equal(tiles.ground.friction[2:].reshape(2, 32) == 1.0, genes[mix.rows, 64:] == 1.0)
+    assert make_mix().next().ground is None

@@ -1,0 +1,185 @@
+"""What the ground is like: friction and softness of patches, from genes to the contacts on them.
+
+A map has a value for each of 4 x 8 patches of 2 m x 2 m, row along y, column along x; patches at the edge go on beyond
+it. Friction is a factor: that of the contacts of a robot on any other ground is multiplied by it. Softness is the time
+constant of a contact [s], critically damped, at MuJoCo's constant impedance: at rest a body sinks in by a depth that
+grows with the time constant's square.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels.contact import ContactBuffer, Layout
+
+ROWS, COLS = 4, 8
+"""Patches along y and along x."""
+PATCH = wp.constant(2.0)
+"""Side of a patch [m]."""
+NUM_PATCHES = ROWS * COLS
+"""Genes of a map: the first row of patches, at y = 0 m to 2 m, comes first."""
+LEAST_FRICTION = wp.constant(0.15)
+"""Factor of a gene of -1; a gene of 1 changes nothing."""
+LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S = wp.constant(0.01), wp.constant(0.06)
+"""Limits of a soft patch [s]: of a gene just above -1, and of 1. A gene of -1 is firm ground."""
+FIRM = wp.constant(0.0)
+"""Time constant of ground that leaves contacts as stiff as the robot's file has them."""
+
+
+@wp.struct
+class Ground:
+    """Maps of all terrains."""
+
+    friction: wp.array3d[float]
+    """Factor of the friction, shape (num_terrains, ROWS, COLS)."""
+    time_constant: wp.array3d[float]
+    """Contact time constant [s], ``FIRM`` for the robot's own; shape (num_terrains, ROWS, COLS)."""
+
+
+@wp.struct
+class Bodies:
+    """What the solver makes of the stiffness and damping of a contact, by collision shape of the robots."""
+
+    inverse_gain: wp.array[float]
+    """What stiffness [N/m] and damping [N s/m] of unit acceleration are divided by [1/kg], shape (num_shapes,)."""
+    time_constant: wp.array[float]
+    """Contact time constant on firm ground [s], shape (num_shapes,)."""
+
+
+@wp.struct
+class GroundRecords:
+    """Columns of ``newton.Contacts`` that differ from contact to contact, shape (capacity,) each; 0 changes nothing."""
+
+    friction: wp.array[float]
+    """Factor of the friction."""
+    stiffness: wp.array[float]
+    """[N/m]."""
+    damping: wp.array[float]
+    """[N s/m]."""
+
+
+@wp.func
+def patch_at(x: float, y: float) -> wp.vec2i:
+    """Row and column of the patch under world-local (x, y) [m]."""
+    row = wp.clamp(int(wp.floor(y / PATCH)), 0, ROWS - 1)
+    col = wp.clamp(int(wp.floor(x / PATCH)), 0, COLS - 1)
+    return wp.vec2i(row, col)
+
+
+@wp.kernel
+def _tell_contacts_kernel(
+    terrain_of_env: wp.array[int],
+    ground: Ground,
+    bodies: Bodies,
+    layout: Layout,
+    contacts: ContactBuffer,
+    records_out: GroundRecords,
+):
+    """Grid (capacity)."""
+    slot = wp.tid()
+    if slot >= contacts.count[0]:
+        return
+    own = contacts.shape1[slot] - layout.first_shape
+    t = terrain_of_env[own // layout.shapes_per_env]
+    patch = patch_at(contacts.point0[slot][0], contacts.point0[slot][1])
+    records_out.friction[slot] = ground.friction[t, patch[0], patch[1]]
+    tau = ground.time_constant[t, patch[0], patch[1]]
+    stiffness = float(0.0)
+    damping = float(0.0)
+    if tau > bodies.time_constant[own]:
+        stiffness = 1.0 / (tau * tau * bodies.inverse_gain[own])
+        damping = 2.0 / (tau * bodies.inverse_gain[own])
+    records_out.stiffness[slot] = stiffness
+    records_out.damping[slot] = damping
+
+
+def tell_contacts(
+    terrain_of_env: Any, ground: Ground, bodies: Bodies, layout: Layout, contacts: ContactBuffer,
+    records_out: GroundRecords,
+) -> None:  # fmt: skip
+    """Give each terrain contact the friction and softness of the patch that its point on the ground lies in.
+
+    Args:
+        terrain_of_env: Terrain of each environment, shape (num_envs,).
+        ground: Maps of the terrains.
+        bodies: Of the robots' shapes.
+        layout: Strides of the flat model arrays.
+        contacts: What :func:`kernels.contact.collide_strips` found.
+        records_out: Columns beside them.
+    """
+    inputs = [terrain_of_env, ground, bodies, layout, contacts]
+    wp.launch(
+        _tell_contacts_kernel,
+        contacts.shape0.shape[0],
+        inputs,
+        outputs=[records_out],
+        device=terrain_of_env.device,
+    )
+
+
+@wp.func
+def _share(gene: float) -> float:
+    return (wp.clamp(gene, -1.0, 1.0) + 1.0) * 0.5
+
+
+@wp.kernel
+def _decode_friction_kernel(genes: wp.array2d[float], friction_out: wp.array3d[float]):
+    """Grid (num_terrains, ROWS, COLS)."""
+    t, row, col = wp.tid()
+    missing = 1.0 - _share(genes[t, row * COLS + col])
+    friction_out[t, row, col] = 1.0 - missing * (1.0 - LEAST_FRICTION)
+
+
+@wp.kernel
+def _decode_softness_kernel(genes: wp.array2d[float], time_constant_out: wp.array3d[float]):
+    """Grid (num_terrains, ROWS, COLS)."""
+    t, row, col = wp.tid()
+    share = _share(genes[t, row * COLS + col])
+    tau = FIRM
+    if share > 0.0:
+        tau = LEAST_TIME_CONSTANT_S * wp.pow(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S, share)
+    time_constant_out[t, row, col] = tau
+
+
+def decode_friction(genes: Any, friction_out: Any) -> None:
+    """Turn genes, shape (num_terrains, NUM_PATCHES), into a map of friction: linear from the least to 1."""
+    _decode(_decode_friction_kernel, genes, friction_out)
+
+
+def decode_softness(genes: Any, time_constant_out: Any) -> None:
+    """Turn genes, shape (num_terrains, NUM_PATCHES), into time constants [s]: equal steps are equal ratios."""
+    _decode(_decode_softness_kernel, genes, time_constant_out)
+
+
+def _decode(kernel: Any, genes: Any, values_out: Any) -> None:
+    expected = (genes.shape[0], ROWS, COLS)
+    if genes.shape[1] != NUM_PATCHES or tuple(values_out.shape) != expected:
+        raise ValueError(
+            f"a map must have shape {expected} and {NUM_PATCHES} genes a terrain, got {tuple(values_out.shape)} and "
+            f"genes of shape {tuple(genes.shape)}"
+        )
+    wp.launch(kernel, expected, [genes], outputs=[values_out], device=genes.device)
+
+
+def make_ground(num_terrains: int, device: str) -> Ground:
+    """Maps of ground that changes nothing."""
+    ground = Ground()
+    ground.friction = wp.ones((num_terrains, ROWS, COLS), dtype=float, device=device)
+    ground.time_constant = wp.zeros((num_terrains, ROWS, COLS), dtype=float, device=device)
+    return ground
+
+
+def make_bodies(inverse_weight: np.ndarray, impedance: np.ndarray, time_constant: np.ndarray, device: str) -> Bodies:
+    """What a solver makes of stiffness and damping.
+
+    Args:
+        inverse_weight: MuJoCo's ``invweight0`` of each shape's body, translational [1/kg], shape (num_shapes,).
+        impedance: Upper impedance of each shape's contacts, below 1, shape (num_shapes,).
+        time_constant: Contact time constant of each shape on firm ground [s], shape (num_shapes,).
+        device: Warp device name.
+    """
+    bodies = Bodies()
+    bodies.inverse_gain = wp.array(inverse_weight * (1.0 - impedance), dtype=float, device=device)
+    bodies.time_constant = wp.array(time_constant, dtype=float, device=device)
+    return bodies

@@ -1,0 +1,122 @@
+"""Friction and softness of the ground on the host: maps of patches, and the names of spaces that have them."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kernels.ground import COLS as COLS
+from kernels.ground import FIRM
+from kernels.ground import LEAST_FRICTION as LEAST_FRICTION
+from kernels.ground import LEAST_TIME_CONSTANT_S as LEAST_TIME_CONSTANT_S
+from kernels.ground import MOST_TIME_CONSTANT_S as MOST_TIME_CONSTANT_S
+from kernels.ground import PATCH as PATCH
+from kernels.ground import ROWS as ROWS
+
+GROUND_KINDS = ("friction", "softness")
+"""What the ground may have maps of."""
+_SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(GROUND_KINDS)}))+)$")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GroundMaps:
+    """Friction and softness of the patches of T terrains; docs/spaces.md says what the numbers do.
+
+    Raises:
+        ValueError: If a shape or a value is not as it must be.
+    """
+
+    friction: NDArray[np.float32]
+    """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8); row along y."""
+    time_constant_s: NDArray[np.float32]
+    """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, shape (T, 4, 8)."""
+
+    def __post_init__(self) -> None:
+        check_friction(self.friction)
+        check_time_constant(self.time_constant_s)
+        if len(self.friction) != len(self.time_constant_s):
+            raise ValueError(
+                f"maps must be of as many terrains, got {len(self.friction)} of friction and "
+                f"{len(self.time_constant_s)} of softness"
+            )
+
+    def __len__(self) -> int:
+        """T."""
+        return len(self.friction)
+
+    def __getitem__(self, rows: slice) -> "GroundMaps":
+        """Those of some terrains."""
+        return GroundMaps(friction=self.friction[rows], time_constant_s=self.time_constant_s[rows])
+
+    @classmethod
+    def plain(cls, num_terrains: int) -> "GroundMaps":
+        """Maps of ground that changes nothing."""
+        shape = num_terrains, ROWS, COLS
+        return cls(friction=np.ones(shape, np.float32), time_constant_s=np.full(shape, FIRM, np.float32))
+
+    def joined(self, other: "GroundMaps") -> "GroundMaps":
+        """These terrains, and others behind them."""
+        return GroundMaps(
+            friction=np.concatenate([self.friction, other.friction]),
+            time_constant_s=np.concatenate([self.time_constant_s, other.time_constant_s]),
+        )
+
+
+def check_friction(friction: NDArray[np.floating]) -> None:
+    """That values are frictions of the patches of terrains.
+
+    Raises:
+        ValueError: If not.
+    """
+    _check_map("friction", friction, (friction >= LEAST_FRICTION - 1e-6) & (friction <= 1.0), f"{LEAST_FRICTION} to 1")
+
+
+def check_time_constant(time_constant_s: NDArray[np.floating]) -> None:
+    """That values are contact time constants [s] of the patches of terrains.
+
+    Raises:
+        ValueError: If not.
+    """
+    low, high = LEAST_TIME_CONSTANT_S - 1e-6, MOST_TIME_CONSTANT_S + 1e-6
+    allowed = (time_constant_s == FIRM) | ((time_constant_s >= low) & (time_constant_s <= high))
+    words = f"{FIRM:g} (firm), or {LEAST_TIME_CONSTANT_S} to {MOST_TIME_CONSTANT_S} s"
+    _check_map("softness", time_constant_s, allowed, words)
+
+
+def _check_map(name: str, values: NDArray[np.floating], allowed: NDArray[np.bool_], words: str) -> None:
+    if values.ndim != 3 or values.shape[1:] != (ROWS, COLS):
+        raise ValueError(
+            f"a map of {name} must have shape (terrains, {ROWS}, {COLS}), a value a patch of 2 m, got {values.shape}"
+        )
+    if not allowed.all():
+        raise ValueError(f"{name} must be {words}, got {values[~allowed][0]:g} in one of the patches")
+
+
+def check_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
+    """What the ground is to have maps of, each once and in the order of :data:`GROUND_KINDS`.
+
+    Raises:
+        ValueError: If one is unknown.
+    """
+    unknown = [kind for kind in kinds if kind not in GROUND_KINDS]
+    if unknown or not kinds:
+        raise ValueError(
+            f"unknown ground {', '.join(map(repr, unknown)) or 'of nothing'}: expected friction, softness or both "
+            "(--ground friction softness)"
+        )
+    return tuple(kind for kind in GROUND_KINDS if kind in kinds)
+
+
+def split_name(name: str) -> tuple[str, tuple[str, ...]]:
+    """The name of a space without its ground, and what that has maps of: ``course+friction`` is of ``course``."""
+    found = _SUFFIX.search(name)
+    if found is None or found.start() == 0:
+        return name, ()
+    return name[: found.start()], check_kinds(found.group(1)[1:].split("+"))
+
+
+def joined_name(name: str, kinds: Sequence[str]) -> str:
+    """The name of a space whose ground has maps of some kinds."""
+    return "+".join((name, *kinds))

@@ -1,0 +1,175 @@
+"""Any terrain space, and 32 genes more for the friction of its ground, 32 for its softness, or both."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kernels.ground import (
+    COLS,
+    LEAST_FRICTION,
+    LEAST_TIME_CONSTANT_S,
+    MOST_TIME_CONSTANT_S,
+    NUM_PATCHES,
+    PATCH,
+    ROWS,
+    Ground,
+    decode_friction,
+    decode_softness,
+)
+from sim.ground import joined_name
+from sim.spaces.base import Seed, TerrainSpace, clipped
+
+_ABSENT = {"friction": 1.0, "softness": -1.0}
+"""The gene of a patch that changes nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnGround(TerrainSpace):
+    """The terrains of a space on ground whose patches differ.
+
+    The genes of the space come first, then those of each map, patch after patch (:mod:`kernels.ground`). A patch is a
+    part; one that changes nothing counts as absent.
+    """
+
+    inner: TerrainSpace
+    """Whose heights it has."""
+    kinds: tuple[str, ...]
+    """Some of :data:`sim.ground.GROUND_KINDS`, in their order."""
+
+    @property
+    def name(self) -> str:
+        """What files and command lines call the space: ``course+friction+softness``."""
+        return joined_name(self.inner.name, self.kinds)
+
+    @property
+    def num_genes(self) -> int:
+        """Those of the space, and 32 a map."""
+        return self.inner.num_genes + NUM_PATCHES * len(self.kinds)
+
+    @property
+    def sha256(self) -> str | None:
+        """Hash of the code of the heights."""
+        return self.inner.sha256
+
+    @property
+    def sigma0(self) -> float:
+        """That of the space."""
+        return self.inner.sigma0
+
+    @property
+    def any_spacing(self) -> bool:
+        """As of the space."""
+        return self.inner.any_spacing
+
+    @property
+    def genes_per_part(self) -> int | None:
+        """That of the space, where maps divide by it too: eight patches are a row along the way."""
+        per_part = self.inner.genes_per_part
+        return per_part if per_part and NUM_PATCHES % per_part == 0 else None
+
+    @property
+    def ground(self) -> tuple[str, ...]:
+        """What its terrains have maps of."""
+        return self.kinds
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
+        """Turns genes into heights on the device, by the space."""
+        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out)
+
+    def lay_ground(self, genes: Any, ground_out: Ground) -> None:
+        """Turns genes into maps on the device (:mod:`kernels.ground`)."""
+        for kind in self.kinds:
+            own = genes[:, self._columns(kind)].contiguous()
+            if kind == "friction":
+                decode_friction(own, ground_out.friction)
+            else:
+                decode_softness(own, ground_out.time_constant)
+
+    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Hard-random terrains of the space; every patch as it always is, or as slippery or soft as can be."""
+        rng = np.random.default_rng(seed)
+        heights = self.inner.hard_random(count, rng)
+        maps = rng.choice([-1.0, 1.0], (count, self.num_genes - self.inner.num_genes))
+        return np.concatenate([heights, maps.astype(np.float32)], axis=1)
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """Those of the space, then each patch of each map in words."""
+        row = clipped(genes)
+        words = [
+            _patch_words(kind, value, patch)
+            for kind in self.kinds
+            for patch, value in enumerate(self._values(row, kind))
+        ]
+        return (*self.inner.parts(row[: self.inner.num_genes]), *words)
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes without some parts: a patch without friction or softness of its own is as ground always is."""
+        found = self.validate(genes).copy()
+        first = self.inner.num_genes
+        if len(found):
+            count = len(self.inner.parts(found[0, :first]))
+            found[:, :first] = self.inner.without(found[:, :first], [part for part in parts if part < count])
+            for part in parts:
+                if part >= count:
+                    found[:, first + part - count] = _ABSENT[self.kinds[(part - count) // NUM_PATCHES]]
+        return found
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """Genes with heights scaled by the space; the ground stays as it is."""
+        return self._with_heights(genes, lambda heights: self.inner.scaled(heights, scale))
+
+    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32] | None:
+        """Genes with heights and patches on the other side of the way."""
+        found = self._with_heights(genes, self.inner.mirrored)
+        if found is not None:
+            for kind in self.kinds:
+                own = found[:, self._columns(kind)].reshape(-1, ROWS, COLS)
+                found[:, self._columns(kind)] = own[:, ::-1].reshape(len(found), NUM_PATCHES)
+        return found
+
+    def describe(self, genes: ArrayLike) -> str:
+        """The terrain of the space in words, and of each map the patches on both sides of the way, a line each."""
+        row = clipped(genes)
+        told = [self.inner.describe(row[: self.inner.num_genes])]
+        for kind in self.kinds:
+            right, left = self._values(row, kind).reshape(ROWS, COLS)[ROWS // 2 - 1 : ROWS // 2 + 1]
+            told.append(f"{_TITLES[kind]}: left of the way {_numbers(left)}, right of it {_numbers(right)}")
+        return "\n".join(told)
+
+    def _columns(self, kind: str) -> slice:
+        first = self.inner.num_genes + NUM_PATCHES * self.kinds.index(kind)
+        return slice(first, first + NUM_PATCHES)
+
+    def _values(self, row: NDArray[np.float32], kind: str) -> NDArray[np.float64]:
+        """Frictions, or time constants [s], of one terrain, shape (32,)."""
+        share = (row[self._columns(kind)].astype(np.float64) + 1.0) / 2.0
+        if kind == "friction":
+            return 1.0 - (1.0 - share) * (1.0 - LEAST_FRICTION)
+        tau = LEAST_TIME_CONSTANT_S * (MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) ** share
+        return np.where(share > 0.0, tau, 0.0)
+
+    def _with_heights(self, genes: ArrayLike, change: Any) -> NDArray[np.float32] | None:
+        found, first = clipped(self.validate(genes)), self.inner.num_genes
+        heights = change(found[:, :first])
+        return None if heights is None else np.concatenate([heights, found[:, first:]], axis=1)
+
+
+_TITLES = {
+    "friction": "friction every 2 m along the way",
+    "softness": "time constant of the ground [s] every 2 m along the way, 0 where it is firm",
+}
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.2f}" for value in values)
+
+
+def _patch_words(kind: str, value: float, patch: int) -> str:
+    row, col = divmod(patch, COLS)
+    place = f"at x = {PATCH * col:.0f} to {PATCH * (col + 1):.0f} m, y = {PATCH * row:.0f} to {PATCH * (row + 1):.0f} m"
+    if kind == "friction":
+        return f"friction {value:.2f} {place}"
+    return f"soft ground of {value:.3f} s {place}" if value else f"firm ground {place}"

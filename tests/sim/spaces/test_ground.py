@@ -1,0 +1,126 @@
+"""Friction and softness as genes beside those of any space."""
+
+import numpy as np
+import pytest
+
+from sim.bank import heights_of, terrains_of
+from sim.space import COURSE, SUPER_GAUSSIAN, get_space, load_space, on_ground, recorded_identity, space_identity
+from tests.sim.spaces.spaces import write_ridges
+
+BOTH = get_space("super_gaussian+friction+softness")
+WET = """
+import torch
+
+
+class Wet:
+    num_genes = 2
+
+    def rasterise(self, genes, x, y):
+        return 0.0 * x + 0.0 * genes[:, :1, None]
+
+    def friction(self, genes, x, y):
+        {friction}
+"""
+
+
+def test_genes_of_the_ground_come_behind_those_of_the_space():
+    genes = BOTH.hard_random(3, 5)
+    assert (BOTH.num_genes, genes.shape, BOTH.ground) == (128, (3, 128), ("friction", "softness"))
+    heights, ground = terrains_of(genes, BOTH)
+    np.testing.assert_array_equal(heights, heights_of(genes[:, :64]))
+    # Hard-random ground is as it always is, or as slippery or soft as can be.
+    assert sorted(np.unique(ground.friction).round(6)) == [0.15, 1.0]
+    assert sorted(np.unique(ground.time_constant_s).round(6)) == [0.0, 0.06]
+    np.testing.assert_array_equal(ground.friction.reshape(3, 32) == 1.0, genes[:, 64:96] == 1.0)
+    np.testing.assert_array_equal(ground.time_constant_s.reshape(3, 32) == 0.0, genes[:, 96:] == -1.0)
+    only = get_space("course+softness")
+    assert (only.num_genes, only.sigma0, only.genes_per_part) == (36 + 32, COURSE.sigma0, None)
+    assert BOTH.genes_per_part == 8
+    assert terrains_of(genes[:, :64], SUPER_GAUSSIAN)[1] is None
+
+
+def test_a_patch_is_a_part_that_is_absent_where_it_changes_nothing():
+    genes = BOTH.uniform_random(2, 1)
+    words = BOTH.parts(genes[0])
+    assert len(words) == 8 + 32 + 32
+    assert words[8 + 10].startswith("friction 0.") and words[8 + 10].endswith("at x = 4 to 6 m, y = 2 to 4 m")
+    assert words[8 + 32].startswith("soft ground of 0.0")
+    without = BOTH.without(genes, [0, 8 + 10, 8 + 32 + 31])
+    heights, ground = terrains_of(without, BOTH)
+    np.testing.assert_array_equal(heights, heights_of(SUPER_GAUSSIAN.without(genes[:, :64], [0])))
+    assert (ground.friction[:, 1, 2] == 1.0).all() and (ground.friction < 1.0).sum() == 2 * 31
+    assert (ground.time_constant_s[:, 3, 7] == 0.0).all() and (ground.time_constant_s > 0.0).sum() == 2 * 31
+    assert (without != genes).sum() == 2 * 3
+
+
+def test_left_and_right_are_exchanged_and_scales_leave_the_ground():
+    genes = BOTH.uniform_random(2, 2)
+    (heights, ground), (mirrored, other) = terrains_of(genes, BOTH), terrains_of(BOTH.mirrored(genes), BOTH)
+    np.testing.assert_allclose(mirrored, heights[:, ::-1], atol=1e-5)
+    np.testing.assert_array_equal(other.friction, ground.friction[:, ::-1])
+    np.testing.assert_array_equal(other.time_constant_s, ground.time_constant_s[:, ::-1])
+    scaled, same = terrains_of(BOTH.scaled(genes, 0.5), BOTH)
+    np.testing.assert_allclose(scaled, 0.5 * heights, atol=1e-6)
+    np.testing.assert_array_equal(same.friction, ground.friction)
+
+
+def test_words_say_what_lies_beside_the_way():
+    genes = np.zeros(128)
+    genes[64:] = np.repeat([1.0, -1.0, 0.0, 1.0, -1.0, 1.0, -1.0, -1.0], 8)
+    told = BOTH.describe(genes).splitlines()[-2:]
+    right, left = " ".join(["0.15"] * 8), " ".join(["0.57"] * 8)
+    assert told[0] == f"friction every 2 m along the way: left of the way {left}, right of it {right}"
+    assert "left of the way 0.00 0.00" in told[1] and "right of it 0.06 0.06" in told[1]
+
+
+def test_words_are_the_numbers_of_the_device():
+    genes = BOTH.uniform_random(1, 4)
+    ground = terrains_of(genes, BOTH)[1]
+    np.testing.assert_allclose(BOTH._values(genes[0], "friction"), ground.friction.ravel(), rtol=1e-5)
+    np.testing.assert_allclose(BOTH._values(genes[0], "softness"), ground.time_constant_s.ravel(), rtol=1e-5)
+
+
+def test_names_are_joined_and_found_again(tmp_path):
+    assert on_ground(None, None) is None and on_ground("course", None) == "course"
+    assert on_ground(None, ["softness", "friction"]) == "super_gaussian+friction+softness"
+    with pytest.raises(ValueError, match="course\\+friction has ground of its own, friction, got --ground softness"):
+        on_ground("course+friction", ["softness"])
+    own = write_ridges(tmp_path)
+    space = load_space(f"{own}+friction")
+    assert (space.num_genes, space.name) == (3 + 32, f"{own}+friction")
+    assert get_space(space.name, space.sha256).num_genes == 35
+    identity = space_identity(space.name)
+    assert identity.endswith("+friction") and identity == recorded_identity("elsewhere.py:X+friction", space.sha256)
+    assert identity != space_identity(own)
+
+
+@pytest.mark.parametrize(
+    ("returned", "says"),
+    [
+        ("return torch.full((len(genes), 4, 8), 2.0)", "friction must return a map: friction must be 0.15 to 1, got 2"),
+        ("return torch.ones(len(genes), 8, 4)", r"friction must return friction of shape \(3, 4, 8\)"),
+        ("return torch.ones(len(genes), 4, 8) * float('nan')", "must return finite friction"),
+        ("return genes.nothing", "friction fails: AttributeError"),
+    ],
+)
+def test_maps_of_a_space_of_ones_own_are_checked(tmp_path, returned, says):
+    file = tmp_path / "wet.py"
+    file.write_text(WET.replace("{friction}", returned))
+    with pytest.raises(ValueError, match=says):
+        load_space(f"{file}:Wet")
+
+
+def test_a_space_of_ones_own_may_have_ground(tmp_path):
+    file = tmp_path / "wet.py"
+    file.write_text(
+        WET.replace("{friction}", "return torch.where(x > 8, 0.5, 1.0).expand(len(genes), -1, -1) * 1.0")
+        + "\n    def softness(self, genes, x, y):\n        return 0.03 * (y < 4) * (genes[:, 1, None, None] > 0)\n"
+    )
+    space = load_space(f"{file}:Wet")
+    ground = terrains_of(np.array([[0.0, 1.0], [0.0, -1.0]]), space)[1]
+    assert (space.ground, space.num_genes) == (("friction", "softness"), 2)
+    assert (ground.friction[:, :, 4:] == 0.5).all() and (ground.friction[:, :, :4] == 1.0).all()
+    assert (ground.time_constant_s[0, :2] == np.float32(0.03)).all()
+    assert not ground.time_constant_s[0, 2:].any() and not ground.time_constant_s[1].any()
+    with pytest.raises(ValueError, match=r"has friction and softness of its own, got --ground friction"):
+        load_space(f"{file}:Wet+friction")
