@@ -311,6 +311,7 @@ def _arrays(archive: Archive) -> dict[str, NDArray[Any]]:
 
 _RATES = tuple(name.replace("_outcomes", ending) for name in COUNTS for ending in ("_goal_rate", "_goal_interval"))
 _FAULT_NAMES = (*_CERTIFIERS, *COUNTS, *_RATES, "confirmed", "certified")
+_KNOWN = {*_SETTINGS, *PER_ELITE, *(_PREFIX + name for name in FRESH), *_CERTIFICATES, *_FAULT_NAMES}
 
 
 def _fault_arrays(archive: Archive) -> dict[str, NDArray[Any]]:
@@ -355,6 +356,8 @@ def read_archive(path: str | Path) -> Archive:
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
         there = set(array_names(file))
+        if unknown := there - _KNOWN:  # a damaged name of an array that older archives lack
+            raise ValueError(f"no archive has an array {', '.join(sorted(unknown))}")
         names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _HASHES or name in there]
         if any(name.startswith(_PREFIX) for name in there):  # then all of them, or it is damage
             names += [_PREFIX + name for name in FRESH]

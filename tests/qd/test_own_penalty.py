@@ -21,7 +21,7 @@ def project(tmp_path):
     page = (ROOT / "docs" / "own-robot.md").read_text()
     (function, name), file = ADDED.findall(page)[0], tmp_path / "kernels" / "penalties.py"
     file.parent.mkdir()
-    for there in (ROOT / "kernels").glob("*.py"):
+    for there in (ROOT / "kernels").glob("*.*"):
         (file.parent / there.name).write_text(there.read_text())
     text = file.read_text()
     assert text.count("\nPENALTIES = ") == 1
