@@ -108,6 +108,7 @@ LEFT_OUT = {
     "faultline compare --robot anymal$": "eight searches take long; the one that names its methods runs",
     "faultline compare .* --certify": "searches and certifies for an hour; tests/qd/studies/test_compare.py runs it",
     "faultline harden .* --against": "trains and searches three times as much",
+    "faultline compare .* emitters=80": "one of its iterations has more terrains than a small run of the others",
     "faultline bench": "compiles torch kernels for minutes; tests/sim/bench runs it small",
     "faultline speed": "measures a GPU",
     "faultline train-speed": "measures a GPU",
