@@ -63,7 +63,7 @@ SMALL: dict[str, dict[str, str | None]] = {
         "--workers": "2",
         "--rounds": "1",
         "--run-dir": "runs/anymal-hardened",
-        "--search-episodes": "12",
+        "--search-episodes": "48",
         "--emitters": "1",
         "--batch-size": "6",
         "--replicas": "2",
