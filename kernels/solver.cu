@@ -34,7 +34,8 @@ float* jaref = coefficient + CHUNK * DIM;
 float* jv = jaref + ROWS;
 float* force = jv + ROWS;
 int* state = (int*)(force + ROWS);
-int* contact_of = state + ROWS;  // -1: none, -2: one that found no room
+int* contact_of = state + ROWS;  // or one of the next line
+enum { NO_CONTACT = -1, NO_ROOM = -2 };
 float* qacc = (float*)(contact_of + ROWS);
 float* momentum = qacc + NV;
 float* gradient = momentum + NV;
@@ -46,6 +47,7 @@ const float* jacobian = &wp::index(problem.jacobian, world, 0, 0);
 const int stride = problem.jacobian.strides[1] / sizeof(float);
 const float* d_of = &wp::index(problem.stiffness, world, 0);
 const float* smooth = &wp::index(problem.qfrc_smooth, world, 0);
+float* constraint = &wp::index(problem.qfrc_constraint, world, 0);
 const float root_impratio = wp::index(problem.impratio_invsqrt, world % problem.impratio_invsqrt.shape[0]);
 const float least = wp::index(problem.tolerance, world % problem.tolerance.shape[0]);
 const float ls_least = wp::index(problem.ls_tolerance, world % problem.ls_tolerance.shape[0]);
@@ -54,12 +56,12 @@ auto first_row = [&](int c) { return wp::index(problem.address, c, 0); };
 auto friction_of = [&](int c, int k) { return wp::index(problem.friction, c)[k]; };
 
 // Force and state of every row at the present residuals, and what the forces do to the joints.
-auto update_forces = [&](float* total_force) {
+auto update_forces = [&]() {
     #pragma unroll 1
     for (int r = lane; r < num_rows; r += LANES) {
         const int c = contact_of[r];
         const float x = jaref[r], d = d_of[r];
-        if (c == -1) {
+        if (c == NO_CONTACT) {
             float f = -d * x;
             int s = QUADRATIC;
             if (r >= num_fixed) {
@@ -71,7 +73,7 @@ auto update_forces = [&](float* total_force) {
             }
             force[r] = f;
             state[r] = s;
-        } else if (c == -2) {
+        } else if (c == NO_ROOM) {
             force[r] = 0.0f;
             state[r] = SATISFIED;
         } else if (r == first_row(c)) {
@@ -108,7 +110,7 @@ auto update_forces = [&](float* total_force) {
         float sum = 0.0f;
         #pragma unroll 4
         for (int r = 0; r < num_rows; ++r) sum += jacobian[r * stride + i] * force[r];
-        total_force[i] = sum;
+        constraint[i] = sum;
     }
 };
 
@@ -236,7 +238,7 @@ auto read_row = [&](int r) {
     Row row;
     row.kind = NOTHING;
     const int c = contact_of[r];
-    if (r < num_equal || c == -2) return row;
+    if (r < num_equal || c == NO_ROOM) return row;
     row.jaref = jaref[r];
     row.jv = jv[r];
     row.d = d_of[r];
@@ -245,7 +247,7 @@ auto read_row = [&](int r) {
         row.loss = wp::index(problem.frictionloss, world, r);
         row.range = safe(row.loss, row.d);
         row.cost0 = loss_at(row, row.jaref).cost;
-    } else if (c == -1) {
+    } else if (c == NO_CONTACT) {
         row.kind = PLAIN;
         row.cost0 = row.jaref < 0.0f ? 0.5f * row.d * row.jaref * row.jaref : 0.0f;
     } else if (r == first_row(c)) {
@@ -455,18 +457,17 @@ for (int r = lane; r < num_rows; r += LANES) {
     float sum = -wp::index(problem.aref, world, r);
     for (int i = 0; i < NV; ++i) sum += jacobian[r * stride + i] * qacc[i];
     jaref[r] = sum;
-    contact_of[r] = -1;
+    contact_of[r] = NO_CONTACT;
     if (wp::index(problem.row_type, world, r) == $elliptic) {
         const int c = wp::index(problem.row_id, world, r);
-        contact_of[r] = c < num_contacts && first_row(c) >= 0 ? c : -2;
+        contact_of[r] = c < num_contacts && first_row(c) >= 0 ? c : NO_ROOM;
     }
 }
 sync();
-float* constraint = &wp::index(problem.qfrc_constraint, world, 0);
 float search_dot, decrement, alpha, gained;
 int iteration = 0, bits = 0;
 while (true) {
-    update_forces(constraint);
+    update_forces();
     float squares = 0.0f;
     for (int i = lane; i < NV; i += LANES) {
         const float g = momentum[i] - smooth[i] - constraint[i];

@@ -121,7 +121,7 @@ def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> tuple[Any, int]
     return solve_all, robots
 
 
-def solve_contacts(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
+def solve_problem(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
     """Joint accelerations and constraint forces of every world, from a warm start.
 
     Args:

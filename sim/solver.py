@@ -8,8 +8,7 @@ from typing import Any
 
 from mujoco_warp._src import solver, types
 
-from kernels.solver import Problem, Sizes
-from kernels.solver import solve_contacts as solve_problem
+from kernels.solver import Problem, Sizes, solve_problem
 
 solve_theirs = solver.solve
 _ON_CUDA = False  # the kernel compiles for a GPU, and has not been run on one

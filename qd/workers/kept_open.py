@@ -12,7 +12,7 @@ _SPARE = 1.25  # room for a run with some more terrains; robots for it cost time
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Kept:
+class _Open:
     cfg: EvaluatorCfg
     evaluate: Evaluate
     stack: ExitStack
@@ -37,7 +37,7 @@ def kept_open(
     Yields:
         The same for several runs. An evaluator under which something failed is not used again.
     """
-    kept: list[_Kept] = []
+    kept: list[_Open] = []
 
     @contextmanager
     def opened(cfg: EvaluatorCfg) -> Iterator[Evaluate]:
@@ -48,7 +48,7 @@ def kept_open(
             spare = _SPARE if cfg.device.startswith("cuda") else 1.0
             roomy = replace(cfg, num_terrains=math.ceil(spare * cfg.num_terrains))
             stack = ExitStack()
-            own = _Kept(cfg=roomy, evaluate=stack.enter_context(open_evaluator(roomy)), stack=stack)
+            own = _Open(cfg=roomy, evaluate=stack.enter_context(open_evaluator(roomy)), stack=stack)
         else:
             kept.remove(own)
         kept.append(own)  # the last one used is the last one to be closed
