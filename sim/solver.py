@@ -11,7 +11,7 @@ from mujoco_warp._src import solver, types
 from kernels.solver import Problem, Sizes, solve_problem
 
 solve_theirs = solver.solve
-_ON_CUDA = False  # the kernel compiles for a GPU, and has not been run on one
+
 _CODES = {state.name.lower(): state.value for state in types.ConstraintState} | {
     "elliptic": types.ConstraintType.CONTACT_ELLIPTIC.value,
     "too_many": types.OverflowType.ITERATIONS.value,
@@ -69,12 +69,12 @@ def solve_contacts(m: Any, d: Any) -> None:
 
 
 def _solve(m: Any, d: Any) -> None:
-    if fits(m, d) and (_ON_CUDA or d.qacc.device.is_cpu):
+    if fits(m, d):
         solve_contacts(m, d)
     else:
         solve_theirs(m, d)
 
 
 def use_own_solver(wanted: bool = True) -> None:
-    """Make steps that are captured from now on solve contacts in one kernel on a CPU, or as mujoco_warp does."""
+    """Make steps that are captured from now on solve contacts in one kernel, or as mujoco_warp does."""
     solver.solve = _solve if wanted else solve_theirs
