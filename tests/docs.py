@@ -94,7 +94,7 @@ class Number(NamedTuple):
         """What the file says."""
         content = _content(self.file)
         names = {"this": content, "abs": abs, "len": len, "max": np.max, "round": round}
-        names |= {"sum": np.sum, "mean": np.mean}
+        names |= {"sum": np.sum, "mean": np.mean, "median": np.median}
         keys = content if isinstance(content, dict) else {}
         return float(eval(self.expression, {"__builtins__": {}}, {**names, **keys}))
 
