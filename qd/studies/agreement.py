@@ -109,7 +109,7 @@ class Agreement(Who, InSpace, Where):
         def measure() -> dict[str, Any]:
             print(_plan(self, terrains, evaluator), flush=True)
             crossings = Crossings(terrains, evaluator, kept)
-            with naming_what_is_next(kept.state, crossings.what_is_next):
+            with naming_what_is_next(kept.state, lambda: "The same command goes on."):
                 crossings.cross(open_evaluator)
             return {
                 **origin_of(evaluator.device, self.seed, self.workers),
@@ -324,11 +324,6 @@ class Crossings:
                         self._cross(name, evaluate)
         for name in _PLAIN:
             self._cross_plain(name, resolved=name != "mujoco_c")
-
-    def what_is_next(self) -> str:
-        """What the same command does after a stop."""
-        begun = any(array.any() for array in self.outcome.values())
-        return "The same command goes on." if begun else "The same command begins anew."
 
     def _left(self, name: str) -> NDArray[np.intp]:
         """Terrains that are still to be crossed in a way."""

@@ -209,7 +209,7 @@ def test_where_nothing_is_valid_the_first_part_ends_it(run):
         return stand_in.make_result(result.penalties, invalid=np.ones(result.invalid.shape, bool))
 
     calls = []
-    with pytest.raises(AllInvalidError, match=r"all 64 episodes are invalid.*begins anew"):
+    with pytest.raises(AllInvalidError, match=r"all 64 episodes are invalid.*goes on"):
         command(run).execute(open_evaluator=opener(calls, nothing))
     assert calls == [(16, False)] and not list(run.glob("agreement*"))
 
