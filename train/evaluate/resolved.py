@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from qd.workers.evaluator import EvaluatorCfg, parse_workers
 from sim.rates import KINDS, agreement, crossing_rates
@@ -120,7 +119,8 @@ def _cross(who: str, policy: str, terrains: TerrainSet, evaluator: EvaluatorCfg,
     left = np.flatnonzero(outcome[:, 0] == 0)
     if len(left) == 0:
         return outcome
-    tqdm.write(f"{who} on {len(left)} terrains of {terrains.name} x {PLAIN_EPISODES} episodes in MuJoCo C")
+    terrains_left = f"{len(left)} terrain{'s' * (len(left) != 1)} of {terrains.name}"
+    print(f"{who} in MuJoCo C on {terrains_left}, {PLAIN_EPISODES} episodes each", flush=True)
 
     def crossed(terrain: int, crossings: Any) -> None:
         outcome[left[terrain]] = crossings.outcome

@@ -145,7 +145,7 @@ def role_words(about: dict[str, Any], who: str) -> str:
 def _print_resolved(rows: dict[str, Any], how: str, wide: int) -> None:
     """Rates of other crossings of the same terrains, and the bias of those above."""
     if rows:
-        print(f"\n{how}: rates, and in how far those at the search's settings lie above them (bias)")
+        print(f"\n{how}: rates, and how far those at the search's settings lie above them (bias)")
     for name, row in rows.items():
         print(_row(name, (_WORDS["goal"], "bias", _WORDS["success"], "bias", "terrains"), wide, 26))
         for who, found in row.items():
