@@ -311,7 +311,7 @@ def _refuse_trained_on(
 
     for name in HELD_OUT:
         if name in sets:
-            check_held_out(controllers, sets[name].terrains, flags.split_seed)
+            check_held_out(controllers, sets[name].terrains, flags.split_seed, flags.part)
     if sources.independent is not None:  # all of its elites: those of a run that was trained on share ancestors
         remedy = "give a search on whose elites no controller was trained"
         check_untrained(controllers, sources.independent.genes, f"of --independent {flags.independent}", remedy)

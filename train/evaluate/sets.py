@@ -466,11 +466,18 @@ def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], 
             raise ValueError(f"{name} was trained on {count} of the {len(marks)} elites {elites}: {remedy}")
 
 
-def check_held_out(controllers: Mapping[str, str], genes: NDArray[np.float32], split_seed: int) -> None:
-    """:func:`check_untrained` of elites that the split of ``split_seed`` holds out, shape (T, num_genes)."""
-    check_untrained(
-        controllers,
-        genes,
-        f"that split seed {split_seed} holds out of this archive",
-        "give the archive as it was then and the split seed of its training",
-    )
+def check_held_out(
+    controllers: Mapping[str, str], genes: NDArray[np.float32], split_seed: int, part: Part = "test"
+) -> None:
+    """:func:`check_untrained` of elites that the split of ``split_seed`` holds out for a purpose.
+
+    Args:
+        controllers: Policy of each controller by its name.
+        genes: The elites, shape (T, num_genes).
+        split_seed: For the message.
+        part: Likewise.
+    """
+    remedy = "give the archive as it was then and the split seed of its training"
+    if part == "validation":
+        remedy += "; one that was trained before any were held out for validation must be trained anew"
+    check_untrained(controllers, genes, f"that split seed {split_seed} holds out of this archive for {part}", remedy)

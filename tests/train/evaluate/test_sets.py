@@ -411,8 +411,20 @@ def test_the_nearest_is_found_among_all_elites_trained_on(published):
     assert found["terrains"] == 3 and report["trained_on"] == len(split.train)
     assert found["median"] == pytest.approx(np.median(by_hand), rel=1e-4)
     assert (found["least"], found["largest"]) == pytest.approx((min(by_hand), max(by_hand)), rel=1e-4)
+    assert "generated_independent" not in report["nearest_m"]
     far = report["nearest_m"]["generated_far"]
     assert far["terrains"] == 1 and far["median"] == pytest.approx(found["largest"])
+
+
+def test_elites_of_another_search_have_their_distance_too(tmp_path):
+    archive, other = make_archive(20), make_archive(6, seed=1)
+    write_archive(tmp_path / "archive.npz", archive)
+    write_archive(tmp_path / "other.npz", other)
+    report = distances(Distances(archive=tmp_path / "archive.npz", independent=tmp_path / "other.npz", terrains=3))
+    train = archive.genes[split_elites(archive, "anymal").train]
+    expected = nearest_distance(independent_set(other, 3, 0).terrains, train)
+    found = report["nearest_m"]["generated_independent"]
+    assert (found["terrains"], found["median"]) == (3, pytest.approx(np.median(expected)))
 
 
 @pytest.mark.parametrize(
