@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,7 +81,8 @@ def print_tables(report: dict[str, Any]) -> None:
     """Prints ``tables.json``: every set with every controller, what became of terrains, and what nobody crossed."""
     if report.get("part") == "validation":
         print("\nValidation terrains, to choose settings by. Rates to report are those of --part test.")
-    wide = 2 + max(12, *(len(who) for row in report["success"].values() for who in row))
+    names = (label for name, row in report["success"].items() for label in (name, *row))
+    wide = 2 + max(12, *map(len, names))
     for name in report["success"]:
         _print_set(report, name, wide)
     _print_certified(report, wide)
@@ -116,8 +118,8 @@ def _print_certified(report: dict[str, Any], wide: int) -> None:
     for name, about in report["certified"].items():
         by = ", ".join(f"{who} {count}" for who, count in about["certifiers"].items())
         print(
-            f"\n{name}: {about['terrains']} of {report['terrains'][name]} terrains are certified: the search's "
-            f"controller fails them, and another one crosses them ({by})"
+            f"\n{name}: certified {about['terrains']} of {report['terrains'][name]} terrains, which the search's "
+            f"controller fails and another one crosses ({by})"
         )
         if about["terrains"]:
             print(_row("", (_WORDS["goal"], _WORDS["success"]), wide + 12, 24))
@@ -358,7 +360,7 @@ def _draw_certified(axes: "Axes", report: dict[str, Any]) -> None:
     roles = {who: role for about in known.values() for who, role in about["chosen_by"].items()}
     ways = {"searched": "too low", "certifier": "too high"}
     told = (f"{who} ({role}) is {ways[role]}" for who, role in roles.items())
-    axes.set_xlabel("by choice of the terrains:\n" + ", ".join(told) if roles else "")
+    axes.set_xlabel("\n".join(["by choice of the terrains:", *wrap(", ".join(told), 70)]) if roles else "")
 
 
 def _draw_bias(axes: "Axes", report: dict[str, Any]) -> None:
@@ -382,7 +384,7 @@ def _draw_bias(axes: "Axes", report: dict[str, Any]) -> None:
     axes.axhline(0.0, color="0.4", linewidth=0.8)
     axes.set_xticks(range(len(names)), [SET_LABELS[name] for name in names], fontsize=_tick_size(names))
     axes.set_xlim(-0.5, len(names) - 0.5)
-    axes.set_ylabel("goal rate above that with contact resolved\n[points]")
+    axes.set_ylabel("bias of the goal rate\n[points above contact resolved]")
     axes.legend(frameon=False, fontsize=8, loc="best")
     axes.grid(axis="y", alpha=0.3)
 

@@ -105,7 +105,7 @@ def test_the_tables_have_both_and_go_on_after_a_stop(tmp_path, walker, monkeypat
     assert "contact resolved: rates, and how far those at the search's settings lie above them (bias)" in shown
     assert "MuJoCo C, contact resolved: rates" in shown and "C-G on hard_random with contact resolved: goal" in shown
     *_, bias = draw_tables(report).axes
-    assert "above that with contact resolved" in bias.get_ylabel()
+    assert "above contact resolved" in bias.get_ylabel()
     told = [text.get_text() for text in bias.get_legend().get_texts()]
     assert told == ["C-G: contact resolved", "C-G: MuJoCo C, contact resolved"]
 

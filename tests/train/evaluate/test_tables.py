@@ -102,8 +102,8 @@ def test_certified_terrains_stand_apart_with_who_certifies_them(certified):
 def test_certified_terrains_are_shown_with_whose_rates_are_biased(certified, capsys):
     print_tables(certified)
     said = capsys.readouterr().out
-    assert "generated: 2 of 4 terrains are certified: the search's controller fails them, and another one" in said
-    assert "crosses them (C-G 2, S 0)" in said and "C-G (certifier)" in said and "base (searched)" in said
+    assert "generated: certified 2 of 4 terrains, which the search's controller fails and another one cross" in said
+    assert "crosses (C-G 2, S 0)" in said and "C-G (certifier)" in said and "base (searched)" in said
     assert "searched: downward, since it fails them all; certifier: upward, since it crosses some of them" in said
     *_, axes = draw_tables(certified).axes
     assert "certified terrains" in axes.get_ylabel()
