@@ -131,11 +131,11 @@ def _print_certified(report: dict[str, Any], wide: int) -> None:
                 print(_row(who + role_words(about, who), cells, wide + 12, 24))
     roles = {role for about in report["certified"].values() for role in about["chosen_by"].values()}
     if roles:
-        print("Terrains are certified because of what these controllers do there, so that their rates are biased:")
+        print("They were chosen by what these controllers did there in other episodes, so their rates are biased:")
         print("; ".join(f"{role}: {_BIASED[role]}" for role in _BIASED if role in roles))
 
 
-_BIASED = {"searched": "downward, since it fails them all", "certifier": "upward, since it crosses some of them"}
+_BIASED = {"searched": "downward, since it failed them all", "certifier": "upward, since it crossed some of them"}
 
 
 def role_words(about: dict[str, Any], who: str) -> str:

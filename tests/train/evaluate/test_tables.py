@@ -104,7 +104,7 @@ def test_certified_terrains_are_shown_with_whose_rates_are_biased(certified, cap
     said = capsys.readouterr().out
     assert "generated: certified 2 of 4 terrains, which the search's controller fails and another one cross" in said
     assert "crosses (C-G 2, S 0)" in said and "C-G (certifier)" in said and "base (searched)" in said
-    assert "searched: downward, since it fails them all; certifier: upward, since it crosses some of them" in said
+    assert "searched: downward, since it failed them all; certifier: upward, since it crossed some of them" in said
     *_, axes = draw_tables(certified).axes
     assert "certified terrains" in axes.get_ylabel()
     assert axes.get_xlabel().endswith("base (searched) is too low, C-G (certifier) is too high")
