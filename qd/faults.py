@@ -256,20 +256,15 @@ def _crossed(
 def _counts_in_mujoco_c(archive: Archive, numbers: NDArray[np.int64], work: Work, processes: int) -> NDArray[np.int64]:
     """Outcomes of elites in plain MuJoCo C, shape (len(numbers), 4)."""
     from kernels.episode import Outcome
-    from sim.bank import terrains_of
-    from sim.mujoco_c.crossing import cross_plain
+    from sim.mujoco_c.crossing import cross_terrains
     from sim.robots.robot import get_robot
-    from sim.simulation import resolved
     from sim.space import get_space
 
-    robot, device = get_robot(work.evaluator.robot), work.evaluator.device
-    space = get_space(archive.space, archive.space_sha256)
-    heights, ground = terrains_of(archive.genes[numbers], space, device=device)
-    seeds = elite_seeds(archive, work.seed, stream=_CONFIRM_STREAM)[numbers]
-    fine, solver = resolved(robot)
-    crossings = cross_plain(
-        fine, work.evaluator.policy, heights, seeds, num_episodes=EPISODES, device=device, processes=processes,
-        time_constant_s=solver.time_constant_s, ground=ground,
+    crossings = cross_terrains(
+        get_robot(work.evaluator.robot), work.evaluator.policy, archive.genes[numbers],
+        elite_seeds(archive, work.seed, stream=_CONFIRM_STREAM)[numbers],
+        space=get_space(archive.space, archive.space_sha256), num_episodes=EPISODES, device=work.evaluator.device,
+        processes=processes, resolved=True,
     )  # fmt: skip
     outcome = np.array([one.outcome for one in crossings])
     return _counts(

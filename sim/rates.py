@@ -59,13 +59,16 @@ def crossing_rates(outcome: NDArray[np.uint8], kind: str) -> NDArray[np.float64]
     return terrain_means(*hits_of(outcome, kind))
 
 
-def agreement(ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int) -> dict[str, Any]:
+def agreement(
+    ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int, families: NDArray[np.int64] | None = None
+) -> dict[str, Any]:
     """How far rates of terrains lie from those of other crossings of the same terrains.
 
     Args:
         ours: Outcomes, shape (num_terrains, num_episodes).
         theirs: Outcomes of the other crossings, shape (num_terrains, any number of episodes).
         seed: Draws the resamples.
+        families: Of terrains that are not independent, shape (num_terrains,).
 
     Returns:
         ``terrains``, those that are valid in both; of each kind the mean of our rate minus theirs
@@ -75,11 +78,12 @@ def agreement(ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int) -> 
     found: dict[str, Any] = {}
     for kind in KINDS:
         apart = crossing_rates(ours, kind) - crossing_rates(theirs, kind)
-        apart = apart[np.isfinite(apart)]
+        known = np.isfinite(apart)
+        apart, kin = apart[known], None if families is None else families[known]
         found |= {
             "terrains": len(apart),
             f"{kind}_bias": float(apart.mean()) if len(apart) else None,
-            f"{kind}_bias_interval": bootstrap_interval(apart, seed),
+            f"{kind}_bias_interval": bootstrap_interval(apart, seed, families=kin),
             f"{kind}_difference": float(np.abs(apart).mean()) if len(apart) else None,
         }
     return found

@@ -96,6 +96,7 @@ CHANGED: dict[str, dict[str, str | None]] = {
     },
     "--resume runs/anymal-generated-1": {"--iterations": "3"},
     "--genes": {"--terrains": None},
+    "--mujoco-c 60": {"--mujoco-c": "1", "--terrains": "2"},
     "--recording": {"--replicas": None, "--elite": None},
     "--certificate": {"--run": HARD, "--replicas": None},
     "--only uncertified": {"--archive": HARD},

@@ -466,7 +466,7 @@ def _tables(job: Hardening) -> dict[str, Any]:
     return {
         "episodes": job.evaluator.num_replicas,
         "controllers": about,
-        **make_tables(crossed, sets, job.robot, 0),
+        **make_tables(crossed, sets, job.robot, 0, hashes={who: one["sha256"] for who, one in about.items()}),
     }
 
 

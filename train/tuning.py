@@ -14,7 +14,15 @@ from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, recorded_space, to_be_named
-from train.evaluate.sets import TRAINED_ON, elites_sha256, marks_of, recorded_marks, space_of, split_elites
+from train.evaluate.sets import (
+    TRAINED_ON,
+    EliteSplit,
+    elites_sha256,
+    marks_of,
+    recorded_marks,
+    space_of,
+    split_elites,
+)
 from train.finetune import Finetune, archive_paths
 from train.ppo.learner import Start, read_start
 from train.ppo.run import (
@@ -35,6 +43,7 @@ _PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "itera
 _PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}  # the paper's ANYmal
 _SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain: episodes end
 _CRITIC_ITERATIONS = 50
+_VALIDATION = "validation"  # key of the settings with the number of elites that are for validation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +155,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
     if saved is not None:
         _check_space(flags, saved["extra"]["settings"])
-    elites = _elites(flags, robot)
+    elites = _elites(flags, robot, keep_validation=_keeps_validation(saved))
     settings = {
         **common,
         "policy": str(flags.policy or "shipped"),
@@ -206,7 +215,12 @@ class _Elites(NamedTuple):
     """Where they are from, as settings have it: of several archives each value is a list."""
 
 
-def _elites(flags: Finetune, robot: RobotCfg) -> _Elites:
+def _keeps_validation(saved: dict[str, Any] | None) -> bool:
+    """Whether no validation elites are trained on; a run begun before there were such goes on with what it has."""
+    return saved is None or _VALIDATION in (saved["extra"]["settings"]["archive"] or {})
+
+
+def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elites:
     """The elites that a command line asks to train on.
 
     Raises:
@@ -227,15 +241,20 @@ def _elites(flags: Finetune, robot: RobotCfg) -> _Elites:
     if len(spaces) > 1:
         told = ", ".join(f"{path} of {name}" for (name, _), path in spaces.items())
         raise ValueError(f"all archives must be of one terrain space, got {told}: leave those of another out")
-    rows = _rows_to_train_on(flags, robot, paths, archives)
+    splits = [
+        split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path, keep_validation=keep_validation)
+        for one, path in zip(archives, paths, strict=True)
+    ]
+    rows = _rows_to_train_on(flags, paths, archives, splits)
     parts = [one.genes[chosen] for one, chosen in zip(archives, rows, strict=True)]
     rates = [(one.fresh or one).goal_rate[chosen] for one, chosen in zip(archives, rows, strict=True)]
     about = [
         {
             "path": str(path), "archive_iterations": one.iterations, "elites": len(one), "trained_on": len(part),
             "elites_sha256": elites_sha256(one),
+            **({_VALIDATION: len(split.validation)} if flags.held_out and keep_validation else {}),
         }
-        for path, one, part in zip(paths, archives, parts, strict=True)
+        for path, one, part, split in zip(paths, archives, parts, splits, strict=True)
     ]  # fmt: skip
     # The defaults are not named, so that a run of before there were others goes on.
     chosen = {"only": flags.only} if flags.only != "all" else {}
@@ -251,22 +270,17 @@ def _elites(flags: Finetune, robot: RobotCfg) -> _Elites:
 
 
 def _rows_to_train_on(
-    flags: Finetune, robot: RobotCfg, paths: Sequence[Path], archives: Sequence[Archive]
+    flags: Finetune, paths: Sequence[Path], archives: Sequence[Archive], splits: Sequence[EliteSplit]
 ) -> list[np.ndarray]:
-    """Which elites of each archive: those asked for, without what any archive holds out.
+    """Which elites of each archive: those asked for, without what any archive holds out for test or validation.
 
     Raises:
         ValueError: If there are none.
     """
-    splits = [
-        split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path)
-        for one, path in zip(archives, paths, strict=True)
-    ]
     held_out = set[str]()
     if flags.held_out:  # searches that begin alike may share an elite
-        held_out.update(
-            mark for one, split in zip(archives, splits, strict=True) for mark in marks_of(one.genes[split.test])
-        )
+        for one, split in zip(archives, splits, strict=True):
+            held_out.update(marks_of(one.genes[np.concatenate([split.test, split.validation])]))
     found = []
     for path, one, split in zip(paths, archives, splits, strict=True):
         # All of them are more than the parts of a split, which has no more than the paper's numbers; in an order that

@@ -111,6 +111,22 @@ def named_by(run: Path, archive: Archive) -> dict[str, Any]:
     return archive.named() | {name: settings[name] for name in ("robot_sha256", "policy_sha256") if name in settings}
 
 
+def search_seed(run: Path) -> int | None:
+    """Seed of the search that left an archive; None where nothing beside it says.
+
+    Args:
+        run: Run directory or archive file.
+
+    Raises:
+        ValueError: If the run's config is damaged.
+    """
+    folder = RunDirectory(directory_of(run))
+    if not (folder.path / CONFIG_FILE).exists():
+        return None
+    seed = folder.read_config()["settings"].get("seed")
+    return seed if isinstance(seed, int) else None
+
+
 def read_archive_of(robot: "RobotCfg", run: Path, space: str | None = None) -> Archive:
     """An archive whose terrains alone are taken; of another robot's name it is for the caller to refuse.
 

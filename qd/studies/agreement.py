@@ -349,31 +349,27 @@ class Crossings:
                 self._kept.write(**self.outcome)
 
     def _cross_plain(self, name: str, *, resolved: bool) -> None:
-        from sim.bank import host_device, terrains_of
-        from sim.mujoco_c.crossing import cross_plain
-        from sim.simulation import SolverCfg
-        from sim.simulation import resolved as with_contact_resolved
+        from sim.bank import host_device
+        from sim.mujoco_c.crossing import cross_terrains
 
         left, drawn = self._left(name), self._drawn
         if len(left) == 0:
             return
-        robot, solver = with_contact_resolved(drawn.robot) if resolved else (drawn.robot, SolverCfg())
 
         def crossed(terrain: int, crossings: Any) -> None:
             self.outcome[name][left[terrain]] = crossings.outcome
             self._kept.write(**self.outcome)
 
-        heights, ground = terrains_of(drawn.genes[left], drawn.space)
-        cross_plain(
-            robot,
+        cross_terrains(
+            drawn.robot,
             drawn.policy,
-            heights,
+            drawn.genes[left],
             drawn.seeds(name)[left],
+            space=drawn.space,
             num_episodes=self._evaluator.num_replicas,
             device=host_device(),
             processes=parse_workers(self._evaluator.workers).num_processes,
-            time_constant_s=solver.time_constant_s,
-            ground=ground,
+            resolved=resolved,
             crossed=crossed,
         )
 

@@ -24,7 +24,7 @@ from kernels.penalties import BASE, PENALTIES
 from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
-from sim.bank import TerrainBank
+from sim.bank import TerrainBank, terrains_of
 from sim.crossing import CrossingCfg, make_start_ranges
 from sim.ground import GroundMaps
 from sim.mujoco_c.model import (
@@ -40,6 +40,9 @@ from sim.policy.loaders import Policy, load_policy, prepare_torch
 from sim.policy.runner import forget_all
 from sim.robots.model import build_robot
 from sim.robots.robot import RobotCfg
+from sim.simulation import SolverCfg
+from sim.simulation import resolved as with_contact_resolved
+from sim.space import TerrainSpace
 
 _mj: Any = mujoco  # its types are not written down
 _WARNINGS = [
@@ -342,4 +345,42 @@ def cross_plain(
     return run_plain(
         robot, policy, heights, starts, processes=processes, time_constant_s=time_constant_s, ground=ground,
         crossed=crossed,
+    )  # fmt: skip
+
+
+def cross_terrains(
+    robot: RobotCfg,
+    policy: str,
+    terrains: NDArray[np.float32],
+    seeds: NDArray[np.uint32],
+    *,
+    space: TerrainSpace,
+    num_episodes: int,
+    device: str,
+    processes: int,
+    resolved: bool,
+    crossed: Callable[[int, PlainCrossings], None] | None = None,
+) -> list[PlainCrossings]:
+    """:func:`cross_plain` of terrains as a search has them, at its settings or with contact resolved.
+
+    Args:
+        robot: Robot settings, those of the search.
+        policy: The controller.
+        terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
+        seeds: One a terrain, uint32.
+        space: What genes mean.
+        num_episodes: Episodes a terrain.
+        device: Warp device that makes the terrains and draws the starts.
+        processes: How many at once.
+        resolved: Whether contact is resolved (:func:`sim.simulation.resolved`).
+        crossed: As of :func:`run_plain`.
+
+    Raises:
+        OSError: If a process dies.
+    """
+    robot, solver = with_contact_resolved(robot) if resolved else (robot, SolverCfg())
+    heights, ground = (terrains, None) if terrains.ndim == 3 else terrains_of(terrains, space, device=device)
+    return cross_plain(
+        robot, policy, heights, seeds, num_episodes=num_episodes, device=device, processes=processes,
+        time_constant_s=solver.time_constant_s, ground=ground, crossed=crossed,
     )  # fmt: skip

@@ -1,10 +1,13 @@
 """Archives of made-up elites."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from kernels.penalties import PENALTY_DEFINITION
-from qd.archive import Archive
+from qd.archive import Archive, FaultCounts
 from sim.space import SUPER_GAUSSIAN
+from tests.builders import fresh_values
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 
@@ -36,3 +39,25 @@ def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Ar
         episodes=counts + 4,
         iteration=counts + 1,
     )
+
+
+def certified_archive(
+    num_elites: int, crossed: int, certifiers: dict[str, str], *, searched: str = "f" * 64
+) -> Archive:
+    """An archive whose controller fails every elite; each certifier crosses the first few of them.
+
+    Args:
+        num_elites: How many.
+        crossed: So many have certificates.
+        certifiers: Hash of each certifier by its name.
+        searched: Hash of the controller that was searched.
+    """
+    archive = make_archive(num_elites)
+    outcomes = np.zeros((num_elites, len(certifiers), 4), np.int64)
+    outcomes[:crossed, :, 0], outcomes[crossed:, :, 1] = 20, 20
+    faults = replace(
+        FaultCounts.none_of(num_elites), certifiers=tuple(certifiers), certifier_sha256=tuple(certifiers.values()),
+        certifier_outcomes=outcomes, certifier_resolved_outcomes=outcomes,
+    )  # fmt: skip
+    fresh = replace(fresh_values(archive), goal_rate=np.zeros(num_elites))
+    return replace(archive, fresh=fresh, faults=faults, policy_sha256=searched)

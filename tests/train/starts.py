@@ -1,12 +1,15 @@
 """Controllers and an archive that a fine-tuning begins with."""
 
 import itertools
+import json
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from qd.archive import write_archive
 from tests.train.archives import make_archive
+from train.evaluate.sets import TRAINED_ON, marks_of
 from train.ppo.cfg import PpoCfg
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
@@ -25,6 +28,13 @@ def write_actor(path, *, hidden=(16, 8), critic=False, **extra):
         content["critic_state_dict"] = {f"{key}.weight": torch.randn(shape) for key, shape in shapes.items()}
         content["critic_state_dict"] |= {f"{key}.bias": torch.zeros(shape[0]) for key, shape in shapes.items()}
     torch.save(content, path)
+    return path
+
+
+def write_trained(folder: Path, genes: np.ndarray) -> Path:
+    """A controller whose record says that it was trained on elites, genes of shape (num_elites, num_genes)."""
+    path = write_actor(folder / "tuned.pt")
+    path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: marks_of(genes)}))
     return path
 
 

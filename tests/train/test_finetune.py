@@ -20,7 +20,7 @@ from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
 from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
-from train.evaluate.sets import marks_of, split_elites
+from train.evaluate.sets import marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import read_checkpoint
 from train.ppo.ppo import CapturedPPO
@@ -71,7 +71,8 @@ def test_a_run_leaves_a_controller_and_its_record(places, finished):
         assert key in record, key
     settings = record["settings"]
     assert settings["mix"] == {"mix": "generated", "terrains": 4, "swap_every": 2, "draw": "uniform"}
-    assert (settings["archive"]["elites"], settings["archive"]["trained_on"]) == (10, 8)
+    assert (settings["archive"]["elites"], settings["archive"]["trained_on"]) == (10, 7)
+    assert settings["archive"]["validation"] == 1
     assert settings["ppo"]["hidden_dims"] == [16, 8] and settings["task"]["crosses"]
     assert record["env_steps"] == 3 * 4 * 6
     same = load_policy(finished / "policy.onnx", ROBOT, "cpu")
@@ -235,11 +236,13 @@ def test_several_archives_are_trained_on_together(places):
         write_archive(places / f"{name}.npz", make_archive(count, seed=seed))
     both = (places / "one.npz", places / "two.npz")
     job = job_of(config(places, archive=both, run_dir=places / "none"))
-    assert len(job.mix.genes) == 8 + 24 and job.mix.weights.reshape(4, 8).sum(axis=1).tolist() == [1.0, *[1 / 3] * 3]
+    # Of 10 and 30 elites 2 and 6 are in the test, 1 and 2 for validation.
+    assert len(job.mix.genes) == 7 + 22
+    assert (job.mix.weights[:7].sum(), job.mix.weights[7:].sum()) == pytest.approx((1.0, 1.0))
     drawn = np.concatenate([rows_of_swap(job.mix, k) for k in range(400)])
-    assert 0.4 < (drawn < 8).mean() < 0.6  # in equal shares, though the second has three times as many
+    assert 0.4 < (drawn < 7).mean() < 0.6  # in equal shares, though the second has three times as many
     assert job.settings["shares"] == "equal" and job.settings["archive"]["path"] == [str(path) for path in both]
-    assert job.settings["archive"]["trained_on"] == [8, 24]
+    assert job.settings["archive"]["trained_on"] == [7, 22] and job.settings["archive"]["validation"] == [1, 2]
     by_size = job_of(config(places, archive=both, shares="size", run_dir=places / "none"))
     assert by_size.mix.weights is None
 
@@ -247,7 +250,8 @@ def test_several_archives_are_trained_on_together(places):
 def test_what_one_archive_holds_out_is_not_trained_on_from_another(places):
     write_archive(places / "same.npz", make_archive(30, seed=1))
     write_archive(places / "part.npz", (whole := make_archive(30, seed=1)).rows(np.arange(20)))
-    held_out = whole.genes[split_elites(whole, "anymal").test]
+    split = split_elites(whole, "anymal")
+    held_out = whole.genes[np.concatenate([split.test, split.validation])]
     job = job_of(config(places, archive=(places / "same.npz", places / "part.npz"), run_dir=places / "none"))
     assert not set(marks_of(held_out)) & set(job.trained_on)
 
@@ -462,6 +466,20 @@ def test_a_run_of_before_starts_were_spread_goes_on(places, finished):
     older = {**settings, "task": {key: value for key, value in settings["task"].items() if key != "start_spread"}}
     old = {**saved, "extra": {**saved["extra"], "settings": older}}
     assert check_resumed(config(places), old, settings) == []
+
+
+def test_a_run_of_before_there_was_a_validation_part_goes_on_with_its_elites(places, monkeypatch):
+    run, archive = places / "before-validation", make_archive(10)
+    with monkeypatch.context() as before:
+        before.setattr("train.tuning._keeps_validation", lambda saved: False)
+        assert finetune(config(places, run_dir=run, iterations=1)) == 0
+    split = split_elites(archive, "anymal")
+    old = sorted(marks_of(archive.genes[np.concatenate([split.train, split.validation])]))
+    assert len(old) == 8 and recorded_marks(str(run / "policy.pt")) == set(old)
+    job = job_of(resumed(run, iterations=2))
+    assert job.trained_on == old and "validation" not in job.settings["archive"]
+    assert finetune(resumed(run, iterations=2)) == 0
+    assert set(job_of(config(places, run_dir=places / "none")).trained_on) < set(old)
 
 
 def test_a_training_in_a_space_of_ones_own_goes_on_only_with_it(places, tmp_path, monkeypatch):

@@ -26,6 +26,7 @@ from train.evaluate.sets import TerrainSet
 
 _MOST_TERRAINS = 2_000  # under way at once: 400 MB of height maps
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
+_HOW = " with contact resolved"
 _FIELDS = tuple(field.name for field in fields(RolloutResult))
 
 
@@ -33,6 +34,25 @@ def take_terrains(result: RolloutResult, places: np.ndarray) -> RolloutResult:
     """Crossings of some of the terrains, shape (num_places,) of integers, in the order given."""
     values = {name: getattr(result, name) for name in _FIELDS}
     return replace(result, **{name: value[places] for name, value in values.items() if isinstance(value, np.ndarray)})
+
+
+def kept_crossings(
+    folder: Path, evaluator: EvaluatorCfg, policy: str, terrains: TerrainSet, *, simulator: str = ""
+) -> Kept:
+    """Where crossings of a controller on a set are kept.
+
+    Args:
+        folder: One file a controller and set.
+        evaluator: What crosses; its policy and terrains do not count.
+        policy: The controller.
+        terrains: The set.
+        simulator: What crosses them if it is no evaluator.
+    """
+    parts = [hashlib.sha256(part.tobytes()).hexdigest() for part in (terrains.terrains, terrains.seeds)]
+    drawn = [*parts, simulator] if simulator else parts
+    key = key_of(replace(evaluator, policy=policy, space=terrains.space), drawn)
+    name = "-".join(filter(None, [terrains.name, simulator, key[:24] if key else "not-kept"]))
+    return Kept(folder / f"{name}.npz", key)
 
 
 class KeptCrossings:
@@ -47,9 +67,7 @@ class KeptCrossings:
         self.folder, self._evaluator = folder, evaluator
 
     def _kept(self, policy: str, terrains: TerrainSet) -> Kept:
-        parts = [hashlib.sha256(part.tobytes()).hexdigest() for part in (terrains.terrains, terrains.seeds)]
-        key = key_of(replace(self._evaluator, policy=policy, space=terrains.space), parts)
-        return Kept(self.folder / f"{terrains.name}-{key[:24] if key else 'not-kept'}.npz", key)
+        return kept_crossings(self.folder, self._evaluator, policy, terrains)
 
     def file(self, policy: str, terrains: TerrainSet) -> Path:
         """Where the crossings of one controller on one set are kept."""
@@ -116,7 +134,8 @@ def cross_all(
     todo = {who: [name for name in whole if (who, name) not in found] for who in controllers}
     if found:
         count = len(controllers) * len(whole)
-        print(f"{len(found)} of {count} crossings of a set are kept from before in {folder}", flush=True)
+        how = _HOW * evaluator.resolved
+        print(f"{len(found)} of {count} crossings of a set{how} are kept from before in {folder}", flush=True)
     episodes = evaluator.num_replicas * sum(len(whole[name]) for names in todo.values() for name in names)
     with tqdm(total=episodes, file=sys.stderr, dynamic_ncols=True, bar_format=_FORMAT, disable=None) as bar:
         for who, names in todo.items():
@@ -141,10 +160,11 @@ def _cross_missing(
         at_once = min(max(map(len, own.values())), _MOST_TERRAINS)
         with open_evaluator(replace(evaluator, num_terrains=at_once, space=space)) as evaluate:
             for name, chosen in own.items():
-                bar.set_description_str(f"{who} on {name}")
+                what = f"{who} on {name}{_HOW * evaluator.resolved}"
+                bar.set_description_str(what)
                 result = _cross(evaluate, chosen, evaluator.num_replicas, bar)
-                tell_invalid(result, f"{who} on {name}")
-                bar.write(_line(who, chosen, result))
+                tell_invalid(result, what)
+                bar.write(_line(what, chosen, result))
                 yield name, result
 
 
@@ -159,9 +179,9 @@ def _cross(evaluate: Evaluate, terrains: TerrainSet, num_replicas: int, bar: tqd
     return result
 
 
-def _line(who: str, terrains: TerrainSet, result: RolloutResult) -> str:
+def _line(what: str, terrains: TerrainSet, result: RolloutResult) -> str:
     rates = {name: values[~np.isnan(values)] for name, values in terrain_rates(result).items()}
     words = {"goal": "goal", "success": "no base collision"}
-    said = ", ".join(f"{what} {rates[name].mean():.3f}" for name, what in words.items() if len(rates[name]))
+    said = ", ".join(f"{word} {rates[name].mean():.3f}" for name, word in words.items() if len(rates[name]))
     size = f"{len(terrains)} terrains x {result.outcome.shape[1]} episodes in {result.wall_s:.0f} s"
-    return f"{who} on {terrains.name}: {said or 'all terrains invalid'} ({size})"
+    return f"{what}: {said or 'all terrains invalid'} ({size})"

@@ -18,6 +18,8 @@ class Distances(OfRobot, InSpace):
 
     archive: Path | None = None
     """Run of a search, or its archive.npz; results/<robot>/archive."""
+    independent: Path | None = None
+    """Run of another search, or its archive.npz, as in the evaluation: how far its elites lie."""
     split_seed: int = setting(0, least=0)
     """Which elites are held out, as in training and evaluation."""
     terrains: int | None = setting(None, least=1)
@@ -45,7 +47,16 @@ def distances(flags: Distances) -> dict[str, Any]:
     from sim.files.provenance import provenance
     from sim.robots.identity import robot_identity
     from sim.robots.robot import get_robot
-    from train.evaluate.sets import far_part, make_sets, nearest_distance, paper_terrains, space_of, split_elites
+    from train.evaluate.sets import (
+        INDEPENDENT,
+        far_part,
+        make_sets,
+        nearest_distance,
+        paper_terrains,
+        read_independent,
+        space_of,
+        split_elites,
+    )
 
     check(flags)
     found = get_robot(flags.robot)
@@ -54,8 +65,11 @@ def distances(flags: Distances) -> dict[str, Any]:
     split = split_elites(archive, robot, flags.split_seed, spec=found.spec, run=path)
     count = flags.terrains or paper_terrains(robot)
     space = space_of(archive)
-    both = ("hard_random", "generated")
-    sets = make_sets(both, count, flags.seed, archive=archive, split=split, space=space)
+    names, other = ["hard_random", "generated"], None
+    if flags.independent is not None:
+        names.append(INDEPENDENT)
+        other = read_independent(found, flags.independent, archive=archive, archive_path=path, named=flags.space)
+    sets = make_sets(names, count, flags.seed, archive=archive, split=split, independent=other, space=space)
     train = archive.genes[split.train]
     nearest = {name: nearest_distance(found.terrains, train, space) for name, found in sets.items()}
     nearest["generated_far"] = nearest["generated"][far_part(nearest["generated"])]
@@ -81,4 +95,4 @@ def _show(report: dict[str, Any]) -> None:
     print(f"RMS distance to the nearest of {report['trained_on']} elites trained on [cm]")
     for name, row in report["nearest_m"].items():
         numbers = "  ".join(f"{key} {100 * row[key]:.1f}" for key in ("median", "least", "largest"))
-        print(f"{name:<14} {row['terrains']:>4} terrains: {numbers}")
+        print(f"{name:<22} {row['terrains']:>4} terrains: {numbers}")

@@ -48,6 +48,27 @@ class Measured:
         return self.episodes > 0
 
 
+Families = NDArray[np.int64] | None
+"""Number of each terrain's family of kin, shape (T,); None of independent terrains."""
+
+
+def mean_of(values: NDArray[np.float64]) -> float | None:
+    """Mean over terrains, shape (T,), without the invalid ones, which are NaN; None without any."""
+    kept = values[~np.isnan(values)]
+    return float(kept.mean()) if len(kept) else None
+
+
+def interval_of(values: NDArray[np.float64], seed: int, families: Families) -> list[float] | None:
+    """95 % interval of :func:`mean_of`: bootstrap over terrains, or over their families."""
+    known = ~np.isnan(values)
+    return bootstrap_interval(values[known], seed, families=of_terrains(families, known))
+
+
+def of_terrains(families: Families, chosen: NDArray[np.bool_]) -> Families:
+    """Families of some of the terrains."""
+    return None if families is None else families[chosen]
+
+
 def invalid_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
     """What to say of invalid episodes, one line for each crossing of a set that has some.
 

@@ -24,6 +24,7 @@ _SETS = {
     "hard_random": "hard-random",
     "generated": "generated",
     "generated_far": "generated, far from training",
+    "generated_independent": "generated, another search",
 }
 _NONE = "-"
 
@@ -173,6 +174,8 @@ def _gpus(count: int) -> str:
 
 def _tables(found: dict[str, Any], robot: str) -> str:
     """Rates and rewards of every kind of controller, the mean of its seeds where it has several."""
+    if found.get("part") == "validation":
+        raise ValueError("tables.json is of validation terrains, by which settings are chosen: publish --part test")
     paper = published(robot) or {}
     rows = []
     for name, label in _SETS.items():
@@ -184,6 +187,7 @@ def _tables(found: dict[str, Any], robot: str) -> str:
             theirs = [paper.get(measure, {}).get(name, {}).get(kind) for measure in ("success", "reward")]
             beside = _NONE if None in theirs else f"{theirs[0]:.3f}, {theirs[1]:.1f}"
             rows.append((f"{label} ({count})", kind, *cells, reward, beside))
+        rows += _certified_rows(found, name, label)
     header = (
         "terrains",
         "controller",
@@ -195,7 +199,47 @@ def _tables(found: dict[str, Any], robot: str) -> str:
     about = found["archive"]
     where = f"; elites of the archive after {about['iterations']:,} iterations" if about else ""
     title = f"In brackets the terrains of a set; {found['episodes']} episodes each{where}."
-    return f"{title}\n\n{table(header, rows)}"
+    return "\n\n".join([f"{title}\n\n{table(header, rows)}", *_about_certified(found), *_resolved(found)])
+
+
+def _about_certified(found: dict[str, Any]) -> list[str]:
+    """What certified terrains are; nothing where none are known."""
+    if not any(about["terrains"] for about in found.get("certified", {}).values()):
+        return []
+    return [
+        "Certified terrains are those that the searched controller fails and another one crosses. They were chosen by "
+        "that, so the rate of a controller marked (searched) is too low there and that of a (certifier) too high."
+    ]
+
+
+def _certified_rows(found: dict[str, Any], name: str, label: str) -> list[tuple[str, ...]]:
+    """Rates on the certified terrains of a set alone; none where none are known."""
+    about = found.get("certified", {}).get(name)
+    if not about or not about["terrains"]:
+        return []
+    rows = []
+    for who in firsts(found["certified_goal"][name]):
+        role = about["chosen_by"].get(who)
+        cells = [_rate(found, measure, name, who) for measure in ("certified_goal", "certified_success")]
+        known = f"{kind_of(who)} ({role})" if role else kind_of(who)
+        rows.append((f"{label}, certified ({about['terrains']})", known, *cells, _NONE, _NONE))
+    return rows
+
+
+def _resolved(found: dict[str, Any]) -> list[str]:
+    """Rates with contact resolved, here and in MuJoCo C, and the bias of those above; nothing without them."""
+    rows = []
+    for key, how in (("resolved", "here"), ("mujoco_c", "MuJoCo C")):
+        for name, row in (found.get(key) or {}).items():
+            for who, one in row.items():
+                cells = []
+                for kind in ("goal", "success"):
+                    cells.append(value_words(one[kind], one["intervals"][kind]))
+                    cells.append(value_words(one[f"{kind}_bias"], one[f"{kind}_bias_interval"], "+.3f"))
+                rows.append((f"{_SETS[name]} ({one['terrains']})", who, how, *cells))
+    header = ("contact resolved", "controller", "in", "goal (95 %)", "bias", "no base collision (95 %)", "bias")
+    about = "The bias is how far the rates at the search's settings lie above those with contact resolved."
+    return [f"{about}\n\n{table(header, rows)}"] if rows else []
 
 
 def _rate(found: dict[str, Any], measure: str, name: str, who: str, form: str = ".3f") -> str:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,13 +22,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
-_WORDS = {"goal": "goal", "success": "no base collision", "fallen": "fallen", "reward": "reward"}
+_WORDS = {
+    "goal": "goal",
+    "success": "no base collision",
+    "fallen": "fallen",
+    "reward": "reward",
+    "certified_goal": "goal on certified terrains",
+    "certified_success": "no base collision on certified terrains",
+}
 """Measures in words: no base collision is what the paper calls success."""
 SET_LABELS = {
     "hand_crafted": "hand-crafted",
     "hard_random": "hard-random",
     "generated": "generated,\nheld out",
     "generated_far": "generated,\nfarthest third",
+    "generated_independent": "generated,\nindependent",
 }
 """Sets as axis labels."""
 
@@ -41,6 +50,7 @@ _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
 _CHANGES = {"mended": "#0072b2", "still_failing": "#bbbbbb", "newly_broken": "#d55e00"}
 _GALLERY, _GALLERY_COLUMNS = 12, 3  # terrains of a pack that are drawn
+_RESOLVED = {"resolved": "contact resolved", "mujoco_c": "MuJoCo C, contact resolved"}
 _PAPER_LABEL = "of that name in the paper"
 
 
@@ -69,9 +79,13 @@ def published_value(report: dict[str, Any], measure: str, name: str, who: str) -
 
 def print_tables(report: dict[str, Any]) -> None:
     """Prints ``tables.json``: every set with every controller, what became of terrains, and what nobody crossed."""
-    wide = 2 + max(12, *(len(who) for row in report["success"].values() for who in row))
+    if report.get("part") == "validation":
+        print("\nValidation terrains, to choose settings by. Rates to report are those of --part test.")
+    names = (label for name, row in report["success"].items() for label in (name, *row))
+    wide = 2 + max(12, *map(len, names))
     for name in report["success"]:
         _print_set(report, name, wide)
+    _print_certified(report, wide)
     if report["paper"] is not None:
         print("paper: its success rate, which is no base collision, and reward, where it has a controller of that name")
     _print_over_seeds(report["over_seeds"])
@@ -79,6 +93,8 @@ def print_tables(report: dict[str, Any]) -> None:
     _print_differences(report)
     for name, groups in report["traversable"].items():
         _print_traversable(name, groups, wide)
+    for key, how in _RESOLVED.items():
+        _print_resolved(report.get(key) or {}, how, wide)
     ended = {f"{who} on {name}": counts for name, row in report["outcomes"].items() for who, counts in row.items()}
     for line in invalid_lines(ended):
         print(line)
@@ -95,6 +111,51 @@ def _print_set(report: dict[str, Any], name: str, wide: int) -> None:
         paper = [published_value(report, measure, name, who) for measure in ("success", "reward")]
         cells.append("" if None in paper else "{:.3f}, {:.1f}".format(*paper))
         print(_row(who, cells, wide, 24))
+
+
+def _print_certified(report: dict[str, Any], wide: int) -> None:
+    """Certified terrains alone, with who certifies them."""
+    for name, about in report["certified"].items():
+        by = ", ".join(f"{who} {count}" for who, count in about["certifiers"].items())
+        print(
+            f"\n{name}: certified {about['terrains']} of {report['terrains'][name]} terrains, which the search's "
+            f"controller fails and another one crosses ({by})"
+        )
+        if about["terrains"]:
+            print(_row("", (_WORDS["goal"], _WORDS["success"]), wide + 12, 24))
+            for who in report["certified_goal"][name]:
+                cells = [
+                    value_words(report[key][name][who], report["intervals"][key][name][who])
+                    for key in ("certified_goal", "certified_success")
+                ]
+                print(_row(who + role_words(about, who), cells, wide + 12, 24))
+    roles = {role for about in report["certified"].values() for role in about["chosen_by"].values()}
+    if roles:
+        print("They were chosen by what these controllers did there in other episodes, so their rates are biased:")
+        print("; ".join(f"{role}: {_BIASED[role]}" for role in _BIASED if role in roles))
+
+
+_BIASED = {"searched": "downward, since it failed them all", "certifier": "upward, since it crossed some of them"}
+
+
+def role_words(about: dict[str, Any], who: str) -> str:
+    """What a controller has to do with how terrains were certified, in brackets; empty if nothing."""
+    role = about["chosen_by"].get(who)
+    return f" ({role})" if role else ""
+
+
+def _print_resolved(rows: dict[str, Any], how: str, wide: int) -> None:
+    """Rates of other crossings of the same terrains, and the bias of those above."""
+    if rows:
+        print(f"\n{how}: rates, and how far those at the search's settings lie above them (bias)")
+    for name, row in rows.items():
+        print(_row(name, (_WORDS["goal"], "bias", _WORDS["success"], "bias", "terrains"), wide, 26))
+        for who, found in row.items():
+            cells = []
+            for kind in ("goal", "success"):
+                cells.append(value_words(found[kind], found["intervals"][kind]))
+                cells.append(value_words(found[f"{kind}_bias"], found[f"{kind}_bias_interval"], "+.3f"))
+            print(_row(f"  {who}", (*cells, str(found["terrains"])), wide, 26))
 
 
 def _row(label: str, cells: Iterable[str], wide: int, each: int) -> str:
@@ -148,7 +209,7 @@ def _print_over_seeds(found: dict[str, Any]) -> None:
     print("\nmean over the controllers of a kind, and its 95 % t interval over them")
     for name in next(iter(found.values())):
         for kind in found[next(iter(found))][name]:
-            each = {measure: rows[name][kind] for measure, rows in found.items()}
+            each = {measure: rows[name][kind] for measure, rows in found.items() if name in rows}
             words = (
                 f"{_WORDS.get(measure, measure)} {value_words(one['mean'], one['interval'])}"
                 for measure, one in each.items()
@@ -250,17 +311,28 @@ def picture_of(report: dict[str, Any]) -> bytes:
 
 
 def draw_tables(report: dict[str, Any]) -> "Figure":
-    """Goal rate, no base collision and reward of controllers by set, with intervals, and what became of terrains."""
+    """Goal rate, no base collision and reward of controllers by set, with intervals, and what became of terrains.
+
+    Where there are such: the goal rate on certified terrains, and how far contact resolved is from it all.
+    """
     pairs = _pairs_from_first(report)
-    figure = new_figure(*((11.5, 8.0) if pairs else (13.0, 4.2)))
-    panels = np.ravel(figure.subplots(2, 2) if pairs else figure.subplots(1, 3))
+    certified = any(about["terrains"] for about in report["certified"].values())
+    more = [
+        *([lambda axes: _draw_changes(axes, report, pairs)] if pairs else []),
+        *([lambda axes: _draw_certified(axes, report)] if certified else []),
+        *([lambda axes: _draw_bias(axes, report)] if report.get("resolved") else []),
+    ]
+    figure, panels = _panels(len(_PANELS) + len(more))
     for axes, (measure, (label, factor)) in zip(panels, _PANELS.items(), strict=False):
         _draw_measure(axes, report, measure, factor)
         axes.set_ylabel(label)
-    if pairs:
-        _draw_changes(panels[3], report, pairs)
+    for axes, draw in zip(panels[len(_PANELS) :], more, strict=True):
+        draw(axes)
     sizes = "; ".join(f"{_on_one_line(name)}: {count}" for name, count in report["terrains"].items())
-    title = f"{report['robot']}: {report['episodes']} episodes on each terrain, 95 % intervals over terrains"
+    validation = ", validation" if report.get("part") == "validation" else ""
+    title = (
+        f"{report['robot']}{validation}: {report['episodes']} episodes on each terrain, 95 % intervals over terrains"
+    )
     figure.suptitle(f"{title}\nterrains: {sizes}", fontsize=11)
     found = [axes.get_legend_handles_labels() for axes in panels[: len(_PANELS)]]
     entries = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}
@@ -268,6 +340,57 @@ def draw_tables(report: dict[str, Any]) -> "Figure":
         entries[_PAPER_LABEL] = entries.pop(_PAPER_LABEL)
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=8, frameon=False)
     return figure
+
+
+def _panels(count: int) -> "tuple[Figure, list[Axes]]":
+    """A figure with so many panels: in one row, or in two."""
+    rows, columns, size = {3: (1, 3, (13.0, 4.2)), 4: (2, 2, (11.5, 8.0))}.get(count, (2, 3, (17.0, 8.4)))
+    figure = new_figure(*size)
+    return figure, [figure.add_subplot(rows, columns, place + 1) for place in range(count)]
+
+
+def _draw_certified(axes: "Axes", report: dict[str, Any]) -> None:
+    """Goal rates on certified terrains, with whose are biased."""
+    known = {name: about for name, about in report["certified"].items() if about["terrains"]}
+    rows = {"certified_goal": {name: report["certified_goal"][name] for name in known}}
+    _draw_measure(axes, {**report, **rows}, "certified_goal", 100.0)
+    labels = [f"{SET_LABELS[name]}\n({about['terrains']} certified)" for name, about in known.items()]
+    axes.set_xticks(range(len(known)), labels)
+    axes.set_ylabel("goal reached on certified terrains\n[% of episodes]")
+    roles = {who: role for about in known.values() for who, role in about["chosen_by"].items()}
+    ways = {"searched": "too low", "certifier": "too high"}
+    told = (f"{who} ({role}) is {ways[role]}" for who, role in roles.items())
+    axes.set_xlabel("\n".join(["by choice of the terrains:", *wrap(", ".join(told), 70)]) if roles else "")
+
+
+def _draw_bias(axes: "Axes", report: dict[str, Any]) -> None:
+    """How far goal rates at the search's settings lie above those with contact resolved."""
+    controllers = list(report["controllers"])
+    kinds = [kind_of(first) for first in firsts(controllers)]
+    columns = [(key, who) for key in _RESOLVED if report.get(key) for who in next(iter(report[key].values()))]
+    names, step = list(report["resolved"]), min(0.16, 0.7 / len(columns))
+    for index, (key, who) in enumerate(columns):
+        kind, shift = kinds.index(kind_of(who)), step * (index - (len(columns) - 1) / 2)
+        found = [(place, report[key][name][who]) for place, name in enumerate(names)]
+        found = [(place, one) for place, one in found if one["goal_bias"] is not None]
+        values = 100.0 * np.array([one["goal_bias"] for _, one in found])
+        limits = 100.0 * np.array([one["goal_bias_interval"] for _, one in found]).reshape(-1, 2)
+        lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)
+        axes.errorbar(
+            np.array([place for place, _ in found]) + shift, values, lengths, linestyle="", capsize=3,
+            marker=_MARKERS[kind % len(_MARKERS)], color=_COLOURS[kind % len(_COLOURS)],
+            markerfacecolor=None if key == "resolved" else "none", label=f"{who}: {_RESOLVED[key]}",
+        )  # fmt: skip
+    axes.axhline(0.0, color="0.4", linewidth=0.8)
+    axes.set_xticks(range(len(names)), [SET_LABELS[name] for name in names], fontsize=_tick_size(names))
+    axes.set_xlim(-0.5, len(names) - 0.5)
+    axes.set_ylabel("bias of the goal rate\n[points above contact resolved]")
+    axes.legend(frameon=False, fontsize=8, loc="best")
+    axes.grid(axis="y", alpha=0.3)
+
+
+def _tick_size(names: Sequence[str]) -> float:
+    return 10.0 if len(names) < 5 else 8.5
 
 
 def _on_one_line(name: str) -> str:
@@ -298,7 +421,7 @@ def _draw_measure(axes: "Axes", report: dict[str, Any], measure: str, factor: fl
             heights = [factor * value for value in paper if value is not None]
             style = {"markersize": 10, "markerfacecolor": "none", "color": "0.4"}
             axes.plot(np.array(known) + shift, heights, "D", label=_PAPER_LABEL, **style)
-    axes.set_xticks(range(len(names)), [SET_LABELS[name] for name in names])
+    axes.set_xticks(range(len(names)), [SET_LABELS[name] for name in names], fontsize=_tick_size(names))
     axes.set_xlim(-0.5, len(names) - 0.5)
     axes.grid(axis="y", alpha=0.3)
 

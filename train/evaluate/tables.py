@@ -19,37 +19,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.fitness import FAILING_GOAL_RATE
-from sim.files.intervals import MAX_T_VALUES, bootstrap_interval, t_interval, wilson_interval
+from sim.files.intervals import MAX_T_VALUES, t_interval, wilson_interval
 from sim.policy.spec import MARK, controller_hash, firsts, kind_of
 from sim.robots.robot import RobotCfg
-from train.evaluate.measures import MEASURES, Measured
+from train.evaluate.measures import MEASURES, Families, Measured, interval_of, mean_of, of_terrains
 from train.evaluate.publish import published
 from train.evaluate.sets import FROM_ARCHIVE, TerrainSet
 
 KINDS = ("mended", "still_failing", "newly_broken", "fine")
 """What may have become of a terrain."""
-RATES = ("success", "goal", "fallen")
+CERTIFIED = {"certified_goal": "goal", "certified_success": "success"}
+"""Measures on the certified terrains of a set alone, by what they measure: there goals can be gained."""
+RATES = ("success", "goal", "fallen", *CERTIFIED)
 """Measures that lie between 0 and 1, and so do their intervals."""
 Crossed = Mapping[str, Mapping[str, Measured]]
 """Set -> controller -> what it made of the set's terrains."""
 
 
-def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCfg, seed: int) -> dict[str, Any]:
+def make_tables(
+    crossed: Crossed,
+    sets: Mapping[str, TerrainSet],
+    robot: RobotCfg,
+    seed: int,
+    *,
+    hashes: Mapping[str, str | None] | None = None,
+) -> dict[str, Any]:
     """Everything that ``tables.json`` says of crossings, as JSON values.
+
+    Args:
+        crossed: What controllers made of the terrains.
+        sets: The terrains.
+        robot: The robot.
+        seed: Of bootstraps.
+        hashes: Of the controllers by name, to tell which of them certify or were searched.
 
     Returns:
         ``success``, ``goal``, ``fallen`` (fractions), ``reward`` (sum over 20 s): set -> controller -> mean;
         ``penalties``: set -> controller -> penalty -> mean, scaled; ``intervals``: the same five with [lower, upper];
+        ``certified_goal`` and ``certified_success`` likewise, of sets whose elites have certificates, on the certified
+        ones alone, with ``intervals``, and about them ``certified`` (:func:`about_certified`);
         ``outcomes`` and ``invalid_terrains``: counts; ``over_seeds``: mean over the controllers of a kind
         (:func:`over_seeds`); ``differences`` of every two kinds' first controllers by set
         (:func:`differences`); ``traversable`` by generated set (:func:`split_by_goal`); ``terrains``: set ->
         number of terrains; ``paper``: the paper's numbers likewise, None of a robot it has none of; ``reward_weights``.
     """
-    means, families = _statistics(crossed, lambda _, values: _mean(values)), _families(sets)
+    means, families = _statistics(crossed, lambda _, values: mean_of(values)), _families(sets)
+    certified = _on_certified(crossed, sets, lambda values, _: mean_of(values))
     return {
         **means,
-        "over_seeds": over_seeds(means, MEASURES),
-        "intervals": _statistics(crossed, lambda name, values: _interval(values, seed, families[name])),
+        **certified,
+        "certified": about_certified(sets, hashes or {}),
+        "over_seeds": over_seeds({**means, **certified}, (*MEASURES, *CERTIFIED)),
+        "intervals": {
+            **_statistics(crossed, lambda name, values: interval_of(values, seed, families[name])),
+            **_on_certified(crossed, sets, lambda values, families: interval_of(values, seed, families)),
+        },
         "terrains": {name: len(chosen) for name, chosen in sets.items()},
         "outcomes": _by_controller(crossed, lambda one: one.outcomes),
         "invalid_terrains": _by_controller(crossed, lambda one: int((~one.valid).sum())),
@@ -70,11 +94,53 @@ def make_tables(crossed: Crossed, sets: Mapping[str, TerrainSet], robot: RobotCf
     }
 
 
-Families = NDArray[np.int64] | None
-
-
 def _families(sets: Mapping[str, TerrainSet]) -> dict[str, Families]:
     return {name: chosen.families for name, chosen in sets.items()}
+
+
+def _on_certified(
+    crossed: Crossed, sets: Mapping[str, TerrainSet], of: Callable[[NDArray[np.float64], Families], Any]
+) -> dict[str, Any]:
+    """Each of :data:`CERTIFIED`: set -> controller -> what ``of`` makes of certified terrains and their families."""
+    members = {name: one.certificates.certified for name, one in sets.items() if one.certificates is not None}
+    return {
+        key: {
+            name: {
+                who: of(one.values[measure][member], of_terrains(sets[name].families, member))
+                for who, one in crossed[name].items()
+            }
+            for name, member in members.items()
+        }
+        for key, measure in CERTIFIED.items()
+    }
+
+
+def about_certified(sets: Mapping[str, TerrainSet], hashes: Mapping[str, str | None]) -> dict[str, Any]:
+    """What certified terrains there are, and whose rates on them are biased by how they were chosen.
+
+    Args:
+        sets: The terrains.
+        hashes: Of the controllers by name.
+
+    Returns:
+        Set -> number of certified ``terrains``; ``certifiers``, name -> how many of them it certifies; ``chosen_by``,
+        controller -> ``certifier``, which crossed some of them to certify them, or ``searched``, which failed them
+        all: the rate of the first is biased upward, that of the other downward.
+    """
+    found = {}
+    for name, chosen in sets.items():
+        given = chosen.certificates
+        if given is not None:
+            counts = dict(zip(given.certifiers, given.given.sum(axis=0).tolist(), strict=True))
+            of_hash = dict(zip(given.sha256, given.certifiers, strict=True))
+            roles = {given.searched_sha256: "searched"}
+            roles |= {sha256: "certifier" for sha256, who in of_hash.items() if counts[who]}
+            found[name] = {
+                "terrains": int(given.certified.sum()),
+                "certifiers": counts,
+                "chosen_by": {who: roles[sha] for who, sha in hashes.items() if sha is not None and sha in roles},
+            }
+    return found
 
 
 def split_by_goal(
@@ -102,9 +168,12 @@ def split_by_goal(
     for name, member in (("crossed", ever & judged), ("never_crossed", ~ever & judged)):
         found[name] = {
             **_counted(member, judged, numbers, seed, families),
-            **{key: {who: _mean(one.values[key][member]) for who, one in row.items()} for key in MEASURES},
+            **{key: {who: mean_of(one.values[key][member]) for who, one in row.items()} for key in MEASURES},
             "intervals": {
-                key: {who: _interval(one.values[key][member], seed, _of(families, member)) for who, one in row.items()}
+                key: {
+                    who: interval_of(one.values[key][member], seed, of_terrains(families, member))
+                    for who, one in row.items()
+                }
                 for key in MEASURES
             },
         }
@@ -145,7 +214,7 @@ def difference(
             found[kind]["clear"] = int((member & apart).sum())
     gains = {name: (after.values[name] - before.values[name])[both] for name in MEASURES}
     found["gain"] = {
-        name: {"mean": _mean(gain), "interval": _interval(gain, seed, _of(families, both))}
+        name: {"mean": mean_of(gain), "interval": interval_of(gain, seed, of_terrains(families, both))}
         for name, gain in gains.items()
     }
     return found
@@ -171,8 +240,8 @@ def _counted(
     shares = member[among].astype(float)
     return {
         "count": int(member.sum()),
-        "share": _mean(shares),
-        "interval": _interval(shares, seed, _of(families, among)),
+        "share": mean_of(shares),
+        "interval": interval_of(shares, seed, of_terrains(families, among)),
         "terrains": np.sort(numbers[member]).tolist(),
     }
 
@@ -255,17 +324,3 @@ def _statistics(crossed: Crossed, of: Callable[[str, NDArray[np.float64]], Any])
 def _by_controller(crossed: Crossed, of: Callable[[Measured], Any]) -> dict[str, dict[str, Any]]:
     """Set -> controller -> what ``of`` makes of what it made of the set."""
     return {name: {who: of(one) for who, one in row.items()} for name, row in crossed.items()}
-
-
-def _mean(values: NDArray[np.float64]) -> float | None:
-    kept = values[~np.isnan(values)]
-    return float(kept.mean()) if len(kept) else None
-
-
-def _of(families: Families, chosen: NDArray[np.bool_]) -> Families:
-    return None if families is None else families[chosen]
-
-
-def _interval(values: NDArray[np.float64], seed: int, families: Families) -> list[float] | None:
-    known = ~np.isnan(values)
-    return bootstrap_interval(values[known], seed, families=_of(families, known))

@@ -7,8 +7,9 @@ from qd.show.crossed import ARRIVED, FAILED, Crossed
 from qd.show.crossing_figures import draw_maps
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, Folded, Picture, absent, counted, heading, paragraph, percent, picture, table
-from qd.show.report.tables import CHANGES, GENERATED, LABELS, MEASURES, Change, Changes, by_kind
+from qd.show.report.tables import CERTIFIED, CHANGES, GENERATED, LABELS, MEASURES, RESOLVED, Change, Changes, by_kind
 from sim.files.command import plain_command
+from sim.files.intervals import value_words
 from sim.files.provenance import without_machine
 
 _TRAINED_ON = {
@@ -32,6 +33,8 @@ def tables_section(shown: Shown) -> list[Block]:
         paragraph(_told(tables, kinds)),
         *([paragraph(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
         *(measure_table(kinds, measure) for measure in MEASURES),
+        *certified_table(kinds),
+        *resolved_table(tables),
         Folded("Show the figure", drawn) if (drawn := _drawn(shown.material.tables_file.with_suffix(".png"))) else "",
         Folded("Show what became of terrains", changes) if (changes := changes_tables(tables)) else "",
         *before_after(shown),
@@ -137,6 +140,12 @@ def _value(tables: dict[str, Any], measure: str, name: str, who: str) -> str:
         return "-"
     if measure == "reward":
         return f"{value:.1f}" + (f" ({limits[0]:.1f} to {limits[1]:.1f})" if limits else "")
+    return _with_limits(value, limits)
+
+
+def _with_limits(value: float | None, limits: list[float] | None) -> str:
+    if value is None:
+        return "-"
     return percent(value) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
 
 
@@ -150,6 +159,62 @@ def measure_table(tables: dict[str, Any], measure: str) -> str:
     controllers = list(tables["controllers"])
     rows = [[_label(name), *(_value(tables, measure, name, who) for who in controllers)] for name in tables[measure]]
     return table([MEASURES[measure], *controllers], rows)
+
+
+def certified_table(kinds: dict[str, Any]) -> list[Block]:
+    """Goal rate and no base collision on certified terrains alone; nothing where none are known.
+
+    Args:
+        kinds: By kind of controller (:func:`qd.show.report.tables.by_kind`).
+    """
+    known = {name: about for name, about in (kinds.get("certified") or {}).items() if about["terrains"]}
+    if not known:
+        return []
+    rows = [
+        [f"{_label(name)} ({about['terrains']} certified): {words}",
+         *(_value(kinds, key, name, who) + _role(about, all_) for who, all_ in kinds["members"].items())]
+        for name, about in known.items() for key, words in CERTIFIED.items()
+    ]  # fmt: skip
+    text = (
+        "Certified terrains alone, which the searched controller fails and another one crosses: there goals can be "
+        "gained. The rate of a controller that was searched is too low there and that of a certifier too high, since "
+        "the terrains were chosen by what they do."
+    )
+    return [paragraph(text), table(["certified terrains", *kinds["members"]], rows)]
+
+
+def _role(about: dict[str, Any], members: list[str]) -> str:
+    """What controllers have to do with how terrains were certified, after a comma; empty if nothing."""
+    return "".join(
+        f", {role}" for role in sorted({about["chosen_by"][who] for who in members if who in about["chosen_by"]})
+    )
+
+
+def resolved_table(tables: dict[str, Any]) -> list[Block]:
+    """Goal rates with contact resolved, and the bias of the others against them; nothing where nobody looked.
+
+    Args:
+        tables: The evaluation's.
+    """
+    rows = [
+        [f"{_label(name)} ({one['terrains']}): {who}, {how}", _with_limits(one["goal"], one["intervals"]["goal"]),
+         _points(one["goal_bias"], one["goal_bias_interval"])]
+        for key, how in RESOLVED.items() for name, row in (tables.get(key) or {}).items() for who, one in row.items()
+    ]  # fmt: skip
+    if not rows:
+        return []
+    text = (
+        "The same terrains with contact resolved (steps of 1 ms, a time constant of 3 ms), here and in MuJoCo C. The "
+        "bias is how far the rate at the search's settings lies above that."
+    )
+    return [paragraph(text), table(["contact resolved", "goal reached", "bias"], rows)]
+
+
+def _points(value: float | None, limits: list[float] | None) -> str:
+    """A difference of rates in points, as people read it."""
+    if value is None:
+        return "-"
+    return value_words(100.0 * value, limits and [100.0 * limit for limit in limits], "+.1f") + " points"
 
 
 def changes_tables(tables: dict[str, Any]) -> list[Block]:

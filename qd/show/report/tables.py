@@ -29,8 +29,13 @@ LABELS = {
     "hard_random": "hard-random",
     GENERATED: "generated, held out",
     FAR: "generated, farthest third",
+    "generated_independent": "generated, another search",
 }
 """Sets in words."""
+CERTIFIED = {"certified_goal": "goal reached", "certified_success": "no base collision"}
+"""Measures on certified terrains alone, in words."""
+RESOLVED = {"resolved": "contact resolved", "mujoco_c": "MuJoCo C"}
+"""Other crossings of the same terrains, both with contact resolved."""
 _KINDS = ("mended", "newly_broken", "still_failing")
 _MENDED = 2  # terrains shown of that kind; of each other one
 _CONTROLLERS = ("*.pt", "*.onnx")  # files beside the tables that may be one
@@ -58,6 +63,10 @@ def read_tables(file: Path, robot: RobotCfg) -> dict[str, Any]:
     if tables["robot"] != robot.name:
         raise ValueError(
             f"{file} is of robot {tables['robot']}, got --robot {robot.name}: give that robot or other tables"
+        )
+    if tables.get("part") == "validation":
+        raise ValueError(
+            f"{file} is of validation terrains, by which settings are chosen: make tables to report with {writer}"
         )
     check_robot(tables, robot, file, f"make them anew with {writer}")
     return tables
@@ -87,6 +96,16 @@ def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     yield from ((measure, values) for measure in MEASURES)
     yield "intervals", dict.fromkeys(MEASURES, intervals)
     yield "over_seeds", {...: {...: {...: {"mean": _NUMBER, "interval": list | None}}}}
+    # What older tables do not have.
+    if tables.get("certified"):
+        yield "certified", {...: {"terrains": int, "chosen_by": {...: str}}}
+        of_sets = dict.fromkeys(tables["certified"], dict.fromkeys(tables["controllers"], _NUMBER))
+        yield from ((measure, of_sets) for measure in CERTIFIED)
+        limits = dict.fromkeys(tables["certified"], dict.fromkeys(tables["controllers"], list | None))
+        yield "intervals", dict.fromkeys(CERTIFIED, limits)
+    rates = {f"goal{what}": kind for what, kind in (("", _NUMBER), ("_bias", _NUMBER), ("_bias_interval", list | None))}
+    known = (key for key in RESOLVED if tables.get(key))
+    yield from ((key, {...: {...: {"terrains": int, **rates, "intervals": {"goal": list | None}}}}) for key in known)
 
 
 def _fits(shape: Any, value: Any) -> bool:
@@ -110,15 +129,15 @@ def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
 
     Returns:
         The same, but for ``controllers``, measures and ``intervals``: of a kind of several those are the mean over them
-        and the interval of that, under the kind's name with the number of its seeds.
+        and the interval of that, under the kind's name with the number of its seeds. ``members`` says who is of it.
     """
     members: dict[str, list[str]] = {}
     for who in tables["controllers"]:
         members.setdefault(kind_of(who), []).append(who)
     labels = {f"{kind} ({len(all_)} seeds)" if len(all_) > 1 else all_[0]: all_ for kind, all_ in members.items()}
     found = {**tables, "controllers": {label: tables["controllers"][all_[0]] for label, all_ in labels.items()}}
-    found["intervals"] = dict(tables["intervals"])
-    for measure in MEASURES:
+    found |= {"members": labels, "intervals": dict(tables["intervals"])}
+    for measure in (*MEASURES, *(CERTIFIED if tables.get("certified") else ())):
         values, limits = {}, {}
         for name in tables[measure]:
             several = tables["over_seeds"].get(measure, {}).get(name, {})

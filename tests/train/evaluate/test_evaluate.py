@@ -17,9 +17,10 @@ from sim.policy.spec import controllers_of
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
+from tests.train.starts import write_trained
 from train.evaluate.crossings import cross_all
 from train.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, evaluator_of
-from train.evaluate.sets import make_sets, split_elites
+from train.evaluate.sets import FROM_ARCHIVE, SETS, make_sets, split_elites
 
 PROTOTYPE = "tests.sim.policies:stretch"
 STANDER = "tests.sim.policies:stand"
@@ -80,8 +81,9 @@ def test_the_tables_from_end_to_end(tmp_path, archive, capsys):
         assert all(len(limits) == 2 for row in written["intervals"][name].values() for limits in row.values())
     assert list(written["penalties"]["generated"]["C-G"]) == list(get_robot("anymal").penalties)
     assert written["archive"] == {
-        "path": str(archive), "elites": 30, "iterations": 3, "train": 24, "test": 6, "split_seed": 0,
+        "path": str(archive), "elites": 30, "iterations": 3, "train": 22, "validation": 2, "test": 6, "split_seed": 0,
     }  # fmt: skip
+    assert (written["part"], written["independent"], written["resolved"], written["mujoco_c"]) == ("test", *[None] * 3)
     assert written["terrains"] == {"hand_crafted": 4, "hard_random": 4, "generated": 4, "generated_far": 2}
     assert written["archive_sha256"] == hashlib.sha256((archive / "archive.npz").read_bytes()).hexdigest()
     assert written["controllers"]["C-G"]["policy"] == PROTOTYPE
@@ -102,6 +104,52 @@ def test_all_controllers_meet_the_same_terrains_and_starts(tmp_path, archive):
     for name in ("success", "goal", "fallen", "reward", "penalties"):
         assert all(row["a"] == row["b"] for row in report[name].values())
     assert report["reward"]["hand_crafted"]["a"] > 0.0
+
+
+def test_elites_of_another_search_are_a_set_of_their_own(tmp_path, archive, capsys):
+    other = tmp_path / "other"
+    other.mkdir()
+    write_archive(other / "archive.npz", make_archive(9, seed=1))
+    report = evaluate_tables(
+        config(tmp_path, archive=archive, independent=other, terrains=4), open_evaluator=Crossings().open
+    )
+    assert list(report["goal"]) == list(SETS) and report["terrains"]["generated_independent"] == 4
+    about = report["independent"]
+    assert (about["path"], about["elites"], about["search_seed"]) == (str(other), 9, None)
+    assert about["sha256"] == hashlib.sha256((other / "archive.npz").read_bytes()).hexdigest()
+    assert report["traversable"].keys() == set(FROM_ARCHIVE)
+    assert "generated_independent: 4 terrains x 2 episodes" in capsys.readouterr().out
+    alone = evaluate_tables(
+        config(tmp_path, independent=other, sets=("generated_independent",)), open_evaluator=Crossings().open
+    )
+    assert list(alone["goal"]) == ["generated_independent"] and alone["archive"] is None
+
+
+def test_a_controller_that_was_trained_on_the_other_search_is_refused(tmp_path, archive):
+    other = make_archive(9, seed=1)
+    write_archive(tmp_path / "other.npz", other)
+    policy = write_trained(tmp_path, other.genes[:1])  # which may not be among those drawn
+    cfg = config(tmp_path, policies=(f"C-G={policy}",), archive=archive, independent=tmp_path / "other.npz")
+    with pytest.raises(ValueError, match=r"C-G was trained on 1 of the 9 elites of --independent .*other.npz: give a"):
+        evaluate_tables(cfg, open_evaluator=None)  # pyright: ignore[reportArgumentType] - nothing is crossed
+
+
+def test_settings_are_chosen_on_terrains_that_are_not_reported(tmp_path, archive, capsys):
+    split = split_elites(make_archive(30), "anymal")
+    cfg = config(tmp_path, archive=archive, part="validation", terrains=4)
+    report = evaluate_tables(cfg, open_evaluator=Crossings().open)
+    assert (tmp_path / "tables" / "validation.json").exists() and not (tmp_path / "tables" / "tables.json").exists()
+    assert report["part"] == "validation" and report["terrains"]["generated"] == 2
+    groups = report["traversable"]["generated"]
+    assert set(groups["crossed"]["terrains"] + groups["never_crossed"]["terrains"]) == set(split.validation.tolist())
+    assert "Validation terrains, to choose settings by." in capsys.readouterr().out
+    policy = write_trained(tmp_path, make_archive(30).genes[split.validation[:1]])
+    with pytest.raises(ValueError, match=r"on 1 of the 2 elites .* for validation: .* must be trained anew"):
+        evaluate_tables(
+            config(tmp_path, policies=(f"C-G={policy}",), archive=archive, part="validation"),
+            open_evaluator=None,  # pyright: ignore[reportArgumentType] - nothing is crossed
+        )
+    assert Evaluate(part="validation").makes_tables and not Evaluate().makes_tables
 
 
 def test_rates_of_one_controller_go_under_runs(tmp_path, monkeypatch, capsys):
@@ -201,7 +249,15 @@ def test_sizes(capsys):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--sets", "easy"], "sets must be some of hand_crafted, hard_random, generated, generated_far, got easy"),
+        (
+            ["--sets", "easy"],
+            "sets must be some of hand_crafted, hard_random, generated, generated_far, generated_independent, got easy",
+        ),
+        (["--sets", "generated_independent"], "give its run (--independent RUN)"),
+        (["--independent", "{folder}/none"], "no archive at {folder}/none"),
+        (["--independent", "{folder}/cassie"], "must be of robot 'anymal', got one of 'cassie'"),
+        (["--archive", "{folder}/good", "--independent", "{folder}/good"], "must share no elite with --archive"),
+        (["--part", "validation", "--independent", "{folder}/good"], "no setting is chosen by them"),
         (
             ["--sets", "generated"],
             "generated is made of elites: give the run that found them (--archive ",

@@ -67,6 +67,40 @@ def test_what_the_results_say_stands_beside_the_papers(results):
     assert "| 100 | 1.50 (1.40 to 1.60) | 3.25 (3.10 to 3.40) |" in cassie
 
 
+def test_certified_terrains_and_contact_resolved_stand_there_where_they_are_known(results):
+    base, tuned = {"base": 0.1, "C-G": 0.8, "C-G@1": 0.9}, {"base": [0.0, 0.2], "C-G": [0.7, 0.9], "C-G@1": [0.8, 1.0]}
+    one = {
+        "terrains": 300, "goal": 0.75, "success": 0.9, "intervals": {"goal": [0.7, 0.8], "success": [0.8, 1.0]},
+        "goal_bias": 0.05, "goal_bias_interval": [0.01, 0.09], "success_bias": 0.0,
+        "success_bias_interval": [-0.1, 0.1],
+    }  # fmt: skip
+    more = {
+        **TABLES, "part": "test",
+        "certified": {"generated": {"terrains": 40, "chosen_by": {"base": "searched", "C-G": "certifier"}}},
+        "certified_goal": {"generated": base}, "certified_success": {"generated": base},
+        "intervals": {
+            **TABLES["intervals"], "certified_goal": {"generated": tuned}, "certified_success": {"generated": tuned},
+        },
+        "resolved": {"generated": {"C-G": one}}, "mujoco_c": {"generated": {"C-G": {**one, "terrains": 60}}},
+    }  # fmt: skip
+    (results / "anymal" / "tables.json").write_text(json.dumps(more))
+    said = numbers_of(results)
+    for line in (
+        "| generated, certified (40) | base (searched) | 0.100 (0.000 to 0.200) | 0.100 (0.000 to 0.200) | - | - |",
+        "| generated, certified (40) | C-G (certifier) | 0.800 (0.700 to 0.900) |",
+        "a controller marked (searched) is too low there and that of a (certifier) too high",
+        "| generated (300) | C-G | here | 0.750 (0.700 to 0.800) | +0.050 (+0.010 to +0.090) | 0.900 (0.8",
+        "| generated (60) | C-G | MuJoCo C |",
+    ):
+        assert line in said
+
+
+def test_numbers_that_settings_were_chosen_by_are_not_published(results):
+    (results / "anymal" / "tables.json").write_text(json.dumps({**TABLES, "part": "validation"}))
+    with pytest.raises(ValueError, match="validation terrains, by which settings are chosen"):
+        numbers_of(results)
+
+
 def test_a_kind_whose_controllers_all_have_a_seed_in_their_name_is_there(results):
     renamed = json.loads(json.dumps(TABLES).replace('"C-G": ', '"C-G@0": '))
     renamed["over_seeds"] = TABLES["over_seeds"]

@@ -15,8 +15,8 @@ from qd.archive import Archive, read_archive, write_archive
 from sim.bank import heights_of
 from sim.space import SUPER_GAUSSIAN
 from sim.spaces.course import COURSE
-from tests.train.archives import make_archive
-from tests.train.starts import PPO, write_actor
+from tests.train.archives import certified_archive, make_archive
+from tests.train.starts import PPO, write_actor, write_trained
 from train.evaluate.distances import Distances, distances
 from train.evaluate.evaluate import Evaluate, evaluate_tables
 from train.evaluate.sets import (
@@ -25,12 +25,14 @@ from train.evaluate.sets import (
     check_held_out,
     far_part,
     generated_set,
+    independent_set,
     make_sets,
     marks_of,
     nearest_distance,
     paper_terrains,
     part_of,
     plain_set,
+    read_independent,
     recorded_marks,
     set_rng,
     split_elites,
@@ -44,36 +46,49 @@ def genes_in(archive: Archive, rows: np.ndarray) -> set[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("robot", "elites", "train", "test"),
+    ("robot", "elites", "train", "validation", "test"),
     [
-        ("anymal", 1129, 750, 300),  # the paper's
-        ("cassie", 930, 750, 180),  # the paper's: none is left over
-        ("anymal", 1050, 750, 300),
-        ("anymal", 1049, 839, 210),  # one too few: 80 % and 20 %
-        ("anymal", 391, 313, 78),
-        ("anymal", 5, 4, 1),
+        ("anymal", 1129, 750, 75, 300),  # the paper's; 79 are left over, of which 75 are for validation
+        ("cassie", 930, 675, 75, 180),  # none is left over: training has so many fewer
+        ("anymal", 1050, 675, 75, 300),
+        ("anymal", 1080, 705, 75, 300),  # 30 are left over
+        ("anymal", 1049, 755, 84, 210),  # one too few: 80 % and 20 %
+        ("anymal", 391, 282, 31, 78),
+        ("anymal", 5, 3, 1, 1),
     ],
 )
-def test_sizes_of_the_parts(robot, elites, train, test):
+def test_sizes_of_the_parts(robot, elites, train, validation, test):
     split = split_elites(make_archive(elites, robot=robot), robot)
-    assert (len(split.train), len(split.test)) == (train, test)
-    together = np.concatenate([split.train, split.test])
-    assert len(np.unique(together)) == train + test and together.min() >= 0 and together.max() < elites
+    assert (len(split.train), len(split.validation), len(split.test)) == (train, validation, test)
+    together = np.concatenate([split.train, split.validation, split.test])
+    assert len(np.unique(together)) == len(together) and together.min() >= 0 and together.max() < elites
+
+
+def test_the_test_part_is_what_it_was_before_there_was_a_validation_part():
+    split = split_elites(make_archive(60), "anymal")
+    assert split.test.tolist() == [10, 38, 31, 54, 32, 52, 26, 40, 55, 6, 47, 45]  # as versions without it had it
+    assert split.train[:5].tolist() == [59, 48, 1, 16, 50]
+    older = split_elites(make_archive(60), "anymal", keep_validation=False)
+    np.testing.assert_array_equal(older.test, split.test)
+    np.testing.assert_array_equal(older.train, np.concatenate([split.train, split.validation]))
+    assert len(older.train) == 48 and not len(older.validation)
 
 
 def test_a_split_follows_from_the_elites_and_the_seed_alone():
     archive = make_archive(60)
     first = split_elites(archive, "anymal")
-    make_sets(SETS, 3, 0, archive=archive, split=first)  # nor from what was drawn before
+    make_sets(SETS[:4], 3, 0, archive=archive, split=first)  # nor from what was drawn before
     again = split_elites(archive, "anymal")
     np.testing.assert_array_equal(first.test, again.test)
     np.testing.assert_array_equal(first.train, again.train)
+    np.testing.assert_array_equal(first.validation, again.validation)
     # The same elites in another order, as after evaluating them again: the same ones are held out, in the same order.
     order = np.random.default_rng(0).permutation(60)
     shuffled = archive.rows(order)
     other = split_elites(shuffled, "anymal")
     np.testing.assert_array_equal(order[other.test], first.test)
     np.testing.assert_array_equal(order[other.train], first.train)
+    np.testing.assert_array_equal(order[other.validation], first.validation)
 
 
 def test_another_seed_or_archive_is_another_draw():
@@ -118,21 +133,96 @@ def test_hard_random_terrains_are_of_the_space_that_is_named():
 
 def test_a_set_is_the_same_whenever_it_is_made():
     archive = make_archive(60)
-    split = split_elites(archive, "anymal")
-    all_at_once = make_sets(SETS, 6, 0, archive=archive, split=split)
+    given = {"archive": archive, "split": split_elites(archive, "anymal"), "independent": make_archive(20, seed=1)}
+    all_at_once = make_sets(SETS, 6, 0, **given)
     assert tuple(all_at_once) == SETS
     for name in SETS:
-        alone = make_sets([name], 6, 0, archive=archive, split=split)[name]
+        alone = make_sets([name], 6, 0, **given)[name]
         np.testing.assert_array_equal(alone.terrains, all_at_once[name].terrains)
         np.testing.assert_array_equal(alone.seeds, all_at_once[name].seeds)
         np.testing.assert_array_equal(alone.numbers, all_at_once[name].numbers)
-    other = make_sets(SETS, 6, 1, archive=archive, split=split)
-    assert (other["hand_crafted"].terrains != all_at_once["hand_crafted"].terrains).any()
-    assert (other["hard_random"].terrains != all_at_once["hard_random"].terrains).any()
+    other = make_sets(SETS, 6, 1, **given)
+    for name in ("hand_crafted", "hard_random", "generated_independent"):
+        assert (other[name].terrains != all_at_once[name].terrains).any()
     np.testing.assert_array_equal(
         other["generated"].terrains, all_at_once["generated"].terrains
     )  # held out all the same
     assert (other["generated"].seeds != all_at_once["generated"].seeds).all()
+
+
+def test_validation_sets_have_other_terrains_and_starts():
+    archive = make_archive(60)
+    split = split_elites(archive, "anymal")
+    test, validation = (
+        make_sets(SETS[:4], 6, 0, archive=archive, split=split, part=part) for part in ("test", "validation")
+    )
+    assert validation["generated"].numbers.tolist() == split.validation.tolist()
+    assert not genes_in(archive, validation["generated"].numbers) & genes_in(archive, split.train)
+    for name in SETS[:4]:
+        assert not {one.tobytes() for one in test[name].terrains} & {one.tobytes() for one in validation[name].terrains}
+        assert not set(test[name].seeds.tolist()) & set(validation[name].seeds.tolist())
+        assert len(validation[name])
+
+
+def test_independent_terrains_are_drawn_from_all_elites_whatever_their_order():
+    other = make_archive(20, seed=1)
+    few, all_ = (independent_set(other, count, 0) for count in (6, 300))
+    assert sorted(all_.numbers.tolist()) == list(range(20)) and all_.families.shape == (20,)
+    np.testing.assert_array_equal(few.numbers, all_.numbers[:6])
+    np.testing.assert_array_equal(few.seeds, all_.seeds[:6])
+    order = np.random.default_rng(0).permutation(20)
+    np.testing.assert_array_equal(independent_set(other.rows(order), 6, 0).terrains, few.terrains)
+
+
+def write_run(folder: Path, archive: Archive, seed: int | None = None) -> Path:
+    """A run with its config, as far as it is read for the seed."""
+    folder.mkdir()
+    write_archive(folder / "archive.npz", archive)
+    if seed is not None:
+        own = {"settings": {"seed": seed, "robot_sha256": None}, "iterations": 3, "device": "CPU", "sessions": []}
+        (folder / "config.json").write_text(json.dumps(own))
+    return folder
+
+
+def test_an_independent_archive_is_of_another_search(tmp_path, anymal):
+    archive = make_archive(20)
+    trained = write_run(tmp_path / "trained", archive, seed=0)
+    other = write_run(tmp_path / "other", make_archive(20, seed=1), seed=1)
+
+    def read(path):
+        return read_independent(anymal, path, archive=archive, archive_path=trained)
+
+    assert len(read(other)) == 20
+    assert len(read(other / "archive.npz")) == 20
+    assert len(read(write_run(tmp_path / "unknown", make_archive(9, seed=3)))) == 9  # nothing says its seed
+    assert len(read_independent(anymal, trained)) == 20  # of nothing that was trained on
+    same_seed = write_run(tmp_path / "same-seed", make_archive(20, seed=2), seed=0)
+    grown = make_archive(20, seed=4)
+    grown.genes[3] = archive.genes[5]
+    for path, message in (
+        (trained, r"share no elite with --archive .*trained, got .*trained with 20 of its 20 in both"),
+        (write_run(tmp_path / "kin", grown, seed=5), r"got .*kin with 1 of its 20 in both: give the run of a search"),
+        (same_seed, r"of another search seed than --archive .*, got seed 0 in both .*same-seed and there"),
+        (write_run(tmp_path / "cassie", make_archive(9, robot="cassie")), "robot 'anymal', got one of 'cassie'"),
+        (write_run(tmp_path / "empty", make_archive(0)), "must be a search that found something, got .*empty"),
+        (
+            write_run(tmp_path / "course", replace(make_archive(9), space="course", genes=COURSE.hard_random(9, 0))),
+            "of the terrain space of --archive .*, super_gaussian, got .*course of course",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(path)
+
+
+def test_elites_carry_the_certificates_of_their_rows():
+    archive = certified_archive(30, 20, {"C-G": "a" * 64})
+    split = split_elites(archive, "anymal")
+    given = generated_set(archive, split, 300, 0).certificates
+    np.testing.assert_array_equal(given.certified, split.test < 20)
+    assert (given.certifiers, given.searched_sha256) == (("C-G",), "f" * 64)
+    part = part_of(generated_set(archive, split, 300, 0), np.array([2, 0]), "generated_far")
+    np.testing.assert_array_equal(part.certificates.certified, split.test[[2, 0]] < 20)
+    assert generated_set(make_archive(30), split, 300, 0).certificates is None
 
 
 def test_generated_terrains_are_those_held_out():
@@ -191,6 +281,7 @@ def test_distance_is_the_root_mean_square_over_all_nodes(monkeypatch):
         ([], "got none"),
         (["hard_random", "hard_random"], "named once, got hard_random, hard_random"),
         (["hand_crafted", "generated"], r"generated is made of elites: give the run that found them \(--archive RUN\)"),
+        (["generated_independent"], r"elites of another search than the one trained on.*\(--independent RUN\)"),
     ],
 )
 def test_sets_that_cannot_be_had_are_refused(names, message):
@@ -203,12 +294,6 @@ def test_the_papers_sizes():
 
 
 ARCHIVE = make_archive(20)
-
-
-def write_trained(folder: Path, genes: np.ndarray) -> Path:
-    path = write_actor(folder / "tuned.pt")
-    path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: marks_of(genes)}))
-    return path
 
 
 def test_marks_are_of_the_genes_alone():
@@ -326,8 +411,20 @@ def test_the_nearest_is_found_among_all_elites_trained_on(published):
     assert found["terrains"] == 3 and report["trained_on"] == len(split.train)
     assert found["median"] == pytest.approx(np.median(by_hand), rel=1e-4)
     assert (found["least"], found["largest"]) == pytest.approx((min(by_hand), max(by_hand)), rel=1e-4)
+    assert "generated_independent" not in report["nearest_m"]
     far = report["nearest_m"]["generated_far"]
     assert far["terrains"] == 1 and far["median"] == pytest.approx(found["largest"])
+
+
+def test_elites_of_another_search_have_their_distance_too(tmp_path):
+    archive, other = make_archive(20), make_archive(6, seed=1)
+    write_archive(tmp_path / "archive.npz", archive)
+    write_archive(tmp_path / "other.npz", other)
+    report = distances(Distances(archive=tmp_path / "archive.npz", independent=tmp_path / "other.npz", terrains=3))
+    train = archive.genes[split_elites(archive, "anymal").train]
+    expected = nearest_distance(independent_set(other, 3, 0).terrains, train)
+    found = report["nearest_m"]["generated_independent"]
+    assert (found["terrains"], found["median"]) == (3, pytest.approx(np.median(expected)))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from sim.policy.spec import firsts
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 from train.evaluate.measures import measure
 from train.evaluate.publish import published
-from train.evaluate.sets import plain_set
+from train.evaluate.sets import Certificates, plain_set
 from train.evaluate.show import draw_tables, picture_of, print_tables
 from train.evaluate.tables import KINDS, check_seeds, difference, differences, make_tables, over_seeds, split_by_goal
 
@@ -63,6 +63,64 @@ def test_intervals_over_elites_are_over_families_of_kin(anymal):
     assert of_terrains["intervals"]["goal"]["generated"]["base"][0] >= 0.5
     fates = of_kin["differences"]["generated"]["base -> C-G"]
     assert fates["fine"]["interval"][0] == 0.0 and fates["gain"]["goal"]["interval"] == [0.0, 0.0]
+
+
+@pytest.fixture
+def certified(anymal):
+    """Three controllers on four elites of a search against base, of which C-G certifies the first two."""
+    given = Certificates(
+        certifiers=("C-G", "S"), sha256=("a", "b"), given=np.array([[1, 0], [1, 0], [0, 0], [0, 0]], bool),
+        searched_sha256="f",
+    )  # fmt: skip
+    rows = {"base": [4, 0, 0, 0], "C-G": [4, 2, 0, 4], "S": [4, 4, 4, 4]}
+    row = {
+        who: measure(result_of([[GOAL] * k + [HIT] * (4 - k) for k in goals], reward=np.ones((4, 4))), (1.0, 1.0))
+        for who, goals in rows.items()
+    }
+    sets = {
+        "generated": replace(a_set("generated", 4, 10), certificates=given, families=np.arange(4)),
+        "hard_random": a_set("hard_random", 4),
+    }
+    hashes = {"base": "f", "C-G": "a", "S": "b"}
+    about = {"robot": "anymal", "episodes": 4, "controllers": {who: {} for who in rows}}
+    return {**about, **make_tables(dict.fromkeys(sets, row), sets, anymal, SEED, hashes=hashes)}
+
+
+def test_certified_terrains_stand_apart_with_who_certifies_them(certified):
+    assert certified["certified_goal"] == {"generated": {"base": 0.5, "C-G": 0.75, "S": 1.0}}
+    assert certified["certified_success"]["generated"]["base"] == 0.5
+    assert certified["intervals"]["certified_goal"]["generated"]["C-G"] == [0.5, 1.0]
+    # S certifies none of these terrains: its rate is not biased by that.
+    assert certified["certified"] == {
+        "generated": {
+            "terrains": 2, "certifiers": {"C-G": 2, "S": 0}, "chosen_by": {"base": "searched", "C-G": "certifier"},
+        }
+    }  # fmt: skip
+    json.dumps(certified, allow_nan=False)
+
+
+def test_certified_terrains_are_shown_with_whose_rates_are_biased(certified, capsys):
+    print_tables(certified)
+    said = capsys.readouterr().out
+    assert "generated: certified 2 of 4 terrains, which the search's controller fails and another one cross" in said
+    assert "crosses (C-G 2, S 0)" in said and "C-G (certifier)" in said and "base (searched)" in said
+    assert "searched: downward, since it failed them all; certifier: upward, since it crossed some of them" in said
+    *_, axes = draw_tables(certified).axes
+    assert "certified terrains" in axes.get_ylabel()
+    assert axes.get_xlabel().endswith("base (searched) is too low, C-G (certifier) is too high")
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["generated,\nheld out\n(2 certified)"]
+
+
+def test_seeds_of_a_kind_have_a_mean_on_certified_terrains_too(certified):
+    tables = {"certified_goal": {"generated": {"C-G@0": 0.9, "C-G@1": 1.0}}}
+    kind = over_seeds(tables, tables)["certified_goal"]["generated"]["C-G"]
+    assert kind["mean"] == pytest.approx(0.95) and kind["interval"][1] == 1.0  # a rate
+
+
+def test_where_no_certifier_was_asked_nothing_is_certified(report, capsys):
+    assert report["certified"] == report["certified_goal"] == {}
+    print_tables(report)
+    assert "certified" not in capsys.readouterr().out
 
 
 def test_intervals_stand_where_values_do(report):

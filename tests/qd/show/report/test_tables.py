@@ -84,6 +84,32 @@ def test_tables_and_the_same_terrain_before_and_after(reported, tables):
     assert (out.parent / "report-figures" / "tables.png").read_bytes() == DOT
 
 
+def test_certified_terrains_and_contact_resolved_are_told(reported, tables):
+    made = json.loads(tables.read_text())
+    limits = {"generated": {"base": [0.0, 0.2], "C-G": None}}
+    one = {"terrains": 4, "goal": 0.5, "intervals": {"goal": [0.4, 0.6]}, "goal_bias": -0.05,
+           "goal_bias_interval": [-0.1, 0.0]}  # fmt: skip
+    values = {"generated": {"base": 0.1, "C-G": None}}
+    changed(
+        tables,
+        certified={"generated": {"terrains": 2, "certifiers": {"C-G": 2}, "chosen_by": {"base": "searched"}}},
+        certified_goal=values, certified_success=values, resolved={"generated": {"base": one}}, mujoco_c=None,
+        intervals={**made["intervals"], "certified_goal": limits, "certified_success": limits},
+    )  # fmt: skip
+    text = Page(reported(tables=tables)[0].read_bytes()).text
+    assert "generated, held out (2 certified): goal reached 10 % (0 % to 20 %), searched -" in text
+    assert "generated, held out (4): base, contact resolved 50 % (40 % to 60 %) -5.0 (-10.0 to +0.0) points" in text
+    changed(tables, certified_goal={"generated": {"base": 0.1}})
+    with pytest.raises(ValueError, match="its certified_goal cannot be read"):
+        read_tables(tables, get_robot("anymal"))
+
+
+def test_validation_tables_are_no_report(tables):
+    changed(tables, part="validation")
+    with pytest.raises(ValueError, match="of validation terrains, by which settings are chosen: make tables to report"):
+        read_tables(tables, get_robot("anymal"))
+
+
 def test_published_tables_are_taken_by_themselves(reported, tables):
     there = tables.parent / "results" / "anymal"
     there.mkdir(parents=True)
