@@ -23,6 +23,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "minimise": Command("qd.run.minimise:Minimise", "which parts of a failing terrain it takes to fail"),
         "pack": Command("train.evaluate.pack:MakePack", "faults of a run as a pack to test any controller on"),
         "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
+        "dose": Command("train.evaluate.dose:MeasureDose", "which real obstacle at which size stops a controller"),
         "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
     },
     "Look at it": {

@@ -157,6 +157,13 @@ class OnGround(TerrainSpace):
         return None if heights is None else np.concatenate([heights, found[:, first:]], axis=1)
 
 
+def gene_of(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Genes of frictions, or of time constants [s] above the least, which is what its gene of -1 does not have."""
+    if kind == "friction":
+        return 1.0 - 2.0 * (1.0 - values) / (1.0 - LEAST_FRICTION)
+    return 2.0 * np.log(values / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) - 1.0
+
+
 _TITLES = {
     "friction": "friction every 2 m along the way",
     "softness": "time constant of the ground [s] every 2 m along the way, 0 where it is firm",

@@ -42,7 +42,7 @@ MIN_ELITES = 5
 
 _TEST_KEY = 20250604  # with the set's number and the seed, the entropy of a test set
 _SPLIT_KEY = 20250605
-_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3, "pack": 4}
+_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3, "pack": 4, "dose": 5}
 _BANK = 50  # height maps that are compared at once
 
 TRAINED_ON = "trained_on"
