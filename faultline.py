@@ -46,7 +46,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
     "Study the search": {
         "compare": Command("qd.studies.compare:Compare", "the search and its baselines on the same number of terrains"),
         "ablation": Command("qd.studies.ablation:Ablation", "with and without standard deviations in the fitness"),
-        "beside": Command("qd.studies.beside:Beside", "searches against different controllers side by side"),
+        "beside": Command("qd.studies.beside:Beside", "searches side by side: controllers, or spaces"),
         "agreement": Command("qd.studies.agreement:Agreement", "rates at finer contact and in MuJoCo C"),
         "penalty-ratios": Command("qd.studies.penalty_ratios:PenaltyRatios", "how well penalties see failures"),
         "crosscheck": Command("sim.commands:Crosscheck", "the same crossings in plain MuJoCo C"),

@@ -227,7 +227,7 @@ def main() -> int:
                 continue
             done.add(str(words))
             if words[0] == "beside":
-                for copy in ("a", "b"):
+                for copy in ("a", "b", "anymal-2"):
                     shutil.copytree(folder / "runs" / "anymal-1", folder / "runs" / copy, dirs_exist_ok=True)
             began = time.monotonic()
             wrong = run(words, folder)
