@@ -241,8 +241,8 @@ def half_of(dose: "Dose", rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     value = _passes_half(values, [row["goal_rate"] for row in known])
     limits = [_passes_half(values, [row["interval"][end] for row in known]) for end in (0, 1)]
     about = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
-    ordered = limits if dose.harder_up else limits[::-1]
-    return {**about, "value": value, "interval": ordered, "words": _half_words(dose, known, value, limits)}
+    interval = limits if dose.harder_up else limits[::-1]
+    return {**about, "value": value, "interval": interval, "words": _half_words(dose, known, value, interval)}
 
 
 def _passes_half(values: Sequence[float], rates: Sequence[float]) -> float | None:
@@ -256,7 +256,7 @@ def _passes_half(values: Sequence[float], rates: Sequence[float]) -> float | Non
 
 
 def _half_words(
-    dose: "Dose", rows: Sequence[dict[str, Any]], value: float | None, limits: Sequence[float | None]
+    dose: "Dose", rows: Sequence[dict[str, Any]], value: float | None, interval: Sequence[float | None]
 ) -> str:
     if not rows:
         return "too many episodes are invalid"
@@ -266,15 +266,14 @@ def _half_words(
     if value is None:
         last = f"{'up' if dose.harder_up else 'down'} to {dose.in_words(rows[-1]['value'])}"
         return f"over half of the robots reach the goal at every {dose.parameter}, {last}"
-    easy, hard = (None if limit is None else dose.in_words(limit) for limit in limits)
-    more, less = ("more", "less") if dose.harder_up else ("less", "more")
+    low, high = (None if limit is None else dose.in_words(limit) for limit in interval)
     between = ""
-    if easy is not None and hard is not None:
-        between = f" ({easy.removesuffix(dose.unit).strip()} to {hard})"
-    elif easy is not None:
-        between = f" ({easy} or {more})"
-    elif hard is not None:
-        between = f" ({hard} or {less})"
+    if low is not None and high is not None:
+        between = f" ({low.removesuffix(dose.unit).strip()} to {high})"
+    elif low is not None:
+        between = f" ({low} or more)"
+    elif high is not None:
+        between = f" ({high} or less)"
     return f"half of the robots reach the goal at {what} {dose.in_words(value)}{between}"
 
 

@@ -134,7 +134,7 @@ def test_where_under_half_begin_to_reach_the_goal():
 def test_what_gets_harder_as_it_falls():
     found = half_words("friction", [0.2, 0.4], [0.9, 0.1], [(0.8, 1.0), (0.0, 0.3)])
     assert found["value"] == pytest.approx(0.3) and found["interval"][0] < 0.3 < found["interval"][1]
-    assert found["words"] == "half of the robots reach the goal at a friction of 0.30 (0.33 to 0.26)"
+    assert found["words"] == "half of the robots reach the goal at a friction of 0.30 (0.26 to 0.33)"
     over = half_words("friction", [0.2, 0.4], [0.9, 0.7], [(0.8, 1.0), (0.6, 0.8)])
     assert over["words"] == "over half of the robots reach the goal at every friction, down to 0.20"
 
