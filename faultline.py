@@ -23,6 +23,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "minimise": Command("qd.run.minimise:Minimise", "which parts of a failing terrain it takes to fail"),
         "pack": Command("train.evaluate.pack:MakePack", "faults of a run as a pack to test any controller on"),
         "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
+        "dose": Command("train.evaluate.dose:MeasureDose", "which real obstacle at which size stops a controller"),
         "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
     },
     "Look at it": {
@@ -45,7 +46,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
     "Study the search": {
         "compare": Command("qd.studies.compare:Compare", "the search and its baselines on the same number of terrains"),
         "ablation": Command("qd.studies.ablation:Ablation", "with and without standard deviations in the fitness"),
-        "beside": Command("qd.studies.beside:Beside", "searches against different controllers side by side"),
+        "beside": Command("qd.studies.beside:Beside", "searches side by side: controllers, or spaces"),
         "agreement": Command("qd.studies.agreement:Agreement", "rates at finer contact and in MuJoCo C"),
         "penalty-ratios": Command("qd.studies.penalty_ratios:PenaltyRatios", "how well penalties see failures"),
         "crosscheck": Command("sim.commands:Crosscheck", "the same crossings in plain MuJoCo C"),

@@ -229,6 +229,23 @@ def _rise_of(element: Element) -> float:
     return 0.0
 
 
+@wp.func
+def _placed(element: Element, shortest: float, first: int, ground: float) -> Element:
+    """The element as it lies behind a node, on ground of a height."""
+    element = _fitted(element, shortest, _LAST - first)
+    element.first = first
+    element.ground = ground
+    element.rise = _rise_of(element)
+    return element
+
+
+@wp.kernel
+def _place_kernel(elements: wp.array2d[Element]):
+    """Grid (num_terrains, num_elements)."""
+    t, e = wp.tid()
+    elements[t, e] = _placed(elements[t, e], 0.0, elements[t, e].first, 0.0)
+
+
 @wp.kernel
 def _lay_out_kernel(
     genes: wp.array2d[float], lows: _Table, highs: _Table, whole: _Table, elements_out: wp.array2d[Element]
@@ -247,10 +264,7 @@ def _lay_out_kernel(
         element.detail = _decode(genes[t, g + 4], lows[k, 2], highs[k, 2], whole[k, 2])
         element.turn = _decode(genes[t, g + 5], lows[k, 3], highs[k, 3], whole[k, 3])
         col = wp.min(col + int(_decode(genes[t, g + 1], _LEAD_LOW, _LEAD_HIGH, 1.0)), _LAST)
-        element = _fitted(element, lows[k, 1], _LAST - col)
-        element.first = col
-        element.ground = ground
-        element.rise = _rise_of(element)
+        element = _placed(element, lows[k, 1], col, ground)
         elements_out[t, e] = element
         col += element.cells
         ground += element.rise
@@ -355,6 +369,26 @@ def lay_out(genes: Any) -> Any:
     return elements
 
 
+def place(elements: Any) -> None:
+    """Lay single elements of any size behind the nodes that they name, each on a course of its own, in place.
+
+    Args:
+        elements: Warp array of :class:`Element`, shape (num_terrains, 1), with kind, first, size, length, detail and
+            turn. One that does not fit before x = 12 m is cut, or becomes FLAT.
+    """
+    wp.launch(_place_kernel, elements.shape, [elements], device=elements.device)
+
+
+def rasterise_elements(elements: Any, heights_out: Any) -> None:
+    """Rasterise elements that lie already.
+
+    Args:
+        elements: As :func:`lay_out` and :func:`place` leave them, shape (num_terrains, num_elements).
+        heights_out: As of :func:`rasterise`.
+    """
+    wp.launch(_rasterise_elements_kernel, heights_out.shape, [elements], outputs=[heights_out], device=elements.device)
+
+
 def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
     """Rasterise one course a terrain.
 
@@ -373,5 +407,4 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
             f"heights_out must have shape ({genes.shape[0]}, nrow, ncol), got {tuple(heights_out.shape)}: "
             "one grid per row of genes"
         )
-    elements = lay_out(genes)
-    wp.launch(_rasterise_elements_kernel, heights_out.shape, [elements], outputs=[heights_out], device=genes.device)
+    rasterise_elements(lay_out(genes), heights_out)

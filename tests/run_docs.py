@@ -50,6 +50,15 @@ SMALL: dict[str, dict[str, str | None]] = {
     "minimise": {**ON_HARD, "--elite": "0", "--how": "greedy", "--certify": None},
     "pack": {**ON_HARD, "--controllers": CERTIFIER, "--episodes": "2"},
     "evaluate": {**CPU, "--terrains": "6", "--episodes": "2", "--workers": "2"},
+    "dose": {
+        **CPU,
+        "--terrains": "1",
+        "--episodes": "2",
+        "--workers": "2",
+        "--elements": "ditch",
+        "--values": None,
+        "--at": None,
+    },
     "cross": {**CPU, "--episodes": "2"},
     "replay": {**CPU, "--replicas": "2"},
     "view": {"--port": "8765"},
@@ -219,7 +228,7 @@ def main() -> int:
                 continue
             done.add(str(words))
             if words[0] == "beside":
-                for copy in ("a", "b"):
+                for copy in ("a", "b", "anymal-2"):
                     shutil.copytree(folder / "runs" / "anymal-1", folder / "runs" / copy, dirs_exist_ok=True)
             began = time.monotonic()
             wrong = run(words, folder)

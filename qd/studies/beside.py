@@ -1,4 +1,4 @@
-"""Searches against different controllers side by side: what breaks one of them, and what is still left of it."""
+"""Searches side by side: against different controllers, what breaks one of them and what is still left of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from qd.archive import Archive, read_archive
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import as_settings, differences
-from sim.files.command import publish
+from sim.files.command import InSpace, publish
 from sim.files.intervals import bootstrap_interval
 
 if TYPE_CHECKING:
@@ -25,15 +25,20 @@ _MOST_RUNS = 4  # lines that can be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
-class Beside:
-    """Lay searches against different controllers side by side: curves, and how their elites end.
+class Beside(InSpace):
+    """Lay searches side by side: against different controllers (--runs), or in several terrain spaces (--spaces).
 
-    The searches are finished runs of one robot, with the same settings and equally many iterations; only controller and
-    seed may differ.
+    --runs shows curves, and how the elites end. The searches are finished runs of one robot, with the same settings and
+    equally many iterations; only controller and seed may differ. --spaces says what was found in each space and in
+    which ways the controller fails there. The searches are of one robot and controller; all else may differ.
     """
 
-    runs: tuple[str, ...]
+    runs: tuple[str, ...] = ()
     """The run directories, each NAME=DIR, the name that of its controller; 2 to 4."""
+    spaces: tuple[str, ...] = ()
+    """Run directories in different spaces, each NAME=DIR; up to 6."""
+    dose: tuple[Path, ...] = ()
+    """Files of `faultline dose`, whose rows go with the spaces."""
     out: Path
     """Where to write the numbers; the figure goes beside it as .png."""
 
@@ -47,6 +52,10 @@ class Beside:
         from sim.files.figures import as_png
         from sim.files.provenance import provenance
 
+        if bool(self.runs) == bool(self.spaces) or (self.dose and not self.spaces):
+            raise ValueError("name either --runs, or --spaces and to these --dose: NAME=DIR each")
+        if self.spaces:
+            return self._lay_spaces()
         sides = sides_of(self.runs)
         report = {
             **provenance("cpu", 0),
@@ -55,6 +64,21 @@ class Beside:
             "runs": {side.name: numbers_of(side) for side in sides},
         }
         return publish(self.out, lambda: report, _show, draw=lambda _: as_png(draw_beside(sides)))
+
+    def _lay_spaces(self) -> dict[str, Any]:
+        from qd.studies.spaces import MOST_SPACES, draw_spaces, joined_dose, print_spaces, searches_of, space_numbers
+        from sim.files.figures import as_png
+        from sim.files.provenance import provenance
+
+        searches = searches_of(_named(self.spaces, "spaces", 1, MOST_SPACES), self.space)
+        named = next(iter(searches.values())).named
+        report = {
+            **provenance("cpu", 0),
+            **named,
+            "spaces": {name: space_numbers(search) for name, search in searches.items()},
+            **joined_dose(self.dose, named),
+        }
+        return publish(self.out, lambda: report, print_spaces, draw=lambda _: as_png(draw_spaces(searches)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +91,21 @@ class Side:
     settings: dict[str, Any]
 
 
+def _named(runs: Sequence[str], flag: str, least: int, most: int) -> dict[str, str]:
+    """Run directories by name, as the command line has them.
+
+    Raises:
+        ValueError: If one has no name, two have the same, or there are too few or too many.
+    """
+    parts = [run.partition("=") for run in runs]
+    named = {name: folder for name, _, folder in parts}
+    if not all(name and folder for name, folder in named.items()) or len(named) < len(parts):
+        raise ValueError(f"{flag} must be NAME=DIR each, with different names, got {' '.join(runs)}")
+    if not least <= len(named) <= most:
+        raise ValueError(f"{flag} must be {least} to {most}, got {len(named)}")
+    return named
+
+
 def sides_of(runs: Sequence[str]) -> list[Side]:
     """The searches that a command line names.
 
@@ -74,13 +113,8 @@ def sides_of(runs: Sequence[str]) -> list[Side]:
         FileNotFoundError: If there is no run.
         ValueError: If one is damaged, or they cannot be compared.
     """
-    named = [run.partition("=") for run in runs]
-    if any(not name or not folder for name, _, folder in named) or len({name for name, _, _ in named}) < len(named):
-        raise ValueError(f"runs must be NAME=DIR each, with different names, got {' '.join(runs)}")
-    if not 2 <= len(named) <= _MOST_RUNS:
-        raise ValueError(f"runs must be 2 to {_MOST_RUNS}, got {len(named)}")
     sides = []
-    for name, _, folder in named:
+    for name, folder in _named(runs, "runs", 2, _MOST_RUNS).items():
         run = RunDirectory(Path(folder))
         settings = as_settings(run.read_cfg())
         sides.append(Side(name=name, archive=read_archive(folder), metrics=run.read_metrics(), settings=settings))

@@ -117,6 +117,14 @@ class TerrainSpace(Protocol):
         """
         return "\n".join(self.parts(genes))
 
+    def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
+        """What lies across the whole way, in words, with the x at which it begins and ends [m]; none of most spaces.
+
+        Args:
+            genes: One row, shape (num_genes,).
+        """
+        return ()
+
     def uniform_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Genes drawn uniformly from [-1, 1], shape (count, num_genes).
 

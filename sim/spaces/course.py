@@ -125,8 +125,16 @@ class Course(TerrainSpace):
 
     def describe(self, genes: ArrayLike) -> str:
         """The elements in words, in the order of the way, without flat ground."""
+        return ", ".join(words for words, _, _ in self.spans(genes)) or "flat ground"
+
+    def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
+        """Each element but flat ground in words, with where it begins and ends [m]."""
         (found,) = self.elements(np.asarray(genes)[None])
-        return ", ".join(_in_words(element) for element in found if element["kind"] != Kind.FLAT) or "flat ground"
+        return tuple(
+            (_in_words(element), SPACING * element["first"], SPACING * (element["first"] + element["cells"]))
+            for element in found
+            if element["kind"] != Kind.FLAT
+        )
 
 
 def _middle_of(number: Any, count: float) -> Any:

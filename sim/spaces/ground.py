@@ -24,6 +24,8 @@ from sim.spaces.base import Seed, TerrainSpace, clipped
 
 _ABSENT = {"friction": 1.0, "softness": -1.0}
 """The gene of a patch that changes nothing."""
+_BESIDE_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the right one first
+_TOLD_FRICTION = 0.995  # rounded, what is above is 1.00
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,13 +133,30 @@ class OnGround(TerrainSpace):
         return found
 
     def describe(self, genes: ArrayLike) -> str:
-        """The terrain of the space in words, and of each map the patches on both sides of the way, a line each."""
+        """The terrain of the space in words, and of each map the patches on both sides of the way, a line each.
+
+        What lies across the way has its ground behind it: ``kerb 0.15 m up (friction 0.25)``.
+        """
         row = clipped(genes)
-        told = [self.inner.describe(row[: self.inner.num_genes])]
+        own = row[: self.inner.num_genes]
+        across = [words + self._ground_words(row, begin, end) for words, begin, end in self.inner.spans(own)]
+        told = [", ".join(across) or self.inner.describe(own)]
         for kind in self.kinds:
-            right, left = self._values(row, kind).reshape(ROWS, COLS)[ROWS // 2 - 1 : ROWS // 2 + 1]
+            right, left = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY]
             told.append(f"{_TITLES[kind]}: left of the way {_numbers(left)}, right of it {_numbers(right)}")
         return "\n".join(told)
+
+    def _ground_words(self, row: NDArray[np.float32], begin: float, end: float) -> str:
+        """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
+        first, last = (min(max(int(x // PATCH), 0), COLS - 1) for x in (begin, end))
+        told = []
+        for kind in self.kinds:
+            there = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, first : last + 1]
+            if kind == "friction" and there.min() < _TOLD_FRICTION:
+                told.append(f"friction {there.min():.2f}")
+            if kind == "softness" and there.max() > 0.0:
+                told.append(f"soft, {there.max():.3f} s")
+        return f" ({', '.join(told)})" if told else ""
 
     def _columns(self, kind: str) -> slice:
         first = self.inner.num_genes + NUM_PATCHES * self.kinds.index(kind)
@@ -155,6 +174,13 @@ class OnGround(TerrainSpace):
         found, first = clipped(self.validate(genes)), self.inner.num_genes
         heights = change(found[:, :first])
         return None if heights is None else np.concatenate([heights, found[:, first:]], axis=1)
+
+
+def gene_of(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Genes of frictions, or of time constants [s] above the least, which is what its gene of -1 does not have."""
+    if kind == "friction":
+        return 1.0 - 2.0 * (1.0 - values) / (1.0 - LEAST_FRICTION)
+    return 2.0 * np.log(values / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) - 1.0
 
 
 _TITLES = {

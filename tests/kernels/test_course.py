@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.course import MAX_ELEMENTS, PARAMETERS, Kind, lay_out, rasterise
+from kernels.course import MAX_ELEMENTS, PARAMETERS, Element, Kind, lay_out, place, rasterise, rasterise_elements
 from tests.kernels import course_oracle as oracle
 from tests.kernels.course_oracle import course, element
 
@@ -157,6 +157,21 @@ def test_a_small_change_of_a_gene_changes_little_but_for_the_kind(device):
     apart = np.sqrt(((before - after) ** 2).mean(axis=(1, 2)))
     other = np.sqrt(((before - before[::-1]) ** 2).mean(axis=(1, 2)))
     assert np.median(apart) < 0.25 * np.median(other)
+
+
+def test_elements_of_any_size_lie_where_they_say(device):
+    # A step of 0.7 m behind column 100, which no gene has, and behind column 200 a ditch of 80 cells that is cut to 40.
+    elements = np.zeros((2, 1), Element.numpy_dtype())
+    elements[0, 0] = (Kind.STEP, 100, 0, 0.0, 0.0, 0.7, 0.0, 0.0, -1.0)
+    elements[1, 0] = (Kind.DITCH, 200, 0, 0.0, 0.0, 0.3, 80.0, 0.0, 0.0)
+    laid = wp.array(elements, dtype=Element, device=device)
+    place(laid)
+    out = wp.zeros((2, 161, 321), dtype=float, device=device)
+    rasterise_elements(laid, out)
+    step, ditch = out.numpy()[:, 80]
+    assert not step[:101].any() and step[101:] == pytest.approx(-0.7)
+    assert np.flatnonzero(ditch).tolist() == list(range(201, 240))
+    assert laid.numpy()["rise"][:, 0] == pytest.approx([-0.7, 0.0])
 
 
 def test_wrong_shapes_are_named(device):

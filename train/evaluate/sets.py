@@ -49,7 +49,7 @@ MIN_ELITES = 5
 
 _KEYS = {"test": 20250604, "validation": 20250606}  # with the set's number and the seed, the entropy of a set
 _SPLIT_KEY = 20250605
-_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3, "pack": 4, INDEPENDENT: 5}
+_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3, "pack": 4, INDEPENDENT: 5, "dose": 6}
 _BANK = 50  # height maps that are compared at once
 
 TRAINED_ON = "trained_on"

@@ -46,8 +46,8 @@ _PANELS = {
     "reward": ("training reward\n[sum over 20 s]", 1.0),
 }
 # Okabe and Ito's colours, apart for every kind of colour blindness; markers tell them apart in grey too.
-_COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-_MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
+COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
 _CHANGES = {"mended": "#0072b2", "still_failing": "#bbbbbb", "newly_broken": "#d55e00"}
 _GALLERY, _GALLERY_COLUMNS = 12, 3  # terrains of a pack that are drawn
 _RESOLVED = {"resolved": "contact resolved", "mujoco_c": "MuJoCo C, contact resolved"}
@@ -378,7 +378,7 @@ def _draw_bias(axes: "Axes", report: dict[str, Any]) -> None:
         lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)
         axes.errorbar(
             np.array([place for place, _ in found]) + shift, values, lengths, linestyle="", capsize=3,
-            marker=_MARKERS[kind % len(_MARKERS)], color=_COLOURS[kind % len(_COLOURS)],
+            marker=MARKERS[kind % len(MARKERS)], color=COLOURS[kind % len(COLOURS)],
             markerfacecolor=None if key == "resolved" else "none", label=f"{who}: {_RESOLVED[key]}",
         )  # fmt: skip
     axes.axhline(0.0, color="0.4", linewidth=0.8)
@@ -406,7 +406,7 @@ def _draw_measure(axes: "Axes", report: dict[str, Any], measure: str, factor: fl
     for index, who in enumerate(controllers):
         shift = step * (index - (len(controllers) - 1) / 2)
         kind = [kind_of(first) for first in kinds].index(kind_of(who))  # other seeds look like the first one
-        colour, marker = _COLOURS[kind % len(_COLOURS)], _MARKERS[kind % len(_MARKERS)]
+        colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
         there = [place for place, name in enumerate(names) if report[measure][name][who] is not None]
         values = factor * np.array([report[measure][names[place]][who] for place in there])
         limits = factor * np.array([report["intervals"][measure][names[place]][who] for place in there]).reshape(-1, 2)

@@ -5,6 +5,7 @@ import pytest
 
 from sim.bank import heights_of, terrains_of
 from sim.space import COURSE, SUPER_GAUSSIAN, get_space, load_space, on_ground, recorded_identity, space_identity
+from tests.kernels.course_oracle import course, element
 from tests.sim.spaces.spaces import write_ridges
 
 BOTH = get_space("super_gaussian+friction+softness")
@@ -71,6 +72,29 @@ def test_words_say_what_lies_beside_the_way():
     right, left = " ".join(["0.15"] * 8), " ".join(["0.57"] * 8)
     assert told[0] == f"friction every 2 m along the way: left of the way {left}, right of it {right}"
     assert "left of the way 0.00 0.00" in told[1] and "right of it 0.06 0.06" in told[1]
+
+
+def test_an_element_of_a_course_has_its_ground_behind_it():
+    # A kerb at x = 4.2 m, a ditch of 0.4 m from x = 4.45 m on, and from x = 5.65 m stairs that end at x = 6.2 m.
+    space = get_space("course+friction+softness")
+    elements = [
+        element("kerb", size=0.15, turn=1),
+        element("ditch", lead=4, size=0.4, length=8),
+        element("stairs", lead=16, size=0.18, length=0.25, detail=3, turn=-1),
+    ]
+    genes = np.concatenate([course(*elements)[0], np.full(32, 1.0), np.full(32, -1.0)])
+    friction, softness = (genes[at : at + 32].reshape(4, 8) for at in (36, 68))
+    assert space.describe(genes).splitlines()[0] == COURSE.describe(genes[:36])
+    friction[[0, 3]] = -1.0  # far beside the way
+    assert space.describe(genes).splitlines()[0] == COURSE.describe(genes[:36])
+    friction[1, 2] = -1.0 + 2 * 0.1 / 0.85  # x = 4 m to 6 m, on the right: 0.25
+    softness[2, 3] = 1.0  # x = 6 m to 8 m, on the left
+    assert space.describe(genes).splitlines()[0] == (
+        "kerb 0.15 m up (friction 0.25), ditch 0.40 m wide and 0.40 m deep (friction 0.25), "
+        "3 stairs of 0.18 x 0.25 m down (friction 0.25, soft, 0.060 s)"
+    )
+    flat = np.concatenate([course()[0], np.full(64, -1.0)])
+    assert space.describe(flat).splitlines()[0] == "flat ground"
 
 
 def test_words_are_the_numbers_of_the_device():

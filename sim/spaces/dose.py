@@ -1,0 +1,285 @@
+"""Doses: one obstacle alone on flat ground, or one ground everywhere, of which one number grows.
+
+An obstacle is an element of a course (:mod:`kernels.course`) of any size, within the ranges of its space or beyond.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from kernels import course
+from kernels.course import SPACING, Element, Kind
+from kernels.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S
+from sim.ground import GROUND_KINDS, joined_name
+from sim.space import SUPER_GAUSSIAN, get_space
+from sim.spaces.ground import gene_of
+from sim.terrain import NUM_COLS, NUM_ROWS
+
+FIRST_COL, NUM_PLACES = 100, 20
+"""An obstacle begins at one of so many neighbouring nodes, from x = 5 m on: over 1 m, more than a stride."""
+LEVEL_SPACE = joined_name(SUPER_GAUSSIAN.name, GROUND_KINDS)
+"""Space of level ground whose friction or softness is the dose."""
+
+
+class Quantity(NamedTuple):
+    """A parameter of an obstacle."""
+
+    field: str
+    """Of :class:`kernels.course.Element`; empty of the ground."""
+    low: float
+    high: float
+    unit: str = "m"
+    cells: int = 0
+    """It is a multiple of so many cells, and the field counts cells. If 0 it is any number, and the field holds it."""
+
+    @property
+    def step(self) -> float:
+        """What values are multiples of; 0 if they may be any number."""
+        return 1.0 if self.unit == "steps" else self.cells * SPACING
+
+    def in_words(self, value: float) -> str:
+        """A value with its unit: ``0.30 m``, ``5 steps``."""
+        digits = {"steps": 0, "s": 3}.get(self.unit, 2)
+        return f"{value:.{digits}f} {self.unit}".strip()
+
+
+def _cells(field: str, low: float, high: float, *, cells: int = 1) -> Quantity:
+    return Quantity(field, low, high, cells=cells)
+
+
+_HEIGHT = {"height": Quantity("size", 0.01, 1.0)}
+_DEPTH = {"depth": Quantity("size", 0.05, 2.0)}
+_SLOPE = {"slope": Quantity("size", 0.01, 2.0, "m/m")}
+_LENGTH = {"length": _cells("length", 0.20, 4.0)}
+
+QUANTITIES: dict[Kind, dict[str, Quantity]] = {
+    Kind.STAIRS: {
+        "rise": Quantity("size", 0.01, 0.50),
+        "tread": Quantity("length", 0.10, 0.60),
+        "flight": Quantity("detail", 2, course.PARAMETERS[Kind.STAIRS][2].high, "steps"),
+    },
+    Kind.STEP: _HEIGHT,
+    Kind.SILL: _HEIGHT | {"width": _cells("length", 0.05, 0.50)},
+    Kind.RAIL: _HEIGHT,
+    Kind.PALLET: _HEIGHT | _LENGTH,
+    Kind.RAMP: _SLOPE | _LENGTH,
+    Kind.CROSS_SLOPE: _SLOPE | {"length": _cells("length", 0.60, 4.0)},
+    Kind.DITCH: _DEPTH | {"width": _cells("length", 0.10, 4.0)},
+    Kind.BRIDGE: _DEPTH | _LENGTH | {"width": _cells("detail", 0.10, 4.0, cells=2)},
+    Kind.STONES: _DEPTH | _LENGTH | {"side": _cells("detail", 0.10, 1.0), "gap": _cells("turn", 0.05, 1.0)},
+    Kind.RUBBLE: _HEIGHT | _LENGTH | {"side": _cells("detail", 0.05, 1.0)},
+}
+"""Parameters of the kinds of obstacles, and how far terrains can follow them."""
+_GROUND = {
+    "friction": Quantity("", LEAST_FRICTION, 1.0, ""),
+    "softness": Quantity("", 1.1 * LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, "s"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dose:
+    """An obstacle, and the one of its parameters that grows."""
+
+    title: str
+    parameter: str
+    values: tuple[float, ...]
+    """Of the parameter, the easiest first."""
+    kind: Kind | None = None
+    """None: the ground, level everywhere, whose map the parameter is."""
+    up: float | None = None
+    """1 up, -1 down; None of an obstacle without a direction."""
+    others: Mapping[str, float] = field(default_factory=dict)
+    """The other parameters."""
+
+    @property
+    def quantities(self) -> Mapping[str, Quantity]:
+        """All parameters."""
+        return _GROUND if self.kind is None else QUANTITIES[self.kind]
+
+    @property
+    def unit(self) -> str:
+        """Of the parameter that grows; empty of a number."""
+        return self.quantities[self.parameter].unit
+
+    @property
+    def harder_up(self) -> bool:
+        """Whether larger values are harder."""
+        return (self.parameter, self.kind) not in (("friction", None), ("width", Kind.BRIDGE))
+
+    def in_words(self, value: float) -> str:
+        """A value of the parameter with its unit."""
+        return self.quantities[self.parameter].in_words(value)
+
+    def describe(self) -> str:
+        """The obstacle and its other parameters in words: ``stairs up, tread 0.30 m, flight 5 steps``."""
+        return ", ".join(
+            [self.title, *(f"{name} {self.quantities[name].in_words(value)}" for name, value in self.others.items())]
+        )
+
+    def changed(self, values: Iterable[float] | None, others: Mapping[str, float]) -> "Dose":
+        """The same with other values, the easiest first, and other parameters where it has them.
+
+        Raises:
+            ValueError: If a value is out of range or comes twice, or there is none.
+        """
+        own = {name: value for name, value in others.items() if name in self.others}
+        found = replace(self, others={**self.others, **own})
+        if values is not None:
+            found = replace(found, values=tuple(sorted(values, reverse=not self.harder_up)))
+        if not found.values or len(set(found.values)) < len(found.values):
+            raise ValueError(f"{self.title}: values of {self.parameter} must be some, each once, got {found.values}")
+        for name, value in [*((self.parameter, value) for value in found.values), *own.items()]:
+            own_range = self.quantities[name]
+            off = own_range.step and abs(value / own_range.step - round(value / own_range.step)) > 1e-6
+            if not own_range.low <= value <= own_range.high or off:
+                steps = f" in steps of {own_range.step:g}" if own_range.step else ""
+                raise ValueError(
+                    f"{self.title}: {name} must be {own_range.low:g} to {own_range.high:g} {own_range.unit}".rstrip()
+                    + f"{steps}, got {value:g}"
+                )
+        return found
+
+    def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Terrains of all values, ``count`` each: those of the first place, value by value, then those of the next.
+
+        An obstacle begins at places that are spread evenly over 1 m. A cross slope leans to a side that is drawn for
+        each place, rubble is another one at each. All else is the same, and equal for all values.
+
+        Args:
+            count: Places, at least 1.
+            rng: Draws sides and rubble.
+
+        Returns:
+            Heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :data:`LEVEL_SPACE`.
+        """
+        if self.kind is None:
+            return np.tile(self._level(), (count, 1))
+        record: Any = Element  # Warp makes its dtype
+        found: Any = np.zeros((count, len(self.values)), record.numpy_dtype())
+        found["kind"] = self.kind
+        found["detail"] = 1.0  # pallets
+        found["first"] = (FIRST_COL + np.arange(count) * NUM_PLACES // count)[:, None]
+        found["turn"] = self._turns(count, rng)[:, None]
+        for name, value in self.others.items():
+            self._set(found, name, value)
+        self._set(found, self.parameter, np.array(self.values))
+        return _heights_of(found.reshape(-1))
+
+    def _set(self, elements: Any, name: str, value: Any) -> None:
+        own = self.quantities[name]
+        elements[own.field] = np.rint(value / SPACING) if own.cells else value
+
+    def _turns(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        if self.kind is Kind.CROSS_SLOPE:
+            return rng.permutation(np.resize([-1.0, 1.0], count))
+        if self.kind is Kind.RUBBLE:
+            return rng.uniform(-0.5, 0.5, count)
+        return np.full(count, self.up or 0.0)
+
+    def _level(self) -> NDArray[np.float32]:
+        """Genes of level ground of each value, shape (num_values, num_genes)."""
+        space = get_space(LEVEL_SPACE)
+        zeros = np.zeros((len(self.values), space.num_genes), np.float32)
+        genes = space.without(zeros, range(len(space.parts(zeros[0]))))
+        maps = genes[:, SUPER_GAUSSIAN.num_genes :].reshape(len(genes), len(GROUND_KINDS), -1)
+        maps[:, GROUND_KINDS.index(self.parameter)] = gene_of(self.parameter, np.array(self.values))[:, None]
+        return genes
+
+
+def _heights_of(elements: Any) -> NDArray[np.float32]:
+    """Heights [m] of elements, each alone on flat ground, shape (num_terrains, NUM_ROWS, NUM_COLS).
+
+    Args:
+        elements: Records of :class:`kernels.course.Element`, as :func:`kernels.course.place` takes them, shape
+            (num_terrains,). All that :data:`QUANTITIES` allow fit before x = 12 m.
+    """
+    from sim.bank import host_device  # it needs the spaces
+
+    with wp.ScopedDevice(host_device()):
+        laid: Any = wp.array(elements[:, None], dtype=Element)
+        course.place(laid)
+        heights: Any = wp.empty((len(elements), NUM_ROWS, NUM_COLS), dtype=float)
+        course.rasterise_elements(laid, heights)
+        return np.array(heights.numpy(), np.float32)
+
+
+_LOW = (0.05, 0.08, 0.10, 0.12, 0.15, 0.18, 0.20, 0.25, 0.30)
+_RISES = (0.05, 0.10, 0.14, 0.17, 0.20, 0.22, 0.24, 0.26, 0.28, 0.30, 0.35)
+_STEPS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.50)
+_SLOPES = (0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00)
+_FLIGHT = {"tread": 0.30, "flight": 5.0}
+DOSES: dict[str, Dose] = {
+    "stairs_up": Dose(
+        title="stairs up", kind=Kind.STAIRS, up=1.0, parameter="rise", others=_FLIGHT, values=_RISES
+    ),
+    "stairs_down": Dose(
+        title="stairs down", kind=Kind.STAIRS, up=-1.0, parameter="rise", others=_FLIGHT, values=_RISES
+    ),
+    "step_up": Dose(title="kerb or step up", kind=Kind.STEP, up=1.0, parameter="height", values=_STEPS),
+    "step_down": Dose(title="kerb or step down", kind=Kind.STEP, up=-1.0, parameter="height", values=_STEPS),
+    "sill": Dose(title="sill", kind=Kind.SILL, parameter="height", others={"width": 0.10}, values=_LOW),
+    "rail": Dose(title="rail", kind=Kind.RAIL, parameter="height", values=_LOW),
+    "pallet": Dose(title="pallet", kind=Kind.PALLET, parameter="height", others={"length": 1.0}, values=_STEPS),
+    "ramp_up": Dose(
+        title="ramp up", kind=Kind.RAMP, up=1.0, parameter="slope", others={"length": 2.0}, values=_SLOPES
+    ),
+    "ramp_down": Dose(
+        title="ramp down", kind=Kind.RAMP, up=-1.0, parameter="slope", others={"length": 2.0}, values=_SLOPES
+    ),
+    "cross_slope": Dose(
+        title="cross slope", kind=Kind.CROSS_SLOPE, parameter="slope", others={"length": 3.0}, values=_SLOPES
+    ),
+    "ditch": Dose(
+        title="ditch", kind=Kind.DITCH, parameter="width", others={"depth": 0.50},
+        values=(0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00),
+    ),
+    "beam": Dose(
+        title="beam over a ditch", kind=Kind.BRIDGE, parameter="width", others={"depth": 0.50, "length": 1.50},
+        values=(1.00, 0.80, 0.70, 0.60, 0.50, 0.40, 0.30, 0.20, 0.10),
+    ),
+    "stones": Dose(
+        title="stepping stones", kind=Kind.STONES, parameter="gap",
+        others={"side": 0.30, "depth": 0.40, "length": 2.00}, values=(0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.40),
+    ),
+    "rubble": Dose(
+        title="rubble", kind=Kind.RUBBLE, parameter="height", others={"side": 0.20, "length": 2.00}, values=_LOW
+    ),
+    "friction": Dose(
+        title="level ground", parameter="friction", values=(1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)
+    ),
+    "softness": Dose(title="level ground", parameter="softness", values=(0.015, 0.02, 0.03, 0.04, 0.05, 0.06)),
+}  # fmt: skip
+"""Every dose by its name."""
+
+
+def chosen_doses(
+    names: Sequence[str], values: Mapping[str, Sequence[float]], others: Mapping[str, float]
+) -> dict[str, Dose]:
+    """Doses that a command line asks for, in the order of :data:`DOSES`.
+
+    Args:
+        names: Some of :data:`DOSES`; all if empty.
+        values: Other values of some of them.
+        others: Other parameters of those that have them.
+
+    Raises:
+        ValueError: If a name is unknown, nobody has a parameter, or a value cannot be used.
+    """
+    unknown = [name for name in (*names, *values) if name not in DOSES]
+    if unknown:
+        raise ValueError(f"elements must be some of {', '.join(DOSES)}, got {', '.join(unknown)}")
+    idle = [name for name in values if names and name not in names]
+    if idle:
+        raise ValueError(f"--values are of {', '.join(idle)}, which --elements leaves out: add it there")
+    chosen = {name: dose for name, dose in DOSES.items() if not names or name in names}
+    known = {name for dose in chosen.values() for name in dose.others}
+    if wrong := others.keys() - known:
+        raise ValueError(
+            f"--at must name parameters that the elements have beside the one that grows, {', '.join(sorted(known))}, "
+            f"got {', '.join(sorted(wrong))}"
+        )
+    return {name: dose.changed(values.get(name), others) for name, dose in chosen.items()}

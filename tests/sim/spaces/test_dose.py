@@ -1,0 +1,119 @@
+"""Doses: obstacles alone on flat ground, of any size, against courses and by numbers worked out by hand."""
+
+import numpy as np
+import pytest
+
+from sim.bank import terrains_of
+from sim.space import get_space
+from sim.spaces.dose import DOSES, FIRST_COL, LEVEL_SPACE, NUM_PLACES, chosen_doses
+from tests.kernels import course_oracle as oracle
+from tests.kernels.course_oracle import course, element
+
+IN_RANGE = {
+    "stairs_up": (element("stairs", size=0.17, length=0.3, detail=5, turn=1), {"rise": 0.17}),
+    "stairs_down": (element("stairs", size=0.2, length=0.3, detail=5, turn=-1), {"rise": 0.2}),
+    "step_up": (element("step", size=0.3, turn=1), {"height": 0.3}),
+    "step_down": (element("step", size=0.3, turn=-1), {"height": 0.3}),
+    "sill": (element("sill", size=0.12, length=2), {"height": 0.12}),
+    "rail": (element("rail", size=0.1, length=0), {"height": 0.1}),
+    "pallet": (element("pallet", size=0.15, length=20, detail=1), {"height": 0.15}),
+    "ramp_up": (element("ramp", size=0.3, length=40, turn=1), {"slope": 0.3}),
+    "ramp_down": (element("ramp", size=0.2, length=40, turn=-1), {"slope": 0.2}),
+    "ditch": (element("ditch", size=0.5, length=8), {"width": 0.4}),
+    "beam": (element("bridge", size=0.5, length=30, detail=8, turn=0), {"width": 0.4}),
+    "stones": (element("stones", size=0.4, length=40, detail=6, turn=4), {"gap": 0.2}),
+}
+
+
+def dose_of(name, *values, **others):
+    return chosen_doses([name], {name: values}, others)[name]
+
+
+@pytest.mark.parametrize("name", IN_RANGE)
+def test_an_obstacle_is_the_element_of_a_course(name):
+    genes, value = IN_RANGE[name]
+    (found,) = dose_of(name, *value.values()).terrains(1, np.random.default_rng(0))
+    expected = oracle.heights(course([*genes[:1], *element("flat", lead=4)[1:2], *genes[2:]])[0])
+    # There it begins behind 4 cells of flat ground, at column 84; here at column 100.
+    np.testing.assert_allclose(found[:, 16:], expected[:, : 321 - 16], atol=1e-5)
+    assert not found[:, :17].any()
+
+
+def test_sizes_go_beyond_what_the_space_has():
+    stairs = dose_of("stairs_up", 0.3, 0.15).terrains(1, np.random.default_rng(0))
+    # The easier value first: five steps of 0.15 m and of 0.30 m, 6 cells apart, the first behind column 100.
+    assert [grid.max() for grid in stairs] == pytest.approx([0.75, 1.5])
+    assert np.flatnonzero(np.diff(stairs[1][80]) > 0).tolist() == [100, 106, 112, 118, 124]
+    steep = dose_of("cross_slope", 1.0).terrains(2, np.random.default_rng(0))
+    assert sorted(grid[160, 130] > 0 for grid in steep) == [False, True]  # one to each side
+    assert np.abs(steep).max() == pytest.approx(2.0)  # 1 in 1 over 2 m
+    narrow = dose_of("beam", 0.1).terrains(1, np.random.default_rng(0))[0]
+    assert np.flatnonzero(narrow[:, 110] == 0.0).tolist() == [79, 80, 81]
+
+
+def test_places_are_spread_over_a_metre_and_the_same_for_all_values():
+    dose = dose_of("ditch", 0.2, 0.4, 0.6)
+    grids = dose.terrains(NUM_PLACES, np.random.default_rng(0)).reshape(NUM_PLACES, 3, 161, 321)
+    begins = (grids[:, :, 80] < 0).argmax(axis=2) - 1
+    assert (begins == begins[:, :1]).all()
+    assert begins[:, 0].tolist() == list(range(FIRST_COL, FIRST_COL + NUM_PLACES))
+    lengths = (grids[:, :, 80] < 0).sum(axis=2)
+    assert (lengths == [3, 7, 11]).all()  # nodes between the edges
+    few = dose.terrains(4, np.random.default_rng(0)).reshape(4, 3, 161, 321)
+    assert ((few[:, 0, 80] < 0).argmax(axis=1) - 1).tolist() == [100, 105, 110, 115]
+
+
+def test_rubble_differs_from_place_to_place():
+    one, other = dose_of("rubble", 0.3).terrains(2, np.random.default_rng(0))
+    assert 0.25 < one.max() <= 0.3
+    # They begin at columns 100 and 110.
+    assert np.abs(one[:, 101:140] - other[:, 111:150]).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "map_of"),
+    [
+        ("friction", (1.0, 0.5, 0.15), lambda ground: ground.friction),
+        ("softness", (0.02, 0.06), lambda ground: ground.time_constant_s),
+    ],
+)
+def test_ground_is_level_and_the_same_everywhere(name, values, map_of):
+    heights, ground = terrains_of(dose_of(name, *values).terrains(2, np.random.default_rng(0)), get_space(LEVEL_SPACE))
+    assert not heights.any() and ground is not None
+    expected = np.tile(values, 2)[:, None, None] * np.ones((4, 8))
+    np.testing.assert_allclose(map_of(ground), expected, atol=1e-6)
+    other = ground.time_constant_s if name == "friction" else ground.friction
+    assert (other == (0.0 if name == "friction" else 1.0)).all()
+
+
+def test_every_dose_can_be_made_and_gets_harder():
+    for name, dose in DOSES.items():
+        assert chosen_doses([name], {name: dose.values}, dose.others)[name] == dose
+        assert len(dose.terrains(1, np.random.default_rng(0))) == len(dose.values)
+        assert dose.parameter in dose.quantities and dose.others.keys() < dose.quantities.keys()
+
+
+def test_words():
+    assert DOSES["stairs_up"].describe() == "stairs up, tread 0.30 m, flight 5 steps"
+    assert dose_of("beam", 0.3, depth=0.2).describe() == "beam over a ditch, depth 0.20 m, length 1.50 m"
+    assert DOSES["softness"].in_words(0.0125) == "0.013 s" and DOSES["friction"].in_words(0.15) == "0.15"
+
+
+@pytest.mark.parametrize(
+    ("names", "values", "others", "message"),
+    [
+        (["stair"], {}, {}, "elements must be some of stairs_up, .*, got stair"),
+        ([], {"stair": [1.0]}, {}, "got stair"),
+        (["ditch"], {"beam": [0.3]}, {}, "--values are of beam, which --elements leaves out"),
+        (["ditch"], {"ditch": [0.12]}, {}, "ditch: width must be 0.1 to 4 m in steps of 0.05, got 0.12"),
+        (["ditch"], {"ditch": [0.1, 0.1]}, {}, "each once"),
+        (["stairs_up"], {"stairs_up": [0.9]}, {}, "stairs up: rise must be 0.01 to 0.5 m, got 0.9"),
+        (["stairs_up"], {}, {"flight": 2.5}, "flight must be 2 to 8 steps in steps of 1, got 2.5"),
+        (["friction"], {"friction": [0.1]}, {}, "level ground: friction must be 0.15 to 1, got 0.1"),
+        (["ditch"], {}, {"tread": 0.3}, "that the elements have beside the one that grows, depth, got tread"),
+        (["sill"], {"sill": [float("nan")]}, {}, "sill: height must be"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(names, values, others, message):
+    with pytest.raises(ValueError, match=message):
+        chosen_doses(names, values, others)
