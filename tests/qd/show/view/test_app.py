@@ -566,7 +566,7 @@ def test_the_command_serves_a_page_and_ends_on_ctrl_c(run, tmp_path):
     process.send_signal(signal.SIGINT)
     rest = process.communicate(timeout=180)[0]
     assert process.returncode == 0 and "Stopped." in rest and "Traceback" not in rest
-    assert any(f"{len(read_archive(run))} elites of anymal, ready after" in line for line in lines)
+    assert any(f"{len(read_archive(run)):,} elites of anymal, ready after" in line for line in lines)
 
 
 def test_bad_input_is_one_line():
