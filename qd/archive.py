@@ -149,10 +149,7 @@ def _goal_intervals(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, kw_only=True)
 class Archive(Evaluation):
-    """Elites as they were found, by descending fitness, the corrected one if there are fresh values.
-
-    Elite 0 is the worst for the robot.
-    """
+    """Elites as they were found, by descending fitness, the corrected one if there are fresh values."""
 
     robot: str
     space: str

@@ -15,7 +15,7 @@ from qd.fitness import FAILING_GOAL_RATE
 class Elites:
     """N elites by what fresh episodes say of each where it has valid ones, else as they were found.
 
-    Penalties are scaled. Lower numbers have a higher fitness: elite 0 is the worst for the robot.
+    Penalties are scaled. Lower numbers have a higher fitness.
     """
 
     penalties: tuple[str, ...]

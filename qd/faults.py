@@ -411,8 +411,8 @@ def elite_words(archive: Archive, number: int) -> list[str]:
     if faults is None:
         return told
     kinds = {
-        "with contact resolved": faults.resolved_outcomes[number],
-        "in MuJoCo C": faults.mujoco_c_outcomes[number],
+        "With contact resolved": faults.resolved_outcomes[number],
+        "In MuJoCo C": faults.mujoco_c_outcomes[number],
     }
     for place, name in enumerate(faults.certifiers):
         kinds[name] = faults.certifier_outcomes[number, place]
@@ -426,7 +426,8 @@ def elite_words(archive: Archive, number: int) -> list[str]:
         told.append("It does not fail by its fresh episodes.")
     elif by:
         kind = "a fault" if archive.confirmed[number] else "certified but not confirmed"
-        told.append(f"It is {kind}: a terrain that {' and '.join(by)} cross{'es' * (len(by) == 1)} and this one not.")
+        crosses = f"{' and '.join(by)} cross{'es' * (len(by) == 1)}"
+        told.append(f"It is {kind}: a terrain that {crosses} and this controller does not.")
     else:
         told.append(f"It is {'' if archive.confirmed[number] else 'not '}confirmed, and not known to be passable.")
     return told

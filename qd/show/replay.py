@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 class ReplayElite(Who, OnDevice, Which):
     """Print one elite of an archive, or its minimal terrain, and draw the terrain with the robots' paths.
 
-    Elites are numbered by descending fitness: 0 is the worst. After fresh episodes their corrected fitness counts.
+    Elites are numbered by falling fitness; after fresh episodes their corrected fitness counts. That is not the order
+    in which the controller fails: `faultline view` and `faultline report` list faults first.
     """
 
     replicas: int = 20

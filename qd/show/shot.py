@@ -234,7 +234,9 @@ class Panel:
         draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
         for place, values in zip(self._places, self._penalties.values(), strict=True):
             frame = min(round(time_s / self._dt), len(values) - 1)
-            draw.text(place, f"{values[frame]:.1f}", fill="black", font=font, anchor="rm")
+            draw.text(
+                place, f"{values[frame]:.{2 if values[frame] < 10.0 else 1}f}", fill="black", font=font, anchor="rm"
+            )
         return np.asarray(picture)
 
 

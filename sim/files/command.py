@@ -88,7 +88,8 @@ class Which(InSpace):
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = "0"
-    """Numbers of the elites, 0 the worst: one, several as in --elite "0 3", or all. replay and view take one."""
+    """Numbers of the elites, from 0, by falling fitness: one, several as in --elite "0 3", or all. replay and view take
+    one."""
     minimal: str | None = None
     """Instead of whole elites, the minimal terrains that `faultline minimise` left of them: numbers of the elites, as
     --elite has them; all are those that have one."""

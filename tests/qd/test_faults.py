@@ -183,12 +183,12 @@ def test_words_by_hand():
     assert fault_numbers(waits)["faults"] is None
     assert fault_words(waits)[1:] == ["2 that C-G or S crosses are still to be confirmed.", rest]
     assert [verdict_of(archive, number) for number in range(5)] == ["fault", "confirmed", "certified", "failing", ""]
-    assert elite_words(archive, 0)[-1] == "It is a fault: a terrain that S crosses and this one not."
+    assert elite_words(archive, 0)[-1] == "It is a fault: a terrain that S crosses and this controller does not."
     assert elite_words(archive, 1)[-1] == "It is confirmed, and not known to be passable."
     assert "It is certified but not confirmed" in elite_words(archive, 2)[-1]
     assert elite_words(archive, 3)[-1] == "It is not confirmed, and not known to be passable."
     assert elite_words(archive, 4)[-1] == "It does not fail by its fresh episodes."
-    assert "with contact resolved: 9 of 20 (45%, 26 to 66%) reach the goal." in elite_words(archive, 0)
+    assert "With contact resolved: 9 of 20 (45%, 26 to 66%) reach the goal." in elite_words(archive, 0)
 
 
 def test_judged_is_an_archive_of_which_nothing_is_left_to_be_crossed(failing, certifier):

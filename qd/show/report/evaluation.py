@@ -30,6 +30,7 @@ def tables_section(shown: Shown) -> list[Block]:
         return [absent(about, _command(shown))]
     kinds = by_kind(tables)
     return [
+        *_of_others(shown, tables),
         paragraph(_told(tables, kinds)),
         *([paragraph(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
         *(measure_table(kinds, measure) for measure in MEASURES),
@@ -39,6 +40,15 @@ def tables_section(shown: Shown) -> list[Block]:
         Folded("Show what became of terrains", changes) if (changes := changes_tables(tables)) else "",
         *before_after(shown),
     ]
+
+
+def _of_others(shown: Shown, tables: dict[str, Any]) -> list[Block]:
+    """That the tables say nothing of the controller that was searched, if so."""
+    searched = shown.material.archive.policy_sha256
+    if searched is None or searched in {about["sha256"] for about in tables["controllers"].values()}:
+        return []
+    text = "None of these controllers is the one whose archive this page is about. Tables with it are made by"
+    return [absent(text, _command(shown))]
 
 
 def _drawn(figure: Path) -> list[Block]:

@@ -45,7 +45,7 @@ def lead_words(shown: Shown) -> str:
     told = ""
     if faults is not None and count is not None:
         what = "fault: a terrain" if count == 1 else "faults: terrains"
-        told = f"{count:,} {what} that {any_of(faults.certifiers)} crosses and this controller of {archive.robot} not. "
+        told = f"{count:,} {what} that {any_of(faults.certifiers)} crosses and this controller does not. "
     told += f"The controller fails on {failing:,} of {counted(len(elites), 'elite')}"
     most_first = sorted(shown.modes.modes, key=lambda mode: -len(mode.members))
     if not most_first:

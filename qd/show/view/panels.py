@@ -30,6 +30,11 @@ _WIDE = 1200  # a window from here on has room for two wide panels; in another t
 _PICKED, _OTHER = (213, 94, 0), (73, 80, 87)
 _TERRAINS = ("whole", "minimal")
 _CONTROL_DT = 0.02  # step of the time slider [s]
+# viser's sheet on a phone has a fixed width, which leaves a strip of the picture beside it.
+_WHOLE_WIDTH = """<style>
+.mantine-Paper-root[style*="position: fixed"][style*="width: 20em"],
+.mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100vw !important; }
+</style>"""
 
 
 class Selection:
@@ -274,7 +279,8 @@ class CrossingPanel:
             tab: Does what a visitor asks for.
         """
         gui, self._post = client.gui, tab.common.post
-        if client.camera.image_width >= PHONE:  # else viser makes a sheet of it
+        is_phone = client.camera.image_width < PHONE  # where viser makes a sheet of it
+        if not is_phone:
             gui.main_panel.dock_right()
             gui.main_panel.set_width(_WIDTH if client.camera.image_width >= _WIDE else _NARROW_WIDTH)
         self._details = gui.add_markdown("")
@@ -297,7 +303,7 @@ class CrossingPanel:
         _on_visit(self._time, lambda value: self._post(tab.seek, float(value), only_last=(self, "time")))
         steps = {f"-{STEP_S} s": (tab.go_on, -STEP_S), f"+{STEP_S} s": (tab.go_on, STEP_S)}
         steps |= {"next mark": (tab.go_to_next_mark,), "next episode": (tab.step_replica, 1)}
-        _add_choices(gui, "Go", steps, lambda asked: self._post(*asked))
+        steps_shown = _add_choices(gui, "Go", steps, lambda asked: self._post(*asked))
         self._curves = gui.add_html("")
         self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 x")
         _on_visit(self._speed, lambda value: self._post(tab.set_speed, SPEEDS[value]))
@@ -316,6 +322,11 @@ class CrossingPanel:
             gui.add_html(legend_html(controllers))
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown("\n".join(f"- **{key}** {words.lower()}" for key, words in KEY_WORDS))
+        if is_phone:
+            gui.add_html(_WHOLE_WIDTH)
+            first = (self._status, self._ghost_status, self._progress, self._play, self._time, steps_shown)
+            for place, handle in enumerate(first):  # so that they are in sight beside the picture
+                handle.order = place - len(first)
 
     def _add_switch(self, gui: Any, label: str, switch: Callable[[bool], None], initial: bool) -> Any:
         box = gui.add_checkbox(label, initial)
@@ -434,10 +445,11 @@ def _small(text: str) -> str:
     return f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>' if text else ""
 
 
-def _add_choices(gui: Any, label: str, choices: dict[str, Any], act: Callable[[Any], None]) -> None:
+def _add_choices(gui: Any, label: str, choices: dict[str, Any], act: Callable[[Any], None]) -> Any:
     """Buttons side by side, each with what to call ``act`` with."""
     buttons = gui.add_button_group(label, tuple(choices))
     buttons.on_click(lambda event: act(choices[event.target.value]))
+    return buttons
 
 
 def _on_visit(handle: Any, act: Callable[[Any], None]) -> None:

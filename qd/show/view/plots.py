@@ -42,6 +42,7 @@ KINDS = {
 """Kinds of elites to choose from: the verdicts that each has."""
 MINIMAL = "with a minimal terrain"
 """One more kind, where there are some."""
+_MANY = 400  # lines, beyond which they are drawn thinner
 _RATE_STEP, _FITNESS_STEP = 0.01, 0.1
 
 
@@ -226,9 +227,10 @@ def axes_svg(axes: Axes, kept: NDArray[np.int64], ranges: Mapping[str, tuple[flo
     y = np.stack([_height_of(axis, axis.values) for axis in axes.axes], axis=1)
     dropped = np.setdiff1d(np.arange(len(axes.elites)), kept)
     parts = [_lines(x, y[dropped], _GREY, 0.6, 0.6)]
+    width = 0.8 * min(1.0, _MANY / max(len(kept), 1)) ** 0.5  # else many lines are one blue area
     # Equally many a shade, so that the first stand out whatever they are sorted by.
     for shade, numbers in zip(_SHADES, reversed(np.array_split(kept, len(_SHADES))), strict=True):
-        parts.append(_lines(x, y[numbers], shade, 0.8, 0.75, _named(axes, numbers)))
+        parts.append(_lines(x, y[numbers], shade, width, 0.75, _named(axes, numbers)))
     if picked is not None:
         parts.append(_lines(x, y[[picked]], _PICKED, 2.5, 1.0))
     parts += [_axis(axis, float(place), ranges.get(axis.name)) for axis, place in zip(axes.axes, x, strict=True)]

@@ -170,7 +170,7 @@ def test_certificates_are_recorded_once_and_replayed(path, monkeypatch, tmp_path
     done = replay(ReplayElite(run=path, elite=str(number), certificate="C-G"))
     assert done.out == path / f"elite-{number}-C-G.png"
     text = describe(done)
-    assert "C-G.pt" in text and "a terrain that C-G crosses and this one not." in text
+    assert "C-G.pt" in text and "a terrain that C-G crosses and this controller does not." in text
     uncertified = str(int(np.flatnonzero(~archive.certified)[0]))
     with pytest.raises(
         FileNotFoundError, match=f"no crossing of elite {uncertified} by C-G is kept at .*certify --record"

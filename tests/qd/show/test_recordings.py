@@ -123,14 +123,21 @@ def test_what_is_missing_is_crossed_in_batches_of_one_controller(anymal, tmp_pat
     assert sizes == [3, 2, 1, *[1] * 5]
 
 
-def test_the_published_recording_is_that_of_the_published_archive(anymal, tmp_path):
+def test_the_published_recordings_are_of_the_elite_that_the_viewer_opens_with(anymal, tmp_path):
     from kernels.penalties import PENALTY_DEFINITION
     from qd.archive import read_archive
     from qd.run.directory import RESULTS
+    from qd.show.ranking import rank
+    from sim.files.provenance import without_machine
+    from sim.space import get_space
 
     archive = read_archive(RESULTS.resolve() / "anymal" / "archive")
     if archive.penalty_definition != PENALTY_DEFINITION:
         pytest.skip("the published archive is of an older definition of the penalties")
     recordings = Recordings(anymal, folder=tmp_path, published=RESULTS.resolve() / "anymal" / "view")
-    found = recordings.read(on_elite(archive, 0, policy=str(anymal.policy_file), replicas=20))
-    assert found is not None and found.num_episodes == 20
+    (worst,) = rank(archive, get_space(archive.space, archive.space_sha256)).worst(1)
+    assert archive.confirmed[worst] and archive.certified[worst]
+    for policy in (anymal.policy_file, RESULTS.resolve() / "anymal" / "panel" / "C-G.pt"):
+        found = recordings.read(on_elite(archive, worst, policy=str(policy), replicas=20))
+        assert found is not None and found.num_episodes == 20
+        assert str(found.origin["policy"]) == without_machine(str(found.origin["policy"]))

@@ -465,6 +465,6 @@ def test_faults_are_told_where_other_controllers_crossed_what_fails(run, reporte
     assert 0 < count < failing
     text = Page(reported()[0].read_bytes()).text
     assert f"faults: elites that C-G crosses and this controller does not {count}" in text
-    assert f"{count} faults: terrains that C-G crosses and this controller of anymal not. The controller fails" in text
+    assert f"{count} faults: terrains that C-G crosses and this controller does not. The controller fails" in text
     assert f"{failing - count} failing elites are not known to be passable." in text
     assert len(re.findall(r"(?<=\s)fault(?=\s)", text)) >= count  # a row each in the table of all elites

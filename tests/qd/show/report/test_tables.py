@@ -1,5 +1,6 @@
 """The page's chapters about an evaluation: tables by kind of controller, and terrains before and after fine-tuning."""
 
+import dataclasses
 import hashlib
 import json
 import re
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from qd.archive import read_archive, write_archive
 from qd.show.report.evaluation import fates, most_mended
 from qd.show.report.tables import by_kind, changes_of, read_tables
 from sim.files.atomic import to_json
@@ -122,6 +124,17 @@ def test_tables_of_another_archive_are_not_told_of_in_the_first_chapter(reported
     text = Page(reported(tables=tables)[0].read_bytes()).text
     assert "held out of training" not in text[: text.index("From iteration 1")]
     assert "Of 4 elites held out of training C-G mends 1 of 2" in text
+
+
+def test_tables_without_the_controller_of_the_search_say_so(reported, tables, run):
+    words = "None of these controllers is the one whose archive this page is about."
+    searched = "1" * 64
+    write_archive(run / "archive.npz", dataclasses.replace(read_archive(run), policy_sha256=searched))
+    controllers = json.loads(tables.read_text())["controllers"]
+    changed(tables, controllers={who: {**about, "sha256": searched} for who, about in controllers.items()})
+    assert words not in Page(reported(tables=tables)[0].read_bytes()).text
+    changed(tables, controllers={who: {**about, "sha256": "0" * 64} for who, about in controllers.items()})
+    assert words in Page(reported(tables=tables)[0].read_bytes()).text
 
 
 def test_tables_of_the_robot_before_it_changed_are_refused(tables):

@@ -12,7 +12,9 @@ from pathlib import Path
 
 from PIL import Image
 
+from qd.run.directory import RESULTS
 from qd.show.elites import find_archive
+from qd.show.ranking import rank
 from qd.show.recordings import Recordings, on_elite
 from qd.show.report.command import Report, html_report
 from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode
@@ -85,7 +87,8 @@ def film_picture(run: Path, elite: int) -> None:
     found = find_archive(None, run)
     archive, robot = found.archive, found.robot
     wanted = on_elite(archive, elite, policy=found.policy(None), replicas=20)
-    (recording,) = Recordings(robot).all_of([wanted])
+    published = RESULTS / robot.name / "view"
+    (recording,) = Recordings(robot, published=published).all_of([wanted])
     scales = dict(zip(archive.penalties, archive.scales, strict=True))
     shot = Shot(recording=recording, episode=typical_episode(recording, scales), ghosts=(0, 1), scales=scales)
     cameras = follow(shot, 4.6 * robot.default_base_height)
@@ -99,17 +102,19 @@ def main() -> None:
     """Takes all pictures."""
     flags = argparse.ArgumentParser(description=__doc__)
     flags.add_argument("--run", type=Path, default=Path("results/anymal/archive"))
-    flags.add_argument("--elite", type=int, default=0)
+    flags.add_argument("--elite", type=int, help="the first of the list if left out")
     flags.add_argument("--report", type=Path, default=Path("runs/anymal-published/report.html"))
     args = flags.parse_args()
     report = args.report if args.report.exists() else html_report(Report(run=args.run, out=args.report, device="cpu"))
+    found = find_archive(None, args.run)
+    elite = rank(found.archive, found.space).worst(1)[0] if args.elite is None else args.elite
     port = free_port()
     process, _ = serve(view_command("--run", str(args.run), "--port", str(port)))
     try:
         with open_chromium() as browser:
-            viewer_pictures(browser, f"http://127.0.0.1:{port}/", args.elite)
+            viewer_pictures(browser, f"http://127.0.0.1:{port}/", elite)
             report_picture(browser, report)
-        film_picture(args.run, args.elite)
+        film_picture(args.run, elite)
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)

@@ -139,16 +139,16 @@ def test_a_link_opens_what_it_shows_and_a_reload_keeps_it(opened):
 
 
 def test_what_is_not_there_is_refused_in_words(opened):
-    page = opened("?elite=999")
-    see(page, r"^There is no elite 999 here: there are 0 to \d+\.$")
+    page = opened("?elite=99999")
+    see(page, r"^There is no elite 99999 here: there are 0 to \d+\.$")
     see(page, "^Episode 1: ")
     number = page.locator("form input[type=text], form input:not([type])").first
     number.fill("")
-    number.press_sequentially("9999", delay=100)
+    number.press_sequentially("88888", delay=100)
     page.wait_for_timeout(1000)
     assert said(page)["elite"] == "0"  # nothing happens before Enter
     number.press("Enter")
-    see(page, "^There is no elite '9999' here")
+    see(page, "^There is no elite '88888' here")
     number.fill("")
     number.press_sequentially("12", delay=100)
     number.press("Enter")
@@ -196,6 +196,7 @@ def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
     if width < 1200:
         assert not page.get_by_text("Sort", exact=True).first.is_visible()  # the archive is folded
     if width < 576:
+        assert play["y"] + play["height"] <= size[1]  # in sight without scrolling
         panel = page.get_by_text("faultline", exact=True).first
         panel.click()  # folds the rest
         page.get_by_role("button", name="Play").wait_for(state="hidden")
@@ -213,3 +214,24 @@ def test_command_and_files_are_taken_along(opened):
         if page.get_by_role("link", name="elite-0.zip").count():  # where it asks first
             page.get_by_role("link", name="elite-0.zip").first.click()
     assert download.value.suggested_filename == "elite-0.zip"
+
+
+def test_a_film_is_made_and_handed_over(opened):
+    page = opened("?elite=0")
+    see(page, "^Elite 0$")
+    number = click_another(page, "0")  # the first of the list, which is recorded and falls soon
+    name = f"elite-{number}-episode-2.mp4"
+    see(page, f"^Elite {number}$")
+    see(page, "^Episode 1: ")
+    page.keyboard.press("2")
+    see(page, "^Episode 2: ")
+    with page.expect_download(timeout=3 * LIMIT_MS) as download:
+        page.get_by_role("button", name="film this").click()
+        see(page, f"^Making {re.escape(name)}$")
+        page.keyboard.press("o")  # the page goes on answering
+        page.get_by_text("is ready").first.wait_for(timeout=3 * LIMIT_MS)
+        if page.get_by_role("link", name=name).count():  # where it asks first
+            page.get_by_role("link", name=name).first.click()
+    assert download.value.suggested_filename == name
+    with open(download.value.path(), "rb") as file:
+        assert file.read(12)[4:8] == b"ftyp"
