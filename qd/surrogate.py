@@ -17,7 +17,7 @@ from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.run.settings import SchedulerCfg
 from qd.variation import iso_line, recombined
-from sim.corridor import NODE_SPACING, SHAPE, corridor_heights
+from sim.corridor import SHAPE, corridor_heights
 from sim.policy.loaders import prepare_torch
 from sim.space import TerrainSpace, clipped, get_space
 
@@ -34,9 +34,6 @@ _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
 _LEAST_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
 _LEARNING_RATE, _WEIGHT_DECAY = 1e-3, 1e-2
-_DROPOUT = 0.3  # of what the last convolution and the layer after it have found
-_SHIFT = 2  # nodes that a terrain is moved by at most while networks learn; robots start within 0.1 m
-_SLOPE_SCALE = 0.4  # m/m, of a steep bump
 _NUM_RATES = 3  # goal rate, collision rate, whether any robot collided
 
 
@@ -63,13 +60,12 @@ class _Networks(nn.ModuleList):
     """Small convolutional networks side by side, as groups of channels.
 
     Heights of shape (batch, MEMBERS, *SHAPE), in which each network sees its own, become (batch, MEMBERS, num_out).
-    They see slopes beside the heights: from some hundred terrains they would not learn by themselves to look for them.
     """
 
     def __init__(self, num_out: int) -> None:
         super().__init__()
         rows, cols = SHAPE
-        for size, stride, channels_in, channels_out in ((5, 3, 3, 12), (3, 2, 12, 24), (3, 2, 24, 32)):
+        for size, stride, channels_in, channels_out in ((5, 3, 1, 12), (3, 2, 12, 24), (3, 2, 24, 32)):
             self.append(_beside(channels_in, channels_out, size, stride=stride, padding=size // 2))
             rows, cols = -(-rows // stride), -(-cols // stride)
         self.append(_beside(32, 64, (rows, cols)))
@@ -77,10 +73,10 @@ class _Networks(nn.ModuleList):
 
     def forward(self, heights: Tensor) -> Tensor:
         if heights.is_cuda:
-            return self._through(_with_slopes(heights), slice(None)).reshape(len(heights), MEMBERS, -1)
+            return self._through(heights, slice(None)).reshape(len(heights), MEMBERS, -1)
         # One by one, since groups are slow on the CPU.
         members = (slice(member, member + 1) for member in range(MEMBERS))
-        return torch.stack([self._through(_with_slopes(heights[:, own]), own).flatten(1) for own in members], dim=1)
+        return torch.stack([self._through(heights[:, own], own).flatten(1) for own in members], dim=1)
 
     def _through(self, rows: Tensor, members: slice) -> Tensor:
         """What some of the networks make of the heights that each sees."""
@@ -90,21 +86,9 @@ class _Networks(nn.ModuleList):
                 part.unflatten(0, (MEMBERS, -1))[members].flatten(0, 1) for part in (layer.weight, _bias_of(layer))
             )
             rows = nn.functional.relu(rows) if index else rows
-            rows = nn.functional.dropout(rows, _DROPOUT, self.training) if index >= len(self) - 2 else rows
             together = rows.shape[1] // weight.shape[1]
             rows = nn.functional.conv2d(rows, weight, bias, layer.stride, layer.padding, groups=together)
         return rows
-
-
-def _with_slopes(heights: Tensor) -> Tensor:
-    """Heights and slopes along and across the way, of each network one after the other, shape (batch, 3 n, *SHAPE).
-
-    Args:
-        heights: Over their scale, shape (batch, n, *SHAPE).
-    """
-    unit = NODE_SPACING * _SLOPE_SCALE / _HEIGHT_SCALE
-    across, along = torch.gradient(heights, spacing=unit, dim=(-2, -1))
-    return torch.stack([heights, along, across], dim=2).flatten(1, 2)
 
 
 def _beside(channels_in: int, channels_out: int, size: Any, stride: int = 1, padding: int = 0) -> nn.Conv2d:
@@ -149,7 +133,7 @@ class Surrogate:
 
     def _make_networks(self) -> None:
         with torch.random.fork_rng(devices=[]):  # torch draws weights first, which are replaced
-            self._networks = _Networks(self._targets.shape[1]).eval()
+            self._networks = _Networks(self._targets.shape[1])
         self._optimiser = torch.optim.AdamW(self._networks.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
         self._heights: Tensor | None = None
 
@@ -179,13 +163,11 @@ class Surrogate:
             evaluation: What became of them; invalid ones are left out.
             fitness: What they are told with, shape (N,).
         """
-        valid, before = evaluation.valid, len(self)
+        valid = evaluation.valid
         if valid.any():
             self._remember(clipped(genes[valid]), _targets_of(evaluation, fitness)[valid])
         if len(self) >= FEWEST:
-            most = self.cfg.training_steps / self.cfg.num_terrains
-            new = len(genes) if before >= FEWEST else len(self)
-            self._train(max(1, round(new * min(most, self.cfg.training_passes / BATCH))))
+            self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
         if self._heights is not None:
@@ -208,19 +190,12 @@ class Surrogate:
         shape = steps, BATCH, MEMBERS
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
-        moved = self._rng.integers(2 * _SHIFT + 1, size=(steps, 2))
-        self._networks.train()
-        with torch.random.fork_rng(devices=[self.device] if self.device.startswith("cuda") else []):
-            torch.manual_seed(int(self._rng.integers(2**63)))  # of what is dropped out
-            for rows, mirror, (row, col) in zip(drawn, turned, moved, strict=True):
-                heights = self._heights[rows].float()
-                heights = torch.where(mirror[..., None, None], heights.flip(-2), heights)
-                heights = nn.functional.pad(heights, (_SHIFT,) * 4, mode="replicate")
-                heights = heights[..., row : row + SHAPE[0], col : col + SHAPE[1]]
-                self._optimiser.zero_grad()
-                self._loss(self._networks(heights), targets[rows]).backward()
-                self._optimiser.step()
-        self._networks.eval()
+        for rows, mirror in zip(drawn, turned, strict=True):
+            heights = self._heights[rows].float()
+            heights = torch.where(mirror[..., None, None], heights.flip(-2), heights)
+            self._optimiser.zero_grad()
+            self._loss(self._networks(heights), targets[rows]).backward()
+            self._optimiser.step()
 
     def _scaled(self, targets: Tensor) -> Tensor:
         middle, spread = torch.from_numpy(self._scale).to(targets.device)

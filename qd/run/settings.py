@@ -81,10 +81,7 @@ class SchedulerCfg:
     disagree_share: float = setting(0.1, **_SHARE)
     """Surrogate: share of its terrains that the networks disagree most about."""
     training_steps: int = setting(100, least=1, most=100_000)
-    """Surrogate: most steps of training an iteration, each on 64 terrains a network."""
-    training_passes: float = setting(40.0, least=0.1, most=100_000.0)
-    """Surrogate: as many steps as learn from each new terrain so often, if an iteration may have so many. Of a few
-    hundred terrains networks soon learn the noise."""
+    """Surrogate: steps of training an iteration, each on 64 terrains a network."""
 
     def __post_init__(self) -> None:
         check(self)
