@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
+from qd.bandit import Bandit
 from qd.descriptors import Cells
 from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, gated_fitness
 from qd.run.settings import SchedulerCfg
@@ -137,7 +138,8 @@ class Scheduler:
         num_certifiers: int = 0,
     ) -> None:
         check_variation(cfg, space)
-        *streams, shared = np.random.SeedSequence(seed).spawn(cfg.emitters + 3)
+        pool = cfg.emitters * (len(cfg.methods) if cfg.shares == "adaptive" else 1)
+        *streams, shared = np.random.SeedSequence(seed).spawn(pool + 3)
         learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
@@ -154,6 +156,7 @@ class Scheduler:
 
             self.surrogate = surrogate.Surrogate(cfg, cells, space, shared)
         self.emitters: list[Emitter] = [self._emitter(cfg, name, space, stream) for name, stream in in_turn]
+        self._bandit = Bandit(np.zeros((2, pool)), cfg.emitters)
         self._asked: list[NDArray[np.float32] | None] = [None] * cfg.groups
 
     def _emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
@@ -190,14 +193,18 @@ class Scheduler:
             seed=stream,
         )
 
-    def _group(self, group: int) -> slice:
-        """Emitters of a group: equal parts of them, as far as that goes."""
-        return slice(*(k * len(self.emitters) // len(self._asked) for k in (group, group + 1)))
+    def _part(self, group: int, whole: int) -> slice:
+        """A group's part of a number of things: equal parts, as far as that goes."""
+        active = self._bandit.active
+        return slice(*(whole // active * (k * active // len(self._asked)) for k in (group, group + 1)))
+
+    def _group(self, group: int) -> list[int]:
+        """Numbers of the emitters of a group that ask next, or have asked and are not told yet."""
+        return self._bandit.best(self._part(group, len(self.emitters)))
 
     def places(self, group: int) -> slice:
         """Places of a group's terrains among those of an iteration."""
-        emitters, sizes = self._group(group), [int(emitter.batch_size) for emitter in self.emitters]
-        return slice(sum(sizes[: emitters.start]), sum(sizes[: emitters.stop]))
+        return self._part(group, self._bandit.active * int(self.emitters[0].batch_size))
 
     def ask(self, group: int = 0) -> NDArray[np.float32]:
         """The next terrains of a group of emitters; the same ones until the group is told their results.
@@ -210,7 +217,7 @@ class Scheduler:
         """
         asked = self._asked[group]
         if asked is None:
-            emitters = self.emitters[self._group(group)]
+            emitters = [self.emitters[number] for number in self._group(group)]
             proposed = self._proposed([emitter for emitter in emitters if isinstance(emitter, SurrogateEmitter)])
             asked = self._asked[group] = np.concatenate(
                 [next(proposed) if isinstance(emitter, SurrogateEmitter) else emitter.ask() for emitter in emitters]
@@ -271,13 +278,15 @@ class Scheduler:
         self._asked[group] = None
         if self.surrogate is not None:
             self.surrogate.learn(asked, evaluation, told["objective"])
+        emitters = self._group(group)
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
         plain = self._add({**told, "objective": ranked}, accepted)
+        self._bandit.tell(self._part(group, len(self.emitters)), emitters, plain["status"] > 0)
         learned = plain if self.archive is self.result else self.archive.add(**told)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
-        for emitter in self.emitters[self._group(group)]:
+        for emitter in [self.emitters[number] for number in emitters]:
             own = slice(first, first + int(emitter.batch_size))
             added = plain if emitter.archive is self.result else learned
             emitter.tell(
@@ -308,7 +317,8 @@ class Scheduler:
 
     def state(self) -> dict[str, Any]:
         """Everything a resumed search needs; what was asked for and not told stays asked for."""
-        return {"archive": self.archive, "result": self.result, "emitters": self.emitters, "asked": self._asked}
+        emitters = {"emitters": self.emitters, "active": self._bandit.active, "counts": self._bandit.counts}
+        return {"archive": self.archive, "result": self.result, **emitters, "asked": self._asked}
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Scheduler":
@@ -326,12 +336,16 @@ class Scheduler:
             and emitters
             and all(isinstance(emitter, Emitter) for emitter in emitters)
             and isinstance(asked, list)
-            and 1 <= len(asked) <= len(emitters)
+            and 1 <= len(asked) <= state.get("active", len(emitters))
             and all(isinstance(genes, np.ndarray | None) for genes in asked)
         ):
             raise ValueError("a search has two archives, emitters, and what they asked for, got something else")
+        # Before emitters shared by their success, all asked and nothing was counted.
+        counts = state.get("counts", np.zeros((2, len(emitters))))
+        active = state.get("active", len(emitters))
         search = cls.__new__(cls)
         search.archive, search.result, search.emitters, search._asked = archive, result, emitters, asked
+        search._bandit = Bandit(counts, active)
         shared = [emitter.surrogate for emitter in emitters if isinstance(emitter, SurrogateEmitter)]
         search.surrogate = shared[0] if shared else None
         return search

@@ -60,6 +60,8 @@ class Archive(Who, OnGround, Where):
     method: str | None = None
     """Where terrains come from: cma_mae, cma_me, map_elites, surrogate, hard_random, uniform_random; several joined by
     +."""
+    shares: str | None = None
+    """How emitters are shared between several methods: fixed, in turn; adaptive, by their success."""
     emitters: int | None = None
     """Emitters."""
     batch_size: int | None = None

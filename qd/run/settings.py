@@ -24,6 +24,7 @@ Settings = dict[str, Any]
 """The settings that make a run what it is, as JSON values."""
 
 METHODS = ("cma_mae", "cma_me", "map_elites", "surrogate", "hard_random", "uniform_random")
+SHARES = ("fixed", "adaptive")
 ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
 _SHARE = {"least": 0.0, "most": 1.0}
@@ -41,8 +42,11 @@ class SchedulerCfg:
     limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn, and
     where there are fewer emitters, the first methods count. After 75 iterations of the paper preset the default's
     corrected QD score was 6,103, that of CMA-MAE alone 5,675 (one seed each; `results/anymal/compare_long.json`)."""
+    shares: str = setting("fixed", one_of=SHARES)
+    """How emitters are shared between several methods: `fixed`, in turn; `adaptive`, there are as many of each method
+    as ask in all, and those ask whose terrains have become elites most often of late."""
     emitters: int = setting(10, least=1)
-    """Emitters, each with an evolution strategy or a stream of its own."""
+    """Emitters that ask, each with an evolution strategy or a stream of its own."""
     batch_size: int = setting(20, least=2)
     """Terrains an emitter asks for in an iteration."""
     groups: int = setting(1, least=1, most=32)
@@ -85,6 +89,8 @@ class SchedulerCfg:
             raise ValueError(
                 f"method must be one of {', '.join(METHODS)}, or several joined by a plus, each once, got {self.method}"
             )
+        if self.shares == "adaptive" and len(self.methods) == 1:
+            raise ValueError(f"shares must be fixed where there is one method, got adaptive with {self.method}")
         if self.restart_rule not in RESTART_RULES and not (self.restart_rule.isdecimal() and int(self.restart_rule)):
             raise ValueError(
                 f"restart_rule must be a positive number of iterations or one of {', '.join(RESTART_RULES)}, "

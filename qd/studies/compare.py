@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -145,7 +145,7 @@ class Compare(StudyFlags):
             counts = self._judged(study.path, list(runs), robot.spec, judges, open_evaluator) if self.certify else {}
             for name in methods if self.certify else ():
                 own = [counts[f"{name}-{seed}"] for seed in seeds[name]]
-                report["methods"][name] |= {key: _over_seeds([one[key] for one in own]) for key in FAULTS}
+                report["methods"][name] |= in_the_end({key: _over_seeds([one[key] for one in own]) for key in FAULTS})
             return {
                 **study.origin,
                 **identity(robot, study.evaluator.policy),
@@ -159,7 +159,7 @@ class Compare(StudyFlags):
                 **report,
             }
 
-        return publish(study.out, measure, _show, draw=lambda report: as_png(draw_comparison(report)))
+        return publish(study.out, measure, show, draw=lambda report: as_png(draw_comparison(report)))
 
     def _judged(
         self, path: Path, names: Sequence[str], robot: str, judges: dict[str, str], open_evaluator: Open
@@ -295,9 +295,11 @@ def report_of(runs: dict[str, list[Metrics]], settings: dict[str, Any]) -> dict[
         settings: Settings of each method's scheduler.
 
     Returns:
-        ``methods``: of each its settings, the curves found (``CURVES``, at ``terrains_evaluated``, cumulative) and
-        corrected (``AGAIN``, at ``corrected_at`` terrains) as mean and 95 % t interval over seeds, what its terrains
-        did to the robots on average, its iterations and episodes.
+        ``methods``: of each its settings, how many seeds and episodes of one seed it had, and what it has in the end,
+        found (``CURVES``), corrected (``AGAIN``) and judged (``FAULTS``), each as the mean over seeds beside its 95 % t
+        interval, None if not counted; ``curves``: the same on the way there, as points of mean, interval and seeds, at
+        ``terrains`` and ``episodes`` of one seed, cumulative, those of ``AGAIN`` at ``corrected_at`` terrains; what its
+        terrains did to the robots on average; iterations of each seed, and sums over seeds.
     """
     return {"methods": {name: _numbers_of_method(seeds, settings[name]) for name, seeds in runs.items()}}
 
@@ -306,20 +308,44 @@ def _numbers_of_method(ended: list[Metrics], settings: Any) -> dict[str, Any]:
     longest = max(ended, key=len)
     seeds = [rows + rows[-1:] * (len(longest) - len(rows)) for rows in ended]
     terrains = np.cumsum([row["terrains"] for row in longest])
+    spent = np.zeros((len(ended), len(longest)))
+    for own, rows in zip(spent, ended, strict=True):
+        own[: len(rows)] = [episodes_in(row) for row in rows]
+    episodes = spent.cumsum(axis=1).mean(axis=0)
     # The last iteration of a comparison that was stopped in it and then extended has them in some runs only.
     at = [k for k in range(len(longest)) if all("corrected_qd_score" in rows[k] for rows in seeds)]
-    every = [row for rows in ended for row in rows]
-    return {
-        "settings": settings,
-        "terrains_evaluated": terrains.tolist(),
+    curves = {
+        "terrains": terrains.tolist(),
+        "episodes": episodes.tolist(),
         "corrected_at": terrains[at].tolist(),
         **{key: [_over_seeds([rows[k][key] for rows in seeds]) for k in range(len(longest))] for key in CURVES},
         **{key: [_over_seeds([rows[k].get(key) for rows in seeds]) for k in at] for key in AGAIN},
+    }
+    counted = (*CURVES, *AGAIN) if len(longest) - 1 in at else CURVES
+    every = [row for rows in ended for row in rows]
+    return {
+        "settings": settings,
+        "seeds": len(ended),
+        "episodes": float(episodes[-1]),
+        **in_the_end({key: curves[key][-1] if key in counted else None for key in (*CURVES, *AGAIN)}),
+        **in_the_end(dict.fromkeys(FAULTS)),
+        "curves": curves,
         **{key: _over_seeds([float(np.mean([row[key] for row in rows])) for rows in ended]) for key in _BATCH},
         "iterations": [len(rows) for rows in ended],
-        "episodes": sum(map(episodes_in, every)),
         **{key: sum(row.get(key, 0) for row in every) for key in ("certifier_episodes", "invalid_episodes", "wall_s")},
     }
+
+
+def in_the_end(points: Mapping[str, dict[str, Any] | None]) -> dict[str, Any]:
+    """Numbers of a method, each with its interval beside it; None where nothing was counted.
+
+    Args:
+        points: Mean and interval over seeds, by what they are of.
+    """
+    found = {}
+    for name, point in points.items():
+        found[name], found[f"{name}_interval"] = (point["mean"], point["interval"]) if point else (None, None)
+    return found
 
 
 def _over_seeds(values: Sequence[float | None]) -> dict[str, Any]:
@@ -331,7 +357,7 @@ def _over_seeds(values: Sequence[float | None]) -> dict[str, Any]:
 
 
 def draw_comparison(report: dict[str, Any]) -> "Figure":
-    """QD score, reachable coverage and corrected QD score over terrains evaluated; bands are 95 % t intervals.
+    """Elites, corrected elites and failing elites over the episodes of one seed; bands are 95 % t intervals.
 
     Args:
         report: As of :func:`report_of`, with ``robot`` and ``seeds``.
@@ -339,30 +365,34 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     from sim.files.figures import new_figure
 
     figure, seeds = new_figure(12.0, 4.6), len(report["seeds"])
-    most = max(method["terrains_evaluated"][-1] for method in report["methods"].values())
+    most = max(method["episodes"] for method in report["methods"].values())
     figure.suptitle(
-        f"{report['robot']}: {most:,} terrains a run, "
+        f"{report['robot']}: {most:,.0f} episodes a run, "
         + (f"{seeds} seeds a method, mean and 95 % interval over them" if seeds > 1 else "one seed")
     )
     panels = (
-        ("qd_score", "QD score, as found", 1.0, "terrains_evaluated"),
-        ("reachable_coverage", "reachable coverage, as found [%]", 100.0, "terrains_evaluated"),
-        ("corrected_qd_score", "QD score, corrected by fresh episodes", 1.0, "corrected_at"),
+        ("elites", "elites, as found"),
+        ("corrected_elites", "elites, corrected by fresh episodes"),
+        ("failing", "elites that the controller fails in fresh episodes"),
     )
     lines: dict[str, Any] = {}
-    for axes, (key, label, factor, along) in zip(figure.subplots(1, 3), panels, strict=True):
+    for axes, (key, label) in zip(figure.subplots(1, 3), panels, strict=True):
         others = iter(_OTHER_LOOKS * len(report["methods"]))
         for name, method in report["methods"].items():
             title, color, style = LABELS.get(name) or (name.replace(":", ": "), *next(others))
-            points = [point for point in zip(method[along], method[key], strict=True) if point[1]["mean"] is not None]
-            x = [terrains for terrains, _ in points]
-            mean = [factor * point["mean"] for _, point in points]
-            marker = "o" if along == "corrected_at" else ""
+            curves = method["curves"]
+            spent = dict(zip(curves["terrains"], curves["episodes"], strict=True))
+            along = curves["corrected_at" if key in AGAIN else "terrains"]
+            points = [(spent[at], point) for at, point in zip(along, curves[key], strict=True)]
+            points = [(at, point) for at, point in points if point["mean"] is not None]
+            x = [at for at, _ in points]
+            mean = [point["mean"] for _, point in points]
+            marker = "o" if key in AGAIN else ""
             lines[title] = axes.plot(x, mean, color=color, linestyle=style, marker=marker, markersize=4)[0]
             bounds = [point["interval"] or (math.nan, math.nan) for _, point in points]
-            low, high = ([factor * bound[side] for bound in bounds] for side in (0, 1))
+            low, high = ([bound[side] for bound in bounds] for side in (0, 1))
             axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
-        axes.set_xlabel("terrains evaluated")
+        axes.set_xlabel("episodes of one seed")
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
@@ -370,20 +400,18 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     return figure
 
 
-def _show(report: dict[str, Any]) -> None:
-    """Prints what each method has found, by the last fresh episodes of all elites."""
-    width = max(map(len, report["methods"]))
-    print(
-        f"\nby fresh episodes, 95 % interval over seeds\n  {'':<{width}}  {'elites':>22}{'failing':>22}{'QD score':>24}"
-    )
-    for name, method in report["methods"].items():
-        if not method["corrected_at"]:
-            continue  # some runs were extended alone, with fresh episodes of some elites only
-        cells = [
-            value_words(method[key][-1]["mean"], method[key][-1]["interval"], ".0f")
-            for key in ("corrected_elites", "failing", "corrected_qd_score")
-        ]
-        print(f"  {name:<{width}}  {cells[0]:>22}{cells[1]:>22}{cells[2]:>24}")
-        if "faults" in method:
-            found = method["faults"]
-            print(f"    faults: {value_words(found['mean'], found['interval'], '.0f')}")
+_COLUMNS = ("elites", "corrected_elites", "failing", "faults")
+
+
+def show(report: dict[str, Any]) -> None:
+    """Prints what each method has found in the end, the one with the most failing elites first."""
+    methods = report["methods"]
+    ranked = sorted(methods, key=lambda name: [-(methods[name][key] or 0.0) for key in ("failing", "elites")])
+    width = max(map(len, methods))
+    heads = "".join(f"{name.replace('_', ' '):>20}" for name in _COLUMNS)
+    print("\nmeans with 95 % intervals over seeds; failing and corrected by fresh episodes, - where not counted")
+    print(f"  {'':<{width}}  seeds{'episodes':>12}{heads}")
+    for name in ranked:
+        method = methods[name]
+        cells = "".join(f"{value_words(method[key], method[f'{key}_interval'], '.0f'):>20}" for key in _COLUMNS)
+        print(f"  {name:<{width}}  {method['seeds']:>5}{method['episodes']:>12,.0f}{cells}")

@@ -35,7 +35,7 @@ def advance(search: Scheduler, first: int, last: int, cells: Cells = CELLS) -> N
 
 
 def told(cell, fitness, invalid=None) -> Evaluation:
-    """An evaluation of 12 terrains with the given cells and fitness."""
+    """An evaluation of terrains with the given cells and fitness."""
     cell = np.asarray(cell)
     rates = np.zeros(len(cell))
     columns = np.full((len(cell), 6), 1 / 6)
@@ -129,6 +129,7 @@ def test_cell_of_an_elite_is_the_cell_of_its_ratios():
         *({"es": kind} for kind in ES_KINDS),
         *({"method": name} for name in (*METHODS, *JOINED)),
         {"method": "map_elites", "crossover_share": 0.5, "mirror_share": 0.2},
+        {"method": "cma_mae+map_elites+surrogate", "shares": "adaptive"},
     ],
 )
 def test_a_saved_search_goes_on_bit_for_bit(changes, tmp_path):
@@ -210,6 +211,52 @@ def test_joined_methods_take_turns_each_judged_by_its_own_archive():
     assert search.archive is not search.result
 
 
+def test_of_emitters_shared_by_success_those_ask_that_find_elites():
+    search = make_search(SchedulerCfg(emitters=2, batch_size=6, method="cma_me+map_elites", shares="adaptive"))
+    strategies = search.emitters[::2]
+    assert [type(emitter) for emitter in search.emitters] == [EvolutionStrategyEmitter, VariationEmitter] * 2
+    told_so_far = []
+    for iteration in (1, 2, 3):  # at first everyone is tried, one of each method at a time
+        assert search.ask().shape == (12, 64)
+        elites = 6 if iteration == 1 else 0
+        search.tell(told(np.arange(12), [5.0] * elites + [FITNESS_FLOOR] * (12 - elites)), iteration)
+        told_so_far.append([emitter.itrs for emitter in strategies])
+    assert told_so_far == [[1, 0], [1, 1], [2, 1]]
+
+
+def test_a_saved_search_of_groups_shared_by_success_goes_on_with_what_was_asked(tmp_path):
+    cfg = SchedulerCfg(emitters=4, batch_size=3, groups=2, method="cma_mae+map_elites", shares="adaptive")
+
+    def go_on(search: Scheduler, first: int, last: int) -> None:
+        for step in range(first, last):  # one group is always under way
+            group = step % 2
+            genes = search.ask(group)
+            seeds = np.random.SeedSequence([0, step]).generate_state(len(genes))
+            search.ask(1 - group)
+            search.tell(evaluation_of(stand_in.evaluate(genes, seeds), CELLS, FITNESS), step // 2 + 1, group)
+
+    straight, cut = make_search(cfg), make_search(cfg)
+    go_on(straight, 0, 16)
+    go_on(cut, 0, 7)
+    save_checkpoint(tmp_path / "saved", cut.state())
+    cut = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
+    go_on(cut, 7, 16)
+    for name, rows in straight.elites().items():
+        assert np.array_equal(rows, cut.elites()[name]), name
+    assert np.array_equal(straight.ask(0), cut.ask(0)) and np.array_equal(straight.ask(1), cut.ask(1))
+
+
+def test_a_state_of_before_success_was_counted_goes_on():
+    straight, cut = make_search(), make_search()
+    advance(straight, 1, 3)
+    advance(cut, 1, 2)
+    state = cut.state()
+    del state["counts"], state["active"]
+    cut = Scheduler.from_state(state)
+    advance(cut, 3, 3)
+    assert np.array_equal(straight.ask(), cut.ask())
+
+
 def test_of_fewer_emitters_than_methods_the_first_ones_count():
     search = make_search(SchedulerCfg(emitters=1, batch_size=2, method="map_elites+cma_mae"))
     assert [type(emitter) for emitter in search.emitters] == [VariationEmitter]
@@ -229,9 +276,14 @@ def test_a_state_of_something_else_is_refused(state):
         ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
         ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")),
         ("crossover_share", 1.5), ("mirror_share", -0.1), ("disagree_share", 0.9), ("training_steps", 0),
-        ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
+        ("shares", "equal"), ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(setting, value):
     with pytest.raises(ValueError, match=f"{setting} must"):
         SchedulerCfg(**{setting: value})
+
+
+def test_one_method_has_nothing_to_share():
+    with pytest.raises(ValueError, match="shares must be fixed where there is one method, got adaptive with cma_me"):
+        SchedulerCfg(method="cma_me", shares="adaptive")

@@ -13,7 +13,7 @@ from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.arguments import Archive, job_of
 from qd.run.directory import RunDirectory, claimed
 from qd.search import run_search
-from qd.studies.compare import AGAIN, LABELS, METHODS, Compare, draw_comparison, report_of
+from qd.studies.compare import AGAIN, LABELS, METHODS, Compare, draw_comparison, report_of, show
 from sim.files.command import Interrupted
 from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
@@ -62,7 +62,9 @@ def numbers_of(path: Path) -> dict:
 
 def corrected_at(path: Path) -> list[int]:
     """Terrains after which the elites of every method crossed fresh episodes."""
-    return sorted(set.intersection(*(set(method["corrected_at"]) for method in numbers_of(path)["methods"].values())))
+    return sorted(
+        set.intersection(*(set(method["curves"]["corrected_at"]) for method in numbers_of(path)["methods"].values()))
+    )
 
 
 def rows_of(run: Path) -> list[dict]:
@@ -122,7 +124,7 @@ def test_corrected_rows_are_at_the_iterations_asked_for():
         assert corrected == [2, 4, 5]
     # 4 emitters x 8 terrains an iteration.
     for method in numbers_of(path)["methods"].values():
-        assert method["terrains_evaluated"] == [32, 64, 96, 128, 160]
+        assert method["curves"]["terrains"] == [32, 64, 96, 128, 160]
     assert corrected_at(path) == [64, 128, 160]
 
 
@@ -151,10 +153,11 @@ def test_searches_of_other_widths_have_as_many_terrains_and_are_those_of_a_searc
     path = run("a", methods=("mixed@1", wide), iterations=4, seeds=2)
     assert runs_of(path) == ["mixed-5", f"{wide}-5", f"{wide}-6"]
     narrow, broad = (numbers_of(path)["methods"][name] for name in ("mixed", wide))
-    assert narrow["terrains_evaluated"] == [32, 64, 96, 128] and broad["terrains_evaluated"] == [128]
-    assert narrow["corrected_at"] == [64, 128] and broad["corrected_at"] == [128]
-    assert (narrow["iterations"], broad["iterations"], broad["episodes"]) == ([4], [1, 1], 2 * 128 * 4)
-    assert len(broad["failing"][-1]["seeds"]) == 2
+    assert narrow["curves"]["terrains"] == [32, 64, 96, 128] and broad["curves"]["terrains"] == [128]
+    assert narrow["curves"]["corrected_at"] == [64, 128] and broad["curves"]["corrected_at"] == [128]
+    assert (narrow["iterations"], broad["iterations"]) == ([4], [1, 1])
+    assert (narrow["seeds"], broad["seeds"]) == (1, 2) and narrow["episodes"] == broad["episodes"] == 128 * 4
+    assert len(broad["curves"]["failing"][-1]["seeds"]) == 2
     asked = Archive(
         preset="small", device="cpu", policy=POLICY, iterations=1, seed=6, reevaluate_every=1, emitters=16, groups=4,
         run_dir=Path("alone"),
@@ -370,49 +373,84 @@ def reported(runs: dict) -> dict:
 def test_report_by_hand():
     report = reported(RUNS)
     found = report["methods"]["cma_mae"]
-    assert (found["iterations"], found["terrains_evaluated"], found["corrected_at"]) == ([2] * 3, [10, 20], [20])
-    assert found["settings"] == {"method": "cma_mae"}
-    assert [point["mean"] for point in found["qd_score"]] == [2.0, 20.0]
-    assert found["qd_score"][0]["interval"] == pytest.approx([2.0 - HALF, 2.0 + HALF])
-    assert found["qd_score"][1]["seeds"] == [10.0, 20.0, 30.0]
-    assert [point["mean"] for point in found["corrected_qd_score"]] == [10.0]
-    assert found["corrected_qd_score"][0]["interval"] == pytest.approx([10.0 - 5 * HALF, 10.0 + 5 * HALF])
+    curves = found["curves"]
+    assert (found["iterations"], curves["terrains"], curves["corrected_at"]) == ([2] * 3, [10, 20], [20])
+    assert (found["settings"], found["seeds"], found["episodes"]) == ({"method": "cma_mae"}, 3, 80)
+    assert curves["episodes"] == [40, 80]
+    assert [point["mean"] for point in curves["qd_score"]] == [2.0, 20.0]
+    assert curves["qd_score"][0]["interval"] == pytest.approx([2.0 - HALF, 2.0 + HALF])
+    assert curves["qd_score"][1]["seeds"] == [10.0, 20.0, 30.0]
+    assert found["qd_score"] == 20.0 and found["qd_score_interval"] == pytest.approx([20 - 10 * HALF, 20 + 10 * HALF])
+    assert [point["mean"] for point in curves["corrected_qd_score"]] == [found["corrected_qd_score"]] == [10.0]
+    assert found["corrected_qd_score_interval"] == pytest.approx([10.0 - 5 * HALF, 10.0 + 5 * HALF])
+    assert found["faults"] is found["faults_interval"] is None  # nobody judged the elites
     assert found["batch_collision_rate"]["mean"] == 0.25  # 0 in the first iteration, .5 in the second
-    assert (found["episodes"], found["invalid_episodes"], found["wall_s"]) == (3 * 2 * 40, 3 * 2, 3 * 2 * 1.5)
-    assert report["methods"]["hard_random"]["qd_score"][1] == {"mean": 8.0, "interval": [8.0, 8.0], "seeds": [8.0] * 3}
+    assert (found["invalid_episodes"], found["wall_s"]) == (3 * 2, 3 * 2 * 1.5)
+    assert report["methods"]["hard_random"]["curves"]["qd_score"][1] == {
+        "mean": 8.0,
+        "interval": [8.0, 8.0],
+        "seeds": [8.0] * 3,
+    }
 
 
 def test_a_seed_without_a_value_leaves_the_mean_out():
     runs = {"mixed": [[{**row(1.0, corrected=1.0), "mean_std": value}] for value in (0.5, None)]}
-    point = reported(runs)["methods"]["mixed"]["mean_std"][0]
-    assert point == {"mean": None, "interval": None, "seeds": [0.5, None]}
+    found = reported(runs)["methods"]["mixed"]
+    assert found["mean_std"] is None
+    assert found["curves"]["mean_std"][0] == {"mean": None, "interval": None, "seeds": [0.5, None]}
 
 
 def test_corrected_rows_that_some_runs_lack_are_left_out():
     runs = {"mixed": [[row(1.0, corrected=1.0), row(2.0, corrected=2.0)], [row(1.0), row(2.0, corrected=2.0)]]}
-    report = reported(runs)
-    assert report["methods"]["mixed"]["corrected_at"] == [20]
-    assert [point["mean"] for point in report["methods"]["mixed"]["corrected_qd_score"]] == [2.0]
+    curves = reported(runs)["methods"]["mixed"]["curves"]
+    assert curves["corrected_at"] == [20]
+    assert [point["mean"] for point in curves["corrected_qd_score"]] == [2.0]
+
+
+def test_what_not_all_elites_were_looked_at_for_is_not_counted_in_the_end():
+    runs = {"mixed": [[row(1.0, corrected=1.0), row(2.0)]]}
+    found = reported(runs)["methods"]["mixed"]
+    assert found["qd_score"] == 2.0
+    assert found["corrected_qd_score"] is found["failing"] is found["failing_interval"] is None
+    assert found["curves"]["corrected_qd_score"][0]["mean"] == 1.0
+
+
+def test_the_table_begins_with_the_most_failing_elites(capsys):
+    counts = {"few": 3.0, "many": 20.0, "uncounted": None}
+    runs = {
+        name: [[row(1.0) if count is None else {**row(1.0, corrected=1.0), "failing": count}]]
+        for name, count in counts.items()
+    }
+    show(reported(runs))
+    lines = capsys.readouterr().out.splitlines()[-3:]
+    assert [line.split() for line in lines] == [
+        ["many", "1", "40", "5", "1", "20", "-"],
+        ["few", "1", "40", "5", "1", "3", "-"],
+        ["uncounted", "1", "40", "5", "-", "-", "-"],
+    ]
 
 
 def test_figure_has_a_line_a_method_and_panel_with_bands():
-    figure = draw_comparison(reported(RUNS))
-    score, coverage, corrected = figure.axes
+    runs = {
+        name: [[{**rows[0], "elites": k + 1}, rows[1]] for k, rows in enumerate(seeds)] for name, seeds in RUNS.items()
+    }
+    figure = draw_comparison(reported(runs))
+    elites, corrected, failing = figure.axes
     assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2]
-    assert score.lines[0].get_xydata().tolist() == [[10, 2], [20, 20]]
-    assert coverage.lines[0].get_ydata().tolist() == [25, 25]  # per cent
-    assert corrected.lines[0].get_xydata().tolist() == [[20, 10]]
-    band = score.collections[0].get_paths()[0].vertices
-    assert band[:, 1].max() == pytest.approx(20 + 10 * HALF)
+    assert elites.lines[0].get_xydata().tolist() == [[40, 2], [80, 5]]
+    assert corrected.lines[0].get_xydata().tolist() == failing.lines[0].get_xydata().tolist() == [[80, 1]]
+    band = elites.collections[0].get_paths()[0].vertices
+    assert band[:, 1].min() == pytest.approx(2 - HALF)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["CMA-MAE", "hard-random"]
-    assert "3 seeds a method" in figure.get_suptitle()
+    assert "80 episodes a run, 3 seeds a method" in figure.get_suptitle()
 
 
 def test_figure_of_one_seed_has_lines_without_bands(tmp_path):
     report = reported({name: seeds[:1] for name, seeds in RUNS.items()})
-    assert report["methods"]["cma_mae"]["qd_score"][0] == {"mean": 1.0, "interval": None, "seeds": [1.0]}
+    curves = report["methods"]["cma_mae"]["curves"]
+    assert curves["elites"][0] == {"mean": 5.0, "interval": None, "seeds": [5.0]}
     figure = draw_comparison(report)
-    assert figure.axes[0].lines[0].get_xydata().tolist() == [[10, 1], [20, 10]]
+    assert figure.axes[0].lines[0].get_xydata().tolist() == [[40, 5], [80, 5]]
     figure.savefig(tmp_path / "figure.png")
 
 
@@ -451,12 +489,13 @@ def test_a_search_for_certified_failures_ends_with_as_many_episodes(capsys):
     assert gated["episodes"] == done * 128 + gated["certifier_episodes"] > 5 * 128
     last = rows_of(path / "gated-5")[-1]
     assert gated["episodes"] - last["episodes"] - last["certifier_episodes"] <= 5 * 128
-    assert len(gated["elites"]) == done and gated["terrains_evaluated"][-1] == gated["corrected_at"][-1] == done * 32
+    curves = gated["curves"]
+    assert len(curves["elites"]) == done and curves["terrains"][-1] == curves["corrected_at"][-1] == done * 32
     for method in (mixed, gated):  # the judge crosses all that fails
-        assert method["faults"]["mean"] == method["certified"]["mean"] == method["confirmed"]["mean"]
-        assert 0 < method["faults"]["mean"] <= method["failing"][-1]["mean"]
+        assert method["faults"] == method["certified"] == method["confirmed"]
+        assert 0 < method["faults"] <= method["failing"]
     assert report["panel"] == ["me"] and [*report["certified_by"]] == ["me"]
-    assert "faults: " in capsys.readouterr().out
+    assert "faults" in capsys.readouterr().out
     again = run("a", **{**changes, "open_evaluator": never})  # all of it is kept
     assert numbers_of(again) == report
     assert_same(path, run("b", **changes))
