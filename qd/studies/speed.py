@@ -104,13 +104,20 @@ def read_iterations(folder: Path, count: int, device_name: str) -> tuple[SearchC
         ValueError: If the run is damaged, too short, or of another device.
     """
     run = RunDirectory(folder)
-    cfg, made_on = run.read_cfg(), run.read_config()["device"]
-    if made_on != device_name:
-        raise ValueError(f"--run {folder} was made on {made_on}, the bare rate would be that of {device_name}")
+    cfg = run.read_cfg()
+    _refuse_another_device(run, "--run", device_name)
     search, metrics = run.load(cfg) or (None, [])
     if search is None or len(metrics) < count + _WARM_UP:
         raise ValueError(f"--run {folder} must have at least {count + _WARM_UP} iterations, got {len(metrics)}")
     return cfg, metrics[-count:], _asked(cfg, search)
+
+
+def _refuse_another_device(run: RunDirectory, flag: str, device_name: str) -> None:
+    made_on = run.read_config()["device"]
+    if made_on != device_name:
+        raise ValueError(
+            f"{flag} {run.path} was made on {made_on}, the rates beside it would be those of {device_name}"
+        )
 
 
 def wide_numbers(folder: Path, device_name: str) -> dict[str, float]:
@@ -119,11 +126,14 @@ def wide_numbers(folder: Path, device_name: str) -> dict[str, float]:
     Raises:
         ValueError: If the run is of another preset or device, damaged, or too short.
     """
-    cfg = RunDirectory(folder).read_cfg()
+    run = RunDirectory(folder)
+    cfg = run.read_cfg()
     if cfg.preset != "wide":
         raise ValueError(f"--wide {folder} must be a run of preset wide, got one of {cfg.preset}")
-    done = RunDirectory(folder).iterations_done()
-    cfg, metrics, _ = read_iterations(folder, max(1, done - _WARM_UP), device_name)
+    _refuse_another_device(run, "--wide", device_name)
+    metrics = run.read_metrics()[_WARM_UP:]
+    if not metrics:
+        raise ValueError(f"--wide {folder} must have more than {_WARM_UP} iterations, got {run.iterations_done()}")
     wall_s = sum(row["wall_s"] for row in metrics)
     waited = sum(row["idle_share"] * row["robot_steps"] for row in metrics)
     return {

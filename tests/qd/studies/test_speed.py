@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from qd.run.directory import RunDirectory
 from qd.studies import scale
 from qd.studies import speed as speed_module
 from qd.studies.scale import Scale
-from qd.studies.speed import Speed, read_iterations, time_iterations
-from tests.qd.searches import CFG, make_job
+from qd.studies.speed import Speed, read_iterations, time_iterations, wide_numbers
+from tests.qd.searches import CFG, make_job, run
 from tests.qd.stand_in import open_stand_in
 
 SHIPPED_RUN = Path(__file__).parents[3] / "results" / "anymal" / "archive"
@@ -43,11 +44,22 @@ def test_numbers_that_make_no_sense_are_refused_before_the_timing(command, says)
         command.execute()
 
 
-def test_a_run_of_another_device_is_not_timed_against_this_one():
-    with pytest.raises(ValueError, match="was made on NVIDIA H200, the bare rate would be that of NVIDIA H100"):
+def test_a_run_of_another_device_is_not_timed_against_this_one(tmp_path):
+    with pytest.raises(ValueError, match="was made on NVIDIA H200, the rates beside it would be those of NVIDIA H100"):
         read_iterations(SHIPPED_RUN, 5, "NVIDIA H100")
-    cfg, metrics, terrains = read_iterations(SHIPPED_RUN, 5, "NVIDIA H200")
-    assert (cfg.robot, len(metrics), terrains.shape) == ("anymal", 5, (1600, 64))
+    run(tmp_path / "run", iterations=4)
+    here = RunDirectory(tmp_path / "run").read_config()["device"]
+    cfg, metrics, terrains = read_iterations(tmp_path / "run", 2, here)
+    assert ([row["iteration"] for row in metrics], len(terrains)) == ([3, 4], cfg.scheduler.num_terrains)
+
+
+def test_a_wide_run_is_told_in_numbers(tmp_path):
+    run(tmp_path, iterations=3)
+    with pytest.raises(ValueError, match="must be a run of preset wide, got one of"):
+        wide_numbers(tmp_path, "any")
+    with pytest.raises(ValueError, match=r"--wide .* was made on NVIDIA H200"):
+        wide_numbers(SHIPPED_RUN, "NVIDIA H100")
+    assert wide_numbers(SHIPPED_RUN, "NVIDIA H200")["iterations"] == 123
 
 
 def test_a_search_is_timed_from_its_start(monkeypatch):
