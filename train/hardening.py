@@ -25,7 +25,7 @@ from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
 from sim.files.command import Interrupted, command_line, naming_what_is_next
 from sim.files.intervals import value_words
 from sim.files.settings import check
-from sim.policy.spec import controller_hash, controllers_of, is_same
+from sim.policy.spec import about_controllers, controllers_of, is_same
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, to_be_named
@@ -462,7 +462,7 @@ def _tables(job: Hardening) -> dict[str, Any]:
     results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
     scales = job.robot.read_penalty_scales(None if job.flags.policy is None else str(job.flags.policy))
     crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
-    about = {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()}
+    about = about_controllers(controllers)
     return {
         "episodes": job.evaluator.num_replicas,
         "controllers": about,

@@ -8,7 +8,7 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -219,6 +219,15 @@ def firsts(names: Iterable[str]) -> list[str]:
     for name in names:
         found.setdefault(kind_of(name), name)
     return list(found.values())
+
+
+def about_controllers(controllers: Mapping[str, str]) -> dict[str, dict[str, str | None]]:
+    """Policy and hash of each controller by its name, as files of results have them.
+
+    Args:
+        controllers: Policy of each by its name.
+    """
+    return {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()}
 
 
 def controllers_of(policies: Sequence[str], robot: "RobotCfg", *, flag: str = "policies") -> dict[str, str]:

@@ -1,7 +1,7 @@
 """Which real obstacle at which size stops a controller: goal rate against a stair's rise, a ditch's width, friction."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import Open
-from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
+from qd.workers.evaluator import check_policy, open_evaluator, origin_of
 from sim.files.atomic import prepare_output
 from sim.files.command import OfRobot, Where, naming_what_is_next, publish, split_words
 from sim.files.intervals import value_words, wilson_interval
-from sim.files.settings import check, setting
-from sim.policy.spec import controller_hash, controllers_of
+from sim.files.settings import setting
+from sim.policy.spec import about_controllers, controllers_of
 from sim.robots.identity import robot_identity
+from train.evaluate.evaluate import sized_evaluator
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
     from sim.spaces.dose import Dose
     from train.evaluate.sets import TerrainSet
@@ -88,7 +88,7 @@ def measure_dose(flags: MeasureDose, *, open_evaluator: Open = open_evaluator) -
     from train.evaluate.crossings import cross_all
 
     robot = get_robot(flags.robot)
-    evaluator = _evaluator_of(flags, robot)
+    evaluator = replace(sized_evaluator(flags, robot, _FULL, _SMALL, "a value"), resolved=flags.resolved)
     doses = chosen_doses(split_words(flags.elements), _values_of(flags.values), _sizes_of(flags.at))
     controllers = controllers_of(flags.policies, robot)
     for policy in controllers.values():
@@ -112,9 +112,7 @@ def measure_dose(flags: MeasureDose, *, open_evaluator: Open = open_evaluator) -
             "resolved": flags.resolved,
             "terrains": evaluator.num_terrains,
             "episodes": evaluator.num_replicas,
-            "controllers": {
-                who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()
-            },
+            "controllers": about_controllers(controllers),
             "titles": {name: dose.describe() for name, dose in doses.items()},
             "dose": [row for _, rows in lines for row in rows],
             "half": [half_of(dose, rows) for dose, rows in lines],
@@ -122,24 +120,6 @@ def measure_dose(flags: MeasureDose, *, open_evaluator: Open = open_evaluator) -
 
     out = flags.out or run_dir / ("dose-resolved.json" if flags.resolved else "dose.json")
     return publish(out, measure, print_dose, draw=_picture_of)
-
-
-def _evaluator_of(flags: MeasureDose, robot: "RobotCfg") -> EvaluatorCfg:
-    check(flags)
-    device = resolve_device(flags.device, flags.workers)
-    terrains, episodes = _FULL if device.startswith("cuda") else _SMALL
-    if not device.startswith("cuda") and flags.terrains is None and flags.episodes is None:
-        print(f"No GPU: {terrains} terrains x {episodes} episodes a value instead of {_FULL[0]} x {_FULL[1]}.")
-    return EvaluatorCfg(
-        robot=robot,
-        policy="",
-        num_terrains=flags.terrains or terrains,
-        num_replicas=flags.episodes or episodes,
-        device=device,
-        workers=flags.workers,
-        num_envs=flags.num_envs,
-        resolved=flags.resolved,
-    )
 
 
 def _values_of(words: Sequence[str]) -> dict[str, list[float]]:

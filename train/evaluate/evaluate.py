@@ -15,13 +15,14 @@ from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, ori
 from sim.files.atomic import prepare_output
 from sim.files.command import OnGround, Where, Who, naming_what_is_next, publish, split_words
 from sim.files.settings import check, setting
-from sim.policy.spec import controller_hash, controllers_of, who_crossed
+from sim.policy.spec import about_controllers, controllers_of, who_crossed
 from sim.robots.identity import identity, robot_identity
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
     from sim.space import TerrainSpace
+    from train.evaluate.dose import MeasureDose
     from train.evaluate.sets import EliteSplit, TerrainSet
 
 _FULL = (300, 20)  # terrains a set and episodes a terrain of the published rates; tables take the paper's terrains
@@ -117,12 +118,31 @@ def evaluator_of(flags: Evaluate, robot: "RobotCfg", full: tuple[int, int] | Non
     """
     from train.evaluate.sets import paper_terrains
 
+    full = full or ((paper_terrains(robot.name), _FULL[1]) if flags.makes_tables else _FULL)
+    sized = sized_evaluator(flags, robot, full, (min(full[0], _SMALL[0]), _SMALL[1]), "a set")
+    return replace(sized, space=space_named(flags).name)
+
+
+def sized_evaluator(
+    flags: "Evaluate | MeasureDose", robot: "RobotCfg", full: tuple[int, int], small: tuple[int, int], each: str
+) -> EvaluatorCfg:
+    """What crosses as many terrains in as many episodes as a command line asks for, or as suit the device.
+
+    Args:
+        flags: What was asked for.
+        robot: The robot.
+        full: Terrains and episodes a terrain on a GPU.
+        small: The same without one; it is told that they are fewer.
+        each: What the terrains are for, as in ``a set``.
+
+    Raises:
+        ValueError: If the device is unknown, or a number is out of range.
+    """
     check(flags)
     device = resolve_device(flags.device, flags.workers)
-    full = full or ((paper_terrains(robot.name), _FULL[1]) if flags.makes_tables else _FULL)
-    terrains, episodes = full if device.startswith("cuda") else (min(full[0], _SMALL[0]), _SMALL[1])
+    terrains, episodes = full if device.startswith("cuda") else small
     if not device.startswith("cuda") and flags.terrains is None and flags.episodes is None:
-        print(f"No GPU: {terrains} terrains x {episodes} episodes a set instead of {full[0]} x {full[1]}.")
+        print(f"No GPU: {terrains} terrains x {episodes} episodes {each} instead of {full[0]} x {full[1]}.")
     return EvaluatorCfg(
         robot=robot,
         policy="",
@@ -131,7 +151,6 @@ def evaluator_of(flags: Evaluate, robot: "RobotCfg", full: tuple[int, int] | Non
         device=device,
         workers=flags.workers,
         num_envs=flags.num_envs,
-        space=space_named(flags).name,
     )
 
 
@@ -347,8 +366,7 @@ def _tables(job: TablesJob, open_evaluator: Open) -> dict[str, Any]:
     flags, evaluator, seed = job.flags, job.evaluator, job.flags.seed
     results = cross_all(job.controllers, job.sets, evaluator, job.kept, open_evaluator=open_evaluator)
     crossed = {name: {who: measure(one, job.scales) for who, one in row.items()} for name, row in results.items()}
-    hashes = {who: controller_hash(policy) for who, policy in job.controllers.items()}
-    about = {who: {"policy": policy, "sha256": hashes[who]} for who, policy in job.controllers.items()}
+    about = about_controllers(job.controllers)
     return {
         **origin_of(evaluator.device, seed, flags.workers),
         "robot": job.robot.name,
@@ -356,7 +374,7 @@ def _tables(job: TablesJob, open_evaluator: Open) -> dict[str, Any]:
         "episodes": evaluator.num_replicas,
         "controllers": about,
         **job.about,
-        **make_tables(crossed, job.sets, job.robot, seed, hashes=hashes),
+        **make_tables(crossed, job.sets, job.robot, seed, hashes={who: one["sha256"] for who, one in about.items()}),
         **_resolved(job, results, open_evaluator),
     }
 

@@ -219,11 +219,16 @@ def _certified_rows(found: dict[str, Any], name: str, label: str) -> list[tuple[
         return []
     rows = []
     for who in firsts(found["certified_goal"][name]):
-        role = about["chosen_by"].get(who)
         cells = [_rate(found, measure, name, who) for measure in ("certified_goal", "certified_success")]
-        known = f"{kind_of(who)} ({role})" if role else kind_of(who)
+        known = kind_of(who) + role_words(about, who)
         rows.append((f"{label}, certified ({about['terrains']})", known, *cells, _NONE, _NONE))
     return rows
+
+
+def role_words(about: dict[str, Any], who: str) -> str:
+    """What a controller has to do with how terrains were certified, in brackets; empty if nothing."""
+    role = about["chosen_by"].get(who)
+    return f" ({role})" if role else ""
 
 
 def _resolved(found: dict[str, Any]) -> list[str]:
@@ -232,14 +237,19 @@ def _resolved(found: dict[str, Any]) -> list[str]:
     for key, how in (("resolved", "here"), ("mujoco_c", "MuJoCo C")):
         for name, row in (found.get(key) or {}).items():
             for who, one in row.items():
-                cells = []
-                for kind in ("goal", "success"):
-                    cells.append(value_words(one[kind], one["intervals"][kind]))
-                    cells.append(value_words(one[f"{kind}_bias"], one[f"{kind}_bias_interval"], "+.3f"))
-                rows.append((f"{_SETS[name]} ({one['terrains']})", who, how, *cells))
+                rows.append((f"{_SETS[name]} ({one['terrains']})", who, how, *resolved_cells(one)))
     header = ("contact resolved", "controller", "in", "goal (95 %)", "bias", "no base collision (95 %)", "bias")
     about = "The bias is how far the rates at the search's settings lie above those with contact resolved."
     return [f"{about}\n\n{table(header, rows)}"] if rows else []
+
+
+def resolved_cells(found: dict[str, Any]) -> list[str]:
+    """Goal rate, its bias, no base collision and its bias, with intervals, of what was crossed in another way."""
+    cells = []
+    for kind in ("goal", "success"):
+        cells.append(value_words(found[kind], found["intervals"][kind]))
+        cells.append(value_words(found[f"{kind}_bias"], found[f"{kind}_bias_interval"], "+.3f"))
+    return cells
 
 
 def _rate(found: dict[str, Any], measure: str, name: str, who: str, form: str = ".3f") -> str:

@@ -16,6 +16,7 @@ from sim.maps.picture import draw_heights
 from sim.policy.spec import firsts, kind_of
 from train.evaluate.measures import invalid_lines
 from train.evaluate.pack_rates import fails
+from train.evaluate.publish import resolved_cells, role_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -138,12 +139,6 @@ def _print_certified(report: dict[str, Any], wide: int) -> None:
 _BIASED = {"searched": "downward, since it failed them all", "certifier": "upward, since it crossed some of them"}
 
 
-def role_words(about: dict[str, Any], who: str) -> str:
-    """What a controller has to do with how terrains were certified, in brackets; empty if nothing."""
-    role = about["chosen_by"].get(who)
-    return f" ({role})" if role else ""
-
-
 def _print_resolved(rows: dict[str, Any], how: str, wide: int) -> None:
     """Rates of other crossings of the same terrains, and the bias of those above."""
     if rows:
@@ -151,11 +146,7 @@ def _print_resolved(rows: dict[str, Any], how: str, wide: int) -> None:
     for name, row in rows.items():
         print(_row(name, (_WORDS["goal"], "bias", _WORDS["success"], "bias", "terrains"), wide, 26))
         for who, found in row.items():
-            cells = []
-            for kind in ("goal", "success"):
-                cells.append(value_words(found[kind], found["intervals"][kind]))
-                cells.append(value_words(found[f"{kind}_bias"], found[f"{kind}_bias_interval"], "+.3f"))
-            print(_row(f"  {who}", (*cells, str(found["terrains"])), wide, 26))
+            print(_row(f"  {who}", (*resolved_cells(found), str(found["terrains"])), wide, 26))
 
 
 def _row(label: str, cells: Iterable[str], wide: int, each: int) -> str:
