@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,7 +82,11 @@ class Kept:
             content = read_arrays(self.file, array_names(self.file))
         except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
             return self.damaged(error)
-        return content if str(content.pop(_KEY, "")) == self._key else {}
+        return content if str(content.pop(_KEY, "")) == self._mark(content) else {}
+
+    def _mark(self, names: Iterable[str]) -> str:
+        """What the file carries: the key, and all names, of which damage may have taken one away."""
+        return " ".join([str(self._key), *sorted(names)])
 
     def damaged(self, why: object) -> dict[str, NDArray[Any]]:
         """Says that the file is damaged, and returns no arrays."""
@@ -96,7 +101,7 @@ class Kept:
         """
         if self._key is not None:
             self.file.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(self.file, npz_bytes({_KEY: np.array(self._key), **arrays}))
+            write_atomically(self.file, npz_bytes({_KEY: np.array(self._mark(arrays)), **arrays}))
 
     def remove(self) -> None:
         """Removes the file, once the work is done."""
