@@ -11,7 +11,7 @@ from qd.faults import fault_numbers
 from qd.fresh import FRESH_EPISODES, numbers_of
 from qd.run.directory import episodes_in
 from sim.files.atomic import write_atomically
-from sim.files.figures import as_png, new_figure
+from sim.files.figures import as_png, bar_lengths, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,9 +125,8 @@ def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> "Figure"
 
 def _draw_std(axes: "Axes", looks: Sequence[dict[str, Any]]) -> None:
     """The paper's mean STD with its 95 % intervals, where elites were looked at again."""
-    means = np.array([row["mean_std"] for row in looks])
-    limits = np.array([row["mean_std_interval"] for row in looks])
-    lengths = np.maximum([means - limits[:, 0], limits[:, 1] - means], 0.0)  # equal limits may be off by rounding
+    means = [row["mean_std"] for row in looks]
+    lengths = bar_lengths(means, [row["mean_std_interval"] for row in looks])
     axes.errorbar([row["iteration"] for row in looks], means, lengths, color=_BLUE, marker=".", capsize=3)
     axes.set_ylabel(f"mean STD of elites\n({FRESH_EPISODES} fresh episodes)")
     axes.set_ylim(bottom=0)

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from qd.fresh import FRESH_EPISODES, Open
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import (
@@ -22,6 +20,7 @@ from qd.run.settings import (
 from qd.studies.study import LOOKS, StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, resolve_device
 from sim.files.command import publish
+from sim.files.intervals import value_words
 from sim.robots.identity import identity
 
 if TYPE_CHECKING:
@@ -149,7 +148,8 @@ def numbers_of(metrics: dict[str, Metrics], iterations: int) -> dict[str, Any]:
         "elites": {name: [row["elites"] for row in own] for name, own in rows.items()},
         "mean_fitness": {name: [row["mean_fitness"] for row in own] for name, own in rows.items()},
         "below_by_more_than_intervals": [
-            one[1] < other[0] for one, other in zip(intervals["alpha_1"], intervals["alpha_0"], strict=True)
+            bool(one and other and one[1] < other[0])
+            for one, other in zip(intervals["alpha_1"], intervals["alpha_0"], strict=True)
         ],
     }
 
@@ -159,21 +159,21 @@ def _show(report: dict[str, Any]) -> None:
     for k, iteration in enumerate(report["iterations"]):
         cells = []
         for name in _ALPHAS:
-            low, high = report["intervals"][name][k]
-            cells.append(f"{name.replace('_', ' ')}: {report['mean_std'][name][k]:.2f} ({low:.2f}-{high:.2f})")
+            mean = value_words(report["mean_std"][name][k], report["intervals"][name][k], ".2f")
+            cells.append(f"{name.replace('_', ' ')}: {mean}")
         print(f"  iteration {iteration}: {', '.join(cells)}")
 
 
 def draw_ablation(report: dict[str, Any]) -> "Figure":
     """Mean STD over the iterations with its intervals, and the number of elites (the paper's ablation figure)."""
-    from sim.files.figures import new_figure
+    from sim.files.figures import bar_lengths, new_figure
 
     figure = new_figure(8.5, 3.6)
     figure.suptitle(f"{report['robot']}: the standard deviations in the fitness (alpha 1) and left out (alpha 0)")
     left, right = figure.subplots(1, 2)
     for name, (color, style) in zip(_ALPHAS, LOOKS, strict=False):
-        means, limits = np.array(report["mean_std"][name]), np.array(report["intervals"][name])
-        lengths = np.maximum([means - limits[:, 0], limits[:, 1] - means], 0.0)
+        means = report["mean_std"][name]
+        lengths = bar_lengths(means, report["intervals"][name])
         marks = {"color": color, "linestyle": style, "marker": "o", "markersize": 4, "label": name.replace("_", " ")}
         left.errorbar(report["iterations"], means, lengths, capsize=3, **marks)
         right.plot(report["iterations"], report["elites"][name], **marks)

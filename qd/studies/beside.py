@@ -13,7 +13,7 @@ from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import as_settings, differences
 from sim.files.command import InSpace, publish
-from sim.files.intervals import bootstrap_interval
+from sim.files.intervals import bootstrap_interval, value_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -208,9 +208,9 @@ def _label(axes: "NDArray[Any] | Sequence[Axes]", archive: Archive) -> None:
 
 def _show(report: dict[str, Any]) -> None:
     for name, numbers in report["runs"].items():
-        low, high = numbers["intervals"]["under_half_cross"]
+        share = value_words(numbers["under_half_cross"], numbers["intervals"]["under_half_cross"], ".0%")
         print(
             f"{name}: {numbers['elites']} elites, QD score {numbers['qd_score']:.0f}; under half of the robots cross "
-            f"{numbers['under_half_cross']:.0%} of them ({low:.0%}-{high:.0%}); mean goal rate "
+            f"{share} of them; mean goal rate "
             f"{numbers['goal_rate']:.3f}, base collisions {numbers['collision_rate']:.3f}"
         )

@@ -1,7 +1,11 @@
 """Figures that need no screen: an empty one, and one as PNG."""
 
 import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,3 +29,15 @@ def as_png(figure: "Figure") -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
     return buffer.getvalue()
+
+
+def bar_lengths(values: ArrayLike, intervals: Sequence[Sequence[float] | None]) -> NDArray[np.float64]:
+    """How far error bars go below and above values, shape (2, count); NaN, which draws none, without interval.
+
+    Args:
+        values: Shape (count,).
+        intervals: Lower and upper limit of each.
+    """
+    limits = np.array([(np.nan, np.nan) if one is None else one for one in intervals], np.float64).reshape(-1, 2)
+    means = np.asarray(values, np.float64)
+    return np.maximum([means - limits[:, 0], limits[:, 1] - means], 0.0)  # equal limits may be off by rounding

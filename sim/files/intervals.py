@@ -63,7 +63,9 @@ def _resamples(count: int, seed: int) -> NDArray[np.float64]:
 def bootstrap_interval(
     values: NDArray[np.floating], seed: int, *, families: NDArray[np.int64] | None = None
 ) -> list[float] | None:
-    """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains; None without any.
+    """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains.
+
+    None of fewer than two terrains or families, whose resamples are all the same and say nothing of their spread.
 
     One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
 
@@ -72,10 +74,11 @@ def bootstrap_interval(
         seed: Of the resamples.
         families: Terrains of one number are not independent: they are drawn together, shape (num_terrains,).
     """
-    if len(values) == 0:
-        return None
     own = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
-    drawn = _resamples(int(own.max()) + 1, seed)
+    count = len(np.unique(own))
+    if count < 2:
+        return None
+    drawn = _resamples(count, seed)
     means = (drawn @ np.bincount(own, weights=values)) / (drawn @ np.bincount(own).astype(np.float64))
     return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.files.command import command_line
-from sim.files.figures import as_png, new_figure
+from sim.files.figures import as_png, bar_lengths, new_figure
 from sim.files.intervals import value_words
 from sim.maps.picture import draw_heights
 from sim.policy.spec import firsts, kind_of
@@ -365,8 +365,7 @@ def _draw_bias(axes: "Axes", report: dict[str, Any]) -> None:
         found = [(place, report[key][name][who]) for place, name in enumerate(names)]
         found = [(place, one) for place, one in found if one["goal_bias"] is not None]
         values = 100.0 * np.array([one["goal_bias"] for _, one in found])
-        limits = 100.0 * np.array([one["goal_bias_interval"] for _, one in found]).reshape(-1, 2)
-        lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)
+        lengths = 100.0 * bar_lengths(values / 100.0, [one["goal_bias_interval"] for _, one in found])
         axes.errorbar(
             np.array([place for place, _ in found]) + shift, values, lengths, linestyle="", capsize=3,
             marker=MARKERS[kind % len(MARKERS)], color=COLOURS[kind % len(COLOURS)],
@@ -400,8 +399,8 @@ def _draw_measure(axes: "Axes", report: dict[str, Any], measure: str, factor: fl
         colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
         there = [place for place, name in enumerate(names) if report[measure][name][who] is not None]
         values = factor * np.array([report[measure][names[place]][who] for place in there])
-        limits = factor * np.array([report["intervals"][measure][names[place]][who] for place in there]).reshape(-1, 2)
-        lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)  # equal limits may be off by rounding
+        limits = [report["intervals"][measure][names[place]][who] for place in there]
+        lengths = factor * bar_lengths(values / factor, limits)
         places = np.array(there) + shift
         seeds = [kind_of(other) for other in controllers].count(kind_of(who))
         label = kind_of(who) + (f" ({seeds} seeds)" if seeds > 1 else "") if who in kinds else ""

@@ -22,7 +22,7 @@ from qd.show.report.page import (
 from qd.show.report.tables import LABELS, MEASURES, by_kind, unreadable
 from sim.files.atomic import prepare_output, read_json
 from sim.files.command import plain_command
-from sim.files.figures import new_figure
+from sim.files.figures import bar_lengths, new_figure
 from sim.files.provenance import without_machine
 from sim.robots.robot import get_robot
 
@@ -200,9 +200,8 @@ def _draw_lines(axes: "Axes", tables: dict[str, Any], measure: str, joined: list
         colour, marker = _LINES[k % len(_LINES)]
         there = [place for place, who in enumerate(controllers) if row[who] is not None]
         values = np.array([100.0 * row[controllers[place]] for place in there])
-        limits = 100.0 * np.array([tables["intervals"][measure][name][controllers[place]] for place in there])
-        limits = limits.reshape(-1, 2)
-        lengths = np.maximum([values - limits[:, 0], limits[:, 1] - values], 0.0)  # equal limits are off by rounding
+        limits = [tables["intervals"][measure][name][controllers[place]] for place in there]
+        lengths = 100.0 * bar_lengths(values / 100.0, limits)
         places = np.array(there) + 0.06 * (k - (count - 1) / 2)
         label = LABELS.get(name, f"{name}, held out")
         axes.errorbar(places, values, lengths, color=colour, marker=marker, capsize=3, label=label, linestyle="")

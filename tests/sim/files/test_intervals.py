@@ -61,6 +61,8 @@ def test_bootstrap_interval():
     # The mean of 100 draws of 0 or 1: 0.5 +- 1.96 * 0.05.
     np.testing.assert_allclose([low, high], [0.40, 0.60], atol=0.02)
     assert bootstrap_interval(np.array([]), 0) is None
+    assert bootstrap_interval(np.array([0.4]), 0) is None
+    assert bootstrap_interval(np.array([0.2, 0.9]), 0, families=np.array([5, 5])) is None
 
 
 def test_the_bootstrap_resamples_terrains():
