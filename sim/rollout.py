@@ -162,8 +162,7 @@ class Rollout:
             cfg: The crossing.
             solver: Solver options.
             space: What the genes of terrains mean.
-            ground_shape: Rows and columns of the friction and softness that heights may come with; with genes the
-                space decides.
+            ground_shape: Rows and columns of maps that heights may come with; with genes the space decides.
 
         Raises:
             ValueError: If the policy does not fit the robot, a number is not positive, or memory is too small.
