@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
-from sim.ground import COLS, PATCH, ROWS
-from sim.terrain import SPACING
+from sim.ground import PATCHES
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 if TYPE_CHECKING:
     from sim.space import TerrainSpace
@@ -60,7 +60,7 @@ class Effects:
     heights: NDArray[np.float32]
     """Heights that it adds to the others [m], shape (num_parts, nrow, ncol)."""
     slippery: NDArray[np.bool_]
-    """Patches that it makes slippery, shape (num_parts, 4, 8)."""
+    """Patches that it makes slippery, shape (num_parts, rows, cols) of its map."""
     soft: NDArray[np.bool_]
     """Patches that it makes soft, likewise."""
 
@@ -75,21 +75,22 @@ class Effects:
 
     def way(self, part: int, half_width: float) -> tuple[float, bool]:
         """Largest height or depth [m] of a part under a robot on its way, and whether it changes the ground there."""
-        rows = _places((-half_width, half_width), CrossingCfg.start[1], ROWS)
-        columns = _places((0.0, CrossingCfg.goal[0] - CrossingCfg.start[0]), CrossingCfg.start[0], COLS)
-        return on_the_way(self.heights[part], half_width), bool(self.patches[part][rows, columns].any())
+        patches, (x, y) = self.patches[part], CrossingCfg.start
+        rows = _places((y - half_width, y + half_width), SPACING * (NUM_ROWS - 1), patches.shape[0])
+        columns = _places((x, CrossingCfg.goal[0]), SPACING * (NUM_COLS - 1), patches.shape[1])
+        return on_the_way(self.heights[part], half_width), bool(patches[rows, columns].any())
 
     def shape(self, part: int, half_width: float) -> Shape:
-        """The shape of a part; of one that changes the ground alone, its kind and nothing else."""
-        if not self.patches[part].any():
+        """The shape of a part; of one that changes the ground and no height on the way, its kind alone."""
+        if not self.patches[part].any() or on_the_way(self.heights[part], half_width) >= LEAST_HEIGHT:
             return shape_of(self.heights[part], half_width)
         kind = "slippery ground" if self.slippery[part].any() else "soft ground"
         return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
 
 
-def _places(span: tuple[float, float], origin: float, count: int) -> slice:
-    """Patches along one axis between two distances [m] from a place [m]."""
-    first, last = (min(max(int((origin + end) // PATCH), 0), count - 1) for end in span)
+def _places(span: tuple[float, float], length: float, count: int) -> slice:
+    """Patches between two places [m] of an axis of some length [m], which so many divide evenly."""
+    first, last = (min(max(int(end * count / length), 0), count - 1) for end in span)
     return slice(first, last + 1)
 
 
@@ -105,7 +106,7 @@ def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: "Terrain
 
     rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
     heights, ground = terrains_of(np.concatenate(rows), space)
-    nothing = np.zeros((len(parts), ROWS, COLS), bool)
+    nothing = np.zeros((len(parts), *PATCHES), bool)
     return Effects(
         heights=heights[0] - heights[1:],
         slippery=nothing if ground is None else ground.friction[0] != ground.friction[1:],

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from kernels.episode import PARKING_HEIGHT
+from kernels.ground import PATCHES
 from sim.bank import TerrainBank
 from sim.bench.scene import Scene
 from sim.rollout import Rollout
@@ -85,7 +86,7 @@ def measure_ground(rollout: Rollout, terrains: np.ndarray, seeds: np.ndarray, *,
         steps: Physics steps of each that are timed at least.
     """
     sim, segments = rollout.sim, record_segments(rollout, terrains, seeds)
-    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, has_ground=True)
+    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, ground_shape=PATCHES)
     bank.set_heights(sim.bank.heights.numpy())
     mapped = Simulation(sim.robot, bank, sim.terrain_of_env.numpy())
     motions = [Motion(sim, segments), Motion(mapped, segments)]

@@ -59,7 +59,7 @@ def read_heightmap(
     """A heightmap from a file: data only, nothing in it can run.
 
     An ``.npz`` holds ``heights`` (nrow, ncol), floats in metres, row along y, and may hold ``size_m``; of the size of a
-    terrain also ``friction`` and ``time_constant_s`` (4, 8), as :class:`sim.ground.GroundMaps` has them. A ``.png`` is
+    terrain also ``friction`` and ``time_constant_s``, as :class:`sim.ground.GroundMaps` has them. A ``.png`` is
     8 or 16-bit grayscale seen from above, x to the right and y up; height = offset + scale * gray level. What is not
     given here is taken from the npz, or from the keys ``size_m``, ``scale_m`` and ``offset_m`` of a JSON of the same
     name beside the image; without an offset it is 0.
@@ -126,10 +126,11 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
 
 
 def _ground_in(path: Path, arrays: dict[str, NDArray[Any]]) -> GroundMaps | None:
-    if not any(name in arrays for name in _GROUND):
+    there = [arrays[name] for name in _GROUND if name in arrays]
+    if not there:
         return None
-    plain = GroundMaps.plain(1)
     try:
+        plain = GroundMaps.plain(1, there[0].shape)
         maps = (np.asarray(arrays.get(name, getattr(plain, name)[0]), dtype=np.float32)[None] for name in _GROUND)
         friction, time_constant_s = maps
         return GroundMaps(friction=friction, time_constant_s=time_constant_s)

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
-from sim.ground import COLS, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCH, ROWS, GroundMaps
-from sim.terrain import SPACING
+from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, GroundMaps
+from sim.terrain import NUM_COLS, NUM_ROWS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +25,7 @@ _TINT = 0.5  # share of the tint where a patch is as slippery or soft as can be
 
 
 def ground_tint(ground: GroundMaps) -> NDArray[np.float64]:
-    """Tint of the patches of one terrain, the stronger the more slippery or soft they are; RGBA, shape (4, 8, 4)."""
+    """Tint of a terrain's patches, the stronger the more slippery or soft they are; RGBA, shape (rows, cols, 4)."""
     slippery = (1.0 - ground.friction[0].astype(np.float64)) / (1.0 - LEAST_FRICTION)
     tau = np.maximum(ground.time_constant_s[0].astype(np.float64), LEAST_TIME_CONSTANT_S)
     soft = np.log(tau / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S)
@@ -43,8 +43,8 @@ def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> 
         margin: Nodes of them on each side that are not of the terrain.
     """
     row, col = (
-        np.clip((np.arange(count) - margin) * SPACING // PATCH, 0, most - 1).astype(int)
-        for count, most in zip(colors.shape[:2], (ROWS, COLS), strict=True)
+        np.clip((np.arange(count) - margin) * patches // (nodes - 1), 0, patches - 1)
+        for count, patches, nodes in zip(colors.shape[:2], ground.shape, (NUM_ROWS, NUM_COLS), strict=True)
     )
     tint = ground_tint(ground)[row[:, None], col]
     return colors + tint[..., 3:] * (tint[..., :3] - colors)

@@ -99,7 +99,7 @@ def png_of(heights: Heights) -> bytes:
 def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None, ground: GroundMaps | None = None) -> bytes:
     """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``.
 
-    With ground of its own also ``friction`` and ``time_constant_s``, float32 (4, 8), row along y.
+    With ground of its own also ``friction`` and ``time_constant_s``, float32 (rows, cols), row along y.
     """
     content = {"heights": np.asarray(heights, np.float32), "size_m": np.array(size_of(heights))}
     if genes is not None:

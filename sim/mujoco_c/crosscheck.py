@@ -65,7 +65,8 @@ class Comparison:
         named = load_space(on_ground(cfg.space, cfg.ground) or SUPER_GAUSSIAN.name)
         self._pool, self.space = (None, named) if cfg.genes is None else read_pool(cfg.genes)
         refuse_softness(self.space)
-        ground = GroundMaps.plain(1) if self.space.ground else None
+        shape = self.space.ground_shape
+        ground = None if shape is None else GroundMaps.plain(1, shape)
         crossing_model(self.robot, np.zeros((NUM_ROWS, NUM_COLS)), ground=ground)  # MuJoCo must read it too
         self._named: list[int] | None = None
         if cfg.elite is not None:

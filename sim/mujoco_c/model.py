@@ -8,13 +8,13 @@ frame.
 
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
+from itertools import pairwise, product
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.ground import COLS, PATCH, ROWS
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
@@ -22,7 +22,7 @@ from sim.maps.terrain_files import Margins, as_hfield
 from sim.robots.robot import RobotCfg
 from sim.simulation import GROUND_FRICTION
 from sim.space import TerrainSpace
-from sim.terrain import SPACING
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
 _MEMORY = "4M"
@@ -73,7 +73,8 @@ def crossing_model(
 
     The solver may take as many iterations as it needs: the caps of the parallel simulation are themselves in question.
     Ground with maps is a geom a patch, whose friction and softness have priority over those of the robot: a box where
-    the patch is level, else a heightfield.
+    the patch is level, else a heightfield. Patches that follow each other along the way are one where they are alike in
+    every row.
 
     Args:
         robot: Robot settings.
@@ -95,7 +96,8 @@ def crossing_model(
     ET.SubElement(option, "flag", autoreset="disable")  # or a state that blows up would begin anew unseen
     if root.find("worldbody") is None:
         raise ValueError(f"robot '{robot.name}': {robot.model_file} has no <worldbody>")
-    data = _add_field(root, heights, 0) if ground is None else _add_patches(root, heights, ground)
+    patches = [] if ground is None else _patches_of(ground)
+    data = _add_patches(root, heights, patches) if patches else _add_field(root, heights, 0)
     sensors = ET.SubElement(root, "sensor")
     for name in robot.geom_names:
         ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")
@@ -106,8 +108,8 @@ def crossing_model(
     model.geom_conaffinity[of_ground] = 1
     if time_constant_s is not None:
         model.geom_solref[:] = time_constant_s, 1.0
-    if ground is not None:
-        _lay_ground(model, robot, of_ground, ground)
+    if patches:
+        _lay_ground(model, robot, of_ground, patches)
     return model
 
 
@@ -128,7 +130,6 @@ def refuse_softness(space: TerrainSpace) -> None:
 
 
 _GROUND = "ground"
-_PATCH_CELLS = round(PATCH / SPACING)
 _DEPTH = 2.0  # of a level patch [m]
 
 
@@ -159,24 +160,67 @@ def _add_geom(root: ET.Element, name: str, position: tuple[float, float, float],
     ET.SubElement(world, "geom", geom | {"conaffinity": "1", "solmix": "0"})
 
 
-def _add_patches(root: ET.Element, heights: NDArray[np.floating], ground: GroundMaps) -> Array:
+@dataclass(frozen=True, kw_only=True)
+class _Patch:
+    """Ground of one geom."""
+
+    rows: slice
+    """Its nodes along y."""
+    cols: slice
+    """Along x."""
+    margin: Margins
+    """Nodes to add to them before and behind along y, and along x: those at the edge go on beyond it."""
+    friction: float
+    time_constant_s: float
+
+
+def _patches_of(ground: GroundMaps) -> list[_Patch]:
+    """The patches of one terrain; columns of the map in which nothing changes are one."""
+    (num_rows, num_cols), maps = ground.shape, np.stack([ground.friction[0], ground.time_constant_s[0]])
+    changes = 1 + np.flatnonzero((maps[..., 1:] != maps[..., :-1]).any(axis=(0, 1)))
+    return [
+        _Patch(
+            rows=_nodes(row, num_rows, NUM_ROWS),
+            cols=_nodes(col, num_cols, NUM_COLS),
+            margin=(_margin(row, num_rows), _margin(col, num_cols)),
+            friction=float(ground.friction[0, row[0], col[0]]),
+            time_constant_s=float(ground.time_constant_s[0, row[0], col[0]]),
+        )
+        for row, col in product(pairwise(range(num_rows + 1)), pairwise([0, *changes.tolist(), num_cols]))
+    ]
+
+
+def _nodes(span: tuple[int, int], count: int, nodes: int) -> slice:
+    """Nodes of the patches from one to before another, of so many along an axis."""
+    first, end = (place * (nodes - 1) // count for place in span)
+    return slice(first, end + 1)
+
+
+def _margin(span: tuple[int, int], count: int) -> tuple[int, int]:
+    return _MARGIN_NODES * (span[0] == 0), _MARGIN_NODES * (span[1] == count)
+
+
+def _add_patches(root: ET.Element, heights: NDArray[np.floating], patches: list[_Patch]) -> Array:
     """Adds a geom a patch, a box where it is level and else a heightfield; returns the data of these.
 
     Raises:
         ValueError: If a patch is soft and not level.
     """
     data = [np.zeros(0)]
-    for number, (row, col) in enumerate(np.ndindex(ROWS, COLS)):
-        rows, cols = (slice(k * _PATCH_CELLS, (k + 1) * _PATCH_CELLS + 1) for k in (row, col))
-        part, margin = heights[rows, cols], (_margin(row, ROWS), _margin(col, COLS))
+    for number, patch in enumerate(patches):
+        part = heights[patch.rows, patch.cols]
         if np.ptp(part) > 0.0:
-            if ground.time_constant_s[0, row, col]:
+            if patch.time_constant_s:
                 raise ValueError(_NO_SOFTNESS)
-            data.append(_add_field(root, part, number, (PATCH * col, PATCH * row), margin))
+            low = SPACING * patch.cols.start, SPACING * patch.rows.start
+            data.append(_add_field(root, part, number, low, patch.margin))
             continue
         (y, half_y), (x, half_x) = (
-            (PATCH * (k + 0.5) + SPACING * (high - low) / 2, PATCH / 2 + SPACING * (high + low) / 2)
-            for k, (low, high) in zip((row, col), margin, strict=True)
+            (
+                SPACING * (nodes.start - low + nodes.stop - 1 + high) / 2,
+                SPACING * (nodes.stop - 1 + high - nodes.start + low) / 2,
+            )
+            for nodes, (low, high) in zip((patch.rows, patch.cols), patch.margin, strict=True)
         )
         box = {"type": "box", "size": f"{half_x!r} {half_y!r} {_DEPTH / 2}"}
         name = f"{_GROUND}-{number}" if number else _GROUND
@@ -184,12 +228,7 @@ def _add_patches(root: ET.Element, heights: NDArray[np.floating], ground: Ground
     return np.concatenate(data)
 
 
-def _margin(place: int, count: int) -> tuple[int, int]:
-    """Nodes to add before and behind a patch: those at the edge go on beyond it."""
-    return _MARGIN_NODES * (place == 0), _MARGIN_NODES * (place == count - 1)
-
-
-def _lay_ground(model: Any, robot: RobotCfg, patches: NDArray[np.intp], ground: GroundMaps) -> None:
+def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: list[_Patch]) -> None:
     """Gives the geoms of the patches their contacts' friction and softness.
 
     Raises:
@@ -203,15 +242,15 @@ def _lay_ground(model: Any, robot: RobotCfg, patches: NDArray[np.intp], ground: 
                 "softness of its own, got several: leave --ground out"
             )
     first = int(np.flatnonzero(own)[0])
-    model.geom_friction[patches] = model.geom_friction[first]
-    model.geom_friction[patches, 0] *= ground.friction[0].ravel()
-    model.geom_solref[patches], model.geom_solimp[patches] = model.geom_solref[first], model.geom_solimp[first]
-    time_constant = ground.time_constant_s[0].ravel()
+    model.geom_friction[geoms] = model.geom_friction[first]
+    model.geom_friction[geoms, 0] *= [patch.friction for patch in patches]
+    model.geom_solref[geoms], model.geom_solimp[geoms] = model.geom_solref[first], model.geom_solimp[first]
+    time_constant = np.array([patch.time_constant_s for patch in patches])
     soft = time_constant > model.geom_solref[first, 0]
     impedance = model.geom_solimp[first, 1]
-    model.geom_solref[patches[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
-    model.geom_solimp[patches[soft]] = impedance, impedance, 0.001, 1.0, 0.5
-    model.geom_priority[patches] = 1
+    model.geom_solref[geoms[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
+    model.geom_solimp[geoms[soft]] = impedance, impedance, 0.001, 1.0, 0.5
+    model.geom_priority[geoms] = 1
 
 
 def _root_of(robot: RobotCfg) -> ET.Element:

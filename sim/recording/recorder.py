@@ -85,7 +85,7 @@ class Recording:
     geom_names: tuple[str, ...] = ()
     """Of the G geoms whose touch is known: base, limbs and feet; none in the first files."""
     friction: NDArray[np.float32] | None = None
-    """Of the patches of each terrain, shape (T, 4, 8); None where the ground is as always, as in the first files."""
+    """Of the patches of each terrain, shape (T, rows, cols); None where ground is as always, as in the first files."""
     time_constant_s: NDArray[np.float32] | None = None
     """Softness of the patches, with and without as ``friction`` (:class:`sim.ground.GroundMaps`)."""
     touching: NDArray[np.bool_] | None = None

@@ -1,6 +1,6 @@
 """Any terrain space, and 32 genes more for the friction of its ground, 32 for its softness, or both."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,8 +22,8 @@ from kernels.ground import (
 from sim.ground import joined_name
 from sim.spaces.base import Seed, TerrainSpace, clipped
 
-_ABSENT = {"friction": 1.0, "softness": -1.0}
-"""The gene of a patch that changes nothing."""
+ABSENT = {"friction": 1.0, "softness": -1.0}
+"""The gene of ground that changes nothing."""
 _BESIDE_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the right one first
 _TOLD_FRICTION = 0.995  # rounded, what is above is 1.00
 
@@ -84,11 +84,7 @@ class OnGround(TerrainSpace):
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps on the device (:mod:`kernels.ground`)."""
         for kind in self.kinds:
-            own = genes[:, self._columns(kind)].contiguous()
-            if kind == "friction":
-                decode_friction(own, ground_out.friction)
-            else:
-                decode_softness(own, ground_out.time_constant)
+            decode(kind, genes[:, self._columns(kind)].contiguous(), ground_out)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Hard-random terrains of the space; every patch as it always is, or as slippery or soft as can be."""
@@ -116,7 +112,7 @@ class OnGround(TerrainSpace):
             found[:, :first] = self.inner.without(found[:, :first], [part for part in parts if part < count])
             for part in parts:
                 if part >= count:
-                    found[:, first + part - count] = _ABSENT[self.kinds[(part - count) // NUM_PATCHES]]
+                    found[:, first + part - count] = ABSENT[self.kinds[(part - count) // NUM_PATCHES]]
         return found
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
@@ -149,14 +145,10 @@ class OnGround(TerrainSpace):
     def _ground_words(self, row: NDArray[np.float32], begin: float, end: float) -> str:
         """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
         first, last = (min(max(int(x // PATCH), 0), COLS - 1) for x in (begin, end))
-        told = []
-        for kind in self.kinds:
-            there = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, first : last + 1]
-            if kind == "friction" and there.min() < _TOLD_FRICTION:
-                told.append(f"friction {there.min():.2f}")
-            if kind == "softness" and there.max() > 0.0:
-                told.append(f"soft, {there.max():.3f} s")
-        return f" ({', '.join(told)})" if told else ""
+        there = slice(first, last + 1)
+        return ground_words(
+            {kind: self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, there] for kind in self.kinds}
+        )
 
     def _columns(self, kind: str) -> slice:
         first = self.inner.num_genes + NUM_PATCHES * self.kinds.index(kind)
@@ -164,16 +156,44 @@ class OnGround(TerrainSpace):
 
     def _values(self, row: NDArray[np.float32], kind: str) -> NDArray[np.float64]:
         """Frictions, or time constants [s], of one terrain, shape (32,)."""
-        share = (row[self._columns(kind)].astype(np.float64) + 1.0) / 2.0
-        if kind == "friction":
-            return 1.0 - (1.0 - share) * (1.0 - LEAST_FRICTION)
-        tau = LEAST_TIME_CONSTANT_S * (MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) ** share
-        return np.where(share > 0.0, tau, 0.0)
+        return values_of(kind, row[self._columns(kind)])
 
     def _with_heights(self, genes: ArrayLike, change: Any) -> NDArray[np.float32] | None:
         found, first = clipped(self.validate(genes)), self.inner.num_genes
         heights = change(found[:, :first])
         return None if heights is None else np.concatenate([heights, found[:, first:]], axis=1)
+
+
+def decode(kind: str, genes: Any, ground_out: Ground) -> None:
+    """Turns genes, a patch of a map each, into that map on the device; shape (num_terrains, rows * cols)."""
+    if kind == "friction":
+        decode_friction(genes, ground_out.friction)
+    else:
+        decode_softness(genes, ground_out.time_constant)
+
+
+def values_of(kind: str, genes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Frictions, or time constants [s], of genes in [-1, 1]."""
+    share = (genes.astype(np.float64) + 1.0) / 2.0
+    if kind == "friction":
+        return 1.0 - (1.0 - share) * (1.0 - LEAST_FRICTION)
+    tau = LEAST_TIME_CONSTANT_S * (MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) ** share
+    return np.where(share > 0.0, tau, 0.0)
+
+
+def ground_words(values: Mapping[str, NDArray[np.float64]]) -> str:
+    """The worst of some ground in brackets, ``(friction 0.25, soft, 0.060 s)``; empty if all is as always.
+
+    Args:
+        values: As of :func:`values_of`, by kind.
+    """
+    told = []
+    for kind, there in values.items():
+        if kind == "friction" and there.min() < _TOLD_FRICTION:
+            told.append(f"friction {there.min():.2f}")
+        if kind == "softness" and there.max() > 0.0:
+            told.append(f"soft, {there.max():.3f} s")
+    return f" ({', '.join(told)})" if told else ""
 
 
 def gene_of(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -57,20 +57,35 @@ def course(*elements):
 
 def heights(genes):
     """Heights of one course [m], shape (161, 321)."""
-    grid, col, ground = np.zeros((161, 321)), 80, 0.0
-    for own in np.asarray(genes, float).reshape(6, 6):
+    grid, ground = np.zeros((161, 321)), 0.0
+    for _, col, patch in patches(genes):
+        end = col + patch.shape[1]
+        grid[:, col:end] = ground + patch
+        ground += patch[80, -1]
+        grid[:, end:] = ground
+    return grid
+
+
+def columns(genes, values):
+    """Values of the elements of one course by column of cells, 0 elsewhere, shape (320,): to 2 cells beyond them."""
+    found = np.zeros(320)
+    for number, col, patch in patches(genes):
+        if patch.shape[1] > 1:
+            found[col - 2 : col + patch.shape[1] + 1] = values[number]
+    return found
+
+
+def patches(genes):
+    """Each element that fits: its number, the node before it, and its heights over the ground there."""
+    col = 80
+    for number, own in enumerate(np.asarray(genes, float).reshape(6, 6)):
         kind = KINDS[value(own[0], {"whole": (0, 12)})]
         size, length, detail, turn = (value(g, span) for g, span in zip(own[2:], RANGES[kind], strict=True))
         col = min(col + value(own[1], {"whole": (4, 16)}), 240)
         patch = patch_of(kind, size, length, detail, turn, 240 - col)
-        if patch is None:
-            continue
-        cells = patch.shape[1] - 1
-        grid[:, col : col + cells + 1] = ground + patch
-        ground += patch[80, -1]
-        col += cells
-        grid[:, col:] = ground
-    return grid
+        if patch is not None:
+            yield number, col, patch
+            col += patch.shape[1] - 1
 
 
 def patch_of(kind, size, length, detail, turn, room):

@@ -10,6 +10,8 @@ from kernels.ground import (
     LEAST_FRICTION,
     LEAST_TIME_CONSTANT_S,
     MOST_TIME_CONSTANT_S,
+    PATCHES,
+    STRIPS,
     GroundRecords,
     decode_friction,
     decode_softness,
@@ -49,21 +51,28 @@ def test_a_map_of_another_shape_is_named(device):
         decode_friction(wp.zeros((1, 31), dtype=float, device=device), wp.zeros((1, 4, 8), dtype=float, device=device))
 
 
-def test_each_contact_has_the_ground_under_its_point(device):
+@pytest.mark.parametrize(
+    ("shape", "places"),
+    [
+        (PATCHES, [(1, 0, 1), (1, 1, 1), (0, 3, 7), (0, 3, 0)]),
+        (STRIPS, [(1, 0, 60), (1, 0, 61), (0, 0, 318), (0, 0, 0)]),
+    ],
+)
+def test_each_contact_has_the_ground_under_its_point(device, shape, places):
     # Two robots of two shapes, the first shape of which is the 3rd of the model; robot 0 stands on terrain 1.
     layout = Layout()
     layout.first_shape, layout.shapes_per_env = 2, 2
-    ground = make_ground(2, device)
+    ground = make_ground(2, device, shape)
     rng = np.random.default_rng(0)
-    friction, tau = rng.uniform(0.15, 1, (2, 4, 8)), rng.uniform(0.02, 0.06, (2, 4, 8))
-    tau[:, 0] = 0.0
+    friction, tau = rng.uniform(0.15, 1, (2, *shape)), rng.uniform(0.02, 0.06, (2, *shape))
+    tau[places[0]] = 0.0
     ground.friction.assign(np.float32(friction))
     ground.time_constant.assign(np.float32(tau))
     # invweight 0.5 and impedance 0.9: unit stiffness is divided by 0.05
     bodies = make_bodies(np.full(4, 0.5), np.full(4, 0.9), np.array([0.01, 0.01, 0.01, 0.07]), device)
-    points = [(3.0, 1.0), (3.0, 2.5), (15.9, 7.9), (-2.0, 9.0), (99.0, 99.0)]
+    # Places are terrain, row, column; beyond the edge the ground goes on.
+    points = [(3.02, 1.0), (3.06, 2.5), (15.92, 7.9), (-2.0, 9.0), (99.0, 99.0)]
     shapes = [2, 3, 4, 5, 5]
-    places = [(1, 0, 1), (1, 1, 1), (0, 3, 7), (0, 3, 0)]  # terrain, row, column; beyond the edge it goes on
     buffer = make_buffer(5, device)
     buffer.shape1.assign(np.array(shapes))
     buffer.point0.assign(np.float32([[x, y, 0.3] for x, y in points]))

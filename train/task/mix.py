@@ -116,7 +116,7 @@ class Mix:
             heights = np.concatenate([heights, others])
             types += (self.cfg.mix,) * count
             if ground is not None:
-                ground = GroundMaps.plain(self.cfg.hand_crafted).joined(ground)
+                ground = GroundMaps.plain(self.cfg.hand_crafted, ground.shape).joined(ground)
             return Tiles(heights=heights, type_of_column=types, ground=ground)
         return Tiles(heights=heights, type_of_column=types)
 

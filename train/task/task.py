@@ -107,7 +107,8 @@ class CommandTask:
 
     def _build_simulation(self, terrain_of_env: np.ndarray, rng: np.random.Generator) -> Simulation:
         tiles = self.tiles
-        bank = TerrainBank(len(tiles.heights), device=self.device, has_ground=tiles.ground is not None)
+        shape = None if tiles.ground is None else tiles.ground.shape
+        bank = TerrainBank(len(tiles.heights), device=self.device, ground_shape=shape)
         bank.set_heights(tiles.heights, ground=tiles.ground)
         return Simulation(
             self.robot,

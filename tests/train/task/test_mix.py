@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.bank import TerrainBank
+from sim.bank import TerrainBank, terrains_of
 from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.course import COURSE
 from sim.terrain import CROSSING_TYPES, TILE_TYPES
@@ -209,3 +209,15 @@ def test_elites_bring_their_ground():
     assert tiles.ground is not None and (tiles.ground.friction[:2] == 1.0).all()
     np.testing.assert_array_equal(tiles.ground.friction[2:].reshape(2, 32) == 1.0, genes[mix.rows, 64:] == 1.0)
     assert make_mix().next().ground is None
+
+
+def test_elites_bring_the_ground_of_their_elements():
+    space = get_space("course+element-friction")
+    genes = space.hard_random(4, 1)
+    cfg = MixCfg(terrains=4, swap_every=2)
+    mix = Mix(cfg=cfg, genes=genes, space=space, crosses=True, seed=0, device="cpu")
+    tiles = mix.next()
+    assert tiles.ground is not None and tiles.ground.shape == (1, 320) and (tiles.ground.friction[:2] == 1.0).all()
+    own = terrains_of(genes[mix.rows], space)[1]
+    assert own is not None and (own.friction < 1.0).any()
+    np.testing.assert_array_equal(tiles.ground.friction[2:], own.friction)
