@@ -17,7 +17,7 @@ from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.run.settings import SchedulerCfg
 from qd.variation import iso_line, recombined
-from sim.corridor import SHAPE, corridor_heights
+from sim.corridor import SHAPE, corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch
 from sim.space import TerrainSpace, clipped, get_space
 
@@ -59,27 +59,28 @@ class Prediction(NamedTuple):
 class _Networks(nn.ModuleList):
     """Small convolutional networks side by side, as groups of channels.
 
-    Heights of shape (batch, MEMBERS, *SHAPE), in which each network sees its own, become (batch, MEMBERS, num_out).
+    Maps of shape (batch, MEMBERS, num_maps, *SHAPE), in which each network sees its own, become (batch, MEMBERS,
+    num_out).
     """
 
-    def __init__(self, num_out: int) -> None:
+    def __init__(self, num_maps: int, num_out: int) -> None:
         super().__init__()
         rows, cols = SHAPE
-        for size, stride, channels_in, channels_out in ((5, 3, 1, 12), (3, 2, 12, 24), (3, 2, 24, 32)):
+        for size, stride, channels_in, channels_out in ((5, 3, num_maps, 12), (3, 2, 12, 24), (3, 2, 24, 32)):
             self.append(_beside(channels_in, channels_out, size, stride=stride, padding=size // 2))
             rows, cols = -(-rows // stride), -(-cols // stride)
         self.append(_beside(32, 64, (rows, cols)))
         self.append(_beside(64, num_out, 1))
 
-    def forward(self, heights: Tensor) -> Tensor:
-        if heights.is_cuda:
-            return self._through(heights, slice(None)).reshape(len(heights), MEMBERS, -1)
+    def forward(self, maps: Tensor) -> Tensor:
+        if maps.is_cuda:
+            return self._through(maps.flatten(1, 2), slice(None)).reshape(len(maps), MEMBERS, -1)
         # One by one, since groups are slow on the CPU.
         members = (slice(member, member + 1) for member in range(MEMBERS))
-        return torch.stack([self._through(heights[:, own], own).flatten(1) for own in members], dim=1)
+        return torch.stack([self._through(maps[:, own].flatten(1, 2), own).flatten(1) for own in members], dim=1)
 
     def _through(self, rows: Tensor, members: slice) -> Tensor:
-        """What some of the networks make of the heights that each sees."""
+        """What some of the networks make of the maps that each sees, all as channels."""
         for index, layer in enumerate(self):
             assert isinstance(layer, nn.Conv2d)
             weight, bias = (
@@ -133,9 +134,9 @@ class Surrogate:
 
     def _make_networks(self) -> None:
         with torch.random.fork_rng(devices=[]):  # torch draws weights first, which are replaced
-            self._networks = _Networks(self._targets.shape[1])
+            self._networks = _Networks(1 + len(self.space.ground), self._targets.shape[1])
         self._optimiser = torch.optim.AdamW(self._networks.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
-        self._heights: Tensor | None = None
+        self._maps: Tensor | None = None  # of the genes
 
     @property
     def space(self) -> TerrainSpace:
@@ -150,7 +151,7 @@ class Surrogate:
         """Moves the work to a Warp device; to the CPU where torch does not see such a device."""
         self.device = device if device.startswith("cuda") and torch.cuda.is_available() else "cpu"
         prepare_torch(self.device)
-        self._heights = None
+        self._maps = None
         self._networks.to(self.device)
         for moments in self._optimiser.state.values():
             moments.update({name: moments[name].to(self.device) for name in ("exp_avg", "exp_avg_sq")})
@@ -170,31 +171,34 @@ class Surrogate:
             self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
-        if self._heights is not None:
-            self._heights = torch.cat([self._heights, self._rasterised(genes)])[-MOST:]
+        if self._maps is not None:
+            self._maps = torch.cat([self._maps, self._mapped(genes)])[-MOST:]
         self._genes = np.concatenate([self._genes, genes])[-MOST:]
         self._targets = np.concatenate([self._targets, targets])[-MOST:]
         numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed]
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
 
-    def _rasterised(self, genes: NDArray[np.float32]) -> Tensor:
-        """Heights over their scale, in half precision, of which there are many."""
+    def _mapped(self, genes: NDArray[np.float32]) -> Tensor:
+        """Heights over their scale and ground, in half precision since there are many, shape (N, num_maps, *SHAPE)."""
         parts = np.array_split(genes, max(1, -(-len(genes) // _AT_ONCE)))
-        heights = [corridor_heights(part, self.space, device=self.device) / _HEIGHT_SCALE for part in parts]
-        return torch.cat([part.half() for part in heights])
+        return torch.cat([self._some_mapped(part).half() for part in parts])
+
+    def _some_mapped(self, genes: NDArray[np.float32]) -> Tensor:
+        heights = corridor_heights(genes, self.space, device=self.device) / _HEIGHT_SCALE
+        return torch.cat([heights[:, None], corridor_ground(genes, self.space, device=self.device)], dim=1)
 
     def _train(self, steps: int) -> None:
-        if self._heights is None:
-            self._heights = self._rasterised(self._genes)
+        if self._maps is None:
+            self._maps = self._mapped(self._genes)
         targets = self._scaled(torch.from_numpy(self._targets).to(self.device))
         shape = steps, BATCH, MEMBERS
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
         for rows, mirror in zip(drawn, turned, strict=True):
-            heights = self._heights[rows].float()
-            heights = torch.where(mirror[..., None, None], heights.flip(-2), heights)
+            maps = self._maps[rows].float()
+            maps = torch.where(mirror[..., None, None, None], maps.flip(-2), maps)
             self._optimiser.zero_grad()
-            self._loss(self._networks(heights), targets[rows]).backward()
+            self._loss(self._networks(maps), targets[rows]).backward()
             self._optimiser.step()
 
     def _scaled(self, targets: Tensor) -> Tensor:
@@ -224,8 +228,8 @@ class Surrogate:
         """
         found = []
         for first in range(0, len(genes), _AT_ONCE):
-            heights = self._rasterised(clipped(genes[first : first + _AT_ONCE])).float()
-            found.append(self._networks(heights[:, None].expand(-1, MEMBERS, -1, -1)).cpu().numpy())
+            maps = self._mapped(clipped(genes[first : first + _AT_ONCE])).float()
+            found.append(self._networks(maps[:, None].expand(-1, MEMBERS, -1, -1, -1)).cpu().numpy())
         columns = np.moveaxis(np.concatenate(found).astype(np.float64), 1, 0)
         ratios, numbers, rates = self._split(columns)
         ratios = np.exp(ratios - ratios.max(axis=-1, keepdims=True))
@@ -322,7 +326,7 @@ class Surrogate:
         return recombined(children, further, *shares, self.space, self._rng)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Plain values and arrays; heights are made again."""
+        """Plain values and arrays; maps are made again."""
         moments = self._optimiser.state
         learned = [
             {"weights": weights.detach(), **{name: moments[weights][name] for name in _MOMENTS if weights in moments}}

@@ -13,11 +13,6 @@ def check_variation(cfg: SchedulerCfg, space: TerrainSpace) -> None:
     Raises:
         ValueError: If there is one.
     """
-    if "surrogate" in cfg.methods and space.ground:
-        raise ValueError(
-            f"method must not have surrogate, whose networks see heights alone, on terrains with "
-            f"{' and '.join(space.ground)} of their own, got {cfg.method}: leave it out, or leave --ground out"
-        )
     if cfg.crossover_share and space.genes_per_part is None:
         raise ValueError(
             f"crossover_share must be 0, got {cfg.crossover_share}: the space {space.name} does not say which genes "

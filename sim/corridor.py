@@ -1,9 +1,10 @@
-"""Heights along the way of a crossing, for networks that judge a terrain by them."""
+"""Heights and ground along the way of a crossing, for networks that judge a terrain by them."""
 
 import numpy as np
 import torch
 import warp as wp
 
+from kernels.ground import LENGTH, MOST_TIME_CONSTANT_S, WIDTH, make_ground
 from sim.bank import TerrainBank
 from sim.space import TerrainSpace
 from sim.terrain import SPACING
@@ -41,6 +42,38 @@ def corridor_heights(genes: np.ndarray, space: TerrainSpace, *, device: str) -> 
             some = slice(first, first + _AT_ONCE)
             found[some] = (_sampled if space.any_spacing else _averaged)(space.validate(genes[some]), space, device)
     return found
+
+
+def corridor_ground(genes: np.ndarray, space: TerrainSpace, *, device: str) -> torch.Tensor:
+    """What :attr:`TerrainSpace.ground` names, around the way, on the nodes of :func:`corridor_heights`.
+
+    Args:
+        genes: Shape (num_terrains, num_genes).
+        space: What the genes mean.
+        device: Warp device name.
+
+    Returns:
+        Float32 tensor on the device, shape (num_terrains, num_maps, 41, 121), 0 where ground is as always: the friction
+        that is missing, and the time constant over that of the softest ground.
+    """
+    if space.ground_shape is None:
+        return torch.empty((len(genes), 0, *SHAPE), device=wp.device_to_torch(device))
+    rows, cols = space.ground_shape
+    ground = make_ground(len(genes), device, space.ground_shape)
+    with wp.ScopedDevice(device):
+        space.lay_ground(wp.array(space.validate(genes), dtype=float, device=device), ground)
+    maps = {
+        "friction": 1.0 - wp.to_torch(ground.friction),
+        "softness": wp.to_torch(ground.time_constant) / float(MOST_TIME_CONSTANT_S),
+    }
+    row, col = _patches(Y, WIDTH, rows, SHAPE[0]), _patches(X, LENGTH, cols, SHAPE[1])
+    return torch.stack([maps[kind][:, row][:, :, col] for kind in space.ground], dim=1)
+
+
+def _patches(span: tuple[float, float], length: float, count: int, nodes: int) -> np.ndarray:
+    """Row or column of the patch that each node lies in, along an axis of some length [m]."""
+    places = np.linspace(*span, nodes) / float(length) * count
+    return np.clip(np.floor(places + 1e-6).astype(int), 0, count - 1)
 
 
 def _sampled(genes: np.ndarray, space: TerrainSpace, device: str) -> torch.Tensor:

@@ -80,15 +80,10 @@ def test_the_run_names_its_ground_and_goes_on_with_it(searched, capsys):
     [
         (("--ground", "ice"), "unknown ground 'ice': expected friction, softness or both"),
         (("--ground", "friction", "--space", "course+softness"), "has ground of its own, softness"),
-        (
-            ("--ground", "friction", "--method", "surrogate"),
-            "surrogate, whose networks see heights alone",
-        ),
     ],
 )
 def test_what_cannot_be_searched_is_said_in_a_line(words, says, capsys):
-    tiny = TINY[:-2] if "--method" in words else TINY
-    assert search("--run-dir", "run", "--iterations", "1", *tiny, *words) == 2
+    assert search("--run-dir", "run", "--iterations", "1", *TINY, *words) == 2
     assert says in capsys.readouterr().err
 
 

@@ -12,7 +12,7 @@ from qd.run.settings import SchedulerCfg
 from qd.scheduler import Scheduler
 from qd.surrogate import Surrogate
 from sim.corridor import corridor_heights
-from sim.space import SUPER_GAUSSIAN
+from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.course import COURSE
 from tests.qd import stand_in
 
@@ -73,16 +73,39 @@ def test_what_it_learned_holds_for_other_terrains(learned):
     assert found.collision_rate.mean() < 0.2 and found.collided.mean() < 0.1
 
 
+def test_it_learns_from_friction_where_heights_say_nothing():
+    space = get_space("super_gaussian+friction")
+
+    def slipped(seed: int, count: int):
+        genes = space.uniform_random(count, seed)
+        genes[:, 7:64:8] = 0.0  # no bump has a height
+        beside_the_way = genes[:, 64:].reshape(count, 4, 8)[:, 1:3, 1:7].mean(axis=1)
+        noise = np.random.default_rng(seed).uniform(0.9, 1.1, (count, 4, 6))
+        penalties = (0.01 + (1.0 - beside_the_way) ** 2)[:, None] * noise * stand_in.SCALES
+        return genes, evaluation_of(stand_in.make_result(penalties), CELLS, FITNESS)
+
+    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=12)
+    search = Surrogate(cfg, CELLS, space, np.random.SeedSequence(0))
+    for seed in range(4):
+        genes, told = slipped(seed, 100)
+        search.learn(genes, told, told.fitness)
+    genes, truth = slipped(9, 150)
+    mean = search.predict(genes).ratios.mean(axis=0)
+    error, spread = ((mean - truth.ratios) ** 2).sum(), ((truth.ratios - truth.ratios.mean(axis=0)) ** 2).sum()
+    assert error < 0.5 * spread
+    assert len(search.propose(10, genes, truth.cell, truth.fitness, genes[:0])) == 10
+
+
 def test_networks_differ_and_learn_apart(learned):
     ratios = learned.predict(SUPER_GAUSSIAN.hard_random(10, 5)).ratios
     assert (ratios.std(axis=0).sum(axis=1) > 1e-3).all()
 
 
 def test_grouped_networks_are_the_same_as_one_by_one(learned):
-    heights = learned._rasterised(SUPER_GAUSSIAN.hard_random(5, 6)).float()[:, None].expand(-1, module.MEMBERS, -1, -1)
+    maps = learned._mapped(SUPER_GAUSSIAN.hard_random(5, 6)).float()[:, None].expand(-1, module.MEMBERS, -1, -1, -1)
     with torch.no_grad():
-        one_by_one = learned._networks(heights)
-        together = learned._networks._through(heights, slice(None)).reshape(5, module.MEMBERS, -1)
+        one_by_one = learned._networks(maps)
+        together = learned._networks._through(maps.flatten(1, 2), slice(None)).reshape(5, module.MEMBERS, -1)
     torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-5)
 
 
@@ -147,11 +170,13 @@ def test_the_newest_are_kept(monkeypatch):
         search.learn(genes, told, told.fitness)
     assert len(search) == 70
     assert np.array_equal(search._genes[-40:], genes)
-    assert torch.equal(search._heights[-40:], search._rasterised(genes))
+    assert torch.equal(search._maps[-40:], search._mapped(genes))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE], ids=lambda space: space.name)
+@pytest.mark.parametrize(
+    "space", [SUPER_GAUSSIAN, COURSE, get_space("course+element-friction")], ids=lambda space: space.name
+)
 def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
     cfg = SchedulerCfg(
         emitters=5, batch_size=8, groups=2, method="surrogate+cma_mae", training_steps=3, candidates=2, generations=2,

@@ -1,8 +1,9 @@
 import numpy as np
+import pytest
 
-from sim.bank import heights_of
-from sim.corridor import SHAPE, corridor_heights
-from sim.space import SUPER_GAUSSIAN
+from sim.bank import heights_of, terrains_of
+from sim.corridor import SHAPE, corridor_ground, corridor_heights
+from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.course import COURSE
 
 
@@ -29,3 +30,24 @@ def test_mirrored_bumps_are_the_mirrored_terrain():
     assert not np.array_equal(mirrored, genes)
     np.testing.assert_allclose(heights_of(mirrored), heights_of(genes)[:, ::-1], atol=1e-5)
     assert np.array_equal(SUPER_GAUSSIAN.mirrored(mirrored), genes)
+
+
+@pytest.mark.parametrize("name", ["super_gaussian+friction+softness", "course+element-softness"])
+def test_ground_around_the_way(name):
+    space = get_space(name)
+    genes = space.uniform_random(3, 2)
+    found = corridor_ground(genes, space, device="cpu").numpy()
+    assert found.shape == (3, len(space.ground), *SHAPE)
+    _, ground = terrains_of(genes, space)
+    maps = {"friction": 1.0 - ground.friction, "softness": ground.time_constant_s / 0.06}
+    rows, cols = ground.shape
+    for row, col in ((0, 0), (20, 57), (40, 120), (7, 70), (19, 71)):
+        patch = int((2.0 + 0.1 * row) * rows / 8.0 + 1e-6), int((2.0 + 0.1 * col) * cols / 16.0 + 1e-6)
+        for place, kind in enumerate(space.ground):
+            np.testing.assert_allclose(found[:, place, row, col], maps[kind][:, *patch], atol=1e-6)
+    assert found.std() > 0.05
+
+
+def test_plain_ground_has_no_maps():
+    genes = SUPER_GAUSSIAN.hard_random(3, 0)
+    assert corridor_ground(genes, SUPER_GAUSSIAN, device="cpu").shape == (3, 0, *SHAPE)
