@@ -28,8 +28,8 @@ def families_of(genes: NDArray[np.float32], space: "TerrainSpace") -> NDArray[np
     """
     from sim.bank import heights_of  # with Warp: not for `--help`
 
-    banks = [heights_of(genes[first : first + _BANK], space) for first in range(0, len(genes), _BANK)]
-    maps = [bank[:, ::_EVERY, ::_EVERY].reshape(len(bank), -1).astype(np.float64) for bank in banks]
+    banks = [heights_of(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
+    maps = [bank.reshape(len(bank), -1).astype(np.float64) for bank in banks]
     return joined(rms_distances(np.concatenate(maps), np.concatenate(maps)) < KIN_M) if maps else np.zeros(0, np.int64)
 
 

@@ -1,5 +1,7 @@
 """The terrains of a simulation, on the device."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -139,21 +141,30 @@ def host_device() -> str:
     return "cpu" if wp.is_cpu_available() else str(wp.get_device())
 
 
-def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str | None = None) -> np.ndarray:
+def heights_of(
+    genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1, device: str | None = None
+) -> np.ndarray:
     """Height grids [m] of genes as a simulation has them, on the host.
 
     Args:
         genes: Shape (num_terrains, num_genes), at least one terrain.
         space: What the genes mean.
+        every: Only every so many nodes of rows and columns, from the first: a divisor of the cells of both.
         device: Warp device name; :func:`host_device` if None.
 
     Returns:
-        Float32, shape (num_terrains, NUM_ROWS, NUM_COLS).
+        Float32, shape (num_terrains, NUM_ROWS, NUM_COLS), or fewer rows and columns.
 
     Raises:
         ValueError: If the shape differs or a gene is not finite.
     """
-    return terrains_of(genes, space, device=device)[0]
+    if every == 1 or not space.any_spacing:
+        return terrains_of(genes, space, device=device)[0][:, ::every, ::every]
+    shape = len(genes), (NUM_ROWS - 1) // every + 1, (NUM_COLS - 1) // every + 1
+    with wp.ScopedDevice(device or host_device()):  # the nodes in between are not worked out
+        heights: Any = wp.empty(shape, dtype=float)
+        space.rasterise(wp.array(space.validate(genes), dtype=float), every * SPACING, heights)
+        return np.array(heights.numpy())
 
 
 def terrains_of(

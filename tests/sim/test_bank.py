@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from sim.bank import TerrainBank
+from sim.bank import TerrainBank, heights_of
 from sim.bench import oracle
 from sim.space import SUPER_GAUSSIAN, SuperGaussian
+from sim.spaces.course import COURSE
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.sim.scenes import NODE_X, NODE_Y
 
@@ -24,6 +25,14 @@ def test_genes_become_heights_and_ceilings(device):
     expected = [oracle.mixture_height(row, NODE_X[None, :], NODE_Y[:, None]) for row in genes]
     np.testing.assert_allclose(bank.heights.numpy(), expected, atol=1e-5)
     np.testing.assert_array_equal(bank.terrain.ceilings.numpy(), block_maxima(bank.heights.numpy()))
+
+
+@pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE], ids=lambda space: space.name)
+def test_every_second_node_is_that_of_the_whole_grid(space):
+    genes = space.hard_random(3, 0)
+    whole, some = heights_of(genes, space), heights_of(genes, space, every=2)
+    assert some.shape == (3, (NUM_ROWS + 1) // 2, (NUM_COLS + 1) // 2)
+    np.testing.assert_allclose(some, whole[:, ::2, ::2], atol=1e-5)
 
 
 @pytest.mark.parametrize("num_bumps", [1, 3])
