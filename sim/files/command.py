@@ -135,7 +135,10 @@ def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None
     except KeyboardInterrupt:
         raise Interrupted(f"Stopped; {state}. {command()}") from None
     except (UserError, OSError) as error:
-        raise type(error)(f"{error}. {command()}") from error
+        # Work within work has named how it goes on alone: the outer one's command does both.
+        inner = error.__cause__
+        named = type(inner) is type(error) and str(error).startswith(f"{inner}. ")
+        raise type(error)(f"{inner if named else error}. {command()}") from (inner if named else error)
 
 
 def debugging() -> bool:

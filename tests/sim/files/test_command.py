@@ -132,6 +132,12 @@ def test_work_that_stops_says_what_comes_next():
         raise ZeroDivisionError
 
 
+def test_work_within_work_names_the_outer_command_alone():
+    outer, inner = (naming_what_is_next("", lambda word=word: f"Go on with {word}") for word in ("outer", "inner"))
+    with pytest.raises(OSError, match=r"^no room\. Go on with outer$"), outer, inner:
+        raise OSError("no room")
+
+
 def test_a_command_line_can_be_typed(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/opt/bin/faultline"])
     flags = {"run": Path("runs/a b"), "elite": [0, 1], "reward": True, "device": None, "no_colour": False}
