@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, get_args, get_origin, get_type_hints, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.provenance import without_machine
@@ -170,6 +170,7 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
     try:
         defaults: Any = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
         flags: Any = cls  # a protocol is no type that tyro's annotations take
+        _refuse_bare_flags(cls, argv)
         command: _Command = tyro.cli(flags, prog=f"faultline {name}", args=list(argv), **defaults)
         check(command)
         status = command.execute()
@@ -182,6 +183,22 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
+
+
+def _refuse_bare_flags(cls: type, argv: Sequence[str]) -> None:
+    """Refuses a flag of several values that has none: it would be taken for one that was left out.
+
+    Raises:
+        ValueError: If there is one.
+    """
+    several = {
+        f"--{name.replace('_', '-')}"
+        for name, kind in get_type_hints(cls).items()
+        if any(get_origin(one) is tuple for one in (kind, *get_args(kind)))
+    }
+    for word, following in zip(argv, [*argv[1:], "--"], strict=True):
+        if word.replace("_", "-") in several and following.startswith("--"):
+            raise ValueError(f"{word} must have one or several values behind it, got none: give some, or leave it out")
 
 
 _COMPILER, _AGAIN_S = f"{os.sep}llvmlite{os.sep}", 0.1
@@ -204,7 +221,7 @@ def command_line(name: str, **flags: object) -> str:
 
     Args:
         name: The word that calls it.
-        flags: Values by field name; None and False are left out, True is a bare flag.
+        flags: Values by field name; None, False and empty lists are left out, True is a bare flag.
     """
     return shlex.join([*_program(), *command_words(name, **flags)])
 
@@ -225,7 +242,7 @@ def _words(flags: Mapping[str, object]) -> Iterator[str]:
         if value is True:
             yield flag
         elif isinstance(value, list | tuple):
-            yield from (flag, *map(str, value))
+            yield from (flag, *map(str, value)) if value else ()
         elif str(value).startswith("-"):  # would be taken for a flag
             yield f"{flag}={value}"
         elif value is not None and value is not False:
