@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol, get_args, get_origin, get_type_hints, runtime_checkable
@@ -196,7 +197,7 @@ def _refuse_bare_flags(cls: type, argv: Sequence[str]) -> None:
         for name, kind in get_type_hints(cls).items()
         if any(get_origin(one) is tuple for one in (kind, *get_args(kind)))
     }
-    for word, following in zip(argv, [*argv[1:], "--"], strict=True):
+    for word, following in pairwise([*argv, "--"]):
         if word.replace("_", "-") in several and following.startswith("--"):
             raise ValueError(f"{word} must have one or several values behind it, got none: give some, or leave it out")
 
