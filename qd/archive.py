@@ -4,6 +4,7 @@ Training and figures read archives without the search's libraries.
 """
 
 import os
+from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,17 @@ class FaultCounts:
     def rows(self, chosen: NDArray[np.int64]) -> "FaultCounts":
         """Those of some of the elites alone, in the order given."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in COUNTS})
+
+    def of_certifiers(self, sha256: Collection[str]) -> "FaultCounts":
+        """Those of some of the certifiers alone, by their hashes."""
+        places = [place for place, digest in enumerate(self.certifier_sha256) if digest in sha256]
+        return replace(
+            self,
+            certifiers=tuple(self.certifiers[place] for place in places),
+            certifier_sha256=tuple(self.certifier_sha256[place] for place in places),
+            certifier_outcomes=self.certifier_outcomes[:, places],
+            certifier_resolved_outcomes=self.certifier_resolved_outcomes[:, places],
+        )
 
     def certificates(self) -> NDArray[np.bool_]:
         """Whether a controller reaches the goal in at least half of both kinds of episodes, shape (N, C)."""

@@ -164,7 +164,7 @@ def certify(archive: Archive, chosen: Sequence[int], certifiers: Mapping[str, st
 
 
 def is_judged(archive: Archive, certifiers: Mapping[str, str]) -> bool:
-    """Whether nothing is left of all failing elites to be crossed for :func:`confirm` and :func:`certify`.
+    """Whether nothing is left to be crossed of all failing elites for :func:`confirm`, and by all for :func:`certify`.
 
     Args:
         archive: With fresh values.
@@ -174,6 +174,8 @@ def is_judged(archive: Archive, certifiers: Mapping[str, str]) -> bool:
         ValueError: As of :func:`with_certifiers`.
     """
     faults = with_certifiers(archive.faults or FaultCounts.none_of(len(archive)), certifiers)
+    if archive.faults is None or faults.certifiers != archive.faults.certifiers:
+        return False
     archive, failing = replace(archive, faults=faults), np.flatnonzero(archive.failing).tolist()
     left = [_Column("resolved_outcomes").missing(archive, failing)]
     for policy in certifiers.values():

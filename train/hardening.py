@@ -5,8 +5,7 @@ a hardening that was killed anywhere goes on where it was. ``rounds.json`` follo
 """
 
 import signal
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -16,40 +15,30 @@ from qd.archive import read_archive
 from qd.faults import is_judged
 from qd.fresh import Open
 from qd.run.arguments import Archive, job_of
-from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, RunDirectory, claimed, read_archive_of
+from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, RunDirectory, claimed
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
 from qd.run.settings import changed, differences, preset
 from qd.search import run_search
-from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
-from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
+from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, resolve_device
+from sim.files.atomic import is_leftover, read_json
 from sim.files.command import Interrupted, command_line, naming_what_is_next
-from sim.files.intervals import value_words
 from sim.files.settings import check
-from sim.policy.spec import about_controllers, controllers_of, is_same
+from sim.policy.spec import certifier_hash, controller_hash, controllers_of, is_same
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, to_be_named
-from train.evaluate.crossings import cross_all
 from train.evaluate.evaluate import Evaluate, evaluator_of
-from train.evaluate.measures import measure
-from train.evaluate.sets import MIN_ELITES, TerrainSet, generated_set, make_sets, split_elites
-from train.evaluate.tables import make_tables
 from train.finetune import Finetune
 from train.harden import Harden
 from train.ppo.learner import read_start
 from train.ppo.run import CHECKPOINT, POLICY
+from train.rounds import FIXED_SETS, begin, divisible, read_rounds, record, tell
 from train.tuning import tuning_sizes
 
 BASE = "base"
 """Name of the controller that a hardening begins with."""
 _GPU_EPISODES = 400_000
-_FIXED_SETS = ("hand_crafted", "hard_random")
 _SEEDS = 100  # of searches and trainings, apart between hardenings of one seed and the next
-_COUNTS = (
-    "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "failing", "confirmed",
-    "certified", "faults", "panel",
-)  # fmt: skip
-_SESSION = ("command", "commit", "device", "date")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,8 +160,10 @@ class Hardening:
 
     def is_searched(self, stage: Stage) -> bool:
         """Whether the search against a controller is over, its fresh episodes included."""
-        archive = RunDirectory(stage.search).fresh_archive()
-        return archive is not None and archive.iterations >= self.search_iterations
+        run = RunDirectory(stage.search)
+        archive = run.fresh_archive()
+        whole = run.read_summary().get("reproduced_by")  # a kill may come between the archive and its numbers
+        return archive is not None and archive.iterations >= self.search_iterations and bool(whole)
 
     def is_judged(self, stage: Stage) -> bool:
         """Whether its faults are counted too."""
@@ -216,7 +207,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     wanted = flags.search_episodes or (_GPU_EPISODES if on_cuda else search.iterations * an_iteration)
     tuning = replace(Finetune.defaults(["--robot", robot.spec]), iterations=flags.tune_iterations)
     names = ("terrains", "episodes", "device", "workers", "num_envs", "space")
-    evaluation = Evaluate(robot=robot.spec, sets=_FIXED_SETS, **{name: getattr(flags, name) for name in names})
+    evaluation = Evaluate(robot=robot.spec, sets=FIXED_SETS, **{name: getattr(flags, name) for name in names})
     found = Hardening(
         flags=flags,
         robot=robot,
@@ -233,6 +224,8 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     for certifier in found.certifiers(str(policy)).values():
         check_policy(certifier, robot, device)
     _refuse_another(found)
+    for stage in found.stages:
+        _refuse_changed(found, stage)
     return found
 
 
@@ -242,8 +235,7 @@ def _path_of(flags: Harden) -> Path:
 
 def _with_known_comparisons(flags: Harden) -> Harden:
     """The flags with what the rounds were compared with before: it stays in the tables."""
-    file = _path_of(flags) / ROUNDS_FILE
-    known = read_json(file).get("comparisons", {}) if file.exists() else {}
+    known = read_rounds(_path_of(flags)).get("comparisons", {})
     there = (kind for kind, row in known.items() if row["rounds"] == flags.rounds)
     return replace(flags, against=tuple(dict.fromkeys([*there, *flags.against])))
 
@@ -269,14 +261,47 @@ def _refuse_another(job: Hardening) -> None:
     """
     path = job.path
     if (path / ROUNDS_FILE).exists():
-        there = read_json(path / ROUNDS_FILE).get("settings")
-        different = differences(there if isinstance(there, dict) else {}, job.settings)
+        content = read_rounds(path)
+        different = differences(content.get("settings", {}), job.settings)
         if different:
             raise ValueError(
                 f"{path} holds a hardening of other settings: {', '.join(different)}: give those, or another --run-dir"
             )
+        done = len(content.get("rounds", [])) - 1
+        if job.flags.rounds < done:
+            raise ValueError(f"rounds must be at least {done}, as many as {path} has done, got {job.flags.rounds}")
     elif path.is_dir() and not all(map(is_leftover, path.iterdir())):
         raise ValueError(f"{path} is not empty and holds no {ROUNDS_FILE}: give another --run-dir")
+
+
+def _refuse_changed(job: Hardening, stage: Stage) -> None:
+    """Refuses a search that is no longer the hardening's: its numbers would not compare with those of the others.
+
+    Raises:
+        ValueError: If it was made longer, its controller is another now, or one certified that is not asked elsewhere.
+    """
+    archive = RunDirectory(stage.search).fresh_archive()
+    if archive is None:
+        return
+    if archive.iterations > job.search_iterations:
+        raise ValueError(
+            f"{stage.search} must have {job.search_iterations} iterations, as all searches of its hardening, got "
+            f"{archive.iterations}: put a copy of it back, or give another --run-dir"
+        )
+    digest = controller_hash(stage.policy)
+    if digest is not None and digest != archive.policy_sha256:
+        raise ValueError(
+            f"{stage.policy} must be the controller that {stage.search} was searched with, got another: put it back, "
+            "or give another --run-dir"
+        )
+    asked = {certifier_hash(*one) for one in job.certifiers(stage.policy).items()}
+    there = archive.faults and dict(zip(archive.faults.certifiers, archive.faults.certifier_sha256, strict=True))
+    others = [name for name, one in (there or {}).items() if one not in asked]
+    if others:
+        raise ValueError(
+            f"all searches of {job.path} must have the same certifiers, got certificates of {', '.join(others)} in "
+            f"{stage.search.name}, who is not asked now: name all of them by --by"
+        )
 
 
 def harden(flags: Harden, *, open_evaluator: Open = open_evaluator) -> int:
@@ -294,7 +319,7 @@ def harden(flags: Harden, *, open_evaluator: Open = open_evaluator) -> int:
     with _time_limit(flags.max_seconds) as is_up:
         try:
             with claimed(job.path), naming_what_is_next("what is finished is kept", lambda: go_on):
-                _begin(job)
+                begin(job)
                 for stage in job.stages:
                     _run(job, stage)
         except Interrupted as stop:
@@ -302,7 +327,7 @@ def harden(flags: Harden, *, open_evaluator: Open = open_evaluator) -> int:
                 raise
             print(f"The time is up. {stop}")
             return 0
-    _tell(read_json(job.path / ROUNDS_FILE))
+    tell(read_json(job.path / ROUNDS_FILE))
     print(f"Next, see it on one page:  {command_line('report', robot=job.robot.spec, run=job.path)}")
     return 0
 
@@ -337,18 +362,18 @@ def _run(job: Hardening, stage: Stage) -> None:
             print(f"\n=== {stage.controller}: training, in {tune.run}", flush=True)
             _tune(job, tune)
     if stage.tunes and not job.is_searched(stage):
-        _record(job)
+        record(job)
     if not job.is_judged(stage):
         print(f"\n=== {stage.controller}: search, in {stage.search}", flush=True)
         _search(job, stage)
         _judge(job, stage)
-    _record(job)
+    record(job)
 
 
 def _tune(job: Hardening, tune: Tune) -> None:
     """Trains, or goes on; raises KeyboardInterrupt where it was asked to stop."""
     flags, robot = job.flags, job.robot.spec
-    own = {"device": flags.device, "iterations": job.tune_iterations, "archive": _divisible(tune.archives)}
+    own = {"device": flags.device, "iterations": job.tune_iterations, "archive": divisible(tune.archives)}
     if (tune.run / CHECKPOINT).exists():
         training = Finetune.defaults(["--robot", robot, "--resume", str(tune.run)])
     else:
@@ -358,17 +383,6 @@ def _tune(job: Hardening, tune: Tune) -> None:
     own["space"] = to_be_named(job.space.name) if tune.archives else job.space.name
     if replace(training, **own).execute():
         raise KeyboardInterrupt
-
-
-def _divisible(runs: Sequence[Path]) -> tuple[Path, ...]:
-    """The searches that found enough elites to train on some and hold out others; the first must have."""
-    enough = tuple(run for run in runs if len(read_archive(run)) >= MIN_ELITES)
-    if runs and runs[0] not in enough:
-        raise ValueError(
-            f"{runs[0]} must have found at least {MIN_ELITES} elites to train on, got {len(read_archive(runs[0]))}: "
-            "give more --search-episodes and another --run-dir"
-        )
-    return enough
 
 
 def _search(job: Hardening, stage: Stage) -> None:
@@ -405,84 +419,3 @@ def _where(job: Hardening) -> dict[str, Any]:
 def _named(job: Hardening, stage: Stage) -> str | None:
     """What a search calls its controller; None for the shipped one."""
     return None if job.flags.policy is None and not stage.tunes else stage.policy
-
-
-def _begin(job: Hardening) -> None:
-    """Writes what is to be done, with this session after those before."""
-    file = job.path / ROUNDS_FILE
-    now = origin_of(job.device, job.flags.seed, job.flags.workers)
-    content = read_json(file) if file.exists() else {**now, "settings": job.settings, "sessions": []}
-    sessions = [*content.pop("sessions"), {name: now[name] for name in _SESSION}]
-    write_atomically(file, to_json({**content, "sessions": sessions}))
-    started = time.strftime("%H:%M")
-    print(f"Hardening '{job.robot.name}' for {job.flags.rounds} rounds in {job.path}, from {started}", flush=True)
-
-
-def _record(job: Hardening) -> None:
-    """Writes ``rounds.json``: the counts of all searches that are over, and the tables of all controllers there are."""
-    file = job.path / ROUNDS_FILE
-    content = read_json(file)
-    rows = {stage.controller: (stage, _row(job, stage)) for stage in job.stages if job.is_judged(stage)}
-    known = dict(content.get("comparisons") or {})  # those of this session and of sessions before
-    known |= {stage.compared: {"rounds": job.flags.rounds, **row} for stage, row in rows.values() if stage.compared}
-    written = {
-        **content,
-        **{name: job.settings[name] for name in ("robot", "robot_sha256", "penalty_definition")},
-        "rounds": [row for stage, row in rows.values() if not stage.compared],
-        "comparisons": known,
-        "tables": _tables(job),
-    }
-    write_atomically(file, to_json(written))
-
-
-def _row(job: Hardening, stage: Stage) -> dict[str, Any]:
-    """What the search against a controller found."""
-    summary = RunDirectory(stage.search).read_summary()
-    counts = {name: summary.get(name) for name in _COUNTS}
-    who = {name: value for name, value in identity(job.robot, stage.policy).items() if name.startswith("policy")}
-    return {
-        "controller": stage.controller,
-        **who,
-        "tuned": [tune.run.name for tune in stage.tunes],
-        "search": stage.search.name,
-        **counts,
-    }
-
-
-def _tables(job: Hardening) -> dict[str, Any]:
-    """Every controller there is on the fixed sets and on the held-out elites of every archive.
-
-    The same keys as of ``tables.json``; what was crossed before is not crossed again.
-    """
-    there = [stage for stage in job.stages if all(map(job.is_tuned, stage.tunes))]
-    controllers = {stage.controller: stage.policy for stage in there}
-    sets = dict(make_sets(_FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space))
-    searched = [stage.search for stage in there if not stage.compared and job.is_searched(stage)]
-    sets |= {run.name: _held_out(job, run) for run in _divisible(searched)}
-    results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
-    scales = job.robot.read_penalty_scales(None if job.flags.policy is None else str(job.flags.policy))
-    crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
-    about = about_controllers(controllers)
-    return {
-        "episodes": job.evaluator.num_replicas,
-        "controllers": about,
-        **make_tables(crossed, sets, job.robot, 0, hashes={who: one["sha256"] for who, one in about.items()}),
-    }
-
-
-def _held_out(job: Hardening, run: Path) -> TerrainSet:
-    """Elites of an archive that no training draws."""
-    archive = read_archive_of(job.robot, run, job.flags.space)
-    split = split_elites(archive, job.robot.name, spec=job.robot.spec, run=run)
-    return replace(generated_set(archive, split, job.evaluator.num_terrains, 0), name=run.name)
-
-
-def _tell(content: Mapping[str, Any]) -> None:
-    """The rounds in a few lines."""
-    goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
-    print("\n" + "".join(f"{title:<12}" for title in ("controller", "elites", "failing", "faults")) + "goal on")
-    for row in [*content["rounds"], *content["comparisons"].values()]:
-        who = row["controller"]
-        counts = ("-" if row[key] is None else row[key] for key in ("elites", "failing", "faults"))
-        rates = (f"{name} {value_words(goal[name].get(who), limits[name].get(who))}" for name in _FIXED_SETS)
-        print("".join(f"{cell:<12}" for cell in (who, *counts)) + ", ".join(rates))

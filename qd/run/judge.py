@@ -15,6 +15,7 @@ from qd.run.arguments import check_certifiers, evaluator_of
 from qd.run.directory import CONFIG_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed, newest_run
 from qd.run.settings import SearchCfg, as_settings, code_of, is_searched, own_policy
 from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
+from sim.files.atomic import read_json
 from sim.files.command import InSpace, OfRobot, Where, Who, chosen_elites, command_line, naming_what_is_next
 from sim.files.intervals import rate_words
 from sim.files.settings import setting
@@ -103,10 +104,13 @@ def judged_run(path: Path, cfg: SearchCfg, robot: "RobotCfg", elite: str) -> Ite
     """The run, kept from other commands.
 
     Raises:
-        ValueError: If its archive is damaged or has no fresh episodes, or an elite that was named does not fail.
+        ValueError: If archive or numbers are damaged, there are no fresh episodes, or an elite that was named does not
+            fail.
     """
     with claimed(path):
         archive = read_archive(path)
+        if (path / SUMMARY_FILE).exists():
+            read_json(path / SUMMARY_FILE)  # what is found is added to it: a damaged one would be lost
         if (archive.robot, archive.penalties, archive.scales) != (
             cfg.robot, cfg.fitness.penalties, cfg.fitness.scales,
         ):  # fmt: skip

@@ -1,14 +1,14 @@
 """The file of minimal terrains: their genes, and every crossing by which they were found, from which work goes on."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import OUTCOMES, Archive, FaultCounts
+from qd.archive import COUNTS, OUTCOMES, Archive, FaultCounts
 from qd.minimal import Case, How, Minimal, Trial
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
@@ -45,10 +45,11 @@ class Known:
             return None
         places = {row.tobytes(): place for place, row in enumerate(self.genes)}
         there = np.array([places.get(row.tobytes(), -1) for row in genes], dtype=np.int64)
-        counts = self.faults.rows(there) if len(self.genes) else FaultCounts.none_of(0)
-        for name in (name for name in _FAULTS if name.endswith("_outcomes")):
-            getattr(counts, name)[there < 0] = 0
-        return counts
+        counts = {name: getattr(self.faults, name) for name in COUNTS}
+        rows = {name: np.zeros((len(genes), *old.shape[1:]), np.int64) for name, old in counts.items()}
+        for name, old in counts.items():
+            rows[name][there >= 0] = old[there[there >= 0]]
+        return replace(self.faults, **rows)
 
 
 def write_minimal(

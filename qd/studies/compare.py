@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qd.archive import Archive
 from qd.faults import fault_numbers
 from qd.fitness import FITNESS_FLOOR
 from qd.fresh import Open, Reevaluate, reevaluate_run
@@ -22,7 +23,7 @@ from qd.workers.kept_open import kept_open
 from sim.files.command import publish
 from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
 from sim.files.settings import check, setting
-from sim.policy.spec import controllers_of, named_file
+from sim.policy.spec import certifier_hash, controllers_of, named_file
 from sim.robots.identity import identity
 
 if TYPE_CHECKING:
@@ -178,8 +179,8 @@ class Compare(StudyFlags):
             for name in names:
                 confirm_run(Confirm(policy=self.policy, run=path / name, **shared), open_evaluator=opened)
             for name in names:
-                certify = Certify(by=by, run=path / name, **shared)
-                found[name] = fault_numbers(certify_run(certify, open_evaluator=opened))
+                archive = certify_run(Certify(by=by, run=path / name, **shared), open_evaluator=opened)
+                found[name] = fault_numbers(judged_by(archive, judges))
         return found
 
     def _methods(self, shared: SearchCfg, certifiers: dict[str, str]) -> dict[str, SearchCfg]:
@@ -233,6 +234,12 @@ class Compare(StudyFlags):
                 )
             found[name] = int(count) if at else self.seeds
         return found
+
+
+def judged_by(archive: Archive, judges: Mapping[str, str]) -> Archive:
+    """An archive with the certificates of these controllers alone; earlier calls may have asked others of some runs."""
+    asked = {certifier_hash(*one) for one in judges.items()}
+    return archive if archive.faults is None else replace(archive, faults=archive.faults.of_certifiers(asked))
 
 
 def _resized(cfg: SearchCfg, shared: SearchCfg, name: str) -> SearchCfg:

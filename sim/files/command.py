@@ -14,9 +14,10 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, get_args, get_origin, get_type_hints, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.provenance import without_machine
@@ -136,7 +137,10 @@ def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None
     except KeyboardInterrupt:
         raise Interrupted(f"Stopped; {state}. {command()}") from None
     except (UserError, OSError) as error:
-        raise type(error)(f"{error}. {command()}") from error
+        # Work within work has named how it goes on alone: the outer one's command does both.
+        inner = error.__cause__
+        named = type(inner) is type(error) and str(error).startswith(f"{inner}. ")
+        raise type(error)(f"{inner if named else error}. {command()}") from (inner if named else error)
 
 
 def debugging() -> bool:
@@ -168,6 +172,7 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
     try:
         defaults: Any = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
         flags: Any = cls  # a protocol is no type that tyro's annotations take
+        _refuse_bare_flags(cls, argv)
         command: _Command = tyro.cli(flags, prog=f"faultline {name}", args=list(argv), **defaults)
         check(command)
         status = command.execute()
@@ -180,6 +185,22 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
+
+
+def _refuse_bare_flags(cls: type, argv: Sequence[str]) -> None:
+    """Refuses a flag of several values that has none: it would be taken for one that was left out.
+
+    Raises:
+        ValueError: If there is one.
+    """
+    several = {
+        f"--{name.replace('_', '-')}"
+        for name, kind in get_type_hints(cls).items()
+        if any(get_origin(one) is tuple for one in (kind, *get_args(kind)))
+    }
+    for word, following in pairwise([*argv, "--"]):
+        if word.replace("_", "-") in several and following.startswith("--"):
+            raise ValueError(f"{word} must have one or several values behind it, got none: give some, or leave it out")
 
 
 _COMPILER, _AGAIN_S = f"{os.sep}llvmlite{os.sep}", 0.1
@@ -202,7 +223,7 @@ def command_line(name: str, **flags: object) -> str:
 
     Args:
         name: The word that calls it.
-        flags: Values by field name; None and False are left out, True is a bare flag.
+        flags: Values by field name; None, False and empty lists are left out, True is a bare flag.
     """
     return shlex.join([*_program(), *command_words(name, **flags)])
 
@@ -223,7 +244,7 @@ def _words(flags: Mapping[str, object]) -> Iterator[str]:
         if value is True:
             yield flag
         elif isinstance(value, list | tuple):
-            yield from (flag, *map(str, value))
+            yield from (flag, *map(str, value)) if value else ()
         elif str(value).startswith("-"):  # would be taken for a flag
             yield f"{flag}={value}"
         elif value is not None and value is not False:

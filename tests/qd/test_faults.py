@@ -204,6 +204,9 @@ def test_judged_is_an_archive_of_which_nothing_is_left_to_be_crossed(failing, ce
     assert is_judged(certify(confirmed, everyone, panel, work(lambda cfg, genes: [0] * len(genes))), panel)
 
 
-def test_where_nothing_fails_nothing_is_left(failing, certifier):
+def test_where_nothing_fails_nothing_is_crossed_and_the_panel_is_named(failing, certifier):
     fine = dataclasses.replace(failing, fresh=dataclasses.replace(failing.fresh, goal_rate=np.ones(6)))
-    assert is_judged(fine, {"C": certifier})
+    assert not is_judged(fine, {"C": certifier})
+    opened = []
+    judged = certify(fine, [], {"C": certifier}, work(lambda cfg, genes: [0] * len(genes), opened=opened))
+    assert is_judged(judged, {"C": certifier}) and fault_numbers(judged)["panel"] == ["C"] and not opened

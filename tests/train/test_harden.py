@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from kernels.episode import Outcome
-from qd.archive import read_archive
+from qd.archive import read_archive, write_archive
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
 from sim.robots.robot import get_robot
@@ -309,3 +309,58 @@ def words_of(name, value):
 def test_too_few_elites_to_train_on_are_said(places, stubbed):
     with pytest.raises(ValueError, match=r"must have found at least 5 elites to train on, got [0-4]: give more"):
         harden(config(places, batch_size=2, search_episodes=4), open_evaluator=Crossings().open)
+
+
+def test_fewer_rounds_than_are_done_are_refused(places, stubbed):
+    harden(config(places), open_evaluator=Crossings().open)
+    with pytest.raises(ValueError, match=r"rounds must be at least 2, as many as .*run has done, got 1"):
+        harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    assert len(rounds_of(places)["rounds"]) == 3
+
+
+def test_all_searches_have_the_same_certifiers(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    content = torch.load(places / "certifier.pt", weights_only=True)
+    content["actor_state_dict"]["mlp.0.bias"] -= 1.0
+    torch.save(content, places / "certifier_2.pt")
+    both = tuple(f"{name}={places / file}.pt" for name, file in (("C", "certifier"), ("D", "certifier_2")))
+    with pytest.raises(ValueError, match=r"must have the same certifiers, got certificates of C in search-0, who is"):
+        harden(config(places, by=both[1:]), open_evaluator=Crossings().open)
+    harden(config(places, by=both), open_evaluator=Crossings().open)
+    assert [row["panel"] for row in rounds_of(places)["rounds"]] == [["C", "D"]] * 3
+
+
+def test_what_was_changed_behind_its_back_is_refused(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    archive, tuned = places / "run" / "search-0" / "archive.npz", places / "run" / "tune-1" / "policy.pt"
+    whole = archive.read_bytes()
+    write_archive(archive, replace(read_archive(archive.parent), iterations=7))
+    with pytest.raises(ValueError, match=r"search-0 must have 1 iterations, as all searches .* got 7: put a copy"):
+        harden(config(places), open_evaluator=Crossings().open)
+    archive.write_bytes(whole)
+    tuned.write_bytes((places / "certifier.pt").read_bytes())
+    with pytest.raises(ValueError, match=r"policy.pt must be the controller that .*search-1 was searched with, got an"):
+        harden(config(places), open_evaluator=Crossings().open)
+
+
+def test_killed_between_an_archive_and_its_numbers_it_makes_them_again(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    expected, summary = rounds_of(places), places / "run" / "search-1" / "archive.json"
+    content = read_json(summary)
+    stale = {"confirmed": None, "certified": None, "faults": None, "panel": []}  # as before the last lot
+    early = {**content, **stale, "elites_reproduced": None, "corrected_elites": None, "reproduced_by": None}
+    for damaged in (to_json({**content, **stale}), to_json(early), b"{"):
+        summary.write_bytes(damaged)
+        assert harden(config(places, rounds=1), open_evaluator=Crossings().open) == 0
+        assert rounds_of(places)["rounds"] == expected["rounds"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("comparisons", {"hard_random": 3}), ("comparisons", []), ("rounds", 3), ("settings", 1), ("sessions", {})],
+)
+def test_a_damaged_file_of_rounds_is_said(places, key, value):
+    (places / "run").mkdir()
+    (places / "run" / "rounds.json").write_bytes(to_json({key: value}))
+    with pytest.raises(ValueError, match=rf"rounds\.json is damaged at {key}: put a copy of it back"):
+        hardening_of(config(places))

@@ -241,3 +241,12 @@ def test_a_robot_that_has_changed_is_refused(path):
     (path / "config.json").write_text(json.dumps(config))
     with pytest.raises(ValueError, match="its settings, model or meshes have changed since"):
         confirmed(path)
+
+
+@pytest.mark.parametrize("damaged", [b"{", b"[]"])
+def test_damaged_numbers_are_refused_not_replaced_by_some_of_them(path, damaged):
+    (path / "archive.json").write_bytes(damaged)
+    for judge in (confirmed, certified):
+        with pytest.raises(ValueError, match=r"archive\.json must .*: put a copy of .* back|put a copy of the right"):
+            judge(path, opened=judges(stop_after=0))
+    assert (path / "archive.json").read_bytes() == damaged

@@ -178,3 +178,17 @@ def test_a_space_without_scales_has_no_margin(path, bump_4, monkeypatch):
     monkeypatch.setattr("sim.space.SuperGaussian.scaled", lambda self, genes, scale: None)
     (first, _) = minimised(path, elite=bump_4)["elites"]
     assert (first["bumps"], first["scale"], first["margin_m"], first["scales"]) == ([4], None, None, [])
+
+
+def test_counts_of_terrains_that_are_gone_do_not_stop_it(path, bump_4):
+    first, second = bump_4.split()
+    minimised(path, elite=first, by=(OTHER,))
+    archive = read_archive(path)
+    assert archive.fresh is not None
+    rates = archive.fresh.goal_rate.copy()
+    rates[int(first)] = 1.0  # by new fresh episodes it does not fail
+    write_archive(path / "archive.npz", replace(archive, fresh=replace(archive.fresh, goal_rate=rates)))
+    with pytest.raises(Interrupted):
+        minimised(path, elite=second, opened=judges(stop_after=20))
+    numbers = minimised(path, elite=second, by=(OTHER,))
+    assert (numbers["minimal"], numbers["certified"], numbers["panel"]) == (1, 1, ["C-G"])

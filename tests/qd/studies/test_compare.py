@@ -499,6 +499,14 @@ def test_a_search_for_certified_failures_ends_with_as_many_episodes(capsys):
     again = run("a", **{**changes, "open_evaluator": never})  # all of it is kept
     assert numbers_of(again) == report
     assert_same(path, run("b", **changes))
+    other = f"C-G={Path(__file__).parents[3]}/results/anymal/C-G.pt"
+    later = numbers_of(run("a", **{**changes, "by": (other,)}))
+    assert later["panel"] == ["C-G"]  # who was asked before does not count
+    for name in ("mixed", "gated"):
+        found = read_archive(path / f"{name}-5")
+        assert found.faults.certifiers == ("me", "C-G")
+        by_other = found.confirmed & found.failing & found.faults.certificates()[:, 1]
+        assert later["methods"][name]["faults"] == by_other.sum() < report["methods"][name]["faults"]
 
 
 def test_gated_and_its_certifiers_need_each_other():

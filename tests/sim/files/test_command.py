@@ -111,6 +111,27 @@ def test_what_comes_next_keeps_the_error_before_it():
     assert raised.value.__cause__ is lost
 
 
+@dataclass(frozen=True, kw_only=True)
+class Several:
+    """Take several values."""
+
+    by: tuple[str, ...] = ()
+    """Names."""
+    ground_of: tuple[str, ...] | None = None
+    """Others."""
+
+    def execute(self) -> int:
+        return len(self.by) + len(self.ground_of or ())
+
+
+@pytest.mark.parametrize("argv", [["--by"], ["--by", "--ground-of", "a"], ["--by", "a", "--ground-of"]])
+def test_a_flag_of_several_values_without_any_is_not_taken_for_one_left_out(argv, capsys):
+    assert run_command(Several, argv, name="several") == 2
+    assert "must have one or several values behind it, got none: give some, or leave it out" in capsys.readouterr().err
+    assert run_command(Several, ["--by", "a", "b", "--ground-of", "c"], name="several") == 3
+    assert run_command(Several, [], name="several") == 0
+
+
 def test_the_option_groups_are_flags(capsys):
     with pytest.raises(SystemExit) as end:
         run("--help")
@@ -130,6 +151,12 @@ def test_work_that_stops_says_what_comes_next():
             raise error
     with pytest.raises(ZeroDivisionError), naming_what_is_next("", lambda: "x"):
         raise ZeroDivisionError
+
+
+def test_work_within_work_names_the_outer_command_alone():
+    outer, inner = (naming_what_is_next("", lambda word=word: f"Go on with {word}") for word in ("outer", "inner"))
+    with pytest.raises(OSError, match=r"^no room\. Go on with outer$"), outer, inner:
+        raise OSError("no room")
 
 
 def test_a_command_line_can_be_typed(monkeypatch):

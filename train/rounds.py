@@ -1,0 +1,141 @@
+"""The file of a hardening: the counts of all its searches, and tables of all its controllers."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qd.archive import read_archive
+from qd.faults import fault_numbers
+from qd.run.directory import ROUNDS_FILE, RunDirectory, read_archive_of
+from qd.workers.evaluator import origin_of
+from sim.files.atomic import read_json, to_json, write_atomically
+from sim.files.intervals import value_words
+from sim.policy.spec import about_controllers
+from sim.robots.identity import identity
+from train.evaluate.crossings import cross_all
+from train.evaluate.measures import measure
+from train.evaluate.sets import MIN_ELITES, TerrainSet, generated_set, make_sets, split_elites
+from train.evaluate.tables import make_tables
+
+if TYPE_CHECKING:
+    from train.hardening import Hardening, Stage
+
+FIXED_SETS = ("hand_crafted", "hard_random")
+"""Sets that every controller is evaluated on, beside the archives."""
+_COUNTS = (
+    "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "failing", "confirmed",
+    "certified", "faults", "panel",
+)  # fmt: skip
+_KINDS = {"settings": dict, "sessions": list, "rounds": list, "comparisons": dict}  # of rounds.json
+_SESSION = ("command", "commit", "device", "date")
+
+
+def read_rounds(path: Path) -> dict[str, Any]:
+    """``rounds.json`` of a directory, nothing if there is none.
+
+    Raises:
+        ValueError: If it is damaged.
+    """
+    file = path / ROUNDS_FILE
+    content = read_json(file) if file.exists() else {}
+    for name, kind in _KINDS.items():
+        value = content.get(name, kind())
+        rows = value.values() if name == "comparisons" and isinstance(value, dict) else ()
+        if not isinstance(value, kind) or not all(isinstance(row, dict) and "rounds" in row for row in rows):
+            raise ValueError(f"{file} is damaged at {name}: put a copy of it back")
+    return content
+
+
+def divisible(runs: Sequence[Path]) -> tuple[Path, ...]:
+    """The searches that found enough elites to train on some and hold out others; the first must have."""
+    enough = tuple(run for run in runs if len(read_archive(run)) >= MIN_ELITES)
+    if runs and runs[0] not in enough:
+        raise ValueError(
+            f"{runs[0]} must have found at least {MIN_ELITES} elites to train on, got {len(read_archive(runs[0]))}: "
+            "give more --search-episodes and another --run-dir"
+        )
+    return enough
+
+
+def begin(job: "Hardening") -> None:
+    """Writes what is to be done, with this session after those before."""
+    file = job.path / ROUNDS_FILE
+    now = origin_of(job.device, job.flags.seed, job.flags.workers)
+    content = read_rounds(job.path) or {**now, "settings": job.settings}
+    sessions = [*content.pop("sessions", []), {name: now[name] for name in _SESSION}]
+    write_atomically(file, to_json({**content, "sessions": sessions}))
+    started = time.strftime("%H:%M")
+    print(f"Hardening '{job.robot.name}' for {job.flags.rounds} rounds in {job.path}, from {started}", flush=True)
+
+
+def record(job: "Hardening") -> None:
+    """Writes ``rounds.json``: the counts of all searches that are over, and the tables of all controllers there are."""
+    file = job.path / ROUNDS_FILE
+    content = read_json(file)
+    rows = {stage.controller: (stage, _row(job, stage)) for stage in job.stages if job.is_judged(stage)}
+    known = dict(content.get("comparisons") or {})  # those of this session and of sessions before
+    known |= {stage.compared: {"rounds": job.flags.rounds, **row} for stage, row in rows.values() if stage.compared}
+    written = {
+        **content,
+        **{name: job.settings[name] for name in ("robot", "robot_sha256", "penalty_definition")},
+        "rounds": [row for stage, row in rows.values() if not stage.compared],
+        "comparisons": known,
+        "tables": _tables(job),
+    }
+    write_atomically(file, to_json(written))
+
+
+def _row(job: "Hardening", stage: "Stage") -> dict[str, Any]:
+    """What the search against a controller found."""
+    # The faults by the archive: a kill may come between it and its numbers.
+    known = RunDirectory(stage.search).read_summary() | fault_numbers(read_archive(stage.search))
+    counts = {name: known.get(name) for name in _COUNTS}
+    who = {name: value for name, value in identity(job.robot, stage.policy).items() if name.startswith("policy")}
+    return {
+        "controller": stage.controller,
+        **who,
+        "tuned": [tune.run.name for tune in stage.tunes],
+        "search": stage.search.name,
+        **counts,
+    }
+
+
+def _tables(job: "Hardening") -> dict[str, Any]:
+    """Every controller there is on the fixed sets and on the held-out elites of every archive.
+
+    The same keys as of ``tables.json``; what was crossed before is not crossed again.
+    """
+    there = [stage for stage in job.stages if all(map(job.is_tuned, stage.tunes))]
+    controllers = {stage.controller: stage.policy for stage in there}
+    sets = dict(make_sets(FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space))
+    searched = [stage.search for stage in there if not stage.compared and job.is_searched(stage)]
+    sets |= {run.name: _held_out(job, run) for run in divisible(searched)}
+    results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
+    scales = job.robot.read_penalty_scales(None if job.flags.policy is None else str(job.flags.policy))
+    crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
+    about = about_controllers(controllers)
+    return {
+        "episodes": job.evaluator.num_replicas,
+        "controllers": about,
+        **make_tables(crossed, sets, job.robot, 0, hashes={who: one["sha256"] for who, one in about.items()}),
+    }
+
+
+def _held_out(job: "Hardening", run: Path) -> TerrainSet:
+    """Elites of an archive that no training draws."""
+    archive = read_archive_of(job.robot, run, job.flags.space)
+    split = split_elites(archive, job.robot.name, spec=job.robot.spec, run=run)
+    return replace(generated_set(archive, split, job.evaluator.num_terrains, 0), name=run.name)
+
+
+def tell(content: Mapping[str, Any]) -> None:
+    """The rounds in a few lines."""
+    goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
+    print("\n" + "".join(f"{title:<12}" for title in ("controller", "elites", "failing", "faults")) + "goal on")
+    for row in [*content["rounds"], *content["comparisons"].values()]:
+        who = row["controller"]
+        counts = ("-" if row[key] is None else row[key] for key in ("elites", "failing", "faults"))
+        rates = (f"{name} {value_words(goal[name].get(who), limits[name].get(who))}" for name in FIXED_SETS)
+        print("".join(f"{cell:<12}" for cell in (who, *counts)) + ", ".join(rates))
