@@ -210,7 +210,7 @@ def claimed(path: Path) -> Iterator[None]:
     except OSError as error:
         raise ValueError(f"run directory {path} cannot be made: {error.strerror}: give another --run-dir") from None
     check_writable(path)
-    with locked(path, f"another search works in {path}: let it end, or give another --run-dir"):
+    with locked(path, f"another command works in {path}: let it end, or name another folder"):
         try:
             yield
         finally:

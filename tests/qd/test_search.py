@@ -278,7 +278,7 @@ def test_two_searches_do_not_share_a_directory(tmp_path):
 
     @contextmanager
     def intruding(cfg: EvaluatorCfg):
-        with pytest.raises(ValueError, match="another search works in"):
+        with pytest.raises(ValueError, match="another command works in"):
             run(path)
         yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds)
 

@@ -21,7 +21,7 @@ def test_a_claimed_directory_that_stays_empty_goes_away(tmp_path):
 
 
 def test_a_claim_ends_with_its_context(tmp_path):
-    with claimed(tmp_path), pytest.raises(ValueError, match="another search works in"), claimed(tmp_path):
+    with claimed(tmp_path), pytest.raises(ValueError, match="another command works in"), claimed(tmp_path):
         pass
     with claimed(tmp_path):
         pass

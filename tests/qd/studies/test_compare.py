@@ -246,14 +246,14 @@ def test_a_search_and_a_comparison_do_not_share_a_run():
 
     @contextmanager
     def intruding(cfg):
-        with pytest.raises(ValueError, match="another search works in a/uniform_random-5"):
+        with pytest.raises(ValueError, match="another command works in a/uniform_random-5"):
             search_alone(path / "uniform_random-5", iterations=2)
         yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds, cfg.num_replicas)
 
     run("a", open_evaluator=intruding, iterations=2)
     with (
         claimed(path / "uniform_random-6"),
-        pytest.raises(ValueError, match="another search works in a/uniform_random-6"),
+        pytest.raises(ValueError, match="another command works in a/uniform_random-6"),
     ):
         run("a", open_evaluator=never, iterations=3)
     run("a", iterations=3)
