@@ -47,7 +47,7 @@ def test_an_invalid_terrain_is_not_reproduced_and_counts_in_no_mean():
     assert again.corrected_elites().tolist() == [0]
     # mean 1 of the two penalties together, no deviation, no collision: fitness 1
     assert numbers_of(again, archive.cells) == {
-        "reevaluated": 2, "reproduced": 1, "mean_std": 0.0, "mean_std_interval": [0.0, 0.0],
+        "reevaluated": 2, "reproduced": 1, "mean_std": 0.0, "mean_std_interval": None,
         "corrected_mean_fitness": 1.0, "failing": 0, "corrected_elites": 1,
         "corrected_coverage": 1 / archive.cells.num_cells, "corrected_qd_score": 21.0,
     }  # fmt: skip
