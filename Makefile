@@ -76,7 +76,7 @@ bench: setup ## Time every kernel against torch and against the device's ceiling
 test: setup ## Run the quick tests: about five minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray and not kills' $(ARGS)
 
-test-all: setup ## Run all tests: about seventeen minutes on two cores
+test-all: setup ## Run all tests: about twenty minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) $(ARGS)
 
 test-gpu: setup ## Run on a GPU (FAULTLINE_DEVICE, default cuda:0) what can run there
