@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
-from sim.ground import PATCHES
+from sim.ground import PATCHES, patches_at
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Effects:
 
 def _places(span: tuple[float, float], length: float, count: int) -> slice:
     """Patches between two places [m] of an axis of some length [m], which so many divide evenly."""
-    first, last = (min(max(int(end * count / length), 0), count - 1) for end in span)
+    first, last = patches_at(span, length, count)
     return slice(first, last + 1)
 
 

@@ -173,10 +173,11 @@ def is_judged(archive: Archive, certifiers: Mapping[str, str]) -> bool:
     Raises:
         ValueError: As of :func:`with_certifiers`.
     """
-    faults = with_certifiers(archive.faults or FaultCounts.none_of(len(archive)), certifiers)
-    if archive.faults is None or faults.certifiers != archive.faults.certifiers:
+    faults = archive.faults
+    asked = with_certifiers(faults or FaultCounts.none_of(len(archive)), certifiers).certifiers
+    if faults is None or faults.certifiers != asked:
         return False
-    archive, failing = replace(archive, faults=faults), np.flatnonzero(archive.failing).tolist()
+    failing = np.flatnonzero(archive.failing).tolist()
     left = [_Column("resolved_outcomes").missing(archive, failing)]
     for policy in certifiers.values():
         place = faults.certifier_sha256.index(str(controller_hash(policy)))

@@ -4,10 +4,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from kernels.ground import LENGTH, MOST_TIME_CONSTANT_S, WIDTH, make_ground
+from kernels.ground import MOST_TIME_CONSTANT_S, make_ground
 from sim.bank import TerrainBank
+from sim.ground import patches_at
 from sim.space import TerrainSpace
-from sim.terrain import SPACING
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 X = (2.0, 14.0)
 """From the start to the goal [m]."""
@@ -66,14 +67,14 @@ def corridor_ground(genes: np.ndarray, space: TerrainSpace, *, device: str) -> t
         "friction": 1.0 - wp.to_torch(ground.friction),
         "softness": wp.to_torch(ground.time_constant) / float(MOST_TIME_CONSTANT_S),
     }
-    row, col = _patches(Y, WIDTH, rows, SHAPE[0]), _patches(X, LENGTH, cols, SHAPE[1])
+    row, col = patches_at(_nodes(Y), NUM_ROWS - 1, rows), patches_at(_nodes(X), NUM_COLS - 1, cols)
     return torch.stack([maps[kind][:, row][:, :, col] for kind in space.ground], dim=1)
 
 
-def _patches(span: tuple[float, float], length: float, count: int, nodes: int) -> np.ndarray:
-    """Row or column of the patch that each node lies in, along an axis of some length [m]."""
-    places = np.linspace(*span, nodes) / float(length) * count
-    return np.clip(np.floor(places + 1e-6).astype(int), 0, count - 1)
+def _nodes(span: tuple[float, float]) -> np.ndarray:
+    """Which nodes of a simulation's grid a corridor has along an axis."""
+    first, last = (round(end / SPACING) for end in span)
+    return np.arange(first, last + 1, round(NODE_SPACING / SPACING))
 
 
 def _sampled(genes: np.ndarray, space: TerrainSpace, device: str) -> torch.Tensor:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import FIRM, PATCHES, STRIPS
 from kernels.ground import LEAST_FRICTION as LEAST_FRICTION
@@ -75,6 +75,17 @@ class GroundMaps:
             friction=np.concatenate([self.friction, other.friction]),
             time_constant_s=np.concatenate([self.time_constant_s, other.time_constant_s]),
         )
+
+
+def patches_at(places: ArrayLike, length: float, count: int) -> NDArray[np.int64]:
+    """Row or column of the patch at each place along an axis; those at the edge go on beyond it.
+
+    Args:
+        places: Nodes or metres from the beginning of the axis.
+        length: Of the axis, likewise.
+        count: Patches that divide it evenly.
+    """
+    return np.clip(np.asarray(places) * count // length, 0, count - 1).astype(np.int64)
 
 
 def check_friction(friction: NDArray[np.floating]) -> None:

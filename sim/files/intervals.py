@@ -75,7 +75,7 @@ def bootstrap_interval(
         families: Terrains of one number are not independent: they are drawn together, shape (num_terrains,).
     """
     own = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
-    count = len(np.unique(own))
+    count = int(own.max(initial=-1)) + 1
     if count < 2:
         return None
     drawn = _resamples(count, seed)

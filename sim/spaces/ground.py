@@ -19,7 +19,7 @@ from kernels.ground import (
     decode_friction,
     decode_softness,
 )
-from sim.ground import joined_name
+from sim.ground import joined_name, patches_at
 from sim.spaces.base import Seed, TerrainSpace, clipped
 
 ABSENT = {"friction": 1.0, "softness": -1.0}
@@ -144,7 +144,7 @@ class OnGround(TerrainSpace):
 
     def _ground_words(self, row: NDArray[np.float32], begin: float, end: float) -> str:
         """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
-        first, last = (min(max(int(x // PATCH), 0), COLS - 1) for x in (begin, end))
+        first, last = patches_at((begin, end), PATCH * COLS, COLS)
         there = slice(first, last + 1)
         return ground_words(
             {kind: self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, there] for kind in self.kinds}

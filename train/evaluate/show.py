@@ -364,10 +364,10 @@ def _draw_bias(axes: "Axes", report: dict[str, Any]) -> None:
         kind, shift = kinds.index(kind_of(who)), step * (index - (len(columns) - 1) / 2)
         found = [(place, report[key][name][who]) for place, name in enumerate(names)]
         found = [(place, one) for place, one in found if one["goal_bias"] is not None]
-        values = 100.0 * np.array([one["goal_bias"] for _, one in found])
-        lengths = 100.0 * bar_lengths(values / 100.0, [one["goal_bias_interval"] for _, one in found])
+        values = np.array([one["goal_bias"] for _, one in found])
+        lengths = bar_lengths(values, [one["goal_bias_interval"] for _, one in found])
         axes.errorbar(
-            np.array([place for place, _ in found]) + shift, values, lengths, linestyle="", capsize=3,
+            np.array([place for place, _ in found]) + shift, 100.0 * values, 100.0 * lengths, linestyle="", capsize=3,
             marker=MARKERS[kind % len(MARKERS)], color=COLOURS[kind % len(COLOURS)],
             markerfacecolor=None if key == "resolved" else "none", label=f"{who}: {_RESOLVED[key]}",
         )  # fmt: skip
@@ -398,9 +398,9 @@ def _draw_measure(axes: "Axes", report: dict[str, Any], measure: str, factor: fl
         kind = [kind_of(first) for first in kinds].index(kind_of(who))  # other seeds look like the first one
         colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
         there = [place for place, name in enumerate(names) if report[measure][name][who] is not None]
-        values = factor * np.array([report[measure][names[place]][who] for place in there])
+        means = np.array([report[measure][names[place]][who] for place in there])
         limits = [report["intervals"][measure][names[place]][who] for place in there]
-        lengths = factor * bar_lengths(values / factor, limits)
+        values, lengths = factor * means, factor * bar_lengths(means, limits)
         places = np.array(there) + shift
         seeds = [kind_of(other) for other in controllers].count(kind_of(who))
         label = kind_of(who) + (f" ({seeds} seeds)" if seeds > 1 else "") if who in kinds else ""

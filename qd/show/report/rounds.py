@@ -199,9 +199,9 @@ def _draw_lines(axes: "Axes", tables: dict[str, Any], measure: str, joined: list
     for k, (name, row) in enumerate(tables[measure].items()):
         colour, marker = _LINES[k % len(_LINES)]
         there = [place for place, who in enumerate(controllers) if row[who] is not None]
-        values = np.array([100.0 * row[controllers[place]] for place in there])
+        rates = np.array([row[controllers[place]] for place in there])
         limits = [tables["intervals"][measure][name][controllers[place]] for place in there]
-        lengths = 100.0 * bar_lengths(values / 100.0, limits)
+        values, lengths = 100.0 * rates, 100.0 * bar_lengths(rates, limits)
         places = np.array(there) + 0.06 * (k - (count - 1) / 2)
         label = LABELS.get(name, f"{name}, held out")
         axes.errorbar(places, values, lengths, color=colour, marker=marker, capsize=3, label=label, linestyle="")
