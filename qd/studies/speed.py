@@ -258,7 +258,7 @@ def measure(args: Speed) -> dict[str, Any]:
 
 
 def _curve_of(file: Path, device_name: str) -> dict[str, Any]:
-    """Commit and curve of a speed.json.
+    """Commit, date and curve of a speed.json.
 
     Raises:
         ValueError: If it is none, or of another device.
@@ -268,4 +268,4 @@ def _curve_of(file: Path, device_name: str) -> dict[str, Any]:
         raise ValueError(
             f"--before {file} must be a speed.json with a curve of {device_name}, got one of {found.get('device')}"
         )
-    return {"commit": found["commit"], "envs_curve": found["envs_curve"]}
+    return {key: found.get(key) for key in ("commit", "date", "envs_curve")}
