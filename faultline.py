@@ -49,7 +49,6 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "beside": Command("qd.studies.beside:Beside", "searches side by side: controllers, or spaces"),
         "agreement": Command("qd.studies.agreement:Agreement", "rates at finer contact and in MuJoCo C"),
         "penalty-ratios": Command("qd.studies.penalty_ratios:PenaltyRatios", "how well penalties see failures"),
-        "crosscheck": Command("sim.commands:Crosscheck", "the same crossings in plain MuJoCo C"),
         "distances": Command("train.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
         "tables": Command("train.evaluate.publish:Tables", "the published numbers beside the paper's"),
     },

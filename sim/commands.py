@@ -5,9 +5,8 @@ Modules with Warp, torch or Newton are imported inside ``execute``, so that ``--
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from sim.files.command import OfRobot, OnDevice, OnGround, Who, command_line, publish
+from sim.files.command import OfRobot, OnDevice, Who, command_line, publish
 from sim.files.settings import setting
 
 
@@ -64,54 +63,6 @@ class ExportPolicy(Who):
         print(f"Written to {self.out}: {sizes}, {self.out.stat().st_size / 1e6:.2f} MB.")
         print(f"Loaded back, its actions are within {apart:.1g} of the original's. Next:")
         print(f"  {command_line('evaluate', robot=self.robot, policy=self.out)}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Crosscheck(Who, OnGround, OnDevice):
-    """Compare the crossings of the parallel simulation with the same crossings in plain MuJoCo C.
-
-    Of a pool of terrains it takes those on which 30 to 90 % of a first set of episodes succeed, or those named by
-    --elite. On each of them, fresh episodes are compared with more episodes of plain MuJoCo C: the same robot file,
-    height grid, controller and starts, but MuJoCo's own heightfield contact, a converged solver, and a second
-    implementation of everything round it.
-
-    The full check is 20 terrains x 200 episodes of MuJoCo: half an hour on two cores, two minutes on 16. Try the cheap
-    one first: --terrains 4 --plain-episodes 20.
-    """
-
-    workers: int | None = setting(None, least=1)
-    """Processes of plain MuJoCo, which always runs on the CPU; one a core if left out."""
-    genes: Path | None = None
-    """Pool of terrains: an archive.npz, or any .npz with genes (num_terrains, num_genes) and, if it is not
-    super_gaussian, the name of their space; drawn hard-random if left out."""
-    space: str | None = None
-    """Terrain space to draw from if --genes is left out, super_gaussian if this is too; or file.py:CLASS that a pool is
-    of."""
-    elite: str | None = None
-    """Compare exactly these of --genes: one number, several as in --elite "97 124", or all. --terrains and --between
-    are then ignored."""
-    terrains: int = setting(20, least=1)
-    """Terrains to compare on."""
-    between: tuple[float, float] = setting((0.3, 0.9), least=0, most=1, rising=True)
-    """Success rate in the first set of episodes that a terrain must have."""
-    episodes: int = setting(20, least=1)
-    """Episodes a terrain of the parallel simulation, in the first set and in the fresh one."""
-    plain_episodes: int = setting(200, least=1)
-    """Episodes a terrain of plain MuJoCo; the first of them begin exactly as the fresh ones do."""
-    fine: Literal["neither", "mujoco", "both"] = "neither"
-    """Which simulators resolve their contacts: steps of 1 ms, a time constant of 3 ms, five times the work. With the
-    file's own 5 and 10 ms, feet sink into the ground and MuJoCo's heightfield holds them by the facets beside. `both`
-    compares the simulators, `mujoco` shows the effect of the file's settings."""
-    seed: int = setting(0, least=0)
-    """Draws pool, choice and starts."""
-    out: Path | None = None
-    """File to write; the numbers are only printed if left out."""
-
-    def execute(self) -> None:
-        """Compares, prints the table, writes the file."""
-        from sim.mujoco_c.crosscheck import Comparison, print_comparison
-
-        publish(self.out, Comparison(self).run, print_comparison)
 
 
 @dataclass(frozen=True, kw_only=True)

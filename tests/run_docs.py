@@ -89,7 +89,6 @@ SMALL: dict[str, dict[str, str | None]] = {
     "beside": {},
     "penalty-ratios": {**CPU, "--terrains": "2", "--replicas": "4"},
     "agreement": {**CPU, "--terrains": "2", "--elites": "1", "--episodes": "2", "--mujoco-c": "1", "--workers": "1"},
-    "crosscheck": {**CPU, "--terrains": "1", "--episodes": "2", "--plain-episodes": "2"},
     "distances": {},
     "tables": {"--check": ""},
 }

@@ -28,6 +28,7 @@ from qd.workers.invalid import refuse_all_invalid
 from qd.workers.kept import Kept
 from sim.files.command import InSpace, Where, Who, chosen_elites, naming_what_is_next, publish
 from sim.files.intervals import value_words
+from sim.files.provenance import without_machine
 from sim.files.settings import check, setting
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ class Agreement(Who, InSpace, Where):
             return {
                 **origin_of(evaluator.device, self.seed, self.workers),
                 **identity(terrains.robot, terrains.policy),
-                "source": terrains.source,
+                "source": terrains.source and without_machine(terrains.source),
                 "episodes": self.episodes,
                 **report_of(terrains, crossings.outcome, self.seed),
             }

@@ -128,7 +128,7 @@ def test_what_is_crossed_how_often_and_from_which_starts(run, monkeypatch, capsy
         assert own["rates"]["search"] != own["rates"]["again"] == own["rates"]["resolved"]
         assert own["mujoco_c"]["terrains"] == own["both_resolved"]["terrains"] == 2
         assert own["mujoco_c"]["goal_bias"] == pytest.approx(np.mean(own["rates"]["search"]["goal"][:2]))
-    assert report["source"] == str(run) and report["episodes"] == 4 and report["robot"] == "anymal"
+    assert report["source"] == run.name and report["episodes"] == 4 and report["robot"] == "anymal"
     assert report.keys() >= {"command", "commit", "device", "versions", "seed", "date", "robot_sha256", "policy_sha256"}
     assert report["invalid_episodes"] == dict.fromkeys(WAYS, 0)
     assert not (run / "agreement.part.npz").exists()
