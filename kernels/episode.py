@@ -309,7 +309,6 @@ def _park_ended_kernel(
     joint_q_out: wp.array2d[float],
     joint_qd_out: wp.array2d[float],
     targets_out: wp.array2d[float],
-    body_q_out: wp.array2d[wp.transform],
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
@@ -324,13 +323,9 @@ def _park_ended_kernel(
     for j in range(default_joint_pos.shape[0]):
         joint_q_out[env, 7 + j] = default_joint_pos[j]
         targets_out[env, 7 + j] = default_joint_pos[j]
-    for b in range(body_q_out.shape[1]):  # or the next contacts would be found where it was
-        body_q_out[env, b] = wp.transform(wp.vec3(0.0, 0.0, PARKING_HEIGHT), wp.quat_identity())
 
 
-def park_ended(
-    outcome: Any, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, targets_out: Any, body_q_out: Any
-) -> None:
+def park_ended(outcome: Any, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, targets_out: Any) -> None:
     """Hold the robots whose episodes have ended at rest, high above the ground, where they touch nothing.
 
     They would otherwise cost as much as the others, and more on their backs. Call it every control step: in between,
@@ -342,13 +337,12 @@ def park_ended(
         joint_q_out: Shape (num_envs, 7 + num_joints).
         joint_qd_out: Shape (num_envs, 6 + num_joints).
         targets_out: Joint targets in columns 7 and up, shape (num_envs, 7 + num_joints).
-        body_q_out: Body poses, shape (num_envs, num_bodies).
     """
     inputs = [outcome, default_joint_pos]
     wp.launch(
         _park_ended_kernel,
         outcome.shape[0],
         inputs,
-        outputs=[joint_q_out, joint_qd_out, targets_out, body_q_out],
+        outputs=[joint_q_out, joint_qd_out, targets_out],
         device=outcome.device,
     )

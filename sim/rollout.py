@@ -223,10 +223,7 @@ class Rollout:
     def _launch_control_step(self) -> None:
         sim, robot = self.sim, self.robot
         apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
-        park_ended(
-            self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets,
-            sim.body_q.reshape((self.num_envs, -1)),
-        )  # fmt: skip
+        park_ended(self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets)
         for _ in range(robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()
@@ -253,7 +250,6 @@ class Rollout:
             begin_episodes(begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
         sim.clear_solver(begins)
-        sim.refresh()
         command_goal(sim.joint_q, self._episode.outcome, self._task, self._command)
         write_observation(
             sim.joint_q, sim.joint_qd, self._command, self._last_action, sim.terrain_of_env, sim.bank.terrain,

@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
+import mujoco_warp
 import newton
 import numpy as np
 import warp as wp
 
 from kernels.contact import ContactBuffer, Layout, collide_strips
+from kernels.coordinates import SolverState, ask_poses, ask_solver, tell_solver
 from kernels.ground import GroundRecords, make_bodies, tell_contacts
 from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
@@ -19,7 +21,7 @@ from sim.bank import TerrainBank
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
-from sim.solver import use_own_solver
+from sim.solver import find_poses, find_poses_before, use_own_solver
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
@@ -203,6 +205,7 @@ class Simulation:
         self.solver.mjw_model.opt.graph_conditional = not self.model.device.is_cuda
         if cfg.time_constant_s is not None:
             self.solver.mjw_model.geom_solref.fill_(wp.vec2(cfg.time_constant_s, 1.0))
+        self.solver.mjw_model.opt.timestep.fill_(self.robot.physics_dt)
         self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:
@@ -265,6 +268,9 @@ class Simulation:
         self.overflow = data.overflow
         self.geom_names = self.robot.geom_names
         self.solver_contacts = view_solver_contacts(data)
+        if not self.solver_collides:
+            self._coordinates = self._build_coordinates()
+            find_poses_before(data)
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()
@@ -272,8 +278,35 @@ class Simulation:
         self.sensors.scan_y = wp.array(scan_y, dtype=float)
         self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
 
+    def _build_coordinates(self) -> SolverState:
+        """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
+        model: Any = self.model
+        solver: Any = self.solver
+        data = solver.mjw_data
+        columns = np.full(self.robot.num_joints, -1, np.int32)
+        column_of, first_of = solver.mj_q_start.numpy(), model.joint_q_start.numpy()
+        for joint in range(1, model.joint_count // self.num_envs):  # the first is the base's
+            columns[first_of[joint] - 7] = column_of[joint]
+        of_solver = solver.mjc_body_to_newton.numpy()[0]
+        # Newton tells actuators what they follow. Targets that are their own numbers show which one that is.
+        self.targets.assign(np.tile(1.0 + np.arange(self.targets.shape[1], dtype=np.float32), (self.num_envs, 1)))
+        solver._apply_mjc_control(model, self._state, self._control, data)
+        followed = data.ctrl.numpy()[0].astype(np.int32) - 1
+        self.targets.zero_()
+        data.ctrl.zero_()
+        coordinates = SolverState()
+        for name in ("qpos", "qvel", "ctrl", "xpos", "xquat"):
+            setattr(coordinates, name, getattr(data, name))
+        coordinates.column_of_joint = wp.array(columns, dtype=int)
+        coordinates.target_of_actuator = wp.array(followed, dtype=int)
+        coordinates.column_of_body = wp.array(
+            [int(np.flatnonzero(of_solver == body)[0]) for body in range(self.layout.bodies_per_env)], dtype=int
+        )
+        coordinates.com = model.body_com
+        return coordinates
+
     def refresh(self) -> None:
-        """Recompute body poses from the joint coordinates; call it after anything but the solver wrote them."""
+        """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""
         state: Any = self._state
         newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
 
@@ -290,9 +323,22 @@ class Simulation:
             )  # fmt: skip
 
     def physics_step(self) -> None:
-        """Terrain contacts, then one solver step of ``robot.physics_dt``, in place."""
-        self.collide()
-        self.solver.step(self._state, self._state, self._control, self._contacts, self.robot.physics_dt)
+        """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
+
+        It is Newton's step without what these robots do not need: forces from outside, which cost 2 % of a step, and
+        poses of bodies after it, which the next step finds again (5 %).
+        """
+        newton_s, coordinates = self.solver, self._coordinates
+        model, data = newton_s.mjw_model, newton_s.mjw_data
+        with wp.ScopedDevice(self.device), newton_s._scoped_mujoco_warp_execution():
+            tell_solver(self.joint_q, self.joint_qd, self.targets, coordinates)
+            find_poses(model, data)
+            ask_poses(coordinates, self.body_q.reshape((self.num_envs, -1)))
+            self.collide()
+            newton_s._convert_contacts_to_mjwarp(self.model, self._state, self._contacts)
+            data.overflow.zero_()
+            mujoco_warp.step(model, data)
+            ask_solver(coordinates, self.joint_q, self.joint_qd)
 
     def read_geom_forces(self) -> None:
         """Sum the last step's contact forces into ``geom_force``."""

@@ -1,16 +1,17 @@
-"""Our solver of contacts within mujoco_warp's step, for every model that fits it.
+"""What is ours within mujoco_warp's step: the solver of contacts, for every model that fits it, and poses found before.
 
-mujoco_warp has no hook for another solver, so this takes the place of one function of the pinned version;
-tests/sim/test_solver.py holds the two against each other.
+mujoco_warp has no hooks for these, so they take the place of two functions of the pinned version.
+tests/sim/test_solver.py holds the solvers against each other.
 """
 
 from typing import Any
 
-from mujoco_warp._src import solver, types
+from mujoco_warp._src import smooth, solver, types
 
 from kernels.solver import Problem, Sizes, solve_problem
 
 solve_theirs = solver.solve
+find_poses = smooth.kinematics
 
 _CODES = {state.name.lower(): state.value for state in types.ConstraintState} | {
     "elliptic": types.ConstraintType.CONTACT_ELLIPTIC.value,
@@ -78,3 +79,14 @@ def _solve(m: Any, d: Any) -> None:
 def use_own_solver(wanted: bool = True) -> None:
     """Make steps that are captured from now on solve contacts in one kernel, or as mujoco_warp does."""
     solver.solve = _solve if wanted else solve_theirs
+
+
+def _find_poses_once(m: Any, d: Any) -> None:
+    if not getattr(d, "poses_are_found", False):
+        find_poses(m, d)
+
+
+def find_poses_before(d: Any) -> None:
+    """Make steps of this data begin with the poses of :func:`find_poses`, called before, and not find them again."""
+    d.poses_are_found = True
+    smooth.kinematics = _find_poses_once

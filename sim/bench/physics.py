@@ -179,7 +179,6 @@ class Motion:
             wp.copy(sim.joint_q, segment.joint_q)
             wp.copy(sim.joint_qd, segment.joint_qd)
             sim.clear_solver(everyone)
-            sim.refresh()
             for targets in segment.targets:
                 wp.copy(sim.targets, targets)
                 wp.capture_launch(self._graph)

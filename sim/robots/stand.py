@@ -161,11 +161,9 @@ def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool, NDArra
         sim.physics_step()
         sim.read_geom_forces()
 
-    sim.refresh()
     graph = sim.capture(launch)  # makes steps of its own
     sim.joint_q.assign(start)
     sim.joint_qd.zero_()
-    sim.refresh()
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
     contacts, rows, overflowed, forces = 0.0, 0, False, []
     steps = max(1, round(seconds / sim.robot.physics_dt))

@@ -105,21 +105,19 @@ def test_an_ended_episode_stays_ended(device, anymal):
 def test_robots_whose_episode_ended_are_parked_and_the_others_left_alone(device):
     rng = np.random.default_rng(8)
     outcome = np.array([Outcome.RUNNING, Outcome.GOAL, Outcome.INVALID])
-    before = [np.float32(rng.normal(size=size)) for size in ((3, 9), (3, 8), (3, 9), (3, 2, 7))]
+    before = [np.float32(rng.normal(size=size)) for size in ((3, 9), (3, 8), (3, 9))]
     before[0][2, 0] = before[1][2, 3] = np.nan  # what made it invalid must not stay
-    arrays = [wp.array(values, device=device) for values in before[:3]]
-    bodies = wp.array(before[3], dtype=wp.transform, device=device)
+    arrays = [wp.array(values, device=device) for values in before]
     pose = wp.array([0.3, -0.4], dtype=float, device=device)
-    park_ended(wp.array(outcome, dtype=int, device=device), pose, *arrays, bodies)
+    park_ended(wp.array(outcome, dtype=int, device=device), pose, *arrays)
     q, qd, targets = (array.numpy() for array in arrays)
-    for values, now in zip(before, (q, qd, targets, bodies.numpy()), strict=True):
+    for values, now in zip(before, (q, qd, targets), strict=True):
         np.testing.assert_array_equal(now[0], values[0])
     height = float(PARKING_HEIGHT)
     for env in (1, 2):
         np.testing.assert_array_equal(q[env, 2:], np.float32([height, 0, 0, 0, 1, 0.3, -0.4]))
         np.testing.assert_array_equal(targets[env, 7:], np.float32([0.3, -0.4]))
         assert not qd[env].any()
-        np.testing.assert_array_equal(bodies.numpy()[env], np.tile(np.float32([0, 0, height, 0, 0, 0, 1]), (2, 1)))
     assert np.isfinite(q).all()
 
 

@@ -81,7 +81,6 @@ def put(sim: Simulation, joint_q: np.ndarray, joint_qd: np.ndarray | None = None
     sim.joint_qd.assign(np.zeros(sim.joint_qd.shape, np.float32) if joint_qd is None else np.float32(joint_qd))
     sim.targets.assign(np.float32(joint_q))
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
-    sim.refresh()
 
 
 class Stepper:
@@ -89,7 +88,6 @@ class Stepper:
 
     def __init__(self, sim: Simulation, steps: int = 4) -> None:
         def launch() -> None:
-            sim.refresh()
             for _ in range(steps):
                 sim.physics_step()
             sim.read_geom_forces()

@@ -92,6 +92,27 @@ def test_state_rows_are_what_they_say(eight, robot):
     assert np.linalg.norm(com) > 0.015  # else this test could not fail
 
 
+def test_a_step_is_newtons(eight, rough_start):
+    # Ours tells and asks mujoco_warp itself, and finds the poses once. Newton does it in its own way.
+    put(eight, rough_start)
+    touched = 0
+    for _ in range(60):
+        before = positions(eight), velocities(eight), np.array(eight.solver.mjw_data.qacc_warmstart.numpy())
+        step(eight)
+        ours = positions(eight), velocities(eight), np.array(eight.body_q.numpy())
+        touched += int(eight.contact_count.numpy()[0])
+        eight.joint_q.assign(np.float32(before[0]))
+        eight.joint_qd.assign(np.float32(before[1]))
+        eight.solver.mjw_data.qacc_warmstart.assign(before[2])
+        eight.refresh()
+        np.testing.assert_allclose(ours[2], eight.body_q.numpy(), atol=3e-6)  # poses of the step's beginning
+        eight.collide()
+        eight.solver.step(eight._state, eight._state, eight._control, eight._contacts, eight.robot.physics_dt)
+        np.testing.assert_allclose(ours[0], positions(eight), atol=1e-5)
+        np.testing.assert_allclose(ours[1], velocities(eight), atol=2e-3)
+    assert touched > 100
+
+
 def run_rough(sim, q, steps):
     put(sim, q)
     for _ in range(steps):

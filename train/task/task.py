@@ -197,7 +197,6 @@ class CommandTask:
     def _control_step(self) -> None:
         sim, episodes, training = self.sim, self._episodes, self._training
         apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
-        sim.refresh()
         for step in range(1, self.robot.decimation + 1):
             sim.physics_step()
             # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.

@@ -363,12 +363,13 @@ def test_the_first_of_the_list_is_shown_where_none_is_named(show, tmp_path):
         shown.close()
 
 
-def test_an_empty_list_says_so_and_leads_back(shown):
-    panel = shown.tab._list
+def test_an_empty_list_says_so_and_leads_back(shown, run):
+    panel, archive = shown.tab._list, read_archive(run / "archive.npz")
+    faults = int((archive.confirmed & archive.certified).sum())
     assert not panel._again.visible
     shown.do((panel.choose, "kind", "faults"), (panel.brush, "goal_rate", 0.9, 1.0))
     assert panel._count.content.startswith("**None of") and panel._again.visible
-    assert not any(line.visible for line in panel._lines) and panel._choosers["kind"][0].value == "faults (391)"
+    assert not any(line.visible for line in panel._lines) and panel._choosers["kind"][0].value == f"faults ({faults})"
     shown.do((panel.change, shown.tab._selection.clear))
     assert not panel._again.visible and panel._lines[0].visible and panel._choosers["kind"][0].value.startswith("all ")
 

@@ -1,0 +1,144 @@
+"""What a physics step tells mujoco_warp of the robots, and what it reads back.
+
+The coordinates are those of :mod:`kernels.state` here. mujoco_warp has the base's quaternion as wxyz, its velocity at
+the base's origin, and its rotation rate in the base's frame. All other joints have one axis, and the same numbers in
+both.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from kernels.state import base_ang_vel_b, base_rotation
+
+
+@wp.struct
+class SolverState:
+    """Arrays of mujoco_warp's data, and where joints, bodies and targets stand in them."""
+
+    qpos: wp.array2d[float]
+    """Coordinates, shape (num_envs, 7 + num_joints)."""
+    qvel: wp.array2d[float]
+    """Velocities, shape (num_envs, 6 + num_joints)."""
+    ctrl: wp.array2d[float]
+    """What actuators are told, shape (num_envs, num_actuators)."""
+    xpos: wp.array2d[wp.vec3]
+    """Positions of bodies, world-local frame [m], shape (num_envs, num_solver_bodies)."""
+    xquat: wp.array2d[wp.quat]
+    """Their rotations, wxyz."""
+    column_of_joint: wp.array[int]
+    """Column of each joint in ``qpos``, shape (num_joints,); in ``qvel`` it is one less."""
+    target_of_actuator: wp.array[int]
+    """Column of the targets that an actuator follows, shape (num_actuators,); -1 of one that follows none."""
+    column_of_body: wp.array[int]
+    """Column of each body of a robot in ``xpos``, shape (bodies_per_env,); the base comes first."""
+    com: wp.array[wp.vec3]
+    """Mass centres of all bodies in their own frames [m], shape (num_envs * bodies_per_env,)."""
+
+
+@wp.func
+def _base_com_w(solver: SolverState, env: int, rotation: wp.quat) -> wp.vec3:
+    """The base's mass centre from its origin, world frame [m]."""
+    return wp.quat_rotate(rotation, solver.com[env * solver.column_of_body.shape[0]])
+
+
+@wp.kernel
+def _tell_solver_kernel(
+    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], targets: wp.array2d[float], solver_out: SolverState
+):
+    """Grid (num_envs, 1 + the larger of num_joints and num_actuators): the base, then a joint and an actuator each."""
+    env, thread = wp.tid()
+    k = thread - 1
+    if k >= 0:
+        if k < solver_out.column_of_joint.shape[0]:
+            column = solver_out.column_of_joint[k]
+            solver_out.qpos[env, column] = joint_q[env, 7 + k]
+            solver_out.qvel[env, column - 1] = joint_qd[env, 6 + k]
+        if k < solver_out.target_of_actuator.shape[0]:
+            target = solver_out.target_of_actuator[k]
+            if target >= 0:
+                solver_out.ctrl[env, k] = targets[env, target]
+        return
+    com = _base_com_w(solver_out, env, base_rotation(joint_q, env))
+    rate = wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
+    velocity = wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2]) - wp.cross(rate, com)
+    rate_b = base_ang_vel_b(joint_q, joint_qd, env)
+    for axis in range(3):
+        solver_out.qpos[env, axis] = joint_q[env, axis]
+        solver_out.qpos[env, 4 + axis] = joint_q[env, 3 + axis]
+        solver_out.qvel[env, axis] = velocity[axis]
+        solver_out.qvel[env, 3 + axis] = rate_b[axis]
+    solver_out.qpos[env, 3] = joint_q[env, 6]
+
+
+def tell_solver(joint_q: Any, joint_qd: Any, targets: Any, solver_out: SolverState) -> None:
+    """Write coordinates, velocities and targets into mujoco_warp's data.
+
+    Args:
+        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
+        joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
+        targets: Joint position targets in columns 7 and up, shape (num_envs, 7 + num_joints).
+        solver_out: ``qpos``, ``qvel`` and ``ctrl`` are written.
+    """
+    threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
+    inputs = [joint_q, joint_qd, targets]
+    wp.launch(_tell_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=[solver_out], device=joint_q.device)
+
+
+@wp.kernel
+def _ask_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float]):
+    """Grid (num_envs, 1 + num_joints): the base, then a joint each."""
+    env, thread = wp.tid()
+    k = thread - 1
+    if k >= 0:
+        column = solver.column_of_joint[k]
+        joint_q_out[env, 7 + k] = solver.qpos[env, column]
+        joint_qd_out[env, 6 + k] = solver.qvel[env, column - 1]
+        return
+    for axis in range(3):
+        joint_q_out[env, axis] = solver.qpos[env, axis]
+        joint_q_out[env, 3 + axis] = solver.qpos[env, 4 + axis]
+    joint_q_out[env, 6] = solver.qpos[env, 3]
+    rotation = base_rotation(joint_q_out, env)
+    rate = wp.quat_rotate(rotation, wp.vec3(solver.qvel[env, 3], solver.qvel[env, 4], solver.qvel[env, 5]))
+    velocity = wp.vec3(solver.qvel[env, 0], solver.qvel[env, 1], solver.qvel[env, 2])
+    velocity += wp.cross(rate, _base_com_w(solver, env, rotation))
+    for axis in range(3):
+        joint_qd_out[env, axis] = velocity[axis]
+        joint_qd_out[env, 3 + axis] = rate[axis]
+
+
+def ask_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> None:
+    """Read coordinates and velocities from mujoco_warp's data.
+
+    Args:
+        solver: Whose ``qpos`` and ``qvel`` are read.
+        joint_q_out: Joint coordinates, shape (num_envs, 7 + num_joints).
+        joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints).
+    """
+    wp.launch(
+        _ask_solver_kernel,
+        (joint_q_out.shape[0], 1 + len(solver.column_of_joint)),
+        [solver],
+        outputs=[joint_q_out, joint_qd_out],
+        device=joint_q_out.device,
+    )
+
+
+@wp.kernel
+def _ask_poses_kernel(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
+    """Grid (num_envs, bodies_per_env)."""
+    env, body = wp.tid()
+    column = solver.column_of_body[body]
+    turned = solver.xquat[env, column]  # wxyz
+    body_q_out[env, body] = wp.transform(solver.xpos[env, column], wp.quat(turned[1], turned[2], turned[3], turned[0]))
+
+
+def ask_poses(solver: SolverState, body_q_out: Any) -> None:
+    """Read the poses of bodies from mujoco_warp's data.
+
+    Args:
+        solver: Whose ``xpos`` and ``xquat`` are read.
+        body_q_out: Transforms, world-local frame, shape (num_envs, bodies_per_env).
+    """
+    wp.launch(_ask_poses_kernel, body_q_out.shape, [solver], outputs=[body_q_out], device=body_q_out.device)
