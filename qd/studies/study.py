@@ -26,7 +26,7 @@ from qd.run.directory import (
     origin_in,
     write_results,
 )
-from qd.run.progress import ProgressBar
+from qd.run.progress import ProgressBar, share_bar
 from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, refuse_changes
 from qd.search import MOST_DRAWN, begin, crossed_iterations, looks_again, row_of
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, origin_of, worker_status
@@ -282,8 +282,10 @@ def _elites_again(active: Sequence[_Search], evaluate: Evaluate, sampled: bool) 
     rows: dict[int, dict[str, Any]] = {}
     for fitness in dict.fromkeys(one.cfg.fitness for one in active):
         own = [k for k, one in enumerate(active) if one.cfg.fitness == fitness]
-        again = reevaluate(
-            [archives[k] for k in own], evaluate, fitness, num_replicas=cfg.replicas, seeds=[seeds[k] for k in own]
-        )
+        with share_bar("fresh episodes") as progress:
+            again = reevaluate(
+                [archives[k] for k in own], evaluate, fitness, num_replicas=cfg.replicas,
+                seeds=[seeds[k] for k in own], progress=progress,
+            )  # fmt: skip
         rows |= {k: numbers_of(one, cfg.cells, sampled=sampled) for k, one in zip(own, again, strict=True)}
     return [rows[k] for k in range(len(active))]
