@@ -188,7 +188,7 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
 
 
 def _refuse_bare_flags(cls: type, argv: Sequence[str]) -> None:
-    """Refuses a flag of several values that has none: it would be taken for one that was left out.
+    """Refuses a flag of several values that has none, where that would be taken for one that was left out.
 
     Raises:
         ValueError: If there is one.
@@ -196,7 +196,7 @@ def _refuse_bare_flags(cls: type, argv: Sequence[str]) -> None:
     several = {
         f"--{name.replace('_', '-')}"
         for name, kind in get_type_hints(cls).items()
-        if any(get_origin(one) is tuple for one in (kind, *get_args(kind)))
+        if any(get_origin(one) is tuple for one in (kind, *get_args(kind))) and not getattr(cls, name, None)
     }
     for word, following in pairwise([*argv, "--"]):
         if word.replace("_", "-") in several and following.startswith("--"):

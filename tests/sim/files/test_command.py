@@ -119,17 +119,24 @@ class Several:
     """Names."""
     ground_of: tuple[str, ...] | None = None
     """Others."""
+    curve: tuple[int, ...] = (1, 2)
+    """Those that it draws; give none to leave them out."""
 
     def execute(self) -> int:
-        return len(self.by) + len(self.ground_of or ())
+        return len(self.by) + len(self.ground_of or ()) + 10 * len(self.curve)
 
 
 @pytest.mark.parametrize("argv", [["--by"], ["--by", "--ground-of", "a"], ["--by", "a", "--ground-of"]])
 def test_a_flag_of_several_values_without_any_is_not_taken_for_one_left_out(argv, capsys):
     assert run_command(Several, argv, name="several") == 2
     assert "must have one or several values behind it, got none: give some, or leave it out" in capsys.readouterr().err
-    assert run_command(Several, ["--by", "a", "b", "--ground-of", "c"], name="several") == 3
-    assert run_command(Several, [], name="several") == 0
+    assert run_command(Several, ["--by", "a", "b", "--ground-of", "c"], name="several") == 23
+    assert run_command(Several, [], name="several") == 20
+
+
+def test_a_flag_that_has_values_of_its_own_can_be_left_empty():
+    assert run_command(Several, ["--curve"], name="several") == 0
+    assert run_command(Several, ["--curve", "--by", "a"], name="several") == 1
 
 
 def test_the_option_groups_are_flags(capsys):
