@@ -21,7 +21,7 @@ from sim.bank import TerrainBank
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
-from sim.solver import find_poses, find_poses_before, use_own_solver
+from sim.solver import find_poses, poses_found, use_own_solver
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
@@ -102,7 +102,8 @@ class Simulation:
         contact_count: Terrain contacts found in the last step over all environments, shape (1,).
         contact_capacity: Contacts that fit.
         contact_records: The contacts themselves, as the solver reads them.
-        body_q: Body poses, world-local frame, transforms of shape (num_envs * bodies_per_env,).
+        body_q: Body poses at the beginning of the last step, or of the last :meth:`refresh`, world-local frame,
+            transforms of shape (num_envs * bodies_per_env,).
         solver_contacts: Contacts and constraint forces of the last step, as the solver keeps them.
         column_of_geom: Column in ``geom_force`` of each solver geom, -1 for none.
     """
@@ -163,9 +164,6 @@ class Simulation:
         )
         scene.replicate(builder, self.num_envs)
         self.model = scene.finalize()
-        # One thread a robot finds the poses of its bodies: 2 % of a step of 32,768 robots on an H200 less than Newton's
-        # choice, a block of 32 threads a robot, of which one of four legs employs four.
-        self.model._fk_level_capacity = 0
 
     def _randomise_model(self, friction: np.ndarray | None, added_base_mass: np.ndarray | None) -> None:
         model, bodies = self.model, self.model.body_count // self.num_envs
@@ -270,7 +268,6 @@ class Simulation:
         self.solver_contacts = view_solver_contacts(data)
         if not self.solver_collides:
             self._coordinates = self._build_coordinates()
-            find_poses_before(data)
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()
@@ -325,8 +322,8 @@ class Simulation:
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
 
-        It is Newton's step without what these robots do not need: forces from outside, which cost 2 % of a step, and
-        poses of bodies after it, which the next step finds again (5 %).
+        It is Newton's step without what these robots do not need: forces from outside (``body_f``, ``joint_f``),
+        targets of velocities, and poses of bodies after the step, which the next one finds again.
         """
         newton_s, coordinates = self.solver, self._coordinates
         model, data = newton_s.mjw_model, newton_s.mjw_data
@@ -337,7 +334,8 @@ class Simulation:
             self.collide()
             newton_s._convert_contacts_to_mjwarp(self.model, self._state, self._contacts)
             data.overflow.zero_()
-            mujoco_warp.step(model, data)
+            with poses_found(data):
+                mujoco_warp.step(model, data)
             ask_solver(coordinates, self.joint_q, self.joint_qd)
 
     def read_geom_forces(self) -> None:

@@ -4,6 +4,8 @@ mujoco_warp has no hooks for these, so they take the place of two functions of t
 tests/sim/test_solver.py holds the solvers against each other.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from mujoco_warp._src import smooth, solver, types
@@ -81,12 +83,19 @@ def use_own_solver(wanted: bool = True) -> None:
     solver.solve = _solve if wanted else solve_theirs
 
 
-def _find_poses_once(m: Any, d: Any) -> None:
+def _find_poses_if_missing(m: Any, d: Any) -> None:
     if not getattr(d, "poses_are_found", False):
         find_poses(m, d)
 
 
-def find_poses_before(d: Any) -> None:
-    """Make steps of this data begin with the poses of :func:`find_poses`, called before, and not find them again."""
+smooth.kinematics = _find_poses_if_missing
+
+
+@contextmanager
+def poses_found(d: Any) -> Iterator[None]:
+    """A step within it takes the poses of this data from :func:`find_poses`, called before, and does not find them."""
     d.poses_are_found = True
-    smooth.kinematics = _find_poses_once
+    try:
+        yield
+    finally:
+        d.poses_are_found = False

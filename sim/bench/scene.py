@@ -94,6 +94,7 @@ def build_scene(
         raise ValueError(f"only {sim.contact_count.numpy()[0]} contacts in {num_envs} environments: no robot walks")
     actions = np.random.default_rng(seed).normal(size=(num_envs, robot.num_joints)).astype(np.float32)
     with wp.ScopedDevice(device):
+        sim.refresh()
         sim.collide()  # of the poses the last step ended in; before, the records are those it began with
         command = wp.zeros((num_envs, 3), dtype=float)
         command_goal(sim.joint_q, wp.zeros(num_envs, dtype=int), make_task(rollout.cfg, robot), command)

@@ -81,6 +81,7 @@ def put(sim: Simulation, joint_q: np.ndarray, joint_qd: np.ndarray | None = None
     sim.joint_qd.assign(np.zeros(sim.joint_qd.shape, np.float32) if joint_qd is None else np.float32(joint_qd))
     sim.targets.assign(np.float32(joint_q))
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
+    sim.refresh()
 
 
 class Stepper:

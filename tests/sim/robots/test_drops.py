@@ -128,7 +128,6 @@ def dropped(robot, device):
     extremes.contacts = wp.zeros(1, dtype=int, device=device)
 
     def launch():
-        sim.refresh()
         for _ in range(4):
             sim.physics_step()
             inputs = [sim.solver.mjw_data.nefc, sim.overflow, sim.contact_count, sim.joint_q, sim.joint_qd, extremes]
