@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels.state import base_ang_vel_b, base_rotation
+from kernels.state import base_ang_vel_b, base_rotation, velocity_beside
 
 
 @wp.struct
@@ -32,14 +32,8 @@ class SolverState:
     """Column of the targets that an actuator follows, shape (num_actuators,); -1 of one that follows none."""
     column_of_body: wp.array[int]
     """Column of each body of a robot in ``xpos``, shape (bodies_per_env,); the base comes first."""
-    com: wp.array[wp.vec3]
-    """Mass centres of all bodies in their own frames [m], shape (num_envs * bodies_per_env,)."""
-
-
-@wp.func
-def _base_com_w(solver: SolverState, env: int, rotation: wp.quat) -> wp.vec3:
-    """The base's mass centre from its origin, world frame [m]."""
-    return wp.quat_rotate(rotation, solver.com[env * solver.column_of_body.shape[0]])
+    base_com: wp.vec3
+    """Mass centre of the base in its own frame [m]."""
 
 
 @wp.kernel
@@ -59,9 +53,9 @@ def _tell_solver_kernel(
             if target >= 0:
                 solver_out.ctrl[env, k] = targets[env, target]
         return
-    com = _base_com_w(solver_out, env, base_rotation(joint_q, env))
+    of_com = wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
     rate = wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
-    velocity = wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2]) - wp.cross(rate, com)
+    velocity = velocity_beside(of_com, rate, base_rotation(joint_q, env), -solver_out.base_com)
     rate_b = base_ang_vel_b(joint_q, joint_qd, env)
     for axis in range(3):
         solver_out.qpos[env, axis] = joint_q[env, axis]
@@ -101,8 +95,8 @@ def _ask_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], join
     joint_q_out[env, 6] = solver.qpos[env, 3]
     rotation = base_rotation(joint_q_out, env)
     rate = wp.quat_rotate(rotation, wp.vec3(solver.qvel[env, 3], solver.qvel[env, 4], solver.qvel[env, 5]))
-    velocity = wp.vec3(solver.qvel[env, 0], solver.qvel[env, 1], solver.qvel[env, 2])
-    velocity += wp.cross(rate, _base_com_w(solver, env, rotation))
+    of_origin = wp.vec3(solver.qvel[env, 0], solver.qvel[env, 1], solver.qvel[env, 2])
+    velocity = velocity_beside(of_origin, rate, rotation, solver.base_com)
     for axis in range(3):
         joint_qd_out[env, axis] = velocity[axis]
         joint_qd_out[env, 3 + axis] = rate[axis]

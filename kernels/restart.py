@@ -8,6 +8,7 @@ from kernels.episode import Episodes, begin_episode
 from kernels.heightfield import Terrain, node_height
 from kernels.observation import Sensors
 from kernels.rewards import Rewards
+from kernels.state import velocity_beside
 
 _CLEARING_THREADS = 64  # a row
 
@@ -70,7 +71,7 @@ def _place_robot(
     v = ranges.velocity_range
     lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
     ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    of_com = lin_vel + wp.cross(ang_vel, wp.quat_rotate(rotation, sensors.base_com))
+    of_com = velocity_beside(lin_vel, ang_vel, rotation, sensors.base_com)
     for k in range(3):
         joint_qd_out[env, k] = of_com[k]
         joint_qd_out[env, 3 + k] = ang_vel[k]

@@ -58,6 +58,12 @@ def base_lin_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base
 
 
 @wp.func
+def velocity_beside(velocity: wp.vec3, ang_vel: wp.vec3, rotation: wp.quat, offset: wp.vec3) -> wp.vec3:
+    """World velocity [m/s] of the point of a body that lies ``offset`` [m, body frame] from one with ``velocity``."""
+    return velocity + wp.cross(ang_vel, wp.quat_rotate(rotation, offset))
+
+
+@wp.func
 def projected_gravity(joint_q: wp.array2d[float], env: int) -> wp.vec3:
     """Unit vector of gravity in the base frame: (0, 0, -1) when upright."""
     return wp.quat_rotate_inv(base_rotation(joint_q, env), wp.vec3(0.0, 0.0, -1.0))

@@ -266,14 +266,14 @@ class Simulation:
         self.overflow = data.overflow
         self.geom_names = self.robot.geom_names
         self.solver_contacts = view_solver_contacts(data)
-        if not self.solver_collides:
-            self._coordinates = self._build_coordinates()
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()
         self.sensors.scan_x = wp.array(scan_x, dtype=float)
         self.sensors.scan_y = wp.array(scan_y, dtype=float)
         self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
+        if not self.solver_collides:
+            self._coordinates = self._build_coordinates()
 
     def _build_coordinates(self) -> SolverState:
         """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
@@ -299,7 +299,7 @@ class Simulation:
         coordinates.column_of_body = wp.array(
             [int(np.flatnonzero(of_solver == body)[0]) for body in range(self.layout.bodies_per_env)], dtype=int
         )
-        coordinates.com = model.body_com
+        coordinates.base_com = self.sensors.base_com
         return coordinates
 
     def refresh(self) -> None:
@@ -325,14 +325,14 @@ class Simulation:
         It is Newton's step without what these robots do not need: forces from outside (``body_f``, ``joint_f``),
         targets of velocities, and poses of bodies after the step, which the next one finds again.
         """
-        newton_s, coordinates = self.solver, self._coordinates
-        model, data = newton_s.mjw_model, newton_s.mjw_data
-        with wp.ScopedDevice(self.device), newton_s._scoped_mujoco_warp_execution():
+        solver, coordinates = self.solver, self._coordinates
+        model, data = solver.mjw_model, solver.mjw_data
+        with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
             tell_solver(self.joint_q, self.joint_qd, self.targets, coordinates)
             find_poses(model, data)
             ask_poses(coordinates, self.body_q.reshape((self.num_envs, -1)))
             self.collide()
-            newton_s._convert_contacts_to_mjwarp(self.model, self._state, self._contacts)
+            solver._convert_contacts_to_mjwarp(self.model, self._state, self._contacts)
             data.overflow.zero_()
             with poses_found(data):
                 mujoco_warp.step(model, data)

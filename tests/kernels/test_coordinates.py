@@ -23,7 +23,7 @@ def solver():
     state.xquat = wp.zeros((ENVS, 3), dtype=wp.quat)
     state.column_of_joint, state.target_of_actuator = wp.array(COLUMNS, dtype=int), wp.array(FOLLOWED, dtype=int)
     state.column_of_body = wp.array(BODIES, dtype=int)
-    state.com = wp.array([COM, (9.0, 9.0, 9.0)] * ENVS, dtype=wp.vec3)  # the second body's does not count
+    state.base_com = wp.vec3(*COM)
     return state
 
 

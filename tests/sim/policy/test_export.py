@@ -149,14 +149,12 @@ def test_crossings_are_those_of_the_original(tmp_path):
     for policy in (ANYMAL.policy_file, tmp_path / "policy.onnx"):
         cfg = CrossingCfg(max_duration_s=0.6, poll_every_s=0.1)
         rollout = Rollout(ANYMAL, policy, num_terrains=2, num_replicas=4, device="cpu", cfg=cfg)
-        found.append(dataclasses.asdict(rollout.evaluate(terrains, np.array([5, 6]))))
+        found.append(dataclasses.asdict(rollout.evaluate(terrains, np.array([7, 8]))))
     first, second = found
     np.testing.assert_array_equal(second["outcome"], first["outcome"])
     np.testing.assert_array_equal(second["fallen"], first["fallen"])
     np.testing.assert_allclose(second["duration_s"], first["duration_s"])
-    # Actions differ by 1e-6, which contacts make 1.5e-5 of most penalties within 0.6 s, and 1e-2 of one where a foot
-    # touches a step sooner.
-    apart = np.abs(second["penalties"] - first["penalties"]) / (1e-1 + first["penalties"])
-    assert np.median(apart) < 1e-4 and np.sort(apart.ravel())[-2] < 1e-3 and apart.max() < 2e-2
-    np.testing.assert_allclose(second["final_position"], first["final_position"], atol=1e-3)
+    # Actions differ by 1e-6, which contacts make 1.5e-5 of a penalty within 0.6 s.
+    np.testing.assert_allclose(second["penalties"], first["penalties"], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(second["final_position"], first["final_position"], atol=1e-4)
     assert (first["penalties"][..., 0] > 0).all()
