@@ -76,7 +76,7 @@ def resolve_device(name: str | None) -> str:
     try:
         return str(wp.get_device("cuda:0" if name == "cuda" else name))
     except (RuntimeError, ValueError) as error:
-        present = ", ".join(str(device) for device in wp.get_devices())
+        present = ", ".join(("cpu", *map(str, wp.get_cuda_devices())))
         raise ValueError(f"unknown device '{name}': expected one of {present}") from error
 
 
