@@ -114,6 +114,34 @@ auto update_forces = [&]() {
     }
 };
 
+// `search` times the inverse of `hessian`, whose lower triangle becomes its Cholesky factor.
+auto solve_hessian = [&]() {
+    #pragma unroll 1
+    for (int k = 0; k < NV; ++k) {  // with the forward substitution as it goes
+        const float root = wp::sqrt(hessian[k * LD + k]), inverse = 1.0f / root, y = search[k] * inverse;
+        sync();
+        for (int i = k + lane; i < NV; i += LANES) {
+            const float below = i == k ? root : hessian[i * LD + k] * inverse;
+            hessian[i * LD + k] = below;
+            search[i] = i == k ? y : search[i] - below * y;
+        }
+        sync();
+        for (int i = k + 1 + lane; i < NV; i += LANES) {
+            const float below = hessian[i * LD + k];
+            #pragma unroll 4
+            for (int j = k + 1; j <= i; ++j) hessian[i * LD + j] -= below * hessian[j * LD + k];
+        }
+        sync();
+    }
+    #pragma unroll 1
+    for (int k = NV - 1; k >= 0; --k) {
+        const float x = search[k] / hessian[k * LD + k];
+        sync();
+        for (int i = lane; i <= k; i += LANES) search[i] = i == k ? x : search[i] - hessian[k * LD + i] * x;
+        sync();
+    }
+};
+
 // Newton's direction at the present gradient. Returns |direction|^2 and the decrement.
 //
 // The Hessian is M plus a sum of squares of rows g. An active plain row gives sqrt(D) J. A contact on the side of its cone,
@@ -192,30 +220,7 @@ auto find_direction = [&](float& search_dot, float& decrement) {
     }
     for (int i = lane; i < NV; i += LANES) search[i] = gradient[i];
     sync();
-    #pragma unroll 1
-    for (int k = 0; k < NV; ++k) {  // Cholesky, with the forward substitution as it goes
-        const float root = wp::sqrt(hessian[k * LD + k]), inverse = 1.0f / root, y = search[k] * inverse;
-        sync();
-        for (int i = k + lane; i < NV; i += LANES) {
-            const float below = i == k ? root : hessian[i * LD + k] * inverse;
-            hessian[i * LD + k] = below;
-            search[i] = i == k ? y : search[i] - below * y;
-        }
-        sync();
-        for (int i = k + 1 + lane; i < NV; i += LANES) {
-            const float below = hessian[i * LD + k];
-            #pragma unroll 4
-            for (int j = k + 1; j <= i; ++j) hessian[i * LD + j] -= below * hessian[j * LD + k];
-        }
-        sync();
-    }
-    #pragma unroll 1
-    for (int k = NV - 1; k >= 0; --k) {
-        const float x = search[k] / hessian[k * LD + k];
-        sync();
-        for (int i = lane; i <= k; i += LANES) search[i] = i == k ? x : search[i] - hessian[k * LD + i] * x;
-        sync();
-    }
+    solve_hessian();
     float dot = 0.0f, along = 0.0f;
     for (int i = lane; i < NV; i += LANES) {
         const float x = search[i];
@@ -441,7 +446,7 @@ for (int m = lane; m < $inertia; m += LANES) {
     inertia[i * LD + j] = inertia[j * LD + i] = wp::index(problem.inertia, world, m);
 }
 for (int i = lane; i < NV; i += LANES) {
-    qacc[i] = num_rows > 0 ? wp::index(problem.qacc_warmstart, world, i) : wp::index(problem.qacc_smooth, world, i);
+    qacc[i] = num_rows > 0 ? wp::index(problem.qacc_warmstart, world, i) : 0.0f;
 }
 sync();
 float trace = 0.0f;
@@ -466,7 +471,18 @@ for (int r = lane; r < num_rows; r += LANES) {
 sync();
 float search_dot, decrement, alpha, gained;
 int iteration = 0, bits = 0;
-while (true) {
+if (num_rows == 0) {  // nothing to iterate: the inertia takes all forces
+    for (int i = lane; i < NV; i += LANES) {
+        for (int j = 0; j <= i; ++j) hessian[i * LD + j] = inertia[i * LD + j];
+        search[i] = momentum[i] = smooth[i];
+        constraint[i] = 0.0f;
+    }
+    sync();
+    solve_hessian();
+    for (int i = lane; i < NV; i += LANES) qacc[i] = search[i];
+    iteration = 1;
+}
+while (num_rows > 0) {
     update_forces();
     float squares = 0.0f;
     for (int i = lane; i < NV; i += LANES) {
@@ -515,6 +531,49 @@ for (int i = lane; i < NV; i += LANES) {
 for (int r = lane; r < num_rows; r += LANES) {
     wp::index(problem.force, world, r) = force[r];
     wp::index(problem.state, world, r) = state[r];
+}
+if ($step) {
+    // Velocities by the forces found, those of joints as they change over the step (MuJoCo's implicitfast); then positions.
+    const float dt = wp::index(motion.timestep, world % motion.timestep.shape[0]);
+    float* qvel = &wp::index(motion.qvel, world, 0);
+    float* qpos = &wp::index(motion.qpos, world, 0);
+    sync();
+    for (int i = lane; i < NV; i += LANES) {
+        for (int j = 0; j <= i; ++j) hessian[i * LD + j] = inertia[i * LD + j];
+        hessian[i * LD + i] += dt * wp::index(motion.slope, world, i);
+        search[i] = momentum[i];
+        wp::index(problem.qacc_warmstart, world, i) = qacc[i];
+    }
+    sync();
+    solve_hessian();
+    for (int i = lane; i < NV; i += LANES) {
+        search[i] = qvel[i] + search[i] * dt;
+        qvel[i] = search[i];
+    }
+    sync();
+    #pragma unroll 1
+    for (int j = lane; j < motion.joint_type.shape[0]; j += LANES) {
+        const float* v = search + motion.joint_dof.data[j];
+        float* q = qpos + motion.joint_qpos.data[j];
+        if (motion.joint_type.data[j] != $free) {
+            q[0] += dt * v[0];
+            continue;
+        }
+        for (int i = 0; i < 3; ++i) q[i] += dt * v[i];
+        const float speed = wp::sqrt(v[3] * v[3] + v[4] * v[4] + v[5] * v[5]), half = 0.5f * dt * speed;
+        const float s = speed > 0.0f ? wp::sin(half) / speed : 0.0f, c = wp::cos(half);
+        const float length = wp::sqrt(q[3] * q[3] + q[4] * q[4] + q[5] * q[5] + q[6] * q[6]);
+        const float w = q[3] / length, x = q[4] / length, y = q[5] / length, z = q[6] / length;
+        const float a = s * v[3], b = s * v[4], d = s * v[5];
+        const float turned[4] = {
+            w * c - x * a - y * b - z * d, w * a + x * c + y * d - z * b, w * b - x * d + y * c + z * a,
+            w * d + x * b - y * a + z * c};
+        const float now = wp::sqrt(
+            turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2] + turned[3] * turned[3]);
+        for (int i = 0; i < 4; ++i) q[3 + i] = turned[i] / now;
+    }
+    if (problem.num_rows.data[world] > ROWS) bits |= $too_many_rows;
+    if (num_contacts > motion.most_contacts) bits |= $too_many_contacts;
 }
 if (lane == 0) {
     problem.iterations.data[world] = iteration;

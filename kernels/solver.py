@@ -46,7 +46,6 @@ class Problem:
     inertia_col: wp.array[int]
     inertia: wp.array2d[float]
     qacc_warmstart: wp.array2d[float]
-    qacc_smooth: wp.array2d[float]
     qfrc_smooth: wp.array2d[float]
     num_equalities: wp.array[int]
     """Rows of equalities; then come those of friction losses, then all others."""
@@ -72,6 +71,21 @@ class Problem:
     state: wp.array2d[int]
     iterations: wp.array[int]
     overflow: wp.array[int]
+
+
+@wp.struct
+class Motion:
+    """What a step needs once the accelerations are known."""
+
+    timestep: wp.array[float]
+    slope: wp.array2d[float]
+    """What a dof's force loses per speed of that dof."""
+    joint_type: wp.array[int]
+    joint_qpos: wp.array[int]
+    joint_dof: wp.array[int]
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    most_contacts: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,38 +114,39 @@ class Sizes:
 
 
 @cache
-def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> tuple[Any, int]:
+def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...], step: bool) -> tuple[Any, int]:
     """The kernel for models of these sizes, and how many robots a block of threads has."""
     robots = min(4, _BLOCK_WORDS // sizes.words)
     snippet = _SOURCE.substitute(
         nv=sizes.dofs, rows=sizes.rows, dim=sizes.dimensions, inertia=sizes.inertia, chunk=_CHUNK, words=sizes.words,
-        robots=robots, **dict(codes),
+        robots=robots, step=int(step), **dict(codes),
     )  # fmt: skip
 
     @wp.func_native(snippet=snippet)
-    def solve_one(problem: Problem, thread: int): ...
+    def solve_one(problem: Problem, motion: Motion, thread: int): ...
 
     options = {"fast_math": True}  # approximate division and roots; slopes below rounding end a line search anyway
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options, cuda_max_registers=_REGISTERS)
-    def solve_all(problem: Problem):
+    def solve_all(problem: Problem, motion: Motion):
         """Grid (num_envs * 32,); of one thread a robot on a CPU."""
-        solve_one(problem, wp.tid())
+        solve_one(problem, motion, wp.tid())
 
     return solve_all, robots
 
 
-def solve_problem(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
+def solve_problem(problem: Problem, sizes: Sizes, codes: dict[str, Any], motion: Any = None) -> None:
     """Joint accelerations and constraint forces of every world, from a warm start.
 
     Args:
-        problem: Its arrays are read, and from ``qacc`` on written: of ``overflow`` the bits of the two caps are added.
+        problem: Its arrays are read, and from ``qacc`` on written: of ``overflow`` bits are added.
         sizes: Sizes of the model, that :attr:`~Sizes.fits`.
         codes: The solver's own numbers, by their names in solver.cu: of constraint states, of an elliptic contact's
-            rows, of the bits in ``overflow``, and the least divisor.
+            rows, of a free joint, of the bits in ``overflow``, and the least divisor.
+        motion: ``qpos`` and ``qvel`` are moved on by a step, and ``qacc_warmstart`` is written; None moves nothing.
     """
     device = problem.qacc.device
-    kernel, robots = _kernel(sizes, tuple(codes.items()))
+    kernel, robots = _kernel(sizes, tuple(codes.items()), motion is not None)
     lanes = 1 if device.is_cpu else _WARP
-    num_worlds = problem.qacc.shape[0]
-    wp.launch(kernel, dim=num_worlds * lanes, inputs=[problem], block_dim=robots * _WARP, device=device)
+    num_threads = problem.qacc.shape[0] * lanes
+    wp.launch(kernel, num_threads, inputs=[problem, motion or Motion()], block_dim=robots * _WARP, device=device)

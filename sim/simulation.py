@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-import mujoco_warp
 import newton
 import numpy as np
 import warp as wp
@@ -21,7 +20,7 @@ from sim.bank import TerrainBank
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
-from sim.solver import find_poses, poses_found, use_own_solver
+from sim.solver import dynamics_of, use_own_solver
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
@@ -274,6 +273,7 @@ class Simulation:
         self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
         if not self.solver_collides:
             self._coordinates = self._build_coordinates()
+            self._dynamics = dynamics_of(self.solver.mjw_model, data)
 
     def _build_coordinates(self) -> SolverState:
         """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
@@ -326,16 +326,14 @@ class Simulation:
         targets of velocities, and poses of bodies after the step, which the next one finds again.
         """
         solver, coordinates = self.solver, self._coordinates
-        model, data = solver.mjw_model, solver.mjw_data
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
             tell_solver(self.joint_q, self.joint_qd, self.targets, coordinates)
-            find_poses(model, data)
+            self._dynamics.find()
             ask_poses(coordinates, self.body_q.reshape((self.num_envs, -1)))
             self.collide()
             solver._convert_contacts_to_mjwarp(self.model, self._state, self._contacts)
-            data.overflow.zero_()
-            with poses_found(data):
-                mujoco_warp.step(model, data)
+            self.overflow.zero_()
+            self._dynamics.step()
             ask_solver(coordinates, self.joint_q, self.joint_qd)
 
     def read_geom_forces(self) -> None:

@@ -1,24 +1,31 @@
-"""What is ours within mujoco_warp's step: the solver of contacts, for every model that fits it, and poses found before.
+"""What is ours within a physics step of mujoco_warp: dynamics and contacts in a kernel each, for every model that fits.
 
-mujoco_warp has no hooks for these, so they take the place of two functions of the pinned version.
-tests/sim/test_solver.py holds the solvers against each other.
+mujoco_warp has no hooks for its solver of contacts, so ours takes the place of a function of the pinned version.
+tests/sim/test_solver.py and test_dynamics.py hold ours against theirs.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
-from mujoco_warp._src import smooth, solver, types
+import mujoco_warp
+import numpy as np
+import warp as wp
+from mujoco_warp._src import constraint, solver, types
 
-from kernels.solver import Problem, Sizes, solve_problem
+from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
+from kernels.solver import Motion, Problem, Sizes, solve_problem
 
 solve_theirs = solver.solve
-find_poses = smooth.kinematics
 
+_ON_CUDA = False  # find_dynamics compiles for sm_90, but has not run on a GPU yet
+
+_JOINT_CODES = {name.lower(): types.JointType[name].value for name in ("FREE", "SLIDE", "HINGE")}
 _CODES = {state.name.lower(): state.value for state in types.ConstraintState} | {
     "elliptic": types.ConstraintType.CONTACT_ELLIPTIC.value,
+    "free": types.JointType.FREE.value,
     "too_many": types.OverflowType.ITERATIONS.value,
     "too_many_on_line": types.OverflowType.LS_ITERATIONS.value,
+    "too_many_rows": types.OverflowType.NEFC.value,
+    "too_many_contacts": types.OverflowType.NARROWPHASE.value,
     "minval": types.MJ_MINVAL,
 }
 
@@ -54,7 +61,7 @@ def problem_of(m: Any, d: Any) -> Problem:
     problem.impratio_invsqrt = m.opt.impratio_invsqrt
     problem.tri_row, problem.tri_col = m.dof_tri_row, m.dof_tri_col
     problem.inertia_row, problem.inertia_col, problem.inertia = m.M_hinit_i, m.M_colind, d.M
-    problem.qacc_warmstart, problem.qacc_smooth, problem.qfrc_smooth = d.qacc_warmstart, d.qacc_smooth, d.qfrc_smooth
+    problem.qacc_warmstart, problem.qfrc_smooth = d.qacc_warmstart, d.qfrc_smooth
     problem.num_equalities, problem.num_losses, problem.num_rows = d.ne, d.nf, d.nefc
     problem.row_type, problem.row_id, problem.jacobian = d.efc.type, d.efc.id, d.efc.J
     problem.stiffness, problem.aref, problem.frictionloss = d.efc.D, d.efc.aref, d.efc.frictionloss
@@ -83,19 +90,125 @@ def use_own_solver(wanted: bool = True) -> None:
     solver.solve = _solve if wanted else solve_theirs
 
 
-def _find_poses_if_missing(m: Any, d: Any) -> None:
-    if not getattr(d, "poses_are_found", False):
-        find_poses(m, d)
+def why_not(m: Any, d: Any) -> str | None:
+    """What keeps :class:`Dynamics` from this model, None if nothing does."""
+    flags = types.DisableBit
+    unforced = flags.GRAVITY | flags.SPRING | flags.DAMPER | flags.ACTUATION | flags.CLAMPCTRL
+    joints, actuated = m.jnt_type.numpy(), m.actuator_trnid.numpy()[:, 0]
+    free, bodies = joints == types.JointType.FREE, m.jnt_bodyid.numpy()
+    gain, bias = m.actuator_gaintype.numpy(), m.actuator_biastype.numpy()
+    of_joints = (m.actuator_trntype.numpy() == types.TrnType.JOINT).all() and not free[actuated].any()
+    reasons = {
+        "contacts that our kernel cannot solve": not fits(m, d),
+        "another integrator than implicitfast": m.opt.integrator != types.IntegratorType.IMPLICITFAST,
+        "disabled gravity, springs, dampers, actuation or control ranges": m.opt.disableflags & unforced,
+        "equalities, tendons or soft bodies": m.neq or m.ntendon or m.nflex,
+        "mocap bodies": m.nmocap,
+        "delays": m.nhistory,
+        "a fluid": m.has_fluid,
+        "adhesion": m.flg_adhesion,
+        "compensated gravity": m.body_gravcomp.numpy().any(),
+        "ball joints": (joints == types.JointType.BALL).any(),
+        "free bodies that carry nothing": m.body_freeadr.size,
+        "a free joint beside others of its body": (np.bincount(bodies, minlength=1)[bodies[free]] != 1).any(),
+        "springs of free joints": m.jnt_stiffness.numpy()[:, free].any(),
+        "springs or dampers that are not linear": m.jnt_stiffnesspoly.numpy().any() or m.dof_dampingpoly.numpy().any(),
+        "actuators that are not of one joint each": not of_joints or len(set(actuated)) != len(actuated),
+        "actuators with states": m.actuator_dyntype.numpy().any(),
+        "actuators without controls": (m.actuator_ctrlnum.numpy() != 1).any(),
+        "actuators that are not affine": (gain != types.GainType.FIXED).any() or (bias > types.BiasType.AFFINE).any(),
+    }
+    return next((reason for reason, holds in reasons.items() if holds), None)
 
 
-smooth.kinematics = _find_poses_if_missing
+def _floats(array: Any) -> Any:
+    """The same memory as numbers, shape (..., 10)."""
+    return wp.array(ptr=array.ptr, dtype=float, shape=(*array.shape, 10), device=array.device)
 
 
-@contextmanager
-def poses_found(d: Any) -> Iterator[None]:
-    """A step within it takes the poses of this data from :func:`find_poses`, called before, and does not find them."""
-    d.poses_are_found = True
-    try:
-        yield
-    finally:
-        d.poses_are_found = False
+class Dynamics:
+    """A physics step's dynamics, of a model and its data, in two kernels around the constraints' rows."""
+
+    def __init__(self, m: Any, d: Any) -> None:
+        """For a model of which :func:`why_not` says nothing."""
+        self._model, self._data = m, d
+        parent = m.body_parentid.numpy()
+        depth = np.zeros(m.nbody, int)
+        for body in range(1, m.nbody):
+            depth[body] = depth[parent[body]] + 1
+        order = np.argsort(depth, kind="stable")[1:].astype(np.int32)
+        levels = np.searchsorted(depth[order], np.arange(1, depth.max() + 2)).astype(np.int32)
+        actuator = np.full(m.nv, -1, np.int32)
+        actuator[m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]] = np.arange(m.nactuator)
+        self._sizes = TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(levels) - 1)
+        device = d.qpos.device
+        tree = self._tree = Tree()
+        with wp.ScopedDevice(device):
+            tree.level, tree.order, tree.actuator = (wp.array(x, dtype=int) for x in (levels, order, actuator))
+            tree.roots = wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int)
+            tree.biased = wp.array(m.actuator_biastype.numpy() == types.BiasType.AFFINE, dtype=bool)
+            self._slope = wp.zeros((d.nworld, m.nv), dtype=float)
+        for name, of_model in _NAMES.items():
+            setattr(tree, name, getattr(m, of_model))
+        tree.gravity = m.opt.gravity
+        tree.gain, tree.bias = _floats(m.actuator_gainprm), _floats(m.actuator_biasprm)
+        robots = self._robots = Robots()
+        for name in ("qpos", "qvel", "xpos", "xquat", "subtree_com", "cdof", "qfrc_actuator", "qfrc_smooth"):
+            setattr(robots, name, getattr(d, name))
+        robots.control, robots.inertia, robots.slope = d.ctrl, d.M, self._slope
+        motion = self._motion = Motion()
+        motion.timestep, motion.slope, motion.most_contacts = m.opt.timestep, self._slope, d.naconmax
+        motion.joint_type, motion.joint_qpos, motion.joint_dof = m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
+        motion.qpos, motion.qvel = d.qpos, d.qvel
+
+    @property
+    def sizes(self) -> TreeSizes:
+        """Sizes of the model."""
+        return self._sizes
+
+    def find(self) -> None:
+        """Poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
+        find_dynamics(self._tree, self._robots, self._sizes, _JOINT_CODES)
+
+    def step(self) -> None:
+        """Constraints, contacts among them, and the move to the next state."""
+        m, d = self._model, self._data
+        constraint.make_constraint(m, d)
+        solve_problem(problem_of(m, d), sizes_of(m, d), _CODES, self._motion)
+
+
+_NAMES = {
+    "parent": "body_parentid", "root": "body_rootid", "joint": "body_jntadr", "num_joints": "body_jntnum",
+    "joint_type": "jnt_type", "joint_body": "jnt_bodyid", "joint_qpos": "jnt_qposadr", "joint_dof": "jnt_dofadr",
+    "dof_body": "dof_bodyid", "dof_joint": "dof_jntid", "dof_parent": "dof_parentid", "inertia_start": "M_rowadr",
+    "inertia_count": "M_rownnz", "body_pos": "body_pos", "body_quat": "body_quat", "body_ipos": "body_ipos",
+    "body_iquat": "body_iquat", "body_mass": "body_mass", "body_inertia": "body_inertia",
+    "subtree_mass": "body_subtreemass", "joint_pos": "jnt_pos", "joint_axis": "jnt_axis", "qpos0": "qpos0",
+    "rest": "qpos_spring", "stiffness": "jnt_stiffness", "armature": "dof_armature", "damping": "dof_damping",
+    "joint_limited": "jnt_actfrclimited", "joint_range": "jnt_actfrcrange", "gear": "actuator_gear",
+    "control_limited": "actuator_ctrllimited", "control_range": "actuator_ctrlrange",
+    "force_limited": "actuator_forcelimited", "force_range": "actuator_forcerange",
+}  # fmt: skip
+"""Arrays of mujoco_warp's model by their names in :class:`kernels.dynamics.Tree`."""
+
+
+class TheirDynamics:
+    """The same by mujoco_warp's own step, of any model."""
+
+    def __init__(self, m: Any, d: Any) -> None:
+        """For any model."""
+        self._model, self._data = m, d
+
+    def find(self) -> None:
+        """Poses alone."""
+        mujoco_warp.kinematics(self._model, self._data)
+
+    def step(self) -> None:
+        """All of the step, poses once more."""
+        mujoco_warp.step(self._model, self._data)
+
+
+def dynamics_of(m: Any, d: Any) -> Dynamics | TheirDynamics:
+    """Ours where the model lets it, else mujoco_warp's."""
+    there = _ON_CUDA or d.qpos.device.is_cpu
+    return Dynamics(m, d) if there and why_not(m, d) is None else TheirDynamics(m, d)
