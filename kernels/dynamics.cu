@@ -262,10 +262,11 @@ sync();
 for (int n = lane; n < NV; n += LANES) {
     const int body = tree.dof_body.data[n], joint = tree.dof_joint.data[n];
     const Six s = get_six(motion, n), carried = momentum(inertia + 10 * body, s);
-    int at = tree.inertia_start.data[n] + tree.inertia_count.data[n] - 1;
+    const int start = tree.inertia_start.data[n];  // of a row that may lack ancestors, where their entries are always 0
+    int at = start + tree.inertia_count.data[n] - 1;
     wp::index(robots.inertia, world, at) = of_model(tree.armature, n) + dot(s, carried);
     #pragma unroll 1
-    for (int m = tree.dof_parent.data[n]; m >= 0; m = tree.dof_parent.data[m]) {
+    for (int m = tree.dof_parent.data[n]; at > start; m = tree.dof_parent.data[m]) {
         wp::index(robots.inertia, world, --at) = dot(get_six(motion, m), carried);
     }
     const float damping = of_model(tree.damping, n);

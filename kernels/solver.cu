@@ -560,8 +560,17 @@ if ($step) {
             continue;
         }
         for (int i = 0; i < 3; ++i) q[i] += dt * v[i];
-        const float speed = wp::sqrt(v[3] * v[3] + v[4] * v[4] + v[5] * v[5]), half = 0.5f * dt * speed;
-        const float s = speed > 0.0f ? wp::sin(half) / speed : 0.0f, c = wp::cos(half);
+        // Approximate sines of small angles would be too coarse for what adds up over a crossing: series, to rounding below 1.
+        const float square = 0.25f * dt * dt * (v[3] * v[3] + v[4] * v[4] + v[5] * v[5]), half = wp::sqrt(square);
+        float s = 1.0f, c = 1.0f;  // s over half
+        if (square < 1.0f) {
+            s -= square / 6.0f * (1.0f - square / 20.0f * (1.0f - square / 42.0f * (1.0f - square / 72.0f)));
+            c -= square / 2.0f * (1.0f - square / 12.0f * (1.0f - square / 30.0f * (1.0f - square / 56.0f)));
+        } else {
+            s = wp::sin(half) / half;
+            c = wp::cos(half);
+        }
+        s *= 0.5f * dt;
         const float length = wp::sqrt(q[3] * q[3] + q[4] * q[4] + q[5] * q[5] + q[6] * q[6]);
         const float w = q[3] / length, x = q[4] / length, y = q[5] / length, z = q[6] / length;
         const float a = s * v[3], b = s * v[4], d = s * v[5];

@@ -100,6 +100,12 @@ def why_not(m: Any, d: Any) -> str | None:
     of_joints = (m.actuator_trntype.numpy() == types.TrnType.JOINT).all() and not free[actuated].any()
     reasons = {
         "contacts that our kernel cannot solve": not fits(m, d),
+        "more bodies than find room": not tree_sizes_of(m).fits,
+        "collisions of its own": m.opt.run_collision_detection,
+        "surfaces that move": m.flg_surfacevel,
+        "callbacks": any(vars(m.callback).values()),
+        "sensors": m.nsensor,
+        "no actuators": not m.nactuator,
         "another integrator than implicitfast": m.opt.integrator != types.IntegratorType.IMPLICITFAST,
         "disabled gravity, springs, dampers, actuation or control ranges": m.opt.disableflags & unforced,
         "equalities, tendons or soft bodies": m.neq or m.ntendon or m.nflex,
@@ -121,26 +127,40 @@ def why_not(m: Any, d: Any) -> str | None:
     return next((reason for reason, holds in reasons.items() if holds), None)
 
 
+def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Bodies but the world, those near their root first, and where each level of the trees begins among them."""
+    parent = m.body_parentid.numpy()
+    depth = np.zeros(m.nbody, int)
+    for body in range(1, m.nbody):
+        depth[body] = depth[parent[body]] + 1
+    order = np.argsort(depth, kind="stable")[1:].astype(np.int32)
+    return order, np.searchsorted(depth[order], np.arange(1, depth.max() + 2)).astype(np.int32)
+
+
+def tree_sizes_of(m: Any) -> TreeSizes:
+    """Sizes of mujoco_warp's model, for the kernel."""
+    return TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(_levels(m)[1]) - 1)
+
+
 def _floats(array: Any) -> Any:
-    """The same memory as numbers, shape (..., 10)."""
+    """The same memory as numbers, shape (..., 10); whoever uses it keeps the array."""
     return wp.array(ptr=array.ptr, dtype=float, shape=(*array.shape, 10), device=array.device)
 
 
 class Dynamics:
-    """A physics step's dynamics, of a model and its data, in two kernels around the constraints' rows."""
+    """A physics step's dynamics, of a model and its data, in two kernels around the constraints' rows.
+
+    Forces from outside (``qfrc_applied``, ``xfrc_applied``) are left out. Numbers of the model may change, its arrays
+    may not be replaced.
+    """
 
     def __init__(self, m: Any, d: Any) -> None:
         """For a model of which :func:`why_not` says nothing."""
         self._model, self._data = m, d
-        parent = m.body_parentid.numpy()
-        depth = np.zeros(m.nbody, int)
-        for body in range(1, m.nbody):
-            depth[body] = depth[parent[body]] + 1
-        order = np.argsort(depth, kind="stable")[1:].astype(np.int32)
-        levels = np.searchsorted(depth[order], np.arange(1, depth.max() + 2)).astype(np.int32)
+        order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
         actuator[m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]] = np.arange(m.nactuator)
-        self._sizes = TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(levels) - 1)
+        self._sizes = tree_sizes_of(m)
         device = d.qpos.device
         tree = self._tree = Tree()
         with wp.ScopedDevice(device):

@@ -36,7 +36,10 @@ MODEL = """
       <geom type="capsule" size=".04" fromto="0 0 0 .4 0 0"/>
       <body pos=".4 0 0" euler="0 0 .5"><joint name="elbow" axis="0 0 1" pos="0 .02 0"/>
         <geom type="box" size=".1 .03 .03" pos=".1 0 0"/></body>
-    </body>{outer}
+    </body>
+    <body pos="0 -2 1">
+      <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/>
+      <geom size=".1" mass="2"/></body>{outer}
   </worldbody>
   <actuator>
     <position joint="roll" kp="30" kv="2" gear="1.5" forcerange="-4 5"/>
@@ -53,7 +56,9 @@ def model_of(device: str, **changes: str) -> tuple[Any, Any]:
     model = Mujoco.MjModel.from_xml_string(MODEL.format(**_NOTHING | changes))
     data = Mujoco.MjData(model)
     with wp.ScopedDevice(device):
-        return mjw.put_model(model), mjw.put_data(model, data, nworld=WORLDS, nconmax=24, njmax=90)
+        m, d = mjw.put_model(model), mjw.put_data(model, data, nworld=WORLDS, nconmax=24, njmax=90)
+    m.opt.run_collision_detection = False  # as Newton has it where it finds the contacts itself
+    return m, d
 
 
 def shake(m: Any, d: Any) -> None:
@@ -86,6 +91,8 @@ def test_every_quantity_of_a_step(device: str) -> None:
         for _ in range(40):
             before = state_of(d)
             theirs.find()
+            mjw.com_pos(m, d)
+            mjw.collision(m, d)
             theirs.step()
             expected = {name: getattr(d, name).numpy().copy() for name in FOUND}
             roots = m.body_rootid.numpy()
@@ -161,6 +168,9 @@ def test_too_many_rows_and_contacts_are_told(device: str) -> None:
         ({"actuator": '<motor joint="knee"/>'}, "one joint each"),
         ({"actuator": '<general joint="elbow" dyntype="filter" dynprm="1"/>'}, "states"),
         ({"actuator": '<general joint="elbow" gaintype="affine" gainprm="1 1 1"/>'}, "affine"),
+        ({"inner": '<geom size=".1" surfacevel="0 0 0 0 0 3"/>'}, "surfaces"),
+        ({"more": '<sensor><jointpos joint="knee"/></sensor>'}, "sensors"),
+        ({"inner": "<body>" * 400 + '<geom size=".1"/>' + "</body>" * 400}, "room"),
         ({"more": '<equality><joint joint1="elbow" joint2="tail"/></equality>'}, "equalities"),
     ],
 )
@@ -176,3 +186,9 @@ def test_disabled_forces_take_their_step(device: str) -> None:
         assert isinstance(dynamics_of(m, d), Dynamics)
     m.opt.disableflags |= Mujoco.mjtDisableBit.mjDSBL_GRAVITY
     assert isinstance(dynamics_of(m, d), TheirDynamics)
+
+
+def test_a_model_that_collides_itself_takes_its_step(device: str) -> None:
+    m, d = model_of(device)
+    m.opt.run_collision_detection = True
+    assert "collisions" in str(why_not(m, d))
