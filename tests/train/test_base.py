@@ -16,7 +16,7 @@ from sim.robots.robot import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import Train
 from train.ppo.cfg import PpoCfg
-from train.ppo.run import StopRequest
+from train.ppo.run import StopRequest, prepare_run_dir
 from train.task.cfg import TaskCfg
 
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
@@ -231,3 +231,17 @@ def test_a_run_is_not_overwritten(finished, tmp_path):
         with pytest.raises(ValueError, match="already holds a training run"):
             config(finished, resume=resume).execute()
     assert (finished / "checkpoint.pt").read_bytes() == before
+
+
+def test_trainings_of_one_second_have_places_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("train.ppo.run.time.strftime", lambda form: "20260102-030405")
+    flags, places = tyro.cli(Train, args=["--robot", "anymal"]), []
+    for _ in range(3):
+        places.append(prepare_run_dir(flags, "anymal-base"))
+        places[-1].mkdir(parents=True, exist_ok=True)
+    assert [place.name for place in places] == [
+        "anymal-base-20260102-030405",
+        "anymal-base-20260102-030405-2",
+        "anymal-base-20260102-030405-3",
+    ]

@@ -132,7 +132,7 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
     Raises:
         ValueError: If it holds another run, one of the places cannot be written to, or the controller has another name.
     """
-    run_dir = flags.run_dir or flags.resume or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    run_dir = flags.run_dir or flags.resume or _new_place(f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     export, resume = flags.export, flags.resume
     if export is not None and export.suffix != ".pt":
         raise ValueError(
@@ -151,6 +151,15 @@ def prepare_run_dir(flags: TrainingFlags, name: str) -> Path:
         prepare_output(export)
     prepare_output(config)  # last: what is refused leaves no run directory
     return run_dir
+
+
+def _new_place(name: str) -> Path:
+    """A directory that is not there yet: small trainings may begin in the same second."""
+    place, number = Path("runs") / name, 1
+    while place.exists():
+        number += 1
+        place = Path("runs") / f"{name}-{number}"
+    return place
 
 
 # Going on with a run ---------------------------------------------------------------------------------------------
