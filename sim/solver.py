@@ -16,7 +16,7 @@ from kernels.solver import Motion, Problem, Sizes, solve_problem
 
 solve_theirs = solver.solve
 
-_ON_CUDA = False  # find_dynamics compiles for sm_90, but has not run on a GPU yet
+_ON_CUDA = True
 
 _JOINT_CODES = {name.lower(): types.JointType[name].value for name in ("FREE", "SLIDE", "HINGE")}
 _CODES = {state.name.lower(): state.value for state in types.ConstraintState} | {
