@@ -4,25 +4,7 @@ struct Quat { float w, x, y, z; };
 struct Six { float v[6]; };
 constexpr int NB = $bodies, NV = $dofs, NJ = $joints, LEVELS = $levels;
 enum { FREE = $free, SLIDE = $slide, HINGE = $hinge };
-#if defined(__CUDA_ARCH__)
-constexpr int LANES = 32;
-const int lane = threadIdx.x % LANES;
-__shared__ float pool[$robots * $words];
-float* memory = pool + threadIdx.x / LANES * $words;
-auto sync = [] { __syncwarp(); };
-auto total = [](float x) {
-    for (int k = LANES / 2; k > 0; k /= 2) x += __shfl_xor_sync(0xffffffffu, x, k);
-    return x;
-};
-#else
-constexpr int LANES = 1;
-const int lane = 0;
-float memory[$words];
-auto sync = [] {};
-auto total = [](float x) { return x; };
-#endif
 using Vec = wp::vec_t<3, float>;
-const int world = thread / LANES;
 float* position = memory;           // NB x 3
 float* rotation = position + NB * 3;  // NB x 4, wxyz
 float* centre = rotation + NB * 4;  // NB x 3: mass centres

@@ -6,17 +6,16 @@ mujoco_warp's, so that results agree to rounding: composite rigid bodies for the
 the bias forces (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, chapters 5 and 6), affine actuators.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import warp as wp
 
-_WARP = 32
-_BLOCK_WORDS = 12 * 1024  # what a block may have without asking: 48 KiB
-_SOURCE = Template(Path(__file__).with_suffix(".cu").read_text())
+from kernels import lanes
+
+_BODY = Path(__file__).with_suffix(".cu")
 
 
 @wp.struct
@@ -112,30 +111,21 @@ class TreeSizes:
         """Words of memory that a robot needs."""
         return 35 * self.bodies + 6 * self.dofs
 
-    @property
-    def fits(self) -> bool:
-        """Whether a robot finds room in a block's shared memory."""
-        return 0 < self.words <= _BLOCK_WORDS
-
 
 @cache
-def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> tuple[Any, int]:
-    """The kernel for models of these sizes, and how many robots a block of threads has."""
-    robots_per_block = min(4, _BLOCK_WORDS // sizes.words)
-    snippet = _SOURCE.substitute(
-        bodies=sizes.bodies, dofs=sizes.dofs, joints=sizes.joints, levels=sizes.levels, words=sizes.words,
-        robots=robots_per_block, **dict(codes),
-    )  # fmt: skip
+def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> Any:
+    """The kernel for models of these sizes."""
+    snippet = lanes.snippet(_BODY, words=sizes.words, **asdict(sizes), **dict(codes))
 
     @wp.func_native(snippet=snippet)
     def find_one(tree: Tree, robots: Robots, thread: int): ...
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_all(tree: Tree, robots: Robots):
-        """Grid (num_envs * 32,); of one thread a robot on a CPU."""
+        """Grid (num_worlds * lanes,)."""
         find_one(tree, robots, wp.tid())
 
-    return find_all, robots_per_block
+    return find_all
 
 
 def find_dynamics(tree: Tree, robots: Robots, sizes: TreeSizes, codes: dict[str, Any]) -> None:
@@ -144,11 +134,9 @@ def find_dynamics(tree: Tree, robots: Robots, sizes: TreeSizes, codes: dict[str,
     Args:
         tree: The model.
         robots: Its arrays are read, and from ``xpos`` on written.
-        sizes: Sizes of the model, that :attr:`~TreeSizes.fits`.
+        sizes: Sizes of the model, whose words :func:`kernels.lanes.fits`.
         codes: The solver's numbers of the types of joints, by their names in dynamics.cu.
     """
-    device = robots.qpos.device
-    kernel, robots_per_block = _kernel(sizes, tuple(codes.items()))
-    lanes = 1 if device.is_cpu else _WARP
+    kernel = _kernel(sizes, tuple(codes.items()))
     num_worlds = robots.qpos.shape[0]
-    wp.launch(kernel, num_worlds * lanes, inputs=[tree, robots], block_dim=robots_per_block * _WARP, device=device)
+    lanes.launch(kernel, num_worlds, [tree, robots], words=sizes.words, device=robots.qpos.device)

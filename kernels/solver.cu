@@ -3,29 +3,10 @@ struct Row {  // what a line search needs of a row, or of a contact at its first
     int kind, state0;
     float jaref, jv, d, cost0, loss, range, q0, q1, q2, mu, u0, v0, uu, uv, vv, dm, t0, r0;
 };
-constexpr int NV = $nv, ROWS = $rows, DIM = $dim, LD = NV | 1, CHUNK = $chunk, ENTRIES = NV * (NV + 1) / 2;
-constexpr int WORDS = $words;
+constexpr int NV = $dofs, ROWS = $rows, DIM = $dimensions, LD = NV | 1, CHUNK = $chunk, ENTRIES = NV * (NV + 1) / 2;
 constexpr float MINVAL = ${minval}f, EPS = 8.0f * 1.1920929e-07f;
 enum { NOTHING, PLAIN, LOSS, CONTACT };
 enum { SATISFIED = $satisfied, QUADRATIC = $quadratic, LINEARNEG = $linearneg, LINEARPOS = $linearpos, CONE = $cone };
-#if defined(__CUDA_ARCH__)
-constexpr int LANES = 32;
-const int lane = threadIdx.x % LANES;
-__shared__ float pool[$robots * WORDS];
-float* memory = pool + threadIdx.x / LANES * WORDS;
-auto sync = [] { __syncwarp(); };
-auto total = [](float x) {
-    for (int k = LANES / 2; k > 0; k /= 2) x += __shfl_xor_sync(0xffffffffu, x, k);
-    return x;
-};
-#else
-constexpr int LANES = 1;
-const int lane = 0;
-float memory[WORDS];
-auto sync = [] {};
-auto total = [](float x) { return x; };
-#endif
-const int world = thread / LANES;
 float* inertia = memory;  // NV x NV, rows LD apart, and so the Hessian and its factor
 float* hessian = inertia + NV * LD;
 float* part = hessian + NV * LD;  // CHUNK x NV

@@ -11,22 +11,21 @@ Only the Hessian of a contact on the side of its cone is put together in another
 so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu, ``find_direction``).
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import warp as wp
 
-_WARP = 32
-_BLOCK_WORDS = 12 * 1024  # what a block may have without asking: 48 KiB
+from kernels import lanes
+
 _REGISTERS = 96  # a thread, so that 20 robots find room on a multiprocessor
 _CHUNK = 16
 """Rows of constraints whose part of the Hessian is summed at once."""
 
 
-_SOURCE = Template(Path(__file__).with_suffix(".cu").read_text())
+_BODY = Path(__file__).with_suffix(".cu")
 
 
 @wp.struct
@@ -107,20 +106,12 @@ class Sizes:
         matrices = 2 * self.dofs * stride + _CHUNK * (stride + self.dimensions)
         return matrices + 5 * self.rows + 5 * self.dofs
 
-    @property
-    def fits(self) -> bool:
-        """Whether a robot finds room in a block's shared memory."""
-        return 0 < self.words <= _BLOCK_WORDS
-
 
 @cache
-def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...], step: bool) -> tuple[Any, int]:
-    """The kernel for models of these sizes, and how many robots a block of threads has."""
-    robots = min(4, _BLOCK_WORDS // sizes.words)
-    snippet = _SOURCE.substitute(
-        nv=sizes.dofs, rows=sizes.rows, dim=sizes.dimensions, inertia=sizes.inertia, chunk=_CHUNK, words=sizes.words,
-        robots=robots, step=int(step), **dict(codes),
-    )  # fmt: skip
+def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...], step: bool) -> Any:
+    """The kernel for models of these sizes."""
+    values = {"step": int(step), "chunk": _CHUNK} | asdict(sizes) | dict(codes)
+    snippet = lanes.snippet(_BODY, words=sizes.words, **values)
 
     @wp.func_native(snippet=snippet)
     def solve_one(problem: Problem, motion: Motion, thread: int): ...
@@ -129,10 +120,10 @@ def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...], step: bool) -> tup
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options, cuda_max_registers=_REGISTERS)
     def solve_all(problem: Problem, motion: Motion):
-        """Grid (num_envs * 32,); of one thread a robot on a CPU."""
+        """Grid (num_worlds * lanes,)."""
         solve_one(problem, motion, wp.tid())
 
-    return solve_all, robots
+    return solve_all
 
 
 def solve_problem(problem: Problem, sizes: Sizes, codes: dict[str, Any], motion: Any = None) -> None:
@@ -140,13 +131,11 @@ def solve_problem(problem: Problem, sizes: Sizes, codes: dict[str, Any], motion:
 
     Args:
         problem: Its arrays are read, and from ``qacc`` on written: of ``overflow`` bits are added.
-        sizes: Sizes of the model, that :attr:`~Sizes.fits`.
+        sizes: Sizes of the model, whose words :func:`kernels.lanes.fits`.
         codes: The solver's own numbers, by their names in solver.cu: of constraint states, of an elliptic contact's
             rows, of a free joint, of the bits in ``overflow``, and the least divisor.
         motion: ``qpos`` and ``qvel`` are moved on by a step, and ``qacc_warmstart`` is written; None moves nothing.
     """
-    device = problem.qacc.device
-    kernel, robots = _kernel(sizes, tuple(codes.items()), motion is not None)
-    lanes = 1 if device.is_cpu else _WARP
-    num_threads = problem.qacc.shape[0] * lanes
-    wp.launch(kernel, num_threads, inputs=[problem, motion or Motion()], block_dim=robots * _WARP, device=device)
+    kernel = _kernel(sizes, tuple(codes.items()), motion is not None)
+    inputs, num_worlds = [problem, motion or Motion()], problem.qacc.shape[0]
+    lanes.launch(kernel, num_worlds, inputs, words=sizes.words, device=problem.qacc.device)

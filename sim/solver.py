@@ -11,12 +11,11 @@ import numpy as np
 import warp as wp
 from mujoco_warp._src import constraint, solver, types
 
+from kernels import lanes
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
 from kernels.solver import Motion, Problem, Sizes, solve_problem
 
 solve_theirs = solver.solve
-
-_ON_CUDA = True
 
 _JOINT_CODES = {name.lower(): types.JointType[name].value for name in ("FREE", "SLIDE", "HINGE")}
 _CODES = {state.name.lower(): state.value for state in types.ConstraintState} | {
@@ -49,7 +48,7 @@ def fits(m: Any, d: Any) -> bool:
         and m.opt.iterations > 0
         and m.nv > 0
         and d.njmax > 0
-        and sizes_of(m, d).fits
+        and lanes.fits(sizes_of(m, d).words)
     )
 
 
@@ -100,7 +99,7 @@ def why_not(m: Any, d: Any) -> str | None:
     of_joints = (m.actuator_trntype.numpy() == types.TrnType.JOINT).all() and not free[actuated].any()
     reasons = {
         "contacts that our kernel cannot solve": not fits(m, d),
-        "more bodies than find room": not tree_sizes_of(m).fits,
+        "more bodies than find room": not lanes.fits(tree_sizes_of(m).words),
         "collisions of its own": m.opt.run_collision_detection,
         "surfaces that move": m.flg_surfacevel,
         "callbacks": any(vars(m.callback).values()),
@@ -181,11 +180,6 @@ class Dynamics:
         motion.joint_type, motion.joint_qpos, motion.joint_dof = m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
         motion.qpos, motion.qvel = d.qpos, d.qvel
 
-    @property
-    def sizes(self) -> TreeSizes:
-        """Sizes of the model."""
-        return self._sizes
-
     def find(self) -> None:
         """Poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
         find_dynamics(self._tree, self._robots, self._sizes, _JOINT_CODES)
@@ -230,5 +224,4 @@ class TheirDynamics:
 
 def dynamics_of(m: Any, d: Any) -> Dynamics | TheirDynamics:
     """Ours where the model lets it, else mujoco_warp's."""
-    there = _ON_CUDA or d.qpos.device.is_cpu
-    return Dynamics(m, d) if there and why_not(m, d) is None else TheirDynamics(m, d)
+    return Dynamics(m, d) if why_not(m, d) is None else TheirDynamics(m, d)
