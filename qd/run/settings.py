@@ -40,8 +40,7 @@ class SchedulerCfg:
     `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `surrogate`, elites varied likewise for some
     generations that networks judge (after DSAGE, Bhatt et al. 2022); `hard_random`, the paper's, every height at its
     limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn, and
-    where there are fewer emitters, the first methods count. After 75 iterations of the paper preset the default's
-    corrected QD score was 6,103, that of CMA-MAE alone 5,675 (one seed each; `results/anymal/compare_long.json`)."""
+    where there are fewer emitters, the first methods count. docs/comparison.md compares them."""
     shares: str = setting("fixed", one_of=SHARES)
     """How emitters are shared between several methods: `fixed`, in turn; `adaptive`, there are as many of each method
     as ask in all, and those ask whose terrains have become elites most often of late."""

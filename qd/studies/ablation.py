@@ -82,11 +82,11 @@ class Ablation(StudyFlags):
         study = study_of(self, "ablation", runs, robot, device, sampled=True, moved=moved)
 
         def measure() -> dict[str, Any]:
-            metrics = run_study(study, open_evaluator)
+            metrics, origin = run_study(study, open_evaluator)
             if self.run is not None:
                 metrics["alpha_1"] = RunDirectory(self.run).read_metrics()
             numbers = numbers_of(metrics, base.iterations)
-            return {**study.origin, **identity(robot, study.evaluator.policy), "preset": base.preset, **numbers}
+            return {**origin, **identity(robot, study.evaluator.policy), "preset": base.preset, **numbers}
 
         return publish(study.out, measure, _show, draw=lambda report: as_png(draw_ablation(report)))
 

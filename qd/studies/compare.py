@@ -59,7 +59,7 @@ LABELS = {
 }
 """Name, colour and line of each method in the figure."""
 _OTHER_LOOKS = [
-    (color, style) for style in ((0, (6, 2, 1, 2)), (0, (1, 3))) for color in ("#009e73", "#0072b2", "#cc79a7")
+    (color, style) for style in ((0, (6, 2, 1, 2)), (0, (1, 3))) for color in ("#332288", "#aa4499", "#117733", "#ddaa33")
 ]
 CURVES = ("qd_score", "reachable_coverage", "elites", "mean_fitness")
 AGAIN = (
@@ -140,7 +140,7 @@ class Compare(StudyFlags):
         study = study_of(self, "compare", runs, robot, device, sampled=False, certifiers=certifiers)
 
         def measure() -> dict[str, Any]:
-            found = run_study(study, open_evaluator)
+            found, origin = run_study(study, open_evaluator)
             metrics = {name: [found[f"{name}-{seed}"] for seed in seeds[name]] for name in methods}
             report = report_of(metrics, {name: as_settings(cfg)["scheduler"] for name, cfg in methods.items()})
             counts = self._judged(study.path, list(runs), robot.spec, judges, open_evaluator) if self.certify else {}
@@ -148,7 +148,7 @@ class Compare(StudyFlags):
                 own = [counts[f"{name}-{seed}"] for seed in seeds[name]]
                 report["methods"][name] |= in_the_end({key: _over_seeds([one[key] for one in own]) for key in FAULTS})
             return {
-                **study.origin,
+                **origin,
                 **identity(robot, study.evaluator.policy),
                 "preset": size,
                 "seeds": list(range(self.seed, self.seed + self.seeds)),
@@ -375,7 +375,7 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     most = max(method["episodes"] for method in report["methods"].values())
     figure.suptitle(
         f"{report['robot']}: {most:,.0f} episodes a run, "
-        + (f"{seeds} seeds a method, mean and 95 % interval over them" if seeds > 1 else "one seed")
+        + (f"{seeds} seeds a method at most, mean and 95 % interval over them" if seeds > 1 else "one seed")
     )
     panels = (
         ("elites", "elites, as found"),
@@ -399,7 +399,8 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
             bounds = [point["interval"] or (math.nan, math.nan) for _, point in points]
             low, high = ([bound[side] for bound in bounds] for side in (0, 1))
             axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
-        axes.set_xlabel("episodes of one seed")
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:,g}")
+        axes.set_xlabel("thousands of episodes of one seed")
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)

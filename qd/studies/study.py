@@ -155,7 +155,7 @@ class _Search:
         return left if len(metrics) < self.iterations and left >= each else 0
 
 
-def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
+def run_study(study: Study, open_evaluator: Open) -> tuple[dict[str, Metrics], dict[str, Any]]:
     """Runs the iterations that are left of each search, and writes what each leaves to look at.
 
     Args:
@@ -163,7 +163,7 @@ def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
         open_evaluator: Opens what crosses the terrains.
 
     Returns:
-        Rows of metrics by name, of the iterations asked for.
+        Rows of metrics by name, of the iterations asked for; and the provenance of the numbers.
 
     Raises:
         ValueError: If a run that is there has other settings, is damaged, or is at work.
@@ -191,7 +191,17 @@ def run_study(study: Study, open_evaluator: Open) -> dict[str, Metrics]:
             for one in searches.values():
                 found = one.run.with_fresh_values(archive_of(one.cfg, one.search, one.done))
                 write_results(one.run, found, one.metrics, one.origin)
-        return {name: one.metrics[: study.runs[name].iterations] for name, one in searches.items()}
+        metrics = {name: one.metrics[: study.runs[name].iterations] for name, one in searches.items()}
+        return metrics, study.origin if left else _origin_of(list(searches.values()), study.origin)
+
+
+_OF_CROSSINGS = ("commit", "device", "versions", "date")
+
+
+def _origin_of(searches: Sequence[_Search], now: dict[str, Any]) -> dict[str, Any]:
+    """Provenance of numbers for which nothing is crossed any more: of the first search's beginning, but the command."""
+    began = searches[0].origin
+    return {**now, **{name: began[name] for name in _OF_CROSSINGS if name in began}}
 
 
 def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
