@@ -105,7 +105,7 @@ def test_grouped_networks_are_the_same_as_one_by_one(learned):
     maps = learned._mapped(SUPER_GAUSSIAN.hard_random(5, 6)).float()[:, None].expand(-1, module.MEMBERS, -1, -1, -1)
     with torch.no_grad():
         one_by_one = learned._networks(maps)
-        together = learned._networks._through(maps.flatten(1, 2), slice(None)).reshape(5, module.MEMBERS, -1)
+        together = learned._networks.together(maps)
     torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-5)
 
 
