@@ -1,5 +1,6 @@
 """The surrogate's networks, and steps of their training: on CUDA each is one launch of a captured graph."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ MEMBERS = 4
 """Networks of the ensemble. Each begins with weights of its own, and learns from draws of its own."""
 _CONVOLUTIONS = ((5, (3, 3), 12), (3, (2, 2), 24), (3, (2, 1), 32))  # size, strides across and along the way, channels
 _FEATURES = 64  # of each place along the way
+_WAVES = 4  # cosines by which a place is known
 _EAGER_STEPS = 3  # before the capture: they allocate the optimiser's state and choose the convolutions' kernels
 _LEARNING_RATE, _WEIGHT_DECAY = 1e-3, 1e-2
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
@@ -23,8 +25,9 @@ Moments = list[dict[str, Tensor]]
 class Networks(nn.ModuleList):
     """Small convolutional networks side by side, as groups of channels.
 
-    They slide along the way, and then keep mean and maximum, so that an obstacle is the same wherever it lies. How far
-    along the way a node lies is an input of theirs, so that what depends on it can be learned, too.
+    They slide along the way, and then keep mean and maximum, so that an obstacle is the same wherever it lies. What
+    depends on where it lies can be learned, too: the last convolution that slides also sees how far along the way each
+    place lies, as cosines. These separate parts of the way in fewer steps of training than one coordinate does.
 
     Args:
         num_maps: Maps of a terrain that are given.
@@ -33,14 +36,14 @@ class Networks(nn.ModuleList):
 
     def __init__(self, num_maps: int, num_out: int) -> None:
         super().__init__()
-        rows, channels = SHAPE[0], num_maps + 1
+        (rows, cols), channels = SHAPE, num_maps
         for size, strides, channels_out in _CONVOLUTIONS:
             self.append(_beside(channels, channels_out, size, stride=strides, padding=size // 2))
-            rows, channels = -(-rows // strides[0]), channels_out
-        self.append(_beside(channels, _FEATURES, (rows, 3), padding=(0, 1)))
+            rows, cols, channels = -(-rows // strides[0]), -(-cols // strides[1]), channels_out
+        self.append(_beside(channels + _WAVES, _FEATURES, (rows, 3), padding=(0, 1)))
         self.append(_beside(2 * _FEATURES, num_out, 1))
-        along = torch.linspace(-1.0, 1.0, SHAPE[1]).expand(1, 1, 1, *SHAPE)  # from the start to the goal
-        self.register_buffer("_along", along.contiguous(), persistent=False)
+        waves = math.pi * torch.arange(1, _WAVES + 1)[:, None] * torch.linspace(0.0, 1.0, cols)  # from start to goal
+        self.register_buffer("_where", waves.cos()[:, None].repeat(1, rows, 1), persistent=False)
 
     def forward(self, maps: Tensor) -> Tensor:
         """What each network says of the maps that it sees.
@@ -63,18 +66,25 @@ class Networks(nn.ModuleList):
 
     def _through(self, maps: Tensor, members: slice) -> Tensor:
         """What some of the networks make of the maps that each sees, shape (batch, networks, num_out)."""
-        count = maps.shape[1]
-        along = self.get_buffer("_along").expand(len(maps), count, -1, -1, -1)
-        rows = torch.cat([maps, along], dim=2).flatten(1, 2)
+        count, rows = maps.shape[1], maps.flatten(1, 2)
         for index, layer in enumerate(self):
             assert isinstance(layer, nn.Conv2d)
             weight, bias = (
                 part.unflatten(0, (MEMBERS, -1))[members].flatten(0, 1) for part in (layer.weight, _bias_of(layer))
             )
             rows = nn.functional.relu(rows) if index else rows
-            rows = _pooled(rows, count) if index == len(_CONVOLUTIONS) + 1 else rows
+            if index == len(_CONVOLUTIONS):
+                rows = self._placed(rows, count)
+            elif index > len(_CONVOLUTIONS):
+                rows = _pooled(rows, count)
             rows = nn.functional.conv2d(rows, weight, bias, layer.stride, layer.padding, groups=count)
         return rows.reshape(len(maps), count, -1)
+
+    def _placed(self, rows: Tensor, networks: int) -> Tensor:
+        """Each network's channels, and beside them where they lie."""
+        apart = rows.unflatten(1, (networks, -1))
+        where = self.get_buffer("_where").expand(len(rows), networks, -1, -1, -1)
+        return torch.cat([apart, where], dim=2).flatten(1, 2)
 
 
 def _beside(channels_in: int, channels_out: int, size: Any, stride: Any = 1, padding: Any = 0) -> nn.Conv2d:

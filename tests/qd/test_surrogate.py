@@ -112,14 +112,14 @@ def test_grouped_networks_are_the_same_as_one_by_one(learned):
     torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-5)
 
 
-def test_what_lies_along_the_way_is_the_same_wherever_it_lies_but_for_the_coordinate(learned):
-    """A bump is shifted by the product of the strides, without and with the coordinate that the networks see."""
+def test_what_lies_along_the_way_is_the_same_wherever_it_lies_but_for_its_place(learned):
+    """A bump is shifted by the product of the strides, without and with the places that the networks see."""
     maps = torch.zeros(2, module.MEMBERS, 1, *SHAPE)
     maps[0, ..., 15:25, 54:60] = maps[1, ..., 15:25, 60:66] = 1.0
     networks = copy.deepcopy(learned._networks)
     with torch.no_grad():
         seen = networks(maps)
-        networks.get_buffer("_along").zero_()
+        networks.get_buffer("_where").zero_()
         blind = networks(maps)
     torch.testing.assert_close(blind[0], blind[1], rtol=1e-4, atol=1e-5)
     assert (seen[0] - seen[1]).abs().max() > 1e-2
@@ -177,7 +177,7 @@ def test_training_is_the_same_on_every_device(device, monkeypatch):
 
 def test_networks_of_another_shape_are_refused_when_loaded():
     state = make_surrogate().__getstate__()
-    state["learned"][0]["weights"] = state["learned"][0]["weights"][:, :1]
+    state["learned"][0]["weights"] = state["learned"][0]["weights"][:1]
     with pytest.raises(ValueError, match="networks of another shape"):
         make_surrogate().__setstate__(state)
 
