@@ -15,14 +15,13 @@ from torch import Tensor, nn
 
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
+from qd.networks import MEMBERS, Networks, Training
 from qd.run.settings import SchedulerCfg
 from qd.variation import iso_line, recombined
-from sim.corridor import SHAPE, corridor_ground, corridor_heights
+from sim.corridor import corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch
 from sim.space import TerrainSpace, clipped, get_space
 
-MEMBERS = 4
-"""Networks of the ensemble. Each begins with weights of its own, and learns from draws of its own."""
 BATCH = 64
 """Terrains of a step of training, for each network."""
 FEWEST = 64
@@ -33,7 +32,6 @@ _AT_ONCE = 1024  # terrains that are judged at once
 _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
 _LEAST_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
-_LEARNING_RATE, _WEIGHT_DECAY = 1e-3, 1e-2
 _NUM_RATES = 3  # goal rate, collision rate, whether any robot collided
 
 
@@ -54,52 +52,6 @@ class Prediction(NamedTuple):
     """Shape (MEMBERS, N)."""
     collided: NDArray[np.bool_]
     """Whether at least one robot has a base collision, shape (MEMBERS, N)."""
-
-
-class _Networks(nn.ModuleList):
-    """Small convolutional networks side by side, as groups of channels.
-
-    Maps of shape (batch, MEMBERS, num_maps, *SHAPE), in which each network sees its own, become (batch, MEMBERS,
-    num_out).
-    """
-
-    def __init__(self, num_maps: int, num_out: int) -> None:
-        super().__init__()
-        rows, cols = SHAPE
-        for size, stride, channels_in, channels_out in ((5, 3, num_maps, 12), (3, 2, 12, 24), (3, 2, 24, 32)):
-            self.append(_beside(channels_in, channels_out, size, stride=stride, padding=size // 2))
-            rows, cols = -(-rows // stride), -(-cols // stride)
-        self.append(_beside(32, 64, (rows, cols)))
-        self.append(_beside(64, num_out, 1))
-
-    def forward(self, maps: Tensor) -> Tensor:
-        if maps.is_cuda:
-            return self._through(maps.flatten(1, 2), slice(None)).reshape(len(maps), MEMBERS, -1)
-        # One by one, since groups are slow on the CPU.
-        members = (slice(member, member + 1) for member in range(MEMBERS))
-        return torch.stack([self._through(maps[:, own].flatten(1, 2), own).flatten(1) for own in members], dim=1)
-
-    def _through(self, rows: Tensor, members: slice) -> Tensor:
-        """What some of the networks make of the maps that each sees, all as channels."""
-        for index, layer in enumerate(self):
-            assert isinstance(layer, nn.Conv2d)
-            weight, bias = (
-                part.unflatten(0, (MEMBERS, -1))[members].flatten(0, 1) for part in (layer.weight, _bias_of(layer))
-            )
-            rows = nn.functional.relu(rows) if index else rows
-            together = rows.shape[1] // weight.shape[1]
-            rows = nn.functional.conv2d(rows, weight, bias, layer.stride, layer.padding, groups=together)
-        return rows
-
-
-def _beside(channels_in: int, channels_out: int, size: Any, stride: int = 1, padding: int = 0) -> nn.Conv2d:
-    channels = MEMBERS * channels_in, MEMBERS * channels_out
-    return nn.Conv2d(*channels, size, groups=MEMBERS, stride=stride, padding=padding)
-
-
-def _bias_of(layer: nn.Conv2d) -> Tensor:
-    assert layer.bias is not None
-    return layer.bias
 
 
 class Surrogate:
@@ -134,8 +86,8 @@ class Surrogate:
 
     def _make_networks(self) -> None:
         with torch.random.fork_rng(devices=[]):  # torch draws weights first, which are replaced
-            self._networks = _Networks(1 + len(self.space.ground), self._targets.shape[1])
-        self._optimiser = torch.optim.AdamW(self._networks.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+            self._networks = Networks(1 + len(self.space.ground), self._targets.shape[1])
+        self._training = Training(self._networks, self._loss, self.device)
         self._maps: Tensor | None = None  # of the genes
 
     @property
@@ -152,9 +104,8 @@ class Surrogate:
         self.device = device if device.startswith("cuda") and torch.cuda.is_available() else "cpu"
         prepare_torch(self.device)
         self._maps = None
-        self._networks.to(self.device)
-        for moments in self._optimiser.state.values():
-            moments.update({name: moments[name].to(self.device) for name in ("exp_avg", "exp_avg_sq")})
+        moments = self._training.moments
+        self._training = Training(self._networks.to(self.device), self._loss, self.device, moments)
 
     def learn(self, genes: NDArray[np.float32], evaluation: Evaluation, fitness: NDArray[np.float64]) -> None:
         """Remembers terrains, and trains for their share of an iteration's steps; draws from all that it remembers.
@@ -194,12 +145,7 @@ class Surrogate:
         shape = steps, BATCH, MEMBERS
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
-        for rows, mirror in zip(drawn, turned, strict=True):
-            maps = self._maps[rows].float()
-            maps = torch.where(mirror[..., None, None, None], maps.flip(-2), maps)
-            self._optimiser.zero_grad()
-            self._loss(self._networks(maps), targets[rows]).backward()
-            self._optimiser.step()
+        self._training.run(self._maps, targets, drawn, turned)
 
     def _scaled(self, targets: Tensor) -> Tensor:
         middle, spread = torch.from_numpy(self._scale).to(targets.device)
@@ -327,11 +273,8 @@ class Surrogate:
 
     def __getstate__(self) -> dict[str, Any]:
         """Plain values and arrays; maps are made again."""
-        moments = self._optimiser.state
-        learned = [
-            {"weights": weights.detach(), **{name: moments[weights][name] for name in _MOMENTS if weights in moments}}
-            for weights in self._networks.parameters()
-        ]
+        parts = zip(self._networks.parameters(), self._training.moments, strict=True)
+        learned = [{"weights": weights.detach(), **moments} for weights, moments in parts]
         return {
             "cfg": asdict(self.cfg),
             "cells": (self.cells.num_ratios, self.cells.intervals, self.cells.collision_bit),
@@ -351,14 +294,13 @@ class Surrogate:
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets, self._scale = (state[k] for k in ("rng", "genes", "targets", "scale"))
         self._make_networks()
-        for weights, one in zip(self._networks.parameters(), state["learned"], strict=True):
-            values = {name: torch.from_numpy(value).clone() for name, value in one.items()}
-            weights.data.copy_(values.pop("weights"))
-            if values:
-                self._optimiser.state[weights] = values
-
-
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
+        learned = [{name: torch.from_numpy(value).clone() for name, value in one.items()} for one in state["learned"]]
+        values, weights = [one.pop("weights") for one in learned], list(self._networks.parameters())
+        if [value.shape for value in values] != [own.shape for own in weights]:
+            raise ValueError("its surrogate has networks of another shape, of another version")
+        for own, value in zip(weights, values, strict=True):
+            own.data.copy_(value)
+        self._training = Training(self._networks, self._loss, self.device, learned)
 
 
 def _targets_of(evaluation: Evaluation, fitness: NDArray[np.float64]) -> NDArray[np.float32]:

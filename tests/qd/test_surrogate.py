@@ -1,5 +1,8 @@
 """The surrogate over a stand-in whose penalties follow from heights, as a robot's do."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +14,7 @@ from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.settings import SchedulerCfg
 from qd.scheduler import Scheduler
 from qd.surrogate import Surrogate
-from sim.corridor import corridor_heights
+from sim.corridor import SHAPE, corridor_heights
 from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.course import COURSE
 from tests.qd import stand_in
@@ -105,8 +108,78 @@ def test_grouped_networks_are_the_same_as_one_by_one(learned):
     maps = learned._mapped(SUPER_GAUSSIAN.hard_random(5, 6)).float()[:, None].expand(-1, module.MEMBERS, -1, -1, -1)
     with torch.no_grad():
         one_by_one = learned._networks(maps)
-        together = learned._networks._through(maps.flatten(1, 2), slice(None)).reshape(5, module.MEMBERS, -1)
+        together = learned._networks.together(maps)
     torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-5)
+
+
+def test_what_lies_along_the_way_is_the_same_wherever_it_lies_but_for_its_place(learned):
+    """A bump is shifted by the product of the strides, without and with the places that the networks see."""
+    maps = torch.zeros(2, module.MEMBERS, 1, *SHAPE)
+    maps[0, ..., 15:25, 54:60] = maps[1, ..., 15:25, 60:66] = 1.0
+    networks = copy.deepcopy(learned._networks)
+    with torch.no_grad():
+        seen = networks(maps)
+        networks.get_buffer("_where").zero_()
+        blind = networks(maps)
+    torch.testing.assert_close(blind[0], blind[1], rtol=1e-4, atol=1e-5)
+    assert (seen[0] - seen[1]).abs().max() > 1e-2
+
+
+def trained(maps: torch.Tensor, turned: bool) -> list[torch.Tensor]:
+    """Weights of a surrogate after a step on given maps, all or none of them mirrored."""
+    search = make_surrogate()
+    targets = torch.rand(len(maps), search._targets.shape[1], generator=torch.Generator().manual_seed(0))
+    drawn = torch.arange(16 * module.MEMBERS).reshape(1, 16, module.MEMBERS) % len(maps)
+    search._training.run(maps, targets, drawn, torch.full_like(drawn, turned, dtype=torch.bool))
+    return list(search._networks.parameters())
+
+
+def test_mirrored_terrains_are_seen_as_if_they_lay_so(learned):
+    maps = learned._mapped(SUPER_GAUSSIAN.hard_random(20, 7))
+    plain, mirrored, laid_so = trained(maps, False), trained(maps, True), trained(maps.flip(-2), False)
+    assert all(torch.equal(one, other) for one, other in zip(mirrored, laid_so, strict=True))
+    assert not torch.equal(mirrored[0], plain[0])
+
+
+def learned_numbers(search: Surrogate) -> dict[str, np.ndarray]:
+    """Weights and what Adam remembers, each in one row."""
+    parts = search.__getstate__()["learned"]
+    return {name: np.concatenate([one[name].ravel() for one in parts]) for name in parts[0]}
+
+
+def test_training_is_the_same_on_every_device(device, monkeypatch):
+    """On CUDA: steps before the capture, its repetition, and what was saved after it; back on the CPU at last.
+
+    Rounding grows with every step, so there are few.
+    """
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=3)
+    here, there = make_surrogate(cfg), make_surrogate(cfg)
+    begun = learned_numbers(here)["weights"]
+    there.compute_on(device)
+    for seed in range(3):
+        genes = SUPER_GAUSSIAN.hard_random(100, seed)
+        told = crossed(genes, seed)
+        here.learn(genes, told, told.fitness)
+        there.learn(genes, told, told.fitness)
+        there = pickle.loads(pickle.dumps(there))  # on the CPU
+        there.compute_on("cpu" if seed == 1 else device)
+    found, wanted = learned_numbers(there), learned_numbers(here)
+    assert np.array_equal(found["step"], wanted["step"]) and (wanted["step"] == 27).all()
+    way = np.linalg.norm(wanted["weights"] - begun)
+    assert np.linalg.norm(found["weights"] - wanted["weights"]) < 0.02 * way
+    for name in ("exp_avg", "exp_avg_sq"):
+        assert np.linalg.norm(found[name] - wanted[name]) < 0.05 * np.linalg.norm(wanted[name]), name
+    there.compute_on(device)
+    genes = SUPER_GAUSSIAN.hard_random(50, 9)
+    np.testing.assert_allclose(there.predict(genes).ratios, here.predict(genes).ratios, atol=0.005)
+
+
+def test_networks_of_another_shape_are_refused_when_loaded():
+    state = make_surrogate().__getstate__()
+    state["learned"][0]["weights"] = state["learned"][0]["weights"][:1]
+    with pytest.raises(ValueError, match="networks of another shape"):
+        make_surrogate().__setstate__(state)
 
 
 def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
