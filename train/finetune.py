@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from sim.files.command import OnGround
 from sim.files.settings import setting
-from sim.robots.training import RewardCfg
+from sim.robots.training import MOST_SPREAD, Draw, RewardCfg
 from train.ppo.cfg import PpoCfg, TrainingFlags
-from train.task.cfg import MOST_SPREAD
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
-_REWARDS = {"termination": -200.0, "tracking_lin_vel": 2.0}  # the best of six weightings
 _PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005)
 
 
@@ -60,18 +58,19 @@ class Finetune(OnGround, TrainingFlags):
     certifier crosses. uncertified: those of them that none is known to cross."""
     held_out: bool = True
     """Whether elites are held out for the evaluation. A specialist, which is to certify, may train on all."""
-    draw: Literal["uniform", "failing", "learnable"] = "uniform"
+    draw: Draw | None = None
     """How elites are drawn at each exchange. uniform: all alike. failing: rather those that were seldom crossed.
-    learnable: rather those that were crossed about half of the time, so that harder ones come later."""
+    learnable: rather those that were crossed about half of the time, so that harder ones come later. If left out:
+    uniform, of Cassie learnable."""
     task: Literal["crossing", "commands"] = "crossing"
     """What robots are told. crossing: to cross the terrain, as in a search. commands: random velocities, as in the
     base's training."""
-    start_spread: float = setting(0.0, least=0.0, most=MOST_SPREAD)
+    start_spread: float | None = setting(None, least=0.0, most=MOST_SPREAD)
     """Robots start up to so far along the way, drawn uniformly [m]. The goal stays where it is. Only for task crossing.
-    So robots also learn what lies behind a hard beginning."""
+    So robots also learn what lies behind a hard beginning. If left out: 0, of Cassie 8."""
     rewards: RewardCfg
-    """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel.
-    The rewards of an evaluation keep the robot's own."""
+    """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel
+    (Cassie: 4). The rewards of an evaluation keep the robot's own."""
     terrains: int | None = setting(None, least=1)
     """Terrains at a time; on CUDA 500 (Cassie: 100), on the CPU 12."""
     swap_every: int | None = setting(None, least=1)
@@ -86,7 +85,9 @@ class Finetune(OnGround, TrainingFlags):
     def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
         """The flags that follow from a robot, or that a run was begun with."""
         if settings is None:
-            return {"rewards": replace(robot.training.rewards, **_REWARDS)}
+            own = robot.tuning
+            weights = {"termination": own.termination, "tracking_lin_vel": own.tracking_lin_vel}
+            return {"rewards": replace(robot.training.rewards, **weights)}
         same = ("seed", "num_envs", "iterations", "critic_iterations", "split_seed", "ppo")
         policy, task = settings["policy"], settings["task"]
         return {

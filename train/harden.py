@@ -6,6 +6,7 @@ from typing import Literal
 
 from sim.files.command import OfRobot, OnGround, Where
 from sim.files.settings import setting
+from sim.robots.training import Draw
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +45,8 @@ class Harden(OfRobot, OnGround, Where):
     """Terrains that an emitter asks for in an iteration; the preset's."""
     replicas: int | None = setting(None, least=1)
     """Episodes a terrain in a search; the preset's."""
-    draw: Literal["uniform", "failing"] = "uniform"
-    """How a training draws elites at each exchange. uniform: all alike. failing: rather those that were seldom crossed.
-    """
+    draw: Draw | None = None
+    """How a training draws elites at each exchange, as of `faultline finetune`."""
     shares: Literal["equal", "size"] = "equal"
     """Whether a training draws as often from each archive (equal), or each elite as often (size)."""
     by: tuple[str, ...] = ()

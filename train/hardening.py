@@ -243,12 +243,13 @@ def _with_known_comparisons(flags: Harden) -> Harden:
 def _settings_of(job: Hardening, size: str, sizes: dict[str, Any], an_iteration: int) -> dict[str, Any]:
     flags = job.flags
     searched = {"preset": size, **sizes, "episodes": an_iteration * job.search_iterations}
+    draw = flags.draw or job.robot.tuning.draw
     return {
         **identity(job.robot, flags.policy or job.robot.policy_file),
         "seed": flags.seed,
         "space": job.space.name,
         "search": searched,
-        "tune": {"iterations": job.tune_iterations, "draw": flags.draw, "shares": flags.shares},
+        "tune": {"iterations": job.tune_iterations, "draw": draw, "shares": flags.shares},
         "evaluation": {"terrains": job.evaluator.num_terrains, "episodes": job.evaluator.num_replicas},
     }
 

@@ -115,7 +115,7 @@ def _tables(job: "Hardening") -> dict[str, Any]:
     results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
     scales = job.robot.read_penalty_scales(None if job.flags.policy is None else str(job.flags.policy))
     crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
-    about = about_controllers(controllers)
+    about = about_controllers(controllers, job.robot)
     return {
         "episodes": job.evaluator.num_replicas,
         "controllers": about,

@@ -146,11 +146,13 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     else:  # all of it is in the checkpoint: the file it began with may be gone
         start, ppo, before = None, flags.ppo, saved["extra"]["settings"].get("trained_before", [])
     crosses = flags.task == "crossing"
-    if flags.start_spread and not crosses:
-        raise ValueError(f"start_spread needs task crossing, got task {flags.task} with {flags.start_spread:g} m")
-    task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards, start_spread=flags.start_spread)
+    draw = flags.draw or (robot.tuning.draw if flags.mix == "generated" else "uniform")
+    spread = (robot.tuning.start_spread if crosses else 0.0) if flags.start_spread is None else flags.start_spread
+    if spread and not crosses:
+        raise ValueError(f"start_spread needs task crossing, got task {flags.task} with {spread:g} m")
+    task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards, start_spread=spread)
     common = settings_of(flags, robot, size, task, ppo)
-    mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=flags.draw)
+    mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=draw)
     if size["num_envs"] < mix_cfg.terrains:
         raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
     if saved is not None:
@@ -176,7 +178,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         start=start,
         mix=Mix(
             cfg=mix_cfg, genes=elites.genes, space=elites.space, weights=elites.weights, crosses=crosses,
-            seed=flags.seed, device=device, goal_rate=elites.goal_rate if flags.draw == "learnable" else None,
+            seed=flags.seed, device=device, goal_rate=elites.goal_rate if draw == "learnable" else None,
         ),
     )  # fmt: skip
 

@@ -59,7 +59,9 @@ LABELS = {
 }
 """Name, colour and line of each method in the figure."""
 _OTHER_LOOKS = [
-    (color, style) for style in ((0, (6, 2, 1, 2)), (0, (1, 3))) for color in ("#332288", "#aa4499", "#117733", "#ddaa33")
+    (color, style)
+    for style in ((0, (6, 2, 1, 2)), (0, (1, 3)))
+    for color in ("#332288", "#aa4499", "#117733", "#ddaa33")
 ]
 CURVES = ("qd_score", "reachable_coverage", "elites", "mean_fitness")
 AGAIN = (

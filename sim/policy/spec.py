@@ -221,13 +221,18 @@ def firsts(names: Iterable[str]) -> list[str]:
     return list(found.values())
 
 
-def about_controllers(controllers: Mapping[str, str]) -> dict[str, dict[str, str | None]]:
-    """Policy and hash of each controller by its name, as files of results have them.
+def about_controllers(controllers: Mapping[str, str], robot: "RobotCfg") -> dict[str, dict[str, str | None]]:
+    """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own.
 
     Args:
         controllers: Policy of each by its name.
+        robot: The robot.
     """
-    return {who: {"policy": policy, "sha256": controller_hash(policy)} for who, policy in controllers.items()}
+    own = str(robot.policy_file)
+    return {
+        who: {"policy": SHIPPED if policy == own else policy, "sha256": controller_hash(policy)}
+        for who, policy in controllers.items()
+    }
 
 
 def controllers_of(policies: Sequence[str], robot: "RobotCfg", *, flag: str = "policies") -> dict[str, str]:

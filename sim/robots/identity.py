@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FIRST_DEFINITION = "absolute"
 """Definition of the penalties in records that name none: there was no other when they were made."""
-_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning")
+_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning")
 _SHOWN = 12  # digits of a hash that a message shows
 
 

@@ -13,7 +13,7 @@ from sim.files.command import command_line
 from sim.files.settings import setting
 from sim.policy.spec import controller_hash
 from sim.robots.identity import check_identity
-from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg
+from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg, TuningCfg
 
 _ROBOTS_DIR = Path(__file__).parent
 
@@ -83,6 +83,8 @@ class RobotCfg:
     """What the training of its controller takes of the robot."""
     learning: LearningCfg = field(default_factory=LearningCfg)
     """How that training goes on a GPU."""
+    tuning: TuningCfg = field(default_factory=TuningCfg)
+    """How the controller is fine-tuned."""
     settings_file: Path | None = None
     """The Python file of a user's robot, set by :func:`get_robot`; None for a shipped robot."""
 
@@ -260,6 +262,7 @@ ROBOTS = {
             start_joint_range=0.2,
         ),
         learning=LearningCfg(num_envs=2048, iterations=3400, init_noise_std=0.5, desired_kl=0.02, entropy=0.005),
+        tuning=TuningCfg(tracking_lin_vel=4.0, draw="learnable", start_spread=8.0),
     ),
 }
 

@@ -1,6 +1,7 @@
 """What the training of a controller takes of its robot: the rewards, and how its starts and its body are varied."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from sim.files.settings import setting
 
@@ -72,3 +73,23 @@ class LearningCfg(PaceCfg):
 
     num_envs: int = setting(8192, least=1)
     iterations: int = setting(2240, least=1)
+
+
+Draw = Literal["uniform", "failing", "learnable"]
+"""How a fine-tuning draws elites (:class:`train.task.mix.MixCfg`)."""
+MOST_SPREAD = 10.0
+"""How far along the way a training's robots may start [m]. Further along they start within 2 m of the goal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuningCfg:
+    """How the robot's controller is fine-tuned on terrains that break it; the defaults are ANYmal's."""
+
+    termination: float = -200.0
+    """Weight of :attr:`RewardCfg.termination` in place of the robot's own."""
+    tracking_lin_vel: float = 2.0
+    """Weight of :attr:`RewardCfg.tracking_lin_vel` in place of the robot's own."""
+    draw: Draw = "uniform"
+    """How elites are drawn."""
+    start_spread: float = setting(0.0, least=0.0, most=MOST_SPREAD)
+    """Robots start up to so far along the way [m]."""

@@ -15,6 +15,7 @@ from sim.files.atomic import locked
 from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
+from sim.robots.training import TuningCfg
 from tests.builders import fresh_values
 from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
@@ -444,6 +445,24 @@ def test_all_elites_are_more_than_both_parts_of_a_split(places, monkeypatch):
     own = {"archive": (places / "ten.npz",), "run_dir": places / "none"}
     marks = {held: marks_of(job_of(config(places, held_out=held, **own)).mix.genes) for held in (True, False)}
     assert len(marks[True]) == 4 and sorted(marks[False]) == sorted(marks_of(archive.genes))
+
+
+def test_what_is_left_out_is_the_robots_own_recipe(places, monkeypatch):
+    weights = Finetune.defaults(["--robot", "cassie"]).rewards
+    assert (weights.tracking_lin_vel, weights.termination, weights.orientation) == (4.0, -200.0, -1.0)
+    assert Finetune.defaults([]).rewards.tracking_lin_vel == 2.0
+
+    def recipe(**changes):
+        settings = job_of(config(places, run_dir=places / "none", **changes)).settings
+        return settings["mix"]["draw"], settings["task"]["start_spread"]
+
+    assert recipe() == ("uniform", 0.0)
+    own = replace(ROBOT, tuning=TuningCfg(draw="learnable", start_spread=8.0))
+    monkeypatch.setattr(tuning, "get_robot", lambda spec: own)
+    assert recipe() == ("learnable", 8.0)
+    assert recipe(draw="uniform", start_spread=0.0) == ("uniform", 0.0)
+    assert recipe(mix="hard-random", archive=()) == ("uniform", 8.0)
+    assert recipe(task="commands") == ("learnable", 0.0)
 
 
 def test_a_specialist_trains_on_what_nobody_crosses_from_along_the_way_and_goes_on(places, judged, capsys):

@@ -112,7 +112,7 @@ def measure_dose(flags: MeasureDose, *, open_evaluator: Open = open_evaluator) -
             "resolved": flags.resolved,
             "terrains": evaluator.num_terrains,
             "episodes": evaluator.num_replicas,
-            "controllers": about_controllers(controllers),
+            "controllers": about_controllers(controllers, robot),
             "titles": {name: dose.describe() for name, dose in doses.items()},
             "dose": [row for _, rows in lines for row in rows],
             "half": [half_of(dose, rows) for dose, rows in lines],

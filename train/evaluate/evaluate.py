@@ -366,7 +366,7 @@ def _tables(job: TablesJob, open_evaluator: Open) -> dict[str, Any]:
     flags, evaluator, seed = job.flags, job.evaluator, job.flags.seed
     results = cross_all(job.controllers, job.sets, evaluator, job.kept, open_evaluator=open_evaluator)
     crossed = {name: {who: measure(one, job.scales) for who, one in row.items()} for name, row in results.items()}
-    about = about_controllers(job.controllers)
+    about = about_controllers(job.controllers, job.robot)
     return {
         **origin_of(evaluator.device, seed, flags.workers),
         "robot": job.robot.name,

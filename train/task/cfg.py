@@ -5,15 +5,11 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from sim.files.settings import problems, setting
-from sim.robots.training import TrainingCfg
+from sim.robots.training import MOST_SPREAD, TrainingCfg
 from sim.terrain import NUM_LEVELS
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
-
-
-MOST_SPREAD = 10.0
-"""A start further along than this lies within 2 m of the goal [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)

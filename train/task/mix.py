@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sim.bank import terrains_of
 from sim.files.settings import check, setting
 from sim.ground import GroundMaps
+from sim.robots.training import Draw
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import (
     CROSSING_TYPES,
@@ -37,7 +38,7 @@ class MixCfg:
     """Terrains trained on at a time."""
     swap_every: int = setting(400, least=1)
     """They are exchanged for others every so many iterations."""
-    draw: Literal["uniform", "failing", "learnable"] = "uniform"
+    draw: Draw = "uniform"
     """How elites are drawn: uniform; failing: the likelier, the less often they were crossed the last time; or
     learnable: the likelier, the nearer to half of the time (goal rate times its rest: Rutherford et al. 2024)."""
 
