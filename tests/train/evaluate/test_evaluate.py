@@ -13,7 +13,7 @@ from qd.archive import write_archive
 from qd.workers.evaluator import EvaluatorCfg
 from sim.crossing import CrossingCfg
 from sim.files.command import run_command, split_words
-from sim.policy.spec import controllers_of
+from sim.policy.spec import about_controllers, controller_hash, controllers_of
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
@@ -333,3 +333,10 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     assert run_command(Evaluate, ["--device", "cpu", "--sets", "hard_random"], name="evaluate") == 130
     said = capsys.readouterr().err
     assert "Stopped; what is crossed is kept" in said and "the same command" in said.lower()
+
+
+def test_the_robots_own_controller_is_named_shipped_wherever_it_lies():
+    robot = get_robot("cassie")
+    about = about_controllers(controllers_of(("base=shipped", f"other={STANDER}"), robot), robot)
+    assert {who: one["policy"] for who, one in about.items()} == {"base": "shipped", "other": STANDER}
+    assert about["base"]["sha256"] == controller_hash(str(robot.policy_file))
