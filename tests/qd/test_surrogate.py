@@ -150,10 +150,12 @@ def learned_numbers(search: Surrogate) -> dict[str, np.ndarray]:
 def test_training_is_the_same_on_every_device(device, monkeypatch):
     """On CUDA: steps before the capture, its repetition, and what was saved after it; back on the CPU at last.
 
-    Rounding grows with every step, so there are few.
+    Rounding grows with every step, so there are few, in single precision, and on the same maps.
     """
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
-    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=3)
+    same = lambda genes, space, device: corridor_heights(genes, space, device="cpu").to(device)  # noqa: E731
+    monkeypatch.setattr(module, "corridor_heights", same)
+    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=2)
     here, there = make_surrogate(cfg), make_surrogate(cfg)
     begun = learned_numbers(here)["weights"]
     there.compute_on(device)
@@ -165,7 +167,7 @@ def test_training_is_the_same_on_every_device(device, monkeypatch):
         there = pickle.loads(pickle.dumps(there))  # on the CPU
         there.compute_on("cpu" if seed == 1 else device)
     found, wanted = learned_numbers(there), learned_numbers(here)
-    assert np.array_equal(found["step"], wanted["step"]) and (wanted["step"] == 27).all()
+    assert np.array_equal(found["step"], wanted["step"]) and (wanted["step"] == 3 * 6).all()
     way = np.linalg.norm(wanted["weights"] - begun)
     assert np.linalg.norm(found["weights"] - wanted["weights"]) < 0.02 * way
     for name in ("exp_avg", "exp_avg_sq"):
