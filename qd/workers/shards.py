@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MIN_ROWS = 4
-"""Fewest robots of a simulation: torch's linear layers give the same bits for batches of 4 rows and more only."""
+"""Fewest robots of a simulation: one more process costs more than fewer of them gain."""
 
 _STEPS = ("physics_steps", "robot_steps", "busy_steps")
 

@@ -14,7 +14,7 @@ import warp as wp
 
 from sim.files.atomic import check_zip
 from sim.policy.onnx_file import load_onnx
-from sim.policy.runner import action_problem
+from sim.policy.runner import action_problem, with_rows_of_zeros
 from sim.policy.spec import ControllerSpec, find_named, in_one_line, place_of_code
 from sim.robots.identity import warn_if_trained_otherwise
 from sim.robots.robot import RobotCfg
@@ -69,7 +69,7 @@ class MlpPolicy(torch.nn.Module):
         """Mean actions, shape (num_envs, num_joints)."""
         if self.normalised:
             observation = (observation - self.mean) / (self.std + 1e-2)
-        return self.layers(observation)
+        return self.layers(with_rows_of_zeros(observation))[: len(observation)]
 
 
 def prepare_torch(device: str) -> None:

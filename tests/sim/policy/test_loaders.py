@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from tensordict import TensorDict
 
-from sim.policy.loaders import MlpPolicy, load_policy
+from sim.policy.loaders import MlpPolicy, load_policy, prepare_torch
 from sim.policy.runner import PolicyRunner
 from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor, save_checkpoint
 
@@ -258,6 +258,36 @@ def test_the_runner_writes_actions_into_its_buffer(anymal, device):
     observation.fill_(-1.0)
     runner()
     assert not torch.allclose(wp.to_torch(action), expected)
+
+
+def test_a_robots_action_is_the_same_bit_for_bit_beside_any_others(anymal):
+    """Torch itself rounds otherwise in batches of a few rows; how few is the processor's matter."""
+    rows = np.random.default_rng(4).normal(size=(200, OBSERVATIONS)).astype(np.float32)
+    policy, actions = load_policy(anymal.policy_file, anymal, "cpu"), {}
+    prepare_torch("cpu")
+    for count in (*range(1, 40), 64, 100, 200):
+        action = wp.zeros((count, ACTIONS), dtype=float, device="cpu")
+        runner_of(policy, wp.array(rows[:count], dtype=float, device="cpu"), action)()
+        actions[count] = action.numpy()
+        with torch.inference_mode():  # as one that calls it in Python does
+            np.testing.assert_array_equal(policy(torch.from_numpy(rows[:count])), actions[count])
+    assert len(np.unique(actions[200])) == 200 * ACTIONS
+    for count, action in actions.items():
+        np.testing.assert_array_equal(action, actions[200][:count], err_msg=f"{count} robots")
+
+
+def test_what_remembers_gets_a_row_a_robot():
+    class Counter(torch.nn.Module):
+        def reset(self, rows):
+            self.rows = len(rows)
+
+        def forward(self, row):
+            assert len(row) == self.rows
+            return row[:, :ACTIONS]
+
+    observation, action = (wp.ones((5, size), dtype=float, device="cpu") for size in (OBSERVATIONS, ACTIONS))
+    runner_of(Counter(), observation, action)()
+    np.testing.assert_array_equal(action.numpy(), 1.0)
 
 
 def test_a_controller_may_keep_and_change_its_row(anymal):
