@@ -16,6 +16,7 @@ from qd.run.settings import (
     is_searched,
     kept_penalties,
     measured_now,
+    moved_certifiers,
     moved_policy,
     policy_spec,
     preset,
@@ -262,9 +263,8 @@ def _certifiers_of(args: Archive, there: SearchCfg | None, robot: "RobotCfg") ->
         raise ValueError(f"{NOT_ON_RAY}, got --workers {args.workers}: leave out one of --workers and --certified-by")
     certifiers = controllers_of([named_file(text) for text in named], robot, flag="certified-by")
     settings = certifier_settings(certifiers)
-    same = there is not None and settings["certifier_sha256"] == there.certifier_sha256
-    if there is not None and same and [*certifiers] == [text.partition("=")[0] for text in there.certified_by]:
-        settings["certified_by"] = there.certified_by  # wherever their files are now
+    if there is not None and moved_certifiers(there, settings["certified_by"], settings["certifier_sha256"]):
+        settings["certified_by"] = there.certified_by
     return certifiers, settings
 
 

@@ -352,6 +352,12 @@ def moved_policy(there: SearchCfg, given: str | None) -> str | None:
     return given if same else None
 
 
+def moved_certifiers(there: SearchCfg, given: Sequence[str], sha256: Sequence[str]) -> bool:
+    """Whether certifiers, as settings name them, are a run's own by name and hash, wherever their files are now."""
+    names = [[text.partition("=")[0] for text in texts] for texts in (given, there.certified_by)]
+    return tuple(sha256) == there.certifier_sha256 and names[0] == names[1]
+
+
 def is_searched(cfg: SearchCfg, policy: str, robot: "RobotCfg") -> bool:
     """Whether a controller is that of a search: by its hash, or by its name where it has none."""
     if cfg.policy_sha256 is None:

@@ -159,6 +159,7 @@ class Compare(StudyFlags):
                 "qd_score_offset": -FITNESS_FLOOR,
                 "certified_by": dict(zip(certifiers, certifier_settings(certifiers)["certifier_sha256"], strict=True)),
                 "panel": list(judges),
+                "judged_by": self._judged_by(study.path / next(iter(runs))) if self.certify else None,
                 **report,
             }
 
@@ -184,6 +185,12 @@ class Compare(StudyFlags):
                 archive = certify_run(Certify(by=by, run=path / name, **shared), open_evaluator=opened)
                 found[name] = fault_numbers(judged_by(archive, judges))
         return found
+
+    @staticmethod
+    def _judged_by(run: Path) -> dict[str, Any]:
+        """Where, when and by which commit a run was judged: it may be another machine than searched."""
+        judged = RunDirectory(run).read_summary()["confirmed_by"]
+        return {name: judged[name] for name in ("commit", "device", "versions", "date")}
 
     def _methods(self, shared: SearchCfg, certifiers: dict[str, str]) -> dict[str, SearchCfg]:
         """Settings of each method: different searches on the same number of terrains, or of episodes.

@@ -27,7 +27,7 @@ from qd.run.directory import (
     write_results,
 )
 from qd.run.progress import ProgressBar, share_bar
-from qd.run.settings import SearchCfg, as_settings, moved_policy, policy_spec, refuse_changes
+from qd.run.settings import SearchCfg, as_settings, moved_certifiers, moved_policy, policy_spec, refuse_changes
 from qd.search import MOST_DRAWN, begin, crossed_iterations, looks_again, row_of
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, origin_of, worker_status
 from sim.files.atomic import is_leftover
@@ -212,6 +212,8 @@ def _opened(study: Study, name: str, claims: ExitStack) -> _Search:
         there = run.read_cfg()
         if moved_policy(there, cfg.policy):
             cfg = replace(cfg, policy=there.policy)
+        if moved_certifiers(there, cfg.certified_by, cfg.certifier_sha256):
+            cfg = replace(cfg, certified_by=there.certified_by)
         refuse_changes(run.path, "run", as_settings(there), as_settings(cfg))
         origin, loaded = origin_in(run.read_config()), run.load(cfg)
     elif all(map(is_leftover, run.path.iterdir())):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -57,6 +58,8 @@ def numbers_of(path: Path) -> dict:
     report = json.loads((path / "compare.json").read_text())
     for method in report["methods"].values():
         del method["wall_s"]
+    if report["judged_by"] is not None:
+        del report["judged_by"]["date"]
     return {name: value for name, value in report.items() if name not in ("date", "command")}
 
 
@@ -506,6 +509,8 @@ def test_a_search_for_certified_failures_ends_with_as_many_episodes(capsys):
         assert method["faults"] == method["certified"] == method["confirmed"]
         assert 0 < method["faults"] <= method["failing"]
     assert report["panel"] == ["me"] and [*report["certified_by"]] == ["me"]
+    confirmed = json.loads((path / "mixed-5" / "archive.json").read_text())["confirmed_by"]
+    assert report["judged_by"] == {name: confirmed[name] for name in ("commit", "device", "versions")}
     assert "faults" in capsys.readouterr().out
     again = run("a", **{**changes, "open_evaluator": never})  # all of it is kept
     assert numbers_of(again) == report
@@ -518,6 +523,17 @@ def test_a_search_for_certified_failures_ends_with_as_many_episodes(capsys):
         assert found.faults.certifiers == ("me", "C-G")
         by_other = found.confirmed & found.failing & found.faults.certificates()[:, 1]
         assert later["methods"][name]["faults"] == by_other.sum() < report["methods"][name]["faults"]
+
+
+def test_a_certifier_may_be_moved_and_not_changed(tmp_path):
+    own, moved = Path(__file__).parents[3] / "results" / "anymal" / "C-G.pt", tmp_path / "another place.pt"
+    shutil.copy(own, moved)
+    changes = {"methods": ("mixed", "gated"), "iterations": 2, "seeds": 1}
+    report = numbers_of(run("a", certified_by=(f"C-G={own}",), **changes, open_evaluator=crossed_by_certifiers))
+    assert numbers_of(run("a", certified_by=(f"C-G={moved}",), **changes, open_evaluator=never)) == report
+    for another in (f"S={moved}", f"C-G={own.parent / 'panel' / 'S.pt'}"):
+        with pytest.raises(ValueError, match="gated-5 holds a run of other settings: certifie"):
+            run("a", certified_by=(another,), **changes, open_evaluator=never)
 
 
 def test_gated_and_its_certifiers_need_each_other():
