@@ -36,6 +36,7 @@ class Networks(nn.ModuleList):
 
     def __init__(self, num_maps: int, num_out: int) -> None:
         super().__init__()
+        self._num_maps = num_maps
         (rows, cols), channels = SHAPE, num_maps
         for size, strides, channels_out in _CONVOLUTIONS:
             self.append(_beside(channels, channels_out, size, stride=strides, padding=size // 2))
@@ -58,15 +59,35 @@ class Networks(nn.ModuleList):
             return self.together(maps)
         # One by one, since groups are slow on the CPU.
         members = (slice(member, member + 1) for member in range(MEMBERS))
-        return torch.cat([self._through(maps[:, own], own) for own in members], dim=1)
+        return torch.cat([self._through(maps[:, own].flatten(1, 2), own) for own in members], dim=1)
 
     def together(self, maps: Tensor) -> Tensor:
         """As :meth:`forward`, with all networks in one convolution."""
-        return self._through(maps, slice(None))
+        return self._through(maps.flatten(1, 2), slice(None))
 
-    def _through(self, maps: Tensor, members: slice) -> Tensor:
-        """What some of the networks make of the maps that each sees, shape (batch, networks, num_out)."""
-        count, rows = maps.shape[1], maps.flatten(1, 2)
+    def judge(self, maps: Tensor) -> Tensor:
+        """What each network says of the same maps; on CUDA in half precision, of which their words need no more.
+
+        Args:
+            maps: Shape (batch, num_maps, *SHAPE).
+
+        Returns:
+            Float32, shape (batch, MEMBERS, num_out).
+        """
+        if not maps.is_cuda:
+            return self(maps[:, None].expand(-1, MEMBERS, -1, -1, -1))
+        with torch.autocast("cuda", torch.float16):
+            return self._through(maps, slice(None)).float()
+
+    def _through(self, rows: Tensor, members: slice) -> Tensor:
+        """What some of the networks say, shape (batch, networks, num_out).
+
+        Args:
+            rows: Maps that each of them sees, one network's after the other, or those that all of them see.
+            members: Which networks.
+        """
+        count = len(range(MEMBERS)[members])
+        alike = rows.shape[1] < count * self._num_maps
         for index, layer in enumerate(self):
             assert isinstance(layer, nn.Conv2d)
             weight, bias = (
@@ -77,8 +98,9 @@ class Networks(nn.ModuleList):
                 rows = self._placed(rows, count)
             elif index > len(_CONVOLUTIONS):
                 rows = _pooled(rows, count)
-            rows = nn.functional.conv2d(rows, weight, bias, layer.stride, layer.padding, groups=count)
-        return rows.reshape(len(maps), count, -1)
+            groups = count if index or not alike else 1
+            rows = nn.functional.conv2d(rows, weight, bias, layer.stride, layer.padding, groups=groups)
+        return rows.reshape(len(rows), count, -1)
 
     def _placed(self, rows: Tensor, networks: int) -> Tensor:
         """Each network's channels, and beside them where they lie."""

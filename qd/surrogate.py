@@ -28,7 +28,7 @@ FEWEST = 64
 """Valid terrains that must be known before the networks are asked."""
 MOST = 50_000
 """Terrains that are learned from, the newest ones."""
-_AT_ONCE = 1024  # terrains that are judged at once
+_AT_ONCE = {"cpu": 1024, "cuda": 8192}  # terrains that are judged at once
 _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
 _LEAST_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
@@ -131,7 +131,7 @@ class Surrogate:
 
     def _mapped(self, genes: NDArray[np.float32]) -> Tensor:
         """Heights over their scale and ground, in half precision since there are many, shape (N, num_maps, *SHAPE)."""
-        parts = np.array_split(genes, max(1, -(-len(genes) // _AT_ONCE)))
+        parts = np.array_split(genes, max(1, -(-len(genes) // _AT_ONCE["cpu"])))
         return torch.cat([self._some_mapped(part).half() for part in parts])
 
     def _some_mapped(self, genes: NDArray[np.float32]) -> Tensor:
@@ -173,9 +173,10 @@ class Surrogate:
             genes: Shape (N, num_genes).
         """
         found = []
-        for first in range(0, len(genes), _AT_ONCE):
-            maps = self._mapped(clipped(genes[first : first + _AT_ONCE])).float()
-            found.append(self._networks(maps[:, None].expand(-1, MEMBERS, -1, -1, -1)).cpu().numpy())
+        at_once = _AT_ONCE["cpu" if self.device == "cpu" else "cuda"]
+        for first in range(0, len(genes), at_once):
+            maps = self._some_mapped(clipped(genes[first : first + at_once]))
+            found.append(self._networks.judge(maps).cpu().numpy())
         columns = np.moveaxis(np.concatenate(found).astype(np.float64), 1, 0)
         ratios, numbers, rates = self._split(columns)
         ratios = np.exp(ratios - ratios.max(axis=-1, keepdims=True))
@@ -237,22 +238,41 @@ class Surrogate:
             best: Fitness in each cell, expected or found, shape (num_cells,).
             count: Terrains of which these are a part.
         """
-        genes = np.zeros((0, elites.shape[1]), np.float32)
-        gain, spread, cells = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
+        each = self.cfg.candidates * count
+        genes = np.empty((self.cfg.generations * each, elites.shape[1]), np.float32)
+        gain, spread, cells = np.empty(len(genes)), np.empty(len(genes)), np.empty(len(genes), np.int64)
         kept = np.zeros(0, np.int64)
-        for _ in range(self.cfg.generations):
-            children = self._varied(np.concatenate([elites, genes[kept]]), self.cfg.candidates * count)
-            found = self.predict(children)
-            genes = np.concatenate([genes, children])
-            gain = np.concatenate([gain, self._gain(found, best)])
-            spread = np.concatenate([spread, found.ratios.std(axis=0).sum(axis=1)])
-            cells = np.concatenate([cells, self._cells(found.ratios.mean(0), _most(found.collided))])
-            kept = _best_of_each(cells, gain)
-        disputed = min(wanted, round(self.cfg.disagree_share * count))
-        chosen = kept[: wanted - disputed]
-        rest = np.setdiff1d(np.arange(len(genes)), chosen)
-        rest = rest[np.argsort(-spread[rest], kind="stable")][: wanted - len(chosen)]
-        return genes[np.concatenate([chosen, rest])]
+        for first in range(0, len(genes), each):
+            own = slice(first, first + each)
+            genes[own] = self._varied(np.concatenate([elites, genes[kept]]), each)
+            if turned := round(self.cfg.gradient_share * each):
+                genes[first : first + turned] = self._stepped(genes[first : first + turned])
+            found = self.predict(genes[own])
+            gain[own], spread[own] = self._gain(found, best), found.ratios.std(axis=0).sum(axis=1)
+            cells[own] = self._cells(found.ratios.mean(0), _most(found.collided))
+            rows = np.concatenate([kept, np.arange(first, first + each)])
+            kept = rows[_best_of_each(cells[rows], gain[rows])]
+        chosen = kept[: wanted - min(wanted, round(self.cfg.disagree_share * count))]
+        spread[chosen] = -np.inf
+        disputed = np.argsort(-spread, kind="stable")[: wanted - len(chosen)]
+        return genes[np.concatenate([chosen, disputed])]
+
+    def _stepped(self, genes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Terrains a step along gradients of the networks' mean, if the space is the rasteriser's."""
+        from qd.gradient import stepped
+
+        def judge(heights: Tensor) -> tuple[Tensor, Tensor]:
+            maps = (heights / _HEIGHT_SCALE)[:, None, None].expand(-1, MEMBERS, -1, -1, -1)
+            ratios, numbers, _ = self._split(self._networks(maps))
+            return 10.0 * ratios.softmax(-1).mean(1), numbers[..., -1].mean(1)  # both of the order of a cell
+
+        networks = list(self._networks.parameters())
+        for weights in networks:
+            weights.requires_grad_(False)
+        found = stepped(genes, judge, self.cells.num_ratios, self.cfg.gradient_sigma, self._rng, self.device)
+        for weights in networks:
+            weights.requires_grad_(True)
+        return found
 
     def _gain(self, found: Prediction, best: NDArray[np.float64]) -> NDArray[np.float64]:
         """QD score that terrains would add, the mean over the networks, shape (N,)."""
@@ -319,8 +339,8 @@ def _targets_of(evaluation: Evaluation, fitness: NDArray[np.float64]) -> NDArray
 
 def _best_of_each(cells: NDArray[np.int64], gain: NDArray[np.float64]) -> NDArray[np.int64]:
     """Of each cell the row with the largest gain, if that is positive; by descending gain."""
-    order = np.argsort(-gain, kind="stable")
-    order = order[gain[order] > 0.0]
+    order = np.flatnonzero(gain > 0.0)
+    order = order[np.argsort(-gain[order], kind="stable")]
     return order[np.sort(np.unique(cells[order], return_index=True)[1])]
 
 

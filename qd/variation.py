@@ -18,6 +18,11 @@ def check_variation(cfg: SchedulerCfg, space: TerrainSpace) -> None:
             f"crossover_share must be 0, got {cfg.crossover_share}: the space {space.name} does not say which genes "
             "are a part (genes_per_part)"
         )
+    if cfg.gradient_share and space.name != "super_gaussian":
+        raise ValueError(
+            f"gradient_share must be 0, got {cfg.gradient_share}: only the rasteriser of super_gaussian has a "
+            f"derivative, not that of {space.name}"
+        )
     if cfg.mirror_share and space.mirrored(np.zeros((1, space.num_genes), np.float32)) is None:
         raise ValueError(
             f"mirror_share must be 0, got {cfg.mirror_share}: the space {space.name} cannot mirror its terrains "
@@ -36,8 +41,8 @@ def iso_line(
         cfg: Both step sizes.
         rng: What they are drawn from.
     """
-    own = rng.normal(scale=cfg.iso_sigma, size=elites.shape)
-    along = rng.normal(scale=cfg.line_sigma, size=(len(elites), 1))
+    own = cfg.iso_sigma * rng.standard_normal(elites.shape, np.float32)
+    along = cfg.line_sigma * rng.standard_normal((len(elites), 1), np.float32)
     return clipped(elites + own + along * (others - elites))
 
 

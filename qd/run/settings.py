@@ -79,6 +79,10 @@ class SchedulerCfg:
     """Surrogate: share of its terrains that are elites varied once, whatever the networks say."""
     disagree_share: float = setting(0.1, **_SHARE)
     """Surrogate: share of its terrains that the networks disagree most about."""
+    gradient_share: float = setting(0.0, **_SHARE)
+    """Surrogate: share of the terrains that the networks judge that step along their gradients first."""
+    gradient_sigma: float = setting(0.05, least=0.0, most=_STEPS["most"])
+    """Surrogate: length of these steps, root mean square over the genes."""
     training_steps: int = setting(100, least=1, most=100_000)
     """Surrogate: steps of training an iteration, each on 64 terrains a network."""
 

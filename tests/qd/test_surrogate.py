@@ -214,6 +214,27 @@ def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
     assert learned._gain(found, best).mean() > chance.mean()
 
 
+def test_a_step_along_gradients_raises_what_it_is_along(learned):
+    from qd.gradient import heights_of, stepped
+
+    genes = SUPER_GAUSSIAN.uniform_random(40, 3)
+    wanted = corridor_heights(genes, SUPER_GAUSSIAN, device="cpu").numpy()
+    np.testing.assert_allclose(heights_of(torch.from_numpy(genes)).numpy(), wanted, atol=1e-5)
+
+    def judge(heights):  # fitness alone: the mean height, whose gradient is known by its effect
+        return torch.zeros(len(heights), 0), heights.mean((1, 2))
+
+    found = stepped(genes, judge, 0, 0.02, np.random.default_rng(0), "cpu")
+    higher = heights_of(torch.from_numpy(found)).mean((1, 2)) - torch.from_numpy(wanted).mean((1, 2))
+    assert (higher > 0.0).float().mean() > 0.9
+    learned.cfg = SchedulerCfg(emitters=2, batch_size=16, gradient_share=0.5)
+    told = crossed(genes, 0)
+    assert len(learned.propose(10, genes, told.cell, told.fitness, genes[:0])) == 10
+    assert all(weights.requires_grad for weights in learned._networks.parameters())
+    with pytest.raises(ValueError, match=r"gradient_share must be 0, got 0\.5: only the rasteriser of super_gaussian"):
+        Scheduler(learned.cfg, cells=CELLS, seed=0, space=COURSE)
+
+
 def test_before_it_knows_enough_it_draws_and_varies():
     search = make_surrogate()
     none = np.zeros((0, 64), np.float32)
