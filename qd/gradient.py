@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kernels.super_gaussian import LOWER, UPPER
 from sim.corridor import NODE_SPACING, SHAPE, X, Y
+from sim.space import clipped
 
 Judge = Callable[[Tensor], tuple[Tensor, Tensor]]
 _AT_ONCE = 512  # terrains whose nodes and bumps are remembered for the way back
@@ -37,10 +38,8 @@ def heights_of(genes: Tensor) -> Tensor:
     dx, dy = x - mu_x, y[:, None] - mu_y
     across = (theta.cos() * dx - theta.sin() * dy) / sigma_x
     along = (theta.sin() * dx + theta.cos() * dy) / sigma_y
-    exponent = sum(
-        distance.abs().clamp_min(_LEAST_DISTANCE) ** (2.0 * power) for distance, power in ((across, p_x), (along, p_y))
-    )
-    return (height * torch.exp(-exponent)).sum(1)
+    u, v = (distance.abs().clamp_min(_LEAST_DISTANCE) for distance in (across, along))
+    return (height * torch.exp(-(u ** (2.0 * p_x)) - v ** (2.0 * p_y))).sum(1)
 
 
 def stepped(
@@ -71,4 +70,4 @@ def stepped(
             assert asked.grad is not None
             way = asked.grad / asked.grad.norm(dim=1, keepdim=True).clamp_min(1e-12)
         found.append(way.cpu().numpy())
-    return np.clip(genes + length * np.concatenate(found), -1.0, 1.0)
+    return clipped(genes + length * np.concatenate(found))
