@@ -97,7 +97,8 @@ class Cells:
         return tuples[np.lexsort(tuples.T[::-1])]
 
     @cached_property
-    def _codes(self) -> NDArray[np.int64]:
+    def codes(self) -> NDArray[np.int64]:
+        """One number a reachable tuple, its digits to the base of the intervals, ascending, shape (num_tuples,)."""
         return self._code(self.tuples)
 
     def _code(self, tuples: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -120,7 +121,7 @@ class Cells:
         ratios = np.asarray(ratios, dtype=np.float64)
         self._check_ratios(ratios)
         tuples = self._to_reachable(self._intervals_of(ratios), ratios)
-        cells = np.searchsorted(self._codes, self._code(tuples))
+        cells = np.searchsorted(self.codes, self._code(tuples))
         if not self.collision_bit:
             return cells
         if collided is None:

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
-from qd.bandit import Bandit
 from qd.descriptors import Cells
 from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, gated_fitness
 from qd.run.settings import SchedulerCfg
-from qd.variation import check_variation, recombined
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, clipped, get_space
 
 if TYPE_CHECKING:
@@ -58,39 +56,6 @@ class RandomEmitter:
         """Learns nothing."""
 
 
-class VariationEmitter(IsoLineEmitter):
-    """Iso+line, of whose children some take parts of a further elite, and some are mirrored.
-
-    Args:
-        archive: The elites.
-        cfg: The shares.
-        space: What genes mean.
-        stream: Seed of these changes.
-        iso_line: Arguments of pyribs' emitter.
-    """
-
-    def __init__(
-        self,
-        archive: GridArchive,
-        cfg: SchedulerCfg,
-        space: TerrainSpace,
-        stream: np.random.SeedSequence,
-        **iso_line: Any,
-    ) -> None:
-        super().__init__(archive, **iso_line)
-        self._shares = cfg.crossover_share, cfg.mirror_share
-        self._space = space.name, space.sha256  # a checkpoint holds no code
-        self._further = np.random.default_rng(stream)
-
-    def ask(self) -> NDArray[np.float32]:
-        """Genes, shape (batch_size, num_genes)."""
-        children = super().ask()
-        if self.archive.empty:
-            return children
-        others: Any = self.archive.sample_elites(len(children))
-        return recombined(children, others["solution"], *self._shares, get_space(*self._space), self._further)
-
-
 class SurrogateEmitter:
     """Asks for what a surrogate proposes, which all such emitters of a search share.
 
@@ -123,9 +88,6 @@ class Scheduler:
         cells: The reachable cells.
         seed: Seed of emitters and archives.
         num_certifiers: Certifiers whose goal rates it is told.
-
-    Raises:
-        ValueError: If elites are to be varied as the space cannot.
     """
 
     def __init__(
@@ -137,9 +99,7 @@ class Scheduler:
         space: TerrainSpace = SUPER_GAUSSIAN,
         num_certifiers: int = 0,
     ) -> None:
-        check_variation(cfg, space)
-        pool = cfg.emitters * (len(cfg.methods) if cfg.shares == "adaptive" else 1)
-        *streams, shared = np.random.SeedSequence(seed).spawn(pool + 3)
+        *streams, shared = np.random.SeedSequence(seed).spawn(cfg.emitters + 3)
         learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
@@ -156,7 +116,6 @@ class Scheduler:
 
             self.surrogate = surrogate.Surrogate(cfg, cells, space, shared)
         self.emitters: list[Emitter] = [self._emitter(cfg, name, space, stream) for name, stream in in_turn]
-        self._bandit = Bandit(np.zeros((2, pool)), cfg.emitters)
         self._asked: list[NDArray[np.float32] | None] = [None] * cfg.groups
 
     def _emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
@@ -166,12 +125,9 @@ class Scheduler:
             assert self.surrogate is not None
             return SurrogateEmitter(self.result, self.surrogate, cfg.batch_size)
         if method == "map_elites":
-            first, later, further = stream.spawn(3)
-            return VariationEmitter(
+            first, later = stream.spawn(2)
+            return IsoLineEmitter(
                 self.result,
-                cfg,
-                space,
-                further,
                 iso_sigma=cfg.iso_sigma,
                 line_sigma=cfg.line_sigma,
                 initial_solutions=space.hard_random(cfg.batch_size, np.random.default_rng(first)),
@@ -195,16 +151,16 @@ class Scheduler:
 
     def _part(self, group: int, whole: int) -> slice:
         """A group's part of a number of things: equal parts, as far as that goes."""
-        active = self._bandit.active
-        return slice(*(whole // active * (k * active // len(self._asked)) for k in (group, group + 1)))
+        emitters = len(self.emitters)
+        return slice(*(whole // emitters * (k * emitters // len(self._asked)) for k in (group, group + 1)))
 
-    def _group(self, group: int) -> list[int]:
-        """Numbers of the emitters of a group that ask next, or have asked and are not told yet."""
-        return self._bandit.best(self._part(group, len(self.emitters)))
+    def _group(self, group: int) -> list[Emitter]:
+        """The emitters of a group."""
+        return self.emitters[self._part(group, len(self.emitters))]
 
     def places(self, group: int) -> slice:
         """Places of a group's terrains among those of an iteration."""
-        return self._part(group, self._bandit.active * int(self.emitters[0].batch_size))
+        return self._part(group, len(self.emitters) * int(self.emitters[0].batch_size))
 
     def ask(self, group: int = 0) -> NDArray[np.float32]:
         """The next terrains of a group of emitters; the same ones until the group is told their results.
@@ -217,7 +173,7 @@ class Scheduler:
         """
         asked = self._asked[group]
         if asked is None:
-            emitters = [self.emitters[number] for number in self._group(group)]
+            emitters = self._group(group)
             proposed = self._proposed([emitter for emitter in emitters if isinstance(emitter, SurrogateEmitter)])
             asked = self._asked[group] = np.concatenate(
                 [next(proposed) if isinstance(emitter, SurrogateEmitter) else emitter.ask() for emitter in emitters]
@@ -278,15 +234,13 @@ class Scheduler:
         self._asked[group] = None
         if self.surrogate is not None:
             self.surrogate.learn(asked, evaluation, told["objective"])
-        emitters = self._group(group)
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
         plain = self._add({**told, "objective": ranked}, accepted)
-        self._bandit.tell(self._part(group, len(self.emitters)), emitters, plain["status"] > 0)
         learned = plain if self.archive is self.result else self.archive.add(**told)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
-        for emitter in [self.emitters[number] for number in emitters]:
+        for emitter in self._group(group):
             own = slice(first, first + int(emitter.batch_size))
             added = plain if emitter.archive is self.result else learned
             emitter.tell(
@@ -317,8 +271,7 @@ class Scheduler:
 
     def state(self) -> dict[str, Any]:
         """Everything a resumed search needs; what was asked for and not told stays asked for."""
-        emitters = {"emitters": self.emitters, "active": self._bandit.active, "counts": self._bandit.counts}
-        return {"archive": self.archive, "result": self.result, **emitters, "asked": self._asked}
+        return {"archive": self.archive, "result": self.result, "emitters": self.emitters, "asked": self._asked}
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Scheduler":
@@ -336,16 +289,12 @@ class Scheduler:
             and emitters
             and all(isinstance(emitter, Emitter) for emitter in emitters)
             and isinstance(asked, list)
-            and 1 <= len(asked) <= state.get("active", len(emitters))
+            and 1 <= len(asked) <= len(emitters)
             and all(isinstance(genes, np.ndarray | None) for genes in asked)
         ):
             raise ValueError("a search has two archives, emitters, and what they asked for, got something else")
-        # Before emitters shared by their success, all asked and nothing was counted.
-        counts = state.get("counts", np.zeros((2, len(emitters))))
-        active = state.get("active", len(emitters))
         search = cls.__new__(cls)
         search.archive, search.result, search.emitters, search._asked = archive, result, emitters, asked
-        search._bandit = Bandit(counts, active)
         shared = [emitter.surrogate for emitter in emitters if isinstance(emitter, SurrogateEmitter)]
         search.surrogate = shared[0] if shared else None
         return search

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.networks import MEMBERS, Networks, Training
-from qd.run.settings import SchedulerCfg
-from qd.variation import iso_line, recombined
+from qd.run.settings import SchedulerCfg, still_there
+from qd.variation import varied
 from sim.corridor import corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch
 from sim.space import TerrainSpace, clipped, get_space
@@ -36,22 +36,45 @@ _NUM_RATES = 3  # goal rate, collision rate, whether any robot collided
 
 
 class Prediction(NamedTuple):
-    """What each of the networks says of N terrains."""
+    """What each of the networks says of N terrains, on their device."""
 
-    ratios: NDArray[np.float64]
+    ratios: Tensor
     """Shape (MEMBERS, N, P), each row summing to 1."""
-    fitness: NDArray[np.float64]
-    """Shape (MEMBERS, N)."""
-    penalty_mean: NDArray[np.float64]
-    """Shape (MEMBERS, N, P)."""
-    penalty_std: NDArray[np.float64]
-    """Shape (MEMBERS, N, P)."""
-    goal_rate: NDArray[np.float64]
-    """Shape (MEMBERS, N)."""
-    collision_rate: NDArray[np.float64]
-    """Shape (MEMBERS, N)."""
-    collided: NDArray[np.bool_]
-    """Whether at least one robot has a base collision, shape (MEMBERS, N)."""
+    numbers: Tensor
+    """Logarithms of the penalties' means and standard deviations, and the fitness' area hyperbolic sine, shape
+    (MEMBERS, N, 2 P + 1)."""
+    rates: Tensor
+    """Logits of goal rate, collision rate, and whether any robot has a base collision, shape (MEMBERS, N, 3)."""
+
+    @property
+    def fitness(self) -> Tensor:
+        """Shape (MEMBERS, N)."""
+        return self.numbers[..., -1].sinh()
+
+    @property
+    def penalty_mean(self) -> Tensor:
+        """Scaled penalties, shape (MEMBERS, N, P)."""
+        return (self.numbers[..., : self.ratios.shape[-1]].exp() - _LEAST_PENALTY).clamp_min(0.0)
+
+    @property
+    def penalty_std(self) -> Tensor:
+        """Shape (MEMBERS, N, P)."""
+        return (self.numbers[..., self.ratios.shape[-1] : -1].exp() - _LEAST_PENALTY).clamp_min(0.0)
+
+    @property
+    def goal_rate(self) -> Tensor:
+        """Shape (MEMBERS, N)."""
+        return self.rates[..., 0].sigmoid()
+
+    @property
+    def collision_rate(self) -> Tensor:
+        """Shape (MEMBERS, N)."""
+        return self.rates[..., 1].sigmoid()
+
+    @property
+    def collided(self) -> Tensor:
+        """Whether at least one robot has a base collision, shape (MEMBERS, N)."""
+        return self.rates[..., 2] > 0.0
 
 
 class Surrogate:
@@ -89,6 +112,7 @@ class Surrogate:
             self._networks = Networks(1 + len(self.space.ground), self._targets.shape[1])
         self._training = Training(self._networks, self._loss, self.device)
         self._maps: Tensor | None = None  # of the genes
+        self._codes: Tensor | None = None  # of the cells
 
     @property
     def space(self) -> TerrainSpace:
@@ -103,7 +127,7 @@ class Surrogate:
         """Moves the work to a Warp device; to the CPU where torch does not see such a device."""
         self.device = device if device.startswith("cuda") and torch.cuda.is_available() else "cpu"
         prepare_torch(self.device)
-        self._maps = None
+        self._maps, self._codes = None, None
         moments = self._training.moments
         self._training = Training(self._networks.to(self.device), self._loss, self.device, moments)
 
@@ -132,11 +156,11 @@ class Surrogate:
     def _mapped(self, genes: NDArray[np.float32]) -> Tensor:
         """Heights over their scale and ground, in half precision since there are many, shape (N, num_maps, *SHAPE)."""
         parts = np.array_split(genes, max(1, -(-len(genes) // _AT_ONCE["cpu"])))
-        return torch.cat([self._some_mapped(part).half() for part in parts])
+        return torch.cat([self._some_mapped(torch.from_numpy(part).to(self.device)).half() for part in parts])
 
-    def _some_mapped(self, genes: NDArray[np.float32]) -> Tensor:
-        heights = corridor_heights(genes, self.space, device=self.device) / _HEIGHT_SCALE
-        return torch.cat([heights[:, None], corridor_ground(genes, self.space, device=self.device)], dim=1)
+    def _some_mapped(self, genes: Tensor) -> Tensor:
+        heights = corridor_heights(genes, self.space) / _HEIGHT_SCALE
+        return torch.cat([heights[:, None], corridor_ground(genes, self.space)], dim=1)
 
     def _train(self, steps: int) -> None:
         if self._maps is None:
@@ -166,34 +190,19 @@ class Surrogate:
         return loss.mean(0).sum()
 
     @torch.inference_mode()
-    def predict(self, genes: NDArray[np.float32]) -> Prediction:
+    def predict(self, genes: Tensor) -> Prediction:
         """What each network says of terrains.
 
         Args:
-            genes: Shape (N, num_genes).
+            genes: In [-1, 1], on the surrogate's device, shape (N, num_genes).
         """
-        found = []
-        at_once = _AT_ONCE["cpu" if self.device == "cpu" else "cuda"]
-        for first in range(0, len(genes), at_once):
-            maps = self._some_mapped(clipped(genes[first : first + at_once]))
-            found.append(self._networks.judge(maps).cpu().numpy())
-        columns = np.moveaxis(np.concatenate(found).astype(np.float64), 1, 0)
-        ratios, numbers, rates = self._split(columns)
-        ratios = np.exp(ratios - ratios.max(axis=-1, keepdims=True))
-        middle, spread = self._scale.astype(np.float64)
-        numbers = np.clip(numbers, -10.0, 10.0) * spread + middle
-        penalties = np.maximum(np.exp(numbers[..., :-1]) - _LEAST_PENALTY, 0.0)
-        mean, std = np.split(penalties, 2, axis=-1)
-        return Prediction(
-            ratios=ratios / ratios.sum(axis=-1, keepdims=True),
-            fitness=np.sinh(numbers[..., -1]),
-            penalty_mean=mean,
-            penalty_std=std,
-            goal_rate=_sigmoid(rates[..., 0]),
-            collision_rate=_sigmoid(rates[..., 1]),
-            collided=rates[..., 2] > 0.0,
-        )
+        at_once = _AT_ONCE["cuda" if genes.is_cuda else "cpu"]
+        columns = torch.cat([self._networks.judge(self._some_mapped(part)) for part in genes.split(at_once)])
+        ratios, numbers, rates = self._split(columns.transpose(0, 1))
+        middle, spread = torch.from_numpy(self._scale).to(self.device)
+        return Prediction(ratios.softmax(-1), numbers.clamp(-10.0, 10.0) * spread + middle, rates)
 
+    @torch.inference_mode()
     def propose(
         self,
         count: int,
@@ -216,20 +225,28 @@ class Surrogate:
         """
         if not len(elites):
             return self.space.hard_random(count, self._rng)
+        draw = torch.Generator(self.device).manual_seed(int(self._rng.integers(2**62)))
+        there = torch.from_numpy(np.ascontiguousarray(elites, np.float32)).to(self.device)
         if len(self) < FEWEST:
-            return self._varied(elites, count)
-        explored = self._varied(elites, round(self.cfg.explore_share * count))
-        best = np.full(self.cells.num_cells, FITNESS_FLOOR)
-        np.maximum.at(best, cell, fitness)
-        expected = np.concatenate([under_way, explored])
-        if len(expected):
-            found = self.predict(expected)
-            np.maximum.at(best, self._cells(found.ratios.mean(0), _most(found.collided)), found.fitness.mean(0))
-        return np.concatenate([explored, self._searched(count - len(explored), elites, best, count)])
+            return self._varied(there, count, draw).cpu().numpy()
+        explored = self._varied(there, round(self.cfg.explore_share * count), draw)
+        best = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
+        np.maximum.at(best, cell, fitness.astype(np.float32))
+        expected = torch.cat([torch.from_numpy(under_way).to(self.device), explored])
+        known = self._with_expected(torch.from_numpy(best).to(self.device), expected)
+        searched = self._searched(count - len(explored), there, known, count, draw)
+        return torch.cat([explored, searched]).cpu().numpy()
 
-    def _searched(
-        self, wanted: int, elites: NDArray[np.float32], best: NDArray[np.float64], count: int
-    ) -> NDArray[np.float32]:
+    def _with_expected(self, best: Tensor, expected: Tensor) -> Tensor:
+        """Fitness in each cell once robots have crossed what they are to cross already, shape (num_cells,)."""
+        if not len(expected):
+            return best
+        found = self.predict(expected)
+        cells = self._cells(found.ratios.mean(0), _most(found.collided))
+        inside = cells >= 0
+        return best.scatter_reduce(0, cells[inside], found.fitness.mean(0)[inside], "amax")
+
+    def _searched(self, wanted: int, elites: Tensor, best: Tensor, count: int, draw: torch.Generator) -> Tensor:
         """The inner loop: what adds most to the predicted archive, and what the networks disagree about.
 
         Args:
@@ -237,59 +254,48 @@ class Surrogate:
             elites: Genes of the elites, where it begins.
             best: Fitness in each cell, expected or found, shape (num_cells,).
             count: Terrains of which these are a part.
+            draw: What children are drawn from.
         """
         each = self.cfg.candidates * count
-        genes = np.empty((self.cfg.generations * each, elites.shape[1]), np.float32)
-        gain, spread, cells = np.empty(len(genes)), np.empty(len(genes)), np.empty(len(genes), np.int64)
-        kept = np.zeros(0, np.int64)
+        genes = elites.new_empty(self.cfg.generations * each, elites.shape[1])
+        gain, spread = elites.new_empty(2, len(genes))
+        cells = torch.empty(len(genes), dtype=torch.int64, device=genes.device)
+        kept = cells[:0]
         for first in range(0, len(genes), each):
             own = slice(first, first + each)
-            genes[own] = self._varied(np.concatenate([elites, genes[kept]]), each)
-            if turned := round(self.cfg.gradient_share * each):
-                genes[first : first + turned] = self._stepped(genes[first : first + turned])
+            genes[own] = self._varied(torch.cat([elites, genes[kept]]), each, draw)
             found = self.predict(genes[own])
-            gain[own], spread[own] = self._gain(found, best), found.ratios.std(axis=0).sum(axis=1)
+            gain[own], spread[own] = self._gain(found, best), found.ratios.std(0, correction=0).sum(1)
             cells[own] = self._cells(found.ratios.mean(0), _most(found.collided))
-            rows = np.concatenate([kept, np.arange(first, first + each)])
-            kept = rows[_best_of_each(cells[rows], gain[rows])]
+            rows = torch.cat([kept, torch.arange(first, first + each, device=genes.device)])
+            kept = rows[_best_of_each(cells[rows], gain[rows], self.cells.num_cells)]
         chosen = kept[: wanted - min(wanted, round(self.cfg.disagree_share * count))]
-        spread[chosen] = -np.inf
-        disputed = np.argsort(-spread, kind="stable")[: wanted - len(chosen)]
-        return genes[np.concatenate([chosen, disputed])]
+        spread[chosen] = -torch.inf
+        disputed = spread.argsort(descending=True, stable=True)[: wanted - len(chosen)]
+        return genes[torch.cat([chosen, disputed])]
 
-    def _stepped(self, genes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Terrains a step along gradients of the networks' mean, if the space is the rasteriser's."""
-        from qd.gradient import stepped
-
-        def judge(heights: Tensor) -> tuple[Tensor, Tensor]:
-            maps = (heights / _HEIGHT_SCALE)[:, None, None].expand(-1, MEMBERS, -1, -1, -1)
-            ratios, numbers, _ = self._split(self._networks(maps))
-            return 10.0 * ratios.softmax(-1).mean(1), numbers[..., -1].mean(1)  # both of the order of a cell
-
-        networks = list(self._networks.parameters())
-        for weights in networks:
-            weights.requires_grad_(False)
-        found = stepped(genes, judge, self.cells.num_ratios, self.cfg.gradient_sigma, self._rng, self.device)
-        for weights in networks:
-            weights.requires_grad_(True)
-        return found
-
-    def _gain(self, found: Prediction, best: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _gain(self, found: Prediction, best: Tensor) -> Tensor:
         """QD score that terrains would add, the mean over the networks, shape (N,)."""
-        gains = [
-            np.maximum(fitness - best[self._cells(ratios, collided)], 0.0)
-            for ratios, fitness, collided in zip(found.ratios, found.fitness, found.collided, strict=True)
-        ]
-        return np.mean(gains, axis=0)
+        cells = self._cells(found.ratios, found.collided)
+        gains = (found.fitness - best[cells]).clamp_min(0.0)
+        return torch.where(cells >= 0, gains, 0.0).mean(0)
 
-    def _cells(self, ratios: NDArray[np.float64], collided: NDArray[np.bool_]) -> NDArray[np.int64]:
-        return self.cells.cell_of(ratios / ratios.sum(axis=1, keepdims=True), collided)
+    def _cells(self, ratios: Tensor, collided: Tensor) -> Tensor:
+        """Cell of each row of ratios, as :meth:`Cells.cell_of` has it; -1 of one on the edge of what can be reached."""
+        if self._codes is None:
+            self._codes = torch.from_numpy(self.cells.codes).to(self.device)
+        intervals = self.cells.intervals
+        digits = (ratios * intervals).long().clamp_max(intervals - 1)
+        places = intervals ** torch.arange(ratios.shape[-1] - 1, -1, -1, device=ratios.device)
+        codes = (digits * places).sum(-1)
+        cells = torch.searchsorted(self._codes, codes).clamp_max(len(self._codes) - 1)
+        reached = self._codes[cells] == codes
+        if self.cells.collision_bit:
+            cells = cells + len(self._codes) * collided
+        return torch.where(reached, cells, -1)
 
-    def _varied(self, pool: NDArray[np.float32], count: int) -> NDArray[np.float32]:
-        elites, others, further = pool[self._rng.integers(len(pool), size=(3, count))]
-        children = iso_line(elites, others, self.cfg, self._rng)
-        shares = self.cfg.crossover_share, self.cfg.mirror_share
-        return recombined(children, further, *shares, self.space, self._rng)
+    def _varied(self, pool: Tensor, count: int, draw: torch.Generator) -> Tensor:
+        return varied(pool, count, self.cfg, self.space.genes_per_part, draw)
 
     def __getstate__(self) -> dict[str, Any]:
         """Plain values and arrays; maps are made again."""
@@ -309,7 +315,7 @@ class Surrogate:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """On the CPU, until :meth:`compute_on` moves it."""
         num_ratios, intervals, collision_bit = state["cells"]
-        self.cfg, self.device = SchedulerCfg(**state["cfg"]), "cpu"
+        self.cfg, self.device = SchedulerCfg(**still_there(state["cfg"])), "cpu"
         self.cells = Cells(num_ratios, intervals, collision_bit=collision_bit)
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets, self._scale = (state[k] for k in ("rng", "genes", "targets", "scale"))
@@ -337,16 +343,14 @@ def _targets_of(evaluation: Evaluation, fitness: NDArray[np.float64]) -> NDArray
     return np.concatenate(columns, axis=1).astype(np.float32)
 
 
-def _best_of_each(cells: NDArray[np.int64], gain: NDArray[np.float64]) -> NDArray[np.int64]:
+def _best_of_each(cells: Tensor, gain: Tensor, num_cells: int) -> Tensor:
     """Of each cell the row with the largest gain, if that is positive; by descending gain."""
-    order = np.flatnonzero(gain > 0.0)
-    order = order[np.argsort(-gain[order], kind="stable")]
-    return order[np.sort(np.unique(cells[order], return_index=True)[1])]
+    order = gain.argsort(descending=True, stable=True)
+    order = order[(gain[order] > 0.0) & (cells[order] >= 0)]
+    ranks = torch.arange(len(order), device=order.device)
+    first = ranks.new_full((num_cells,), len(order)).scatter_reduce(0, cells[order], ranks, "amin")
+    return order[first[cells[order]] == ranks]
 
 
-def _most(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return flags.mean(axis=0) >= 0.5
-
-
-def _sigmoid(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return 1.0 / (1.0 + np.exp(-np.clip(values, -30.0, 30.0)))
+def _most(flags: Tensor) -> Tensor:
+    return flags.float().mean(0) >= 0.5

@@ -21,48 +21,43 @@ SHAPE = tuple(round((high - low) / NODE_SPACING) + 1 for low, high in (Y, X))
 _AT_ONCE = 2048  # terrains, whole grids of which take 420 MB
 
 
-def corridor_heights(genes: np.ndarray, space: TerrainSpace, *, device: str) -> torch.Tensor:
+def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     """Heights [m] around the way of terrains, every 0.1 m; row 20 is the way, row 0 is to its right.
 
     A space that is made for 0.05 m gives the means of 3 x 3 nodes, so that nothing narrow falls between two nodes.
 
     Args:
-        genes: Shape (num_terrains, num_genes).
+        genes: Float32 in [-1, 1], shape (num_terrains, num_genes), on the device that does the work.
         space: What the genes mean.
-        device: Warp device name.
 
     Returns:
-        Float32 tensor on the device, shape (num_terrains, 41, 121).
-
-    Raises:
-        ValueError: If the shape of the genes differs or a gene is not finite.
+        Float32 tensor on that device, shape (num_terrains, 41, 121).
     """
-    found = torch.empty((len(genes), *SHAPE), device=wp.device_to_torch(device))
-    with wp.ScopedDevice(device):
+    found = genes.new_empty(len(genes), *SHAPE)
+    with wp.ScopedDevice(wp.device_from_torch(genes.device)):
         for first in range(0, len(genes), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
-            found[some] = (_sampled if space.any_spacing else _averaged)(space.validate(genes[some]), space, device)
+            found[some] = (_sampled if space.any_spacing else _averaged)(genes[some], space)
     return found
 
 
-def corridor_ground(genes: np.ndarray, space: TerrainSpace, *, device: str) -> torch.Tensor:
+def corridor_ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     """What :attr:`TerrainSpace.ground` names, around the way, on the nodes of :func:`corridor_heights`.
 
     Args:
-        genes: Shape (num_terrains, num_genes).
+        genes: As of :func:`corridor_heights`.
         space: What the genes mean.
-        device: Warp device name.
 
     Returns:
-        Float32 tensor on the device, shape (num_terrains, num_maps, 41, 121), 0 where ground is as always: the friction
-        that is missing, and the time constant over that of the softest ground.
+        Float32 tensor on their device, shape (num_terrains, num_maps, 41, 121), 0 where ground is as always: the
+        friction that is missing, and the time constant over that of the softest ground.
     """
     if space.ground_shape is None:
-        return torch.empty((len(genes), 0, *SHAPE), device=wp.device_to_torch(device))
-    rows, cols = space.ground_shape
+        return genes.new_empty(len(genes), 0, *SHAPE)
+    (rows, cols), device = space.ground_shape, str(wp.device_from_torch(genes.device))
     ground = make_ground(len(genes), device, space.ground_shape)
     with wp.ScopedDevice(device):
-        space.lay_ground(wp.array(space.validate(genes), dtype=float, device=device), ground)
+        space.lay_ground(wp.from_torch(genes.contiguous()), ground)
     maps = {
         "friction": 1.0 - wp.to_torch(ground.friction),
         "softness": wp.to_torch(ground.time_constant) / float(MOST_TIME_CONSTANT_S),
@@ -77,15 +72,15 @@ def _nodes(span: tuple[float, float]) -> np.ndarray:
     return np.arange(first, last + 1, round(NODE_SPACING / SPACING))
 
 
-def _sampled(genes: np.ndarray, space: TerrainSpace, device: str) -> torch.Tensor:
+def _sampled(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     row, col = round(Y[0] / NODE_SPACING), round(X[0] / NODE_SPACING)
-    heights = wp.empty((len(genes), row + SHAPE[0], col + SHAPE[1]), dtype=float, device=device)
-    space.rasterise(wp.array(genes, dtype=float, device=device), NODE_SPACING, heights)
-    return wp.to_torch(heights)[:, row:, col:]
+    heights = genes.new_empty(len(genes), row + SHAPE[0], col + SHAPE[1])
+    space.rasterise(wp.from_torch(genes.contiguous()), NODE_SPACING, wp.from_torch(heights))
+    return heights[:, row:, col:]
 
 
-def _averaged(genes: np.ndarray, space: TerrainSpace, device: str) -> torch.Tensor:
-    bank = TerrainBank(len(genes), device=device)
-    space.rasterise(wp.array(genes, dtype=float, device=device), SPACING, bank.heights)
+def _averaged(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
+    bank = TerrainBank(len(genes), device=str(wp.device_from_torch(genes.device)))
+    space.rasterise(wp.from_torch(genes.contiguous()), SPACING, bank.heights)
     rows, cols = (slice(round(low / SPACING) - 1, round(high / SPACING) + 2) for low, high in (Y, X))
     return torch.nn.functional.avg_pool2d(wp.to_torch(bank.heights)[:, None, rows, cols], 3, stride=2)[:, 0]

@@ -21,7 +21,6 @@ from sim.spaces.elements import OnElements
 from sim.spaces.ground import OnGround
 
 _HEIGHT = PARAMETERS.index("w")
-_SIDED = [PARAMETERS.index(name) for name in ("mu_y", "theta")]  # their ranges are as wide to the left as to the right
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +79,6 @@ class SuperGaussian(TerrainSpace):
         """Genes with the height of every bump times ``scale``."""
         found = clipped(self.validate(genes))
         found[:, _HEIGHT::GENES_PER_BUMP] *= scale  # 0 is the height in the middle of its range
-        return found
-
-    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32]:
-        """Genes with every bump on the other side of the way, turned the other way."""
-        found = self.validate(genes).copy()
-        found.reshape(len(found), self.num_bumps, GENES_PER_BUMP)[:, :, _SIDED] *= -1.0
         return found
 
 

@@ -59,10 +59,8 @@ class Archive(Who, OnGround, Where):
     replicas: int | None = None
     """Episodes a terrain."""
     method: str | None = None
-    """Where terrains come from: cma_mae, cma_me, map_elites, surrogate, hard_random, uniform_random; several joined by
-    +."""
-    shares: str | None = None
-    """How emitters are shared between several methods: fixed, in turn; adaptive, by their success."""
+    """Where terrains come from: surrogate (the default), cma_mae (the paper's), cma_me, map_elites, hard_random,
+    uniform_random; several joined by +."""
     emitters: int | None = None
     """Emitters."""
     batch_size: int | None = None
@@ -78,9 +76,7 @@ class Archive(Who, OnGround, Where):
     es: str | None = None
     """Evolution strategy: cma_es or sep_cma_es."""
     crossover_share: float | None = None
-    """Share of the children of map_elites and surrogate that take parts, such as bumps, from a further elite; 0."""
-    mirror_share: float | None = None
-    """Share of these children that are mirrored left to right; 0."""
+    """Share of what a surrogate varies that takes parts, such as bumps, from a further elite; .3."""
     intervals: int | None = None
     """Intervals of each ratio."""
     without: tuple[str, ...] | None = None

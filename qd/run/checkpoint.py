@@ -33,7 +33,7 @@ _ADMITTED = {
     "ribs.emitters.opt._cma_es": ("CMAEvolutionStrategy", "DecompMatrix"),
     "ribs.emitters.opt._sep_cma_es": ("DiagonalMatrix", "SeparableCMAEvolutionStrategy"),
     "ribs.emitters.rankers": ("ImprovementRanker", "TwoStageImprovementRanker"),
-    "qd.scheduler": ("RandomEmitter", "SurrogateEmitter", "VariationEmitter"),
+    "qd.scheduler": ("RandomEmitter", "SurrogateEmitter"),
     "qd.surrogate": ("Surrogate",),
 }
 """Classes that a state may hold, by their modules."""

@@ -24,7 +24,6 @@ Settings = dict[str, Any]
 """The settings that make a run what it is, as JSON values."""
 
 METHODS = ("cma_mae", "cma_me", "map_elites", "surrogate", "hard_random", "uniform_random")
-SHARES = ("fixed", "adaptive")
 ES_KINDS = ("cma_es", "sep_cma_es")
 RESTART_RULES = ("basic", "no_improvement")
 _SHARE = {"least": 0.0, "most": 1.0}
@@ -35,15 +34,12 @@ _STEPS = {"least": 1e-6, "most": 1e3}  # what evolution strategies can reckon wi
 class SchedulerCfg:
     """How terrains are asked for."""
 
-    method: str = "cma_mae+map_elites"
-    """Where new terrains come from: `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
-    `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `surrogate`, elites varied likewise for some
-    generations that networks judge (after DSAGE, Bhatt et al. 2022); `hard_random`, the paper's, every height at its
-    limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn, and
-    where there are fewer emitters, the first methods count. docs/comparison.md compares them."""
-    shares: str = setting("fixed", one_of=SHARES)
-    """How emitters are shared between several methods: `fixed`, in turn; `adaptive`, there are as many of each method
-    as ask in all, and those ask whose terrains have become elites most often of late."""
+    method: str = "surrogate"
+    """Where new terrains come from: `surrogate`, elites varied by iso+line for some generations that networks judge
+    (after DSAGE, Bhatt et al. 2022); `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
+    `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `hard_random`, the paper's, every height at
+    its limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn,
+    and where there are fewer emitters, the first methods count. docs/search.md compares them."""
     emitters: int = setting(10, least=1)
     """Emitters that ask, each with an evolution strategy or a stream of its own."""
     batch_size: int = setting(20, least=2)
@@ -65,24 +61,17 @@ class SchedulerCfg:
     """Iso+line: standard deviation of each gene's own change (published: .01 of the genes' range)."""
     line_sigma: float = setting(0.2, least=0.0, most=_STEPS["most"])
     """Iso+line: standard deviation of the step along the line to another elite, in its length (published: .2)."""
-
-    crossover_share: float = setting(0.0, **_SHARE)
-    """Iso+line: share of the children that take each of their parts, such as bumps, from a further elite with a chance
-    of a half."""
-    mirror_share: float = setting(0.0, **_SHARE)
-    """Iso+line: share of the children that are mirrored left to right."""
+    crossover_share: float = setting(0.3, **_SHARE)
+    """Surrogate: share of the varied elites that take each of their parts, such as bumps, from a further elite with a
+    chance of a half; of no effect where a space has no parts."""
     candidates: int = setting(20, least=1, most=10_000)
     """Surrogate: terrains that the networks judge in each generation for one that robots cross."""
-    generations: int = setting(3, least=1, most=1_000)
+    generations: int = setting(10, least=1, most=1_000)
     """Surrogate: generations that the networks judge before robots cross the best."""
     explore_share: float = setting(0.25, **_SHARE)
     """Surrogate: share of its terrains that are elites varied once, whatever the networks say."""
     disagree_share: float = setting(0.1, **_SHARE)
     """Surrogate: share of its terrains that the networks disagree most about."""
-    gradient_share: float = setting(0.0, **_SHARE)
-    """Surrogate: share of the terrains that the networks judge that step along their gradients first."""
-    gradient_sigma: float = setting(0.05, least=0.0, most=_STEPS["most"])
-    """Surrogate: length of these steps, root mean square over the genes."""
     training_steps: int = setting(100, least=1, most=100_000)
     """Surrogate: steps of training an iteration, each on 64 terrains a network."""
 
@@ -92,8 +81,6 @@ class SchedulerCfg:
             raise ValueError(
                 f"method must be one of {', '.join(METHODS)}, or several joined by a plus, each once, got {self.method}"
             )
-        if self.shares == "adaptive" and len(self.methods) == 1:
-            raise ValueError(f"shares must be fixed where there is one method, got adaptive with {self.method}")
         if self.restart_rule not in RESTART_RULES and not (self.restart_rule.isdecimal() and int(self.restart_rule)):
             raise ValueError(
                 f"restart_rule must be a positive number of iterations or one of {', '.join(RESTART_RULES)}, "
@@ -204,10 +191,13 @@ def preset(name: str, robot: "RobotCfg", policy: str | None = None) -> SearchCfg
 
 
 _PRESETS: dict[str, dict[str, Any]] = {
-    "wide": {"iterations": 125, "replicas": 20, "scheduler": SchedulerCfg(emitters=80, groups=8)},
+    "wide": {"iterations": 125, "replicas": 20, "scheduler": SchedulerCfg(emitters=80, groups=8, training_steps=400)},
     "paper": {"iterations": 1000, "replicas": 20, "scheduler": SchedulerCfg()},
-    "small": {"iterations": 20, "replicas": 4, "scheduler": SchedulerCfg(emitters=4, batch_size=8, groups=2)},
-}
+    "small": {
+        "iterations": 20, "replicas": 4,
+        "scheduler": SchedulerCfg(emitters=4, batch_size=8, groups=2, generations=3),  # judging takes time on a CPU
+    },
+}  # fmt: skip
 
 
 def changed(cfg: SearchCfg, changes: dict[str, Any]) -> SearchCfg:
@@ -241,6 +231,15 @@ def _json_object(items: list[tuple[str, Any]]) -> Settings:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in items}
 
 
+_GONE = {"mirror_share": 0.0, "shares": "fixed", "gradient_share": 0.0, "gradient_sigma": 0.05}
+"""Settings that did not pay and are gone, with the values that changed nothing."""
+
+
+def still_there(values: Settings) -> Settings:
+    """How terrains are asked for, as JSON values, without settings that are gone and changed nothing."""
+    return {name: value for name, value in values.items() if name not in _GONE or value != _GONE[name]}
+
+
 def from_settings(settings: Settings, iterations: int) -> SearchCfg:
     """Settings as a run directory remembers them.
 
@@ -252,8 +251,9 @@ def from_settings(settings: Settings, iterations: int) -> SearchCfg:
         ValueError: If they are not the settings of a search.
     """
     try:
-        return built(SearchCfg, {**settings, "iterations": iterations}, "a search")
-    except (TypeError, ValueError) as error:
+        own = {"scheduler": still_there(settings["scheduler"]), "iterations": iterations}
+        return built(SearchCfg, {**settings, **own}, "a search")
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
 
 

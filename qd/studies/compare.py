@@ -89,11 +89,11 @@ class Compare(StudyFlags):
     times as many terrains in an iteration, and an eighth of the iterations.
     """
 
-    methods: tuple[str, ...] = tuple(name for name in METHODS if name not in (GATED, "surrogate"))
+    methods: tuple[str, ...] = tuple(name for name in METHODS if name != GATED)
     """Which methods: uniform_random, hard_random, map_elites, cma_me, cma_mae, cma_mae_sep, cma_mae_narrow (first step
-    size .5), mixed (cma_mae+map_elites), surrogate (elites varied as networks advise), gated (mixed, for failures that
-    others can cross); all but the last two. Settings of the search after a colon make another one of it:
-    cma_mae:restart-rule=20,learning-rate=0.3. Of NAME@1 only the first seed is run."""
+    size .5), mixed (cma_mae+map_elites), surrogate (elites varied as networks advise, the default of a search), gated
+    (mixed, for failures that others can cross); all but the last. Settings of the search after a colon make another one
+    of it: cma_mae:restart-rule=20,learning-rate=0.3. Of NAME@1 only the first seed is run."""
     certified_by: tuple[str, ...] = ()
     """Certifiers of the method gated, FILE or NAME=FILE. This method ends after as many episodes as the others. The
     certifiers' episodes count too, so it has fewer iterations."""

@@ -106,14 +106,6 @@ class TerrainSpace(Protocol):
         """
         return None
 
-    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32] | None:
-        """Genes of the same terrains with left and right exchanged, at y = 4 m; None where the space cannot.
-
-        Args:
-            genes: Shape (num_terrains, num_genes).
-        """
-        return None
-
     def describe(self, genes: ArrayLike) -> str:
         """A terrain in words, one part a line.
 

@@ -119,15 +119,6 @@ class OnGround(TerrainSpace):
         """Genes with heights scaled by the space; the ground stays as it is."""
         return self._with_heights(genes, lambda heights: self.inner.scaled(heights, scale))
 
-    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32] | None:
-        """Genes with heights and patches on the other side of the way."""
-        found = self._with_heights(genes, self.inner.mirrored)
-        if found is not None:
-            for kind in self.kinds:
-                own = found[:, self._columns(kind)].reshape(-1, ROWS, COLS)
-                found[:, self._columns(kind)] = own[:, ::-1].reshape(len(found), NUM_PATCHES)
-        return found
-
     def describe(self, genes: ArrayLike) -> str:
         """The terrain of the space in words, and of each map the patches on both sides of the way, a line each.
 

@@ -197,16 +197,6 @@ class OwnSpace(TerrainSpace):
             return None
         return self._rows("scaled", self._call("scaled", clipped(self.validate(genes)), scale))
 
-    def mirrored(self, genes: ArrayLike) -> NDArray[np.float32] | None:
-        """What the user's method makes of genes; None if there is none.
-
-        Raises:
-            ValueError: If it does not return genes.
-        """
-        if not hasattr(self._own, "mirrored"):
-            return None
-        return self._rows("mirrored", self._call("mirrored", clipped(self.validate(genes))))
-
     def _rows(self, method: str, found: Any) -> NDArray[np.float32]:
         try:
             return clipped(self.validate(found))
@@ -247,6 +237,5 @@ def load_own(spec: str) -> OwnSpace:
     terrains_of(np.concatenate([np.zeros((1, space.num_genes), np.float32), hard]), space)
     space.without(hard, range(len(space.parts(hard[0]))))
     space.scaled(hard, 0.5)
-    space.mirrored(hard)
     space.describe(hard[0])
     return space

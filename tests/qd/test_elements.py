@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from qd.archive import read_archive, write_archive
 from qd.causes import effects_of
@@ -15,7 +16,7 @@ from qd.show.elites import find_archive
 from qd.show.export import Export, export
 from qd.show.recordings import Recordings, on_heights
 from qd.show.view.meshes import terrain_mesh
-from qd.variation import check_variation, recombined
+from qd.variation import varied
 from sim.bank import terrains_of
 from sim.ground import GroundMaps
 from sim.maps.heightmap import read_heightmap
@@ -107,13 +108,13 @@ def test_effects_of_elements_are_their_heights_and_their_ground():
 
 def test_a_child_takes_an_element_with_its_ground():
     space = get_space(SPACE)
-    own, others = (space.uniform_random(50, seed) for seed in (0, 1))
-    found = recombined(own, others, 1.0, 0.0, space, np.random.default_rng(2)).reshape(50, 6, 8)
-    taken, kept = ((found == genes.reshape(50, 6, 8)).all(axis=2) for genes in (others, own))
-    assert (taken ^ kept).all() and 0.4 < taken.mean() < 0.6
-    check_variation(SchedulerCfg(crossover_share=0.5), space)
-    with pytest.raises(ValueError, match="cannot mirror its terrains"):
-        check_variation(SchedulerCfg(mirror_share=0.5), space)
+    pool = space.uniform_random(2, 0)
+    cfg = SchedulerCfg(crossover_share=1.0, iso_sigma=0.0, line_sigma=0.0)
+    draw = torch.Generator().manual_seed(0)
+    found = varied(torch.from_numpy(pool), 100, cfg, space.genes_per_part, draw).numpy().reshape(100, 6, 8)
+    first, second = ((found == genes.reshape(6, 8)).all(axis=2) for genes in pool)
+    assert (first ^ second).all()  # every element is one of the two, whole, with its ground
+    assert 0.4 < (first.any(axis=1) & second.any(axis=1)).mean() < 0.6  # an elite meets another half of the time
 
 
 def test_recordings_keep_strips_beside_patches(anymal, tmp_path):

@@ -1,20 +1,20 @@
 import numpy as np
 import pytest
-from ribs.emitters import EvolutionStrategyEmitter
+from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd import surrogate
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.settings import ES_KINDS, METHODS, SchedulerCfg
-from qd.scheduler import RandomEmitter, Scheduler, VariationEmitter
+from qd.scheduler import RandomEmitter, Scheduler
 from tests.qd import stand_in
 
 CELLS = Cells(6)
 FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
 JOINED = ("cma_me+cma_mae", "map_elites+hard_random", "surrogate+cma_mae")
 BRIEF = {"training_steps": 2, "candidates": 2, "generations": 2}  # networks learn little in it
-SMALL = SchedulerCfg(emitters=2, batch_size=6, restart_rule="4", **BRIEF)
+SMALL = SchedulerCfg(method="cma_mae+map_elites", emitters=2, batch_size=6, restart_rule="4", **BRIEF)
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +104,7 @@ def test_an_invalid_terrain_is_never_an_elite():
 
 
 def test_iterations_without_a_valid_terrain_are_survived():
-    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule="1"))
+    search = make_search(SchedulerCfg(method="cma_mae", emitters=2, batch_size=6, restart_rule="1"))
     for iteration in (1, 2):
         search.ask()
         search.tell(told([0] * 12, [FITNESS_FLOOR] * 12, invalid=[4] * 12), iteration)
@@ -126,10 +126,9 @@ def test_cell_of_an_elite_is_the_cell_of_its_ratios():
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"es": kind} for kind in ES_KINDS),
+        *({"es": kind, "method": "cma_mae+map_elites"} for kind in ES_KINDS),
         *({"method": name} for name in (*METHODS, *JOINED)),
-        {"method": "map_elites", "crossover_share": 0.5, "mirror_share": 0.2},
-        {"method": "cma_mae+map_elites+surrogate", "shares": "adaptive"},
+        {"method": "cma_mae+map_elites+surrogate"},
     ],
 )
 def test_a_saved_search_goes_on_bit_for_bit(changes, tmp_path):
@@ -211,55 +210,9 @@ def test_joined_methods_take_turns_each_judged_by_its_own_archive():
     assert search.archive is not search.result
 
 
-def test_of_emitters_shared_by_success_those_ask_that_find_elites():
-    search = make_search(SchedulerCfg(emitters=2, batch_size=6, method="cma_me+map_elites", shares="adaptive"))
-    strategies = search.emitters[::2]
-    assert [type(emitter) for emitter in search.emitters] == [EvolutionStrategyEmitter, VariationEmitter] * 2
-    told_so_far = []
-    for iteration in (1, 2, 3):  # at first everyone is tried, one of each method at a time
-        assert search.ask().shape == (12, 64)
-        elites = 6 if iteration == 1 else 0
-        search.tell(told(np.arange(12), [5.0] * elites + [FITNESS_FLOOR] * (12 - elites)), iteration)
-        told_so_far.append([emitter.itrs for emitter in strategies])
-    assert told_so_far == [[1, 0], [1, 1], [2, 1]]
-
-
-def test_a_saved_search_of_groups_shared_by_success_goes_on_with_what_was_asked(tmp_path):
-    cfg = SchedulerCfg(emitters=4, batch_size=3, groups=2, method="cma_mae+map_elites", shares="adaptive")
-
-    def go_on(search: Scheduler, first: int, last: int) -> None:
-        for step in range(first, last):  # one group is always under way
-            group = step % 2
-            genes = search.ask(group)
-            seeds = np.random.SeedSequence([0, step]).generate_state(len(genes))
-            search.ask(1 - group)
-            search.tell(evaluation_of(stand_in.evaluate(genes, seeds), CELLS, FITNESS), step // 2 + 1, group)
-
-    straight, cut = make_search(cfg), make_search(cfg)
-    go_on(straight, 0, 16)
-    go_on(cut, 0, 7)
-    save_checkpoint(tmp_path / "saved", cut.state())
-    cut = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
-    go_on(cut, 7, 16)
-    for name, rows in straight.elites().items():
-        assert np.array_equal(rows, cut.elites()[name]), name
-    assert np.array_equal(straight.ask(0), cut.ask(0)) and np.array_equal(straight.ask(1), cut.ask(1))
-
-
-def test_a_state_of_before_success_was_counted_goes_on():
-    straight, cut = make_search(), make_search()
-    advance(straight, 1, 3)
-    advance(cut, 1, 2)
-    state = cut.state()
-    del state["counts"], state["active"]
-    cut = Scheduler.from_state(state)
-    advance(cut, 3, 3)
-    assert np.array_equal(straight.ask(), cut.ask())
-
-
 def test_of_fewer_emitters_than_methods_the_first_ones_count():
     search = make_search(SchedulerCfg(emitters=1, batch_size=2, method="map_elites+cma_mae"))
-    assert [type(emitter) for emitter in search.emitters] == [VariationEmitter]
+    assert [type(emitter) for emitter in search.emitters] == [IsoLineEmitter]
     assert search.archive is search.result  # nobody goes by CMA-MAE's
 
 
@@ -275,15 +228,10 @@ def test_a_state_of_something_else_is_refused(state):
         ("emitters", 0), ("batch_size", 1), ("method", "cma_me+"), ("method", "cma_me+cma_me"),
         ("learning_rate", 1.5), ("sigma0", 0.0), ("es", "openai"),
         ("method", "ppo"), ("iso_sigma", -1.0), ("line_sigma", float("inf")),
-        ("crossover_share", 1.5), ("mirror_share", -0.1), ("disagree_share", 0.9), ("training_steps", 0),
-        ("shares", "equal"), ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
+        ("crossover_share", 1.5), ("disagree_share", 0.9), ("training_steps", 0),
+        ("restart_rule", "0"), ("restart_rule", "never"), ("sigma0", float("nan")),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(setting, value):
     with pytest.raises(ValueError, match=f"{setting} must"):
         SchedulerCfg(**{setting: value})
-
-
-def test_one_method_has_nothing_to_share():
-    with pytest.raises(ValueError, match="shares must be fixed where there is one method, got adaptive with cma_me"):
-        SchedulerCfg(method="cma_me", shares="adaptive")

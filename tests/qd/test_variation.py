@@ -1,59 +1,55 @@
 import numpy as np
 import pytest
+import torch
 
 from qd.run.settings import SchedulerCfg
-from qd.variation import check_variation, iso_line, recombined
-from sim import space
-from sim.space import SUPER_GAUSSIAN, load_space
-from sim.spaces.course import COURSE
-from tests.sim.spaces.spaces import write_ridges
+from qd.variation import varied
+from sim.space import SUPER_GAUSSIAN
 
-CHILDREN, OTHERS = (SUPER_GAUSSIAN.uniform_random(400, seed) for seed in (0, 1))
+PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))
+LINE = (PAIR[1] - PAIR[0]).numpy()
 
 
-def changed(crossover: float = 0.0, mirror: float = 0.0):
-    return recombined(CHILDREN, OTHERS, crossover, mirror, SUPER_GAUSSIAN, np.random.default_rng(2))
+def children(pool: torch.Tensor, count: int = 400, genes_per_part: int | None = 8, **steps: float) -> np.ndarray:
+    cfg = SchedulerCfg(**{"iso_sigma": 0.0, "line_sigma": 0.0, "crossover_share": 0.0, **steps})
+    return varied(pool, count, cfg, genes_per_part, torch.Generator().manual_seed(0)).numpy()
 
 
-def test_without_shares_children_stay_as_they_are():
-    assert np.array_equal(changed(), CHILDREN)
+def test_without_steps_and_crossover_children_are_elites():
+    found = children(PAIR)
+    assert all((row == PAIR.numpy()).all(axis=1).any() for row in found)
+    assert 0.4 < (found == PAIR[0].numpy()).all(axis=1).mean() < 0.6
 
 
-def test_a_child_takes_whole_bumps_half_of_them():
-    found, own, other = (genes.reshape(400, 8, 8) for genes in (changed(crossover=0.3), CHILDREN, OTHERS))
-    taken, kept = (found == other).all(axis=2), (found == own).all(axis=2)
-    assert (taken ^ kept).all()
-    crossed = taken.any(axis=1)
-    assert 0.25 < crossed.mean() < 0.35  # 0.3, of 400: a standard deviation of .023
-    assert 0.45 < taken[crossed].mean() < 0.55
+def test_of_a_share_of_the_children_half_of_the_bumps_are_another_elites():
+    found = children(PAIR, crossover_share=0.4).reshape(-1, 8, 8)
+    first, second = ((found == elite.reshape(8, 8).numpy()).all(axis=2) for elite in PAIR)
+    assert (first ^ second).all()
+    mixed = first.any(axis=1) & second.any(axis=1)
+    # 0.4 are crossed, half of them with the other of the two, which takes 1 to 7 bumps in 254 of 256 cases.
+    assert mixed.mean() == pytest.approx(0.4 * 0.5 * 254 / 256, abs=0.06)
+    assert 0.4 < first[mixed].mean() < 0.6
 
 
-def test_a_share_is_mirrored():
-    found = changed(mirror=0.5)
-    turned = (found == SUPER_GAUSSIAN.mirrored(CHILDREN)).all(axis=1)
-    assert 0.4 < turned.mean() < 0.6
-    assert np.array_equal(found[~turned], CHILDREN[~turned])
+def test_a_space_without_parts_has_no_crossover():
+    found = children(PAIR, crossover_share=1.0, genes_per_part=None)
+    assert all((row == PAIR.numpy()).all(axis=1).any() for row in found)
 
 
-def test_iso_line_without_steps_repeats_and_along_lines_stays_on_them():
-    def varied(**sigmas):
-        return iso_line(CHILDREN, OTHERS, SchedulerCfg(**sigmas), np.random.default_rng(3))
+def test_steps_along_lines_stay_on_them():
+    found = children(PAIR, line_sigma=0.1)
+    steps = np.stack([found - elite.numpy() for elite in PAIR])
+    nearest = np.abs(steps).sum(axis=2).argmin(axis=0)
+    step = steps[nearest, np.arange(len(found))]
+    share = (step @ LINE) / (LINE @ LINE)
+    np.testing.assert_allclose(step, share[:, None] * LINE, atol=1e-6)
+    moved = share[np.abs(share) > 1e-6]
+    assert 0.4 < len(moved) / len(found) < 0.6  # half of them meet the other elite
+    assert moved.std() == pytest.approx(0.1, rel=0.2)
 
-    assert np.array_equal(varied(iso_sigma=0.0, line_sigma=0.0), CHILDREN)
-    step, line = varied(iso_sigma=0.0, line_sigma=0.1) - CHILDREN, OTHERS - CHILDREN
-    inside = np.abs(CHILDREN + step) < 1.0
-    shares = np.where(inside, step / line, np.nan)
-    median = np.nanmedian(shares, axis=1)
-    assert 0.08 < median.std() < 0.12
-    assert np.nanmax(np.abs(step - median[:, None] * line)[inside]) < 1e-5
 
-
-def test_what_a_space_cannot_vary_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(space, "_named", [])
-    ridges = load_space(write_ridges(tmp_path))
-    with pytest.raises(ValueError, match=r"crossover_share must be 0, got 0.5: .*genes_per_part"):
-        check_variation(SchedulerCfg(crossover_share=0.5), ridges)
-    with pytest.raises(ValueError, match=r"mirror_share must be 0, got 0.5: the space course cannot mirror"):
-        check_variation(SchedulerCfg(mirror_share=0.5), COURSE)
-    check_variation(SchedulerCfg(crossover_share=0.5), COURSE)
-    check_variation(SchedulerCfg(crossover_share=0.5, mirror_share=0.5), SUPER_GAUSSIAN)
+def test_own_steps_are_of_every_gene_and_end_at_the_limits():
+    found = children(PAIR[:1], iso_sigma=0.02)
+    step = found - PAIR[0].numpy()
+    assert step.std() == pytest.approx(0.02, rel=0.05) and abs(step.mean()) < 1e-3
+    assert np.abs(children(PAIR, iso_sigma=5.0)).max() == 1.0

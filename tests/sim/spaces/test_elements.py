@@ -76,7 +76,6 @@ def test_scales_leave_the_ground():
     heights = genes.reshape(3, 6, 8)[..., :6].reshape(3, 36)
     np.testing.assert_array_equal(scaled, heights_of(COURSE.scaled(heights, 0.5), COURSE))
     np.testing.assert_array_equal(same.friction, ground.friction)
-    assert BOTH.mirrored(genes) is None
 
 
 def test_hard_random_ground_is_as_always_or_as_bad_as_can_be():
