@@ -34,7 +34,7 @@ CFG = SearchCfg(
     intervals=10,
     collision_bit=False,
     fitness=FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES),
-    scheduler=SchedulerCfg(emitters=2, batch_size=6, sigma0=0.5, restart_rule="3"),
+    scheduler=SchedulerCfg(method="cma_mae+map_elites", emitters=2, batch_size=6, sigma0=0.5, restart_rule="3"),
 )
 
 

@@ -26,7 +26,7 @@ CFG = EvaluatorCfg(
 SETTINGS = {
     "replicas": 2,
     "fitness": FitnessCfg(penalties=ROBOT.penalties, scales=(1.0, 2.0, 1.0, 300.0, 0.05, 0.3)),
-    "scheduler": SchedulerCfg(emitters=1, batch_size=4, sigma0=1.0),
+    "scheduler": SchedulerCfg(method="cma_mae", emitters=1, batch_size=4, sigma0=1.0),
 }
 
 
@@ -101,7 +101,7 @@ def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go(tmp_path, 
     if device != "cpu":
         pytest.skip("a GPU adds in any order")
     monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
-    scheduler = SchedulerCfg(emitters=3, batch_size=2, sigma0=1.0, groups=groups)
+    scheduler = SchedulerCfg(method="cma_mae+map_elites", emitters=3, batch_size=2, sigma0=1.0, groups=groups)
     settings = {**SETTINGS, "scheduler": scheduler, "replicas": 3, "reevaluate_every": 0}
 
     def searched(path, iterations, *, workers="1", resumes=False):

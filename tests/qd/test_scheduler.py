@@ -48,7 +48,7 @@ def told(cell, fitness, invalid=None) -> Evaluation:
 
 
 def test_asks_for_clipped_genes_of_every_emitter():
-    genes = make_search(SchedulerCfg(emitters=3, batch_size=5, sigma0=2.0)).ask()
+    genes = make_search(SchedulerCfg(method="cma_mae", emitters=3, batch_size=5, sigma0=2.0)).ask()
     assert genes.shape == (15, 64)
     assert genes.min() == -1.0
     assert genes.max() == 1.0

@@ -11,6 +11,7 @@ from qd.run import checkpoint
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.settings import SchedulerCfg
 from qd.scheduler import Scheduler
+from qd.surrogate import MOST
 from tests.qd.test_scheduler import advance, make_search
 
 
@@ -31,7 +32,7 @@ def saved(tmp_path):
 
 @pytest.mark.parametrize("es", ["cma_es", "sep_cma_es"])
 def test_round_trip(tmp_path, es):
-    search = make_search(SchedulerCfg(emitters=2, batch_size=6, es=es))
+    search = make_search(SchedulerCfg(method="cma_mae+map_elites", emitters=2, batch_size=6, es=es))
     advance(search, 1, 8)
     path = tmp_path / "checkpoint.bin"
     save_checkpoint(path, search.state())
@@ -41,13 +42,13 @@ def test_round_trip(tmp_path, es):
 
 
 def test_what_a_full_search_needs_fits(tmp_path):
-    cfg = SchedulerCfg()
-    search = make_search(cfg)
+    search = make_search(SchedulerCfg(method="cma_mae+surrogate"))
     rng = np.random.default_rng(0)
     archive_rows = {"solution": rng.normal(size=(4795, 64)), "objective": rng.normal(size=4795)}
     extra = {name: rng.random((4795, *shape)) for name, (shape, _) in _extra_fields(search).items()}
     for archive in (search.archive, search.result):
         archive.add(**archive_rows, measures=np.arange(4795)[:, None] + 0.5, **extra)
+    search.surrogate._remember(rng.uniform(-1.0, 1.0, (MOST, 64)), rng.normal(size=(MOST, 22)))
     save_checkpoint(tmp_path / "full.bin", search.state())
     assert (tmp_path / "full.bin").stat().st_size < 16 << 20
 

@@ -2,14 +2,26 @@
 
 import json
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from qd.run import settings
 from qd.run.directory import RunDirectory
 from qd.studies.ablation import Ablation, numbers_of
 from sim.files.command import Interrupted
 from tests.qd.stand_in import open_stand_in
+
+
+@pytest.fixture(autouse=True, scope="module")
+def plain_searches():
+    """The preset as it is, but for the networks of its method, which would learn longer than the stand-in takes."""
+    small = settings._PRESETS["small"]
+    plain = {**small, "scheduler": replace(small["scheduler"], method="cma_mae+map_elites")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(settings._PRESETS, "small", plain)
+        yield
 
 
 def config(folder, **changes) -> Ablation:
@@ -29,9 +41,9 @@ def test_both_searches_and_their_looks(finished):
     assert report == json.loads((folder / "both" / "ablation.json").read_text())
     assert (folder / "both" / "ablation.png").stat().st_size > 10_000
     assert report["iterations"] == [2, 4]
-    settings = {name: RunDirectory(folder / "both" / name).read_cfg() for name in ("alpha_1", "alpha_0")}
-    assert settings["alpha_1"].fitness.alpha == 1.0 and settings["alpha_0"].fitness.alpha == 0.0
-    for name in settings:
+    there = {name: RunDirectory(folder / "both" / name).read_cfg() for name in ("alpha_1", "alpha_0")}
+    assert there["alpha_1"].fitness.alpha == 1.0 and there["alpha_0"].fitness.alpha == 0.0
+    for name in there:
         rows = RunDirectory(folder / "both" / name).read_metrics()
         assert [rows[k]["mean_std"] for k in (1, 3)] == report["mean_std"][name]
         assert [rows[k]["elites"] for k in (1, 3)] == report["elites"][name]

@@ -163,7 +163,7 @@ def test_searches_of_other_widths_have_as_many_terrains_and_are_those_of_a_searc
     assert len(broad["curves"]["failing"][-1]["seeds"]) == 2
     asked = Archive(
         preset="small", device="cpu", policy=POLICY, iterations=1, seed=6, reevaluate_every=1, emitters=16, groups=4,
-        run_dir=Path("alone"),
+        method="cma_mae+map_elites", run_dir=Path("alone"),
     )  # fmt: skip
     alone, together = (
         vars(run_search(job_of(asked), open_evaluator=open_stand_in)),
