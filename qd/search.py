@@ -45,6 +45,8 @@ class Crossed(NamedTuple):
 
     result: "RolloutResult"
     evaluation: Evaluation
+    search_s: float = 0.0
+    """Time that the search took to learn of them and to ask again, without crossing anything [s]."""
 
 
 def search_terrains(
@@ -139,7 +141,7 @@ def crossed_iterations(
             waiting.append(group)
             while len(waiting) > (behind if group < groups[-1] else 0):
                 done = waiting.popleft()
-                _tell(searches, results[done], gate, iteration, done)
+                results[done] = _tell(searches, results[done], gate, iteration, done)
                 if ahead:
                     put(iteration + 1, done)
         under_way = len(groups) if ahead else 0
@@ -169,7 +171,7 @@ def _crossed(searches: "Sequence[tuple[SearchCfg, Scheduler]]", result: "Rollout
 def _joined(groups: Sequence[Crossed]) -> Crossed:
     """The groups of an iteration, one after the other."""
     evaluation = concatenated([one.evaluation for one in groups])
-    return Crossed(merged([one.result for one in groups], join=1), evaluation)
+    return Crossed(merged([one.result for one in groups], join=1), evaluation, sum(one.search_s for one in groups))
 
 
 def _ask_certifiers(
@@ -195,17 +197,20 @@ def _tell(
     gate: Gate | None,
     iteration: int,
     group: int,
-) -> None:
-    """Tells a group of emitters of each search what became of its terrains, and lets it ask again."""
-    counts, first = None if gate is None else gate.take(), 0
+) -> list[Crossed]:
+    """Tells a group of emitters of each search what became of its terrains, lets it ask again, and takes the time."""
+    counts, first, told = None if gate is None else gate.take(), 0, []
     for (cfg, search), one in zip(searches, crossed, strict=True):
         rates = None
         if cfg.certified_by and counts is not None:
             asked = one.evaluation.not_crossed
             last = first + int(asked.sum())
             rates, first = rates_of(asked, counts[first:last]), last
+        began = time.perf_counter()
         search.tell(one.evaluation, iteration, group, rates)
         search.ask(group)
+        told.append(one._replace(search_s=time.perf_counter() - began))
+    return told
 
 
 def looks_again(cfg: SearchCfg, iteration: int) -> bool:
@@ -222,7 +227,7 @@ def row_of(cfg: SearchCfg, found: Archive, crossed: Crossed, iteration: int) -> 
         crossed: The iteration's crossings.
         iteration: Number of the iteration, from 1.
     """
-    result, evaluation = crossed
+    result, evaluation = crossed.result, crossed.evaluation
     certified = {}
     if found.certificates is not None:
         asked = int(evaluation.not_crossed.sum()) * len(cfg.certified_by)
@@ -240,6 +245,7 @@ def row_of(cfg: SearchCfg, found: Archive, crossed: Crossed, iteration: int) -> 
         "robot_steps": int(result.robot_steps),
         "idle_share": result.idle_share,
         "rollout_s": float(result.wall_s),
+        "search_s": crossed.search_s,
         "mean_duration_s": float(result.duration_s.mean()),
     }
 

@@ -120,7 +120,7 @@ def _refuse_another_device(run: RunDirectory, flag: str, device_name: str) -> No
         )
 
 
-def wide_numbers(folder: Path, device_name: str) -> dict[str, float]:
+def wide_numbers(folder: Path, device_name: str) -> dict[str, float | None]:
     """What a search of preset wide takes, over all its iterations but the first two.
 
     Raises:
@@ -140,8 +140,15 @@ def wide_numbers(folder: Path, device_name: str) -> dict[str, float]:
         "iterations": len(metrics),
         "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
         "idle_share": waited / sum(row["robot_steps"] for row in metrics),
+        "search_share": search_share(metrics),
         "minutes_per_4m_episodes": _PAPER_EPISODES / (len(metrics) * cfg.episodes_per_iteration) * wall_s / 60,
     }
+
+
+def search_share(metrics: Metrics) -> float | None:
+    """Share of an iteration in which the search learns and asks, the median; None if a run of before did not say."""
+    shares = [row["search_s"] / row["wall_s"] for row in metrics if "search_s" in row]
+    return float(np.median(shares)) if shares else None
 
 
 def time_curve(evaluator: EvaluatorCfg, terrains: NDArray[Any], counts: tuple[int, ...]) -> list[dict[str, float]]:
@@ -242,6 +249,7 @@ def measure(args: Speed) -> dict[str, Any]:
         "num_envs": num_envs,
         "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
         "idle_share": float(np.median([row["idle_share"] for row in metrics])),
+        "search_share": search_share(metrics),
         "bare_physics_ratio": float(np.median(rates)) / bare.walking,
         "bare_physics_ratio_standing": float(np.median(rates)) / bare.standing,
         "world_steps_per_s": float(np.median(rates)),

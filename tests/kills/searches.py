@@ -22,10 +22,12 @@ from tests.qd.stand_in import open_stand_in
 POLICY = "tests.sim.policies:stand"
 SIZE = ["--emitters", "2", "--batch-size", "4", "--replicas", "2", "--seed", "5", "--restart-rule", "4"]
 SIZE += ["--intervals", "3"]  # few cells: a small checkpoint
+SIZE += ["--method", "cma_mae+map_elites"]  # networks of a surrogate would learn longer than the stand-in takes
 _TIMES = (
     "wall_s",
     "episodes_per_s",
     "rollout_s",
+    "search_s",
     "physics_steps",
     "robot_steps",
     "idle_share",

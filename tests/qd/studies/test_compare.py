@@ -72,7 +72,7 @@ def corrected_at(path: Path) -> list[int]:
 
 def rows_of(run: Path) -> list[dict]:
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [{name: value for name, value in row.items() if name not in ("wall_s", "episodes_per_s")} for row in rows]
+    return [{name: value for name, value in row.items() if name not in ("wall_s", "episodes_per_s", "search_s")} for row in rows]
 
 
 def runs_of(path: Path) -> list[str]:

@@ -9,7 +9,7 @@ from qd.run.directory import RunDirectory
 from qd.studies import scale
 from qd.studies import speed as speed_module
 from qd.studies.scale import Scale
-from qd.studies.speed import Speed, read_iterations, time_iterations, wide_numbers
+from qd.studies.speed import Speed, read_iterations, search_share, time_iterations, wide_numbers
 from tests.qd.searches import CFG, make_job, run
 from tests.qd.stand_in import open_stand_in
 
@@ -59,7 +59,8 @@ def test_a_wide_run_is_told_in_numbers(tmp_path):
         wide_numbers(tmp_path, "any")
     with pytest.raises(ValueError, match=r"--wide .* was made on NVIDIA H200"):
         wide_numbers(SHIPPED_RUN, "NVIDIA H100")
-    assert wide_numbers(SHIPPED_RUN, "NVIDIA H200")["iterations"] == 123
+    found = wide_numbers(SHIPPED_RUN, "NVIDIA H200")
+    assert found["iterations"] == 123 and found["search_share"] is None  # it was made before that was counted
 
 
 def test_a_search_is_timed_from_its_start(monkeypatch):
@@ -67,3 +68,5 @@ def test_a_search_is_timed_from_its_start(monkeypatch):
     cfg = replace(CFG, iterations=2)
     metrics, terrains = time_iterations(cfg, make_job(Path("unused")).evaluator)
     assert len(metrics) == 2 and len(terrains) == cfg.scheduler.num_terrains
+    shares = sorted(row["search_s"] / row["wall_s"] for row in metrics)
+    assert 0.0 < shares[0] and shares[1] < 1.0 and search_share(metrics) == sum(shares) / 2
