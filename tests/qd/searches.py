@@ -78,6 +78,10 @@ def found_and_fresh(folder: Path) -> Path:
     return folder
 
 
+TIMES = ("wall_s", "episodes_per_s", "search_s")
+"""What differs between two searches that are the same."""
+
+
 def rows_of(path: Path, *, timed: bool = False) -> list[dict]:
     rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
-    return [{k: v for k, v in row.items() if timed or k not in ("wall_s", "episodes_per_s", "search_s")} for row in rows]
+    return [{k: v for k, v in row.items() if timed or k not in TIMES} for row in rows]
