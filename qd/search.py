@@ -266,9 +266,6 @@ def begin(
         cfg: The search.
         device: Warp device of what it computes beside the simulation.
         loaded: One that goes on.
-
-    Raises:
-        ValueError: If elites are to be varied as the space cannot.
     """
     search, metrics = loaded or (_new(cfg), [])
     search.compute_on(device)

@@ -29,7 +29,7 @@ FEWEST = 64
 MOST = 50_000
 """Terrains that are learned from, the newest ones."""
 _AT_ONCE = {"cpu": 1024, "cuda": 8192}  # terrains that are judged at once
-_REMEMBERED = np.float16  # of what terrains and crossings differ by, far more digits than networks see
+_GENE_UNITS = 32767  # genes are remembered as whole numbers of 16 bits, which keep a course's kinds apart
 _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
 _LEAST_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
@@ -94,8 +94,8 @@ class Surrogate:
         self.cfg, self.cells, self.device = cfg, cells, "cpu"
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
-        self._genes = np.zeros((0, space.num_genes), _REMEMBERED)
-        self._targets = np.zeros((0, 3 * cells.num_ratios + 1 + _NUM_RATES), _REMEMBERED)
+        self._genes = np.zeros((0, space.num_genes), np.int16)
+        self._targets = np.zeros((0, 3 * cells.num_ratios + 1 + _NUM_RATES), np.float16)
         self._scale = np.stack([np.zeros(self._regressed), np.ones(self._regressed)]).astype(np.float32)
         self._make_networks()
         for weights in self._networks.parameters():
@@ -147,18 +147,22 @@ class Surrogate:
             self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
-        kept = genes.astype(_REMEMBERED)
+        kept = np.rint(genes * _GENE_UNITS).astype(np.int16)
         if self._maps is not None:
             self._maps = torch.cat([self._maps, self._mapped(kept)])[-MOST:]
         self._genes = np.concatenate([self._genes, kept])[-MOST:]
-        self._targets = np.concatenate([self._targets, targets.astype(_REMEMBERED)])[-MOST:]
+        self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-MOST:]
         numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed].astype(np.float32)
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
 
-    def _mapped(self, genes: NDArray[np.float16]) -> Tensor:
-        """Heights over their scale and ground, in half precision since there are many, shape (N, num_maps, *SHAPE)."""
-        parts = np.array_split(genes, max(1, -(-len(genes) // _AT_ONCE["cpu"])))
-        return torch.cat([self._some_mapped(torch.from_numpy(part).to(self.device).float()).half() for part in parts])
+    def _mapped(self, genes: NDArray[np.int16]) -> Tensor:
+        """Heights over their scale and ground, in half precision since there are many, shape (N, num_maps, *SHAPE).
+
+        Args:
+            genes: As they are remembered.
+        """
+        parts = torch.from_numpy(genes).to(self.device).split(_AT_ONCE["cpu"])
+        return torch.cat([self._some_mapped(part / _GENE_UNITS).half() for part in parts])
 
     def _some_mapped(self, genes: Tensor) -> Tensor:
         heights = corridor_heights(genes, self.space) / _HEIGHT_SCALE
@@ -198,8 +202,8 @@ class Surrogate:
         Args:
             genes: In [-1, 1], on the surrogate's device, shape (N, num_genes).
         """
-        at_once = _AT_ONCE["cuda" if genes.is_cuda else "cpu"]
-        columns = torch.cat([self._networks.judge(self._some_mapped(part)) for part in genes.split(at_once)])
+        parts = genes.split(_AT_ONCE[genes.device.type])
+        columns = torch.cat([self._networks.judge(self._some_mapped(part)) for part in parts])
         ratios, numbers, rates = self._split(columns.transpose(0, 1))
         middle, spread = torch.from_numpy(self._scale).to(self.device)
         return Prediction(ratios.softmax(-1), numbers.clamp(-10.0, 10.0) * spread + middle, rates)

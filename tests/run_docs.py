@@ -114,7 +114,7 @@ CHANGED: dict[str, dict[str, str | None]] = {
 }
 """What differs where a command has these words."""
 LEFT_OUT = {
-    "faultline compare --robot anymal$": "eight searches take long; the one that names its methods runs",
+    "faultline compare --robot anymal$": "nine searches take long; the one that names its methods runs",
     "faultline compare .* --certify": "searches and certifies for an hour; tests/qd/studies/test_compare.py runs it",
     "faultline harden .* --against": "trains and searches three times as much",
     "faultline compare .* emitters=80": "one of its iterations has more terrains than a small run of the others",

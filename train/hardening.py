@@ -17,7 +17,7 @@ from qd.fresh import Open
 from qd.run.arguments import Archive, job_of
 from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, RunDirectory, claimed
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
-from qd.run.settings import changed, differences, preset
+from qd.run.settings import SearchCfg, changed, differences, preset
 from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, resolve_device
 from sim.files.atomic import is_leftover, read_json
@@ -220,7 +220,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         settings={},
         open_evaluator=open_evaluator,
     )
-    found = replace(found, settings=_settings_of(found, search.preset, sizes, an_iteration))
+    found = replace(found, settings=_settings_of(found, search, sizes))
     for certifier in found.certifiers(str(policy)).values():
         check_policy(certifier, robot, device)
     _refuse_another(found)
@@ -240,9 +240,9 @@ def _with_known_comparisons(flags: Harden) -> Harden:
     return replace(flags, against=tuple(dict.fromkeys([*there, *flags.against])))
 
 
-def _settings_of(job: Hardening, size: str, sizes: dict[str, Any], an_iteration: int) -> dict[str, Any]:
-    flags = job.flags
-    searched = {"preset": size, **sizes, "episodes": an_iteration * job.search_iterations}
+def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> dict[str, Any]:
+    flags, episodes = job.flags, search.episodes_per_iteration * job.search_iterations
+    searched = {"preset": search.preset, "method": search.scheduler.method, **sizes, "episodes": episodes}
     draw = flags.draw or job.robot.tuning.draw
     return {
         **identity(job.robot, flags.policy or job.robot.policy_file),

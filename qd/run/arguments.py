@@ -38,9 +38,8 @@ if TYPE_CHECKING:
 class Archive(Who, OnGround, Where):
     """Search the terrains on which a controller fails, each in its own way.
 
-    Every iteration asks CMA-MAE and MAP-Elites for terrains, lets robots cross them, and files each terrain by the
-    proportions of what went wrong. State is saved after every iteration: stop with Ctrl-C whenever you like and go on
-    with --resume.
+    Every iteration lets robots cross the terrains that --method asks for, and files each terrain by the proportions of
+    what went wrong. State is saved after every iteration: stop with Ctrl-C whenever you like and go on with --resume.
     """
 
     preset: str | None = None
@@ -398,7 +397,7 @@ def _mention_unfinished(name: str, cfg: SearchCfg, args: Archive, robot: "RobotC
             there, done = run.read_cfg(), run.iterations_done()
         except (OSError, ValueError):
             continue
-        if done < there.iterations and as_settings(there) == as_settings(cfg):
+        if done < there.iterations and not differences(as_settings(there), as_settings(cfg)):
             state = f"stopped after {done} of {there.iterations} iterations"
             print(f"{path} holds the same search, {state}. Go on with:")
             print(f"  {_resume_command(robot, path, args, code_of(cfg))}")

@@ -37,12 +37,16 @@ _ADMITTED = {
     "qd.surrogate": ("Surrogate",),
 }
 """Classes that a state may hold, by their modules."""
+_FORMER = {("qd.scheduler", "VariationEmitter")}
+"""Classes of former versions, whose searches cannot go on."""
 
 
 class _StateUnpickler(pickle.Unpickler):
     """Builds plain values and the admitted classes."""
 
     def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in _FORMER:
+            raise pickle.UnpicklingError("it is of a former version, whose map_elites was another")
         if name not in _ADMITTED.get(module, ()):
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is no part of a search")
         return super().find_class(module, name)

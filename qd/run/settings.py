@@ -39,7 +39,7 @@ class SchedulerCfg:
     (after DSAGE, Bhatt et al. 2022); `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
     `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `hard_random`, the paper's, every height at
     its limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn,
-    and where there are fewer emitters, the first methods count. docs/search.md compares them."""
+    and where there are fewer emitters, the first methods count. docs/comparison.md compares them."""
     emitters: int = setting(10, least=1)
     """Emitters that ask, each with an evolution strategy or a stream of its own."""
     batch_size: int = setting(20, least=2)
@@ -235,8 +235,10 @@ _GONE = {"mirror_share": 0.0, "shares": "fixed", "gradient_share": 0.0, "gradien
 """Settings that did not pay and are gone, with the values that changed nothing."""
 
 
-def still_there(values: Settings) -> Settings:
+def still_there(values: Any) -> Any:
     """How terrains are asked for, as JSON values, without settings that are gone and changed nothing."""
+    if not isinstance(values, dict):
+        return values  # which is refused later
     return {name: value for name, value in values.items() if name not in _GONE or value != _GONE[name]}
 
 
@@ -251,16 +253,23 @@ def from_settings(settings: Settings, iterations: int) -> SearchCfg:
         ValueError: If they are not the settings of a search.
     """
     try:
-        own = {"scheduler": still_there(settings["scheduler"]), "iterations": iterations}
+        own = {"scheduler": still_there(settings.get("scheduler")), "iterations": iterations}
         return built(SearchCfg, {**settings, **own}, "a search")
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
 
 
+_OF_SURROGATE = {
+    "crossover_share", "candidates", "generations", "explore_share", "disagree_share", "training_steps",
+}  # fmt: skip
+"""Settings of no effect where no method of a search is ``surrogate``."""
+
+
 def differences(there: Settings, wanted: Settings, prefix: str = "") -> list[str]:
-    """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
+    """Settings that differ and have an effect, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
     found = []
-    for key in sorted(there.keys() | wanted.keys()):
+    unused = set() if any("surrogate" in own.get("method", "surrogate") for own in (there, wanted)) else _OF_SURROGATE
+    for key in sorted((there.keys() | wanted.keys()) - unused):
         a, b = there.get(key), wanted.get(key)
         if isinstance(a, dict) and isinstance(b, dict):
             found += differences(a, b, f"{prefix}{key}.")

@@ -26,8 +26,7 @@ class OwnSpace(TerrainSpace):
         spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
         own: What is found there. It has ``num_genes`` and ``rasterise(genes, x, y)``, and may have ``hard_random(count,
             rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``, ``scaled(genes,
-            scale)``, ``mirrored(genes)``, ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``, and
-            ``sigma0``.
+            scale)``, ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``, and ``sigma0``.
 
     Raises:
         ValueError: If it lacks something, or what it has is not as it must be.

@@ -130,6 +130,7 @@ def test_rounds_from_end_to_end(places, stubbed, capsys):
     records = [read_json(places / "run" / f"tune-{number}" / "policy.train.json") for number in (1, 2)]
     assert [len(record["archives"]) for record in records] == [1, 2]
     assert content["settings"]["search"]["episodes"] == 24  # 20 are rounded up
+    assert content["settings"]["search"]["method"] == "surrogate"
     for key in ("command", "commit", "device", "versions", "seed", "date", "robot_sha256"):
         assert key in content, key
     said = capsys.readouterr().out

@@ -90,17 +90,43 @@ def test_differences_name_every_key():
     assert differences(there, there) == []
 
 
+def test_settings_of_a_surrogate_make_no_difference_to_other_methods():
+    former = {"scheduler": {"method": "cma_mae+map_elites", "generations": 3, "crossover_share": 0.0, "sigma0": 2.0}}
+    now = {"scheduler": {"method": "cma_mae+map_elites", "generations": 10, "crossover_share": 0.3, "sigma0": 2.0}}
+    assert differences(former, now) == []
+    for run in (former, now):
+        run["scheduler"]["method"] = "surrogate+cma_mae"
+    assert len(differences(former, now)) == 2
+
+
 def test_long_values_are_shortened():
     (line,) = differences({"sha": "a" * 64}, {"sha": "b" * 64})
     assert line == f'sha ("{"a" * 36}... there, "{"b" * 36}... wanted)'
 
 
 @pytest.mark.parametrize(
-    "bad", [{}, {"fitness": {}, "scheduler": {}}, {"fitness": {"penalties": [], "scales": []}, "scheduler": {}}]
+    ("bad", "what"),
+    [
+        ({}, "scheduler must be an object, got None"),
+        ({"scheduler": "wide"}, "scheduler must be an object, got 'wide'"),
+        ({"fitness": {}, "scheduler": {}}, "penalties"),
+        ({"fitness": {"penalties": [], "scales": []}, "scheduler": {}}, ""),
+    ],
 )
-def test_settings_of_something_else(bad):
-    with pytest.raises(ValueError, match="settings must be those of a search of this version"):
+def test_settings_of_something_else(bad, what):
+    with pytest.raises(ValueError, match=f"settings must be those of a search of this version, but: .*{what}"):
         from_settings(bad, 1)
+
+
+def test_settings_that_are_gone_are_read_where_they_changed_nothing():
+    settings = as_settings(preset("wide", robot()))
+    gone = {"mirror_share": 0.0, "shares": "fixed"}
+    former = {**settings, "scheduler": {**settings["scheduler"], **gone}}
+    assert as_settings(from_settings(former, 7)) == settings
+    for name, value in (("mirror_share", 0.3), ("shares", "adaptive")):
+        former["scheduler"] = {**settings["scheduler"], **gone, name: value}
+        with pytest.raises(ValueError, match=f"has no setting {name}$"):
+            from_settings(former, 7)
 
 
 def test_the_controllers_file_is_part_of_the_settings(tmp_path):
