@@ -16,7 +16,7 @@ from qd.fresh import Open, Reevaluate, reevaluate_run
 from qd.run.arguments import NOT_ON_RAY, certifier_settings, check_certifiers
 from qd.run.directory import Metrics, RunDirectory, episodes_in
 from qd.run.judge import Certify, Confirm, certifiers_of, certify_run, confirm_run
-from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, measured_now, preset
+from qd.run.settings import SchedulerCfg, SearchCfg, as_settings, changed, differences, measured_now, preset
 from qd.studies.study import StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, parse_workers, resolve_device
 from qd.workers.kept_open import kept_open
@@ -60,7 +60,7 @@ LABELS = {
 """Name, colour and line of each method in the figure."""
 _OTHER_LOOKS = [
     (color, style)
-    for style in ((0, (6, 2, 1, 2)), (0, (1, 3)))
+    for style in ((0, (6, 2, 1, 2)), (0, (1, 3)), "-", "--")
     for color in ("#332288", "#aa4499", "#117733", "#ddaa33")
 ]
 CURVES = ("qd_score", "reachable_coverage", "elites", "mean_fitness")
@@ -214,7 +214,7 @@ class Compare(StudyFlags):
             )
         if gated and parse_workers(self.workers).on_ray:
             raise ValueError(f"methods: {NOT_ON_RAY}, got --workers {self.workers}")
-        names: dict[SearchCfg, str] = {}
+        found: dict[str, SearchCfg] = {}
         for name in asked:
             if not _NAME.fullmatch(name):
                 raise ValueError(
@@ -223,10 +223,11 @@ class Compare(StudyFlags):
             cfg = _resized(changed(shared, changes_of(name)), shared, name)
             if name in gated:
                 cfg = replace(cfg, **certifier_settings(certifiers), certify_episodes=self.certify_episodes)
-            if cfg in names:
-                raise ValueError(f"methods: {names[cfg]} and {name} are the same search: leave one of them out")
-            names[cfg] = name
-        return {name: cfg for cfg, name in names.items()}
+            for other, there in found.items():
+                if there.iterations == cfg.iterations and not differences(as_settings(there), as_settings(cfg)):
+                    raise ValueError(f"methods: {other} and {name} are the same search: leave one of them out")
+            found[name] = cfg
+        return found
 
     def _asked(self) -> dict[str, int]:
         """How many seeds of each method.
@@ -380,7 +381,9 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
     """
     from sim.files.figures import new_figure
 
-    figure, seeds = new_figure(12.0, 4.6), len(report["seeds"])
+    columns = 2 if any(len(name) > 30 for name in report["methods"]) else 4  # names with settings are long
+    legend_rows = -(-len(report["methods"]) // columns)
+    figure, seeds = new_figure(12.0, 4.4 + 0.2 * legend_rows), len(report["seeds"])
     most = max(method["episodes"] for method in report["methods"].values())
     figure.suptitle(
         f"{report['robot']}: {most:,.0f} episodes a run, "
@@ -413,7 +416,7 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
-    figure.legend(list(lines.values()), list(lines), loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(list(lines.values()), list(lines), loc="outside lower center", ncols=columns, frameon=False)
     return figure
 
 

@@ -314,6 +314,7 @@ def test_numbers_go_where_they_are_asked_for():
         ({"methods": (f"cma_mae:sigma0=1.{200 * '0'}",)}, "a name must be up to 200 letters"),
         ({"methods": ("mixed:method=../../x",)}, "a name must be up to 200 letters"),
         ({"methods": ("cma_mae", "cma_mae_sep:es=cma_es")}, "cma_mae and cma_mae_sep:es=cma_es are the same search"),
+        ({"methods": ("map_elites", "map_elites:generations=5")}, "map_elites:generations=5 are the same search"),
         (
             {"methods": ("cma_mae", "cma_mae:emitters=8")},
             "iterations of cma_mae:emitters=8 must make up the 96 terrains of the others, got 64 terrains an iteration",
