@@ -147,7 +147,7 @@ class Surrogate:
             self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
-        kept = np.rint(genes * _GENE_UNITS).astype(np.int16)
+        kept = _in_units(genes)
         if self._maps is not None:
             self._maps = torch.cat([self._maps, self._mapped(kept)])[-MOST:]
         self._genes = np.concatenate([self._genes, kept])[-MOST:]
@@ -248,7 +248,7 @@ class Surrogate:
         if not len(expected):
             return best
         found = self.predict(expected)
-        cells = self._cells(found.ratios.mean(0), _most(found.collided))
+        cells = self._expected_cells(found)
         inside = cells >= 0
         return best.scatter_reduce(0, cells[inside], found.fitness.mean(0)[inside], "amax")
 
@@ -272,7 +272,7 @@ class Surrogate:
             genes[own] = self._varied(torch.cat([elites, genes[kept]]), each, draw)
             found = self.predict(genes[own])
             gain[own], spread[own] = self._gain(found, best), found.ratios.std(0, correction=0).sum(1)
-            cells[own] = self._cells(found.ratios.mean(0), _most(found.collided))
+            cells[own] = self._expected_cells(found)
             rows = torch.cat([kept, torch.arange(first, first + each, device=genes.device)])
             kept = rows[_best_of_each(cells[rows], gain[rows], self.cells.num_cells)]
         chosen = kept[: wanted - min(wanted, round(self.cfg.disagree_share * count))]
@@ -285,6 +285,10 @@ class Surrogate:
         cells = self._cells(found.ratios, found.collided)
         gains = (found.fitness - best[cells]).clamp_min(0.0)
         return torch.where(cells >= 0, gains, 0.0).mean(0)
+
+    def _expected_cells(self, found: Prediction) -> Tensor:
+        """Cell of each terrain by the networks' mean, and by most of them whether robots collide, shape (N,)."""
+        return self._cells(found.ratios.mean(0), found.collided.float().mean(0) >= 0.5)
 
     def _cells(self, ratios: Tensor, collided: Tensor) -> Tensor:
         """Cell of each row of ratios, as :meth:`Cells.cell_of` has it; -1 of one on the edge of what can be reached."""
@@ -325,6 +329,8 @@ class Surrogate:
         self.cells = Cells(num_ratios, intervals, collision_bit=collision_bit)
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets, self._scale = (state[k] for k in ("rng", "genes", "targets", "scale"))
+        if self._genes.dtype != np.int16:  # of before they were kept so
+            self._genes = _in_units(self._genes)
         self._make_networks()
         learned = [{name: torch.from_numpy(value).clone() for name, value in one.items()} for one in state["learned"]]
         values, weights = [one.pop("weights") for one in learned], list(self._networks.parameters())
@@ -333,6 +339,10 @@ class Surrogate:
         for own, value in zip(weights, values, strict=True):
             own.data.copy_(value)
         self._training = Training(self._networks, self._loss, self.device, learned)
+
+
+def _in_units(genes: NDArray[np.float32]) -> NDArray[np.int16]:
+    return np.rint(genes * _GENE_UNITS).astype(np.int16)
 
 
 def _targets_of(evaluation: Evaluation, fitness: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -356,7 +366,3 @@ def _best_of_each(cells: Tensor, gain: Tensor, num_cells: int) -> Tensor:
     ranks = torch.arange(len(order), device=order.device)
     first = ranks.new_full((num_cells,), len(order)).scatter_reduce(0, cells[order], ranks, "amin")
     return order[first[cells[order]] == ranks]
-
-
-def _most(flags: Tensor) -> Tensor:
-    return flags.float().mean(0) >= 0.5

@@ -117,7 +117,9 @@ class OnGround(TerrainSpace):
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
         """Genes with heights scaled by the space; the ground stays as it is."""
-        return self._with_heights(genes, lambda heights: self.inner.scaled(heights, scale))
+        found, first = clipped(self.validate(genes)), self.inner.num_genes
+        heights = self.inner.scaled(found[:, :first], scale)
+        return None if heights is None else np.concatenate([heights, found[:, first:]], axis=1)
 
     def describe(self, genes: ArrayLike) -> str:
         """The terrain of the space in words, and of each map the patches on both sides of the way, a line each.
@@ -148,11 +150,6 @@ class OnGround(TerrainSpace):
     def _values(self, row: NDArray[np.float32], kind: str) -> NDArray[np.float64]:
         """Frictions, or time constants [s], of one terrain, shape (32,)."""
         return values_of(kind, row[self._columns(kind)])
-
-    def _with_heights(self, genes: ArrayLike, change: Any) -> NDArray[np.float32] | None:
-        found, first = clipped(self.validate(genes)), self.inner.num_genes
-        heights = change(found[:, :first])
-        return None if heights is None else np.concatenate([heights, found[:, first:]], axis=1)
 
 
 def decode(kind: str, genes: Any, ground_out: Ground) -> None:

@@ -17,21 +17,14 @@ from qd.show import figures
 from sim.files.atomic import write_atomically
 from sim.files.command import run_command
 from tests.kills.steps import Steps
+from tests.qd.searches import TIMES
 from tests.qd.stand_in import open_stand_in
 
 POLICY = "tests.sim.policies:stand"
 SIZE = ["--emitters", "2", "--batch-size", "4", "--replicas", "2", "--seed", "5", "--restart-rule", "4"]
 SIZE += ["--intervals", "3"]  # few cells: a small checkpoint
 SIZE += ["--method", "cma_mae+map_elites"]  # networks of a surrogate would learn longer than the stand-in takes
-_TIMES = (
-    "wall_s",
-    "episodes_per_s",
-    "rollout_s",
-    "search_s",
-    "physics_steps",
-    "robot_steps",
-    "idle_share",
-)  # of this machine and session
+_TIMES = (*TIMES, "rollout_s", "physics_steps", "robot_steps", "idle_share")  # of this machine and session
 
 
 def arguments(path: Path, iterations: int, *, policy: str = POLICY) -> list[str]:

@@ -213,6 +213,12 @@ def test_one_that_was_saved_when_there_were_more_settings_is_read():
     assert search.cfg == CFG
 
 
+def test_genes_that_were_saved_as_floats_are_the_same_terrains(learned):
+    state, search = learned.__getstate__(), make_surrogate()
+    search.__setstate__({**state, "genes": (state["genes"] / 32767).astype(np.float32)})
+    assert search._genes.dtype == np.int16 and np.array_equal(search._genes, learned._genes)
+
+
 def test_networks_of_another_shape_are_refused_when_loaded():
     state = make_surrogate().__getstate__()
     state["learned"][0]["weights"] = state["learned"][0]["weights"][:1]

@@ -19,7 +19,7 @@ from sim.files.command import Interrupted
 from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
 from tests.qd.run.test_arguments import fine_policy
-from tests.qd.searches import TIMES
+from tests.qd.searches import rows_of
 from tests.qd.stand_in import open_stand_in
 
 POLICY = "shipped"
@@ -69,11 +69,6 @@ def corrected_at(path: Path) -> list[int]:
     return sorted(
         set.intersection(*(set(method["curves"]["corrected_at"]) for method in numbers_of(path)["methods"].values()))
     )
-
-
-def rows_of(run: Path) -> list[dict]:
-    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [{name: value for name, value in row.items() if name not in TIMES} for row in rows]
 
 
 def runs_of(path: Path) -> list[str]:
