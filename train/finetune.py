@@ -60,14 +60,14 @@ class Finetune(OnGround, TrainingFlags):
     """Whether elites are held out for the evaluation. A specialist, which is to certify, may train on all."""
     draw: Draw | None = None
     """How elites are drawn at each exchange. uniform: all alike. failing: rather those that were seldom crossed.
-    learnable: rather those that were crossed about half of the time, so that harder ones come later. If left out:
-    uniform, of Cassie learnable."""
+    learnable: rather those that were crossed about half of the time, so that harder ones come later; so if
+    left out."""
     task: Literal["crossing", "commands"] = "crossing"
     """What robots are told. crossing: to cross the terrain, as in a search. commands: random velocities, as in the
     base's training."""
     start_spread: float | None = setting(None, least=0.0, most=MOST_SPREAD)
     """Robots start up to so far along the way, drawn uniformly [m]. The goal stays where it is. Only for task crossing.
-    So robots also learn what lies behind a hard beginning. If left out: 0, of Cassie 8."""
+    So robots also learn what lies behind a hard beginning. If left out: 8."""
     rewards: RewardCfg
     """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel
     (Cassie: 4). The rewards of an evaluation keep the robot's own."""

@@ -243,13 +243,13 @@ def _with_known_comparisons(flags: Harden) -> Harden:
 def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> dict[str, Any]:
     flags, episodes = job.flags, search.episodes_per_iteration * job.search_iterations
     searched = {"preset": search.preset, "method": search.scheduler.method, **sizes, "episodes": episodes}
-    draw = flags.draw or job.robot.tuning.draw
+    recipe = {**vars(job.robot.tuning), **({"draw": flags.draw} if flags.draw else {})}
     return {
         **identity(job.robot, flags.policy or job.robot.policy_file),
         "seed": flags.seed,
         "space": job.space.name,
         "search": searched,
-        "tune": {"iterations": job.tune_iterations, "draw": draw, "shares": flags.shares},
+        "tune": {"iterations": job.tune_iterations, "shares": flags.shares, **recipe},
         "evaluation": {"terrains": job.evaluator.num_terrains, "episodes": job.evaluator.num_replicas},
     }
 

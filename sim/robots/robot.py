@@ -262,7 +262,7 @@ ROBOTS = {
             start_joint_range=0.2,
         ),
         learning=LearningCfg(num_envs=2048, iterations=3400, init_noise_std=0.5, desired_kl=0.02, entropy=0.005),
-        tuning=TuningCfg(tracking_lin_vel=4.0, draw="learnable", start_spread=8.0),
+        tuning=TuningCfg(tracking_lin_vel=4.0),
     ),
 }
 

@@ -89,7 +89,7 @@ class TuningCfg:
     """Weight of :attr:`RewardCfg.termination` in place of the robot's own."""
     tracking_lin_vel: float = 2.0
     """Weight of :attr:`RewardCfg.tracking_lin_vel` in place of the robot's own."""
-    draw: Draw = "uniform"
+    draw: Draw = "learnable"
     """How elites are drawn."""
-    start_spread: float = setting(0.0, least=0.0, most=MOST_SPREAD)
+    start_spread: float = setting(8.0, least=0.0, most=MOST_SPREAD)
     """Robots start up to so far along the way [m]."""

@@ -71,7 +71,7 @@ def test_a_run_leaves_a_controller_and_its_record(places, finished):
     for key in ("command", "commit", "device", "versions", "seed", "date", "wall_s", "settings", "pieces"):
         assert key in record, key
     settings = record["settings"]
-    assert settings["mix"] == {"mix": "generated", "terrains": 4, "swap_every": 2, "draw": "uniform"}
+    assert settings["mix"] == {"mix": "generated", "terrains": 4, "swap_every": 2, "draw": "learnable"}
     assert (settings["archive"]["elites"], settings["archive"]["trained_on"]) == (10, 7)
     assert settings["archive"]["validation"] == 1
     assert settings["ppo"]["hidden_dims"] == [16, 8] and settings["task"]["crosses"]
@@ -456,13 +456,13 @@ def test_what_is_left_out_is_the_robots_own_recipe(places, monkeypatch):
         settings = job_of(config(places, run_dir=places / "none", **changes)).settings
         return settings["mix"]["draw"], settings["task"]["start_spread"]
 
-    assert recipe() == ("uniform", 0.0)
-    own = replace(ROBOT, tuning=TuningCfg(draw="learnable", start_spread=8.0))
-    monkeypatch.setattr(tuning, "get_robot", lambda spec: own)
     assert recipe() == ("learnable", 8.0)
+    own = replace(ROBOT, tuning=TuningCfg(draw="failing", start_spread=2.0))
+    monkeypatch.setattr(tuning, "get_robot", lambda spec: own)
+    assert recipe() == ("failing", 2.0)
     assert recipe(draw="uniform", start_spread=0.0) == ("uniform", 0.0)
-    assert recipe(mix="hard-random", archive=()) == ("uniform", 8.0)
-    assert recipe(task="commands") == ("learnable", 0.0)
+    assert recipe(mix="hard-random", archive=()) == ("uniform", 2.0)
+    assert recipe(task="commands") == ("failing", 0.0)
 
 
 def test_a_specialist_trains_on_what_nobody_crosses_from_along_the_way_and_goes_on(places, judged, capsys):
@@ -481,10 +481,11 @@ def test_a_specialist_trains_on_what_nobody_crosses_from_along_the_way_and_goes_
 
 def test_a_run_of_before_starts_were_spread_goes_on(places, finished):
     saved = read_saved(finished, ROBOT, "finetune")
-    settings = saved["extra"]["settings"]
+    settings = job_of(config(places, start_spread=0.0)).settings
     older = {**settings, "task": {key: value for key, value in settings["task"].items() if key != "start_spread"}}
     old = {**saved, "extra": {**saved["extra"], "settings": older}}
     assert check_resumed(config(places), old, settings) == []
+    assert Finetune.begun(ROBOT, older)["start_spread"] == 0.0
 
 
 def test_a_run_of_before_there_was_a_validation_part_goes_on_with_its_elites(places, monkeypatch):
