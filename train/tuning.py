@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,7 +63,7 @@ class TuningJob(Job):
     @property
     def trained_on(self) -> list[str]:
         """Marks of all elites that the controller has been trained on in the end (:func:`marks_of`)."""
-        return sorted({*marks_of(self.mix.genes), *self.settings.get("trained_before", [])})
+        return sorted({*chain(*map(marks_of, self.mix.genes)), *self.settings.get("trained_before", [])})
 
 
 class FineTuning(Training):
@@ -122,7 +123,7 @@ class FineTuning(Training):
             robot=self.job.robot.spec,
             policies=[f"base={settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
             archive=newest,
-            space=to_be_named(self.mix.space.name),
+            space=to_be_named(self.mix.spaces[-1].name),
             split_seed=(settings["split_seed"] or None) if newest else None,
         )
 
@@ -167,7 +168,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         "split_seed": flags.split_seed,
         "critic_iterations": alone,
         **({"trained_before": before} if before else {}),
-        **_named(elites.space, saved),
+        **_named(elites.spaces, saved),
     }
     if saved is not None:
         _refuse_changes(flags, saved, settings)
@@ -177,7 +178,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
         start=start,
         mix=Mix(
-            cfg=mix_cfg, genes=elites.genes, space=elites.space, weights=elites.weights, crosses=crosses,
+            cfg=mix_cfg, genes=elites.genes, spaces=elites.spaces, weights=elites.weights, crosses=crosses,
             seed=flags.seed, device=device, goal_rate=elites.goal_rate if draw == "learnable" else None,
         ),
     )  # fmt: skip
@@ -206,9 +207,10 @@ def paper_sizes(robot: str) -> dict[str, int]:
 class _Elites(NamedTuple):
     """Elites to train on."""
 
-    genes: np.ndarray
-    """Shape (E, num_genes)."""
-    space: TerrainSpace
+    genes: tuple[np.ndarray, ...]
+    """A part of each archive, shape (E, genes of its space); E sums up over the parts."""
+    spaces: tuple[TerrainSpace, ...]
+    """Of each part; without elites one, that of hard-random terrains."""
     weights: np.ndarray | None = None
     """How likely each is drawn, shape (E,); all alike if None."""
     goal_rate: np.ndarray | None = None
@@ -226,7 +228,7 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
     """The elites that a command line asks to train on.
 
     Raises:
-        ValueError: If there are none, or archives are of different terrain spaces.
+        ValueError: If there are none, or the ground of two archives cannot be in one training.
     """
     if flags.mix != "generated":
         if flags.archive:
@@ -234,15 +236,13 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
         if flags.only != "all" or not flags.held_out:
             raise ValueError(f"mix {flags.mix} has no elites: leave --only and --no-held-out out, or use mix generated")
         space = load_space(on_ground(flags.space, flags.ground) or SUPER_GAUSSIAN.name)
-        return _Elites(np.zeros((0, space.num_genes), np.float32), space)
+        return _Elites((np.zeros((0, space.num_genes), np.float32),), (space,))
     if flags.ground is not None:
         raise ValueError("mix generated takes the ground of its archives, got --ground: leave it out")
     paths = flags.archive or (_usual_archive(flags, robot),)
     archives = [_read_archive(flags, robot, path) for path in paths]
-    spaces = {(one.space, one.space_sha256): path for one, path in zip(archives, paths, strict=True)}
-    if len(spaces) > 1:
-        told = ", ".join(f"{path} of {name}" for (name, _), path in spaces.items())
-        raise ValueError(f"all archives must be of one terrain space, got {told}: leave those of another out")
+    spaces = tuple(map(space_of, archives))
+    _check_grounds(paths, spaces)
     splits = [
         split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path, keep_validation=keep_validation)
         for one, path in zip(archives, paths, strict=True)
@@ -261,14 +261,30 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
     # The defaults are not named, so that a run of before there were others goes on.
     chosen = {"only": flags.only} if flags.only != "all" else {}
     chosen |= {} if flags.held_out else {"held_out": False}
+    chosen |= {"space": [space.name for space in spaces]} if len({space.name for space in spaces}) > 1 else {}
     equal = len(parts) > 1 and flags.shares == "equal"
     return _Elites(
-        genes=np.concatenate(parts),
-        space=space_of(archives[0]),
+        genes=tuple(parts),
+        spaces=spaces,
         weights=np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts]) if equal else None,
         goal_rate=np.concatenate(rates),
         about=(about[0] if len(about) == 1 else {key: [one[key] for one in about] for key in about[0]}) | chosen,
     )
+
+
+def _check_grounds(paths: Sequence[Path], spaces: Sequence[TerrainSpace]) -> None:
+    """Refuses archives whose maps of the ground have different rows and columns: a training has one shape of maps.
+
+    Raises:
+        ValueError: If there are such.
+    """
+    shapes = {space.ground_shape: f"{path} of {space.name}" for path, space in zip(paths, spaces, strict=True)}
+    told = [of for shape, of in shapes.items() if shape is not None]
+    if len(told) > 1:
+        raise ValueError(
+            f"the ground of all archives must differ by patch or by element, got both: {', '.join(told)}: leave out "
+            "those of one kind"
+        )
 
 
 def _rows_to_train_on(
@@ -346,9 +362,13 @@ def chosen_elites(archive: Archive, only: str, path: Path) -> np.ndarray:
     return archive.certified if only == "certified" else archive.failing & ~archive.certified
 
 
-def _named(space: TerrainSpace, saved: dict[str, Any] | None) -> dict[str, Any]:
-    """What settings say of a terrain space; a run of a user's own goes on with the name that it began with."""
-    if space is SUPER_GAUSSIAN:  # the only one at first, which no settings name
+def _named(spaces: Sequence[TerrainSpace], saved: dict[str, Any] | None) -> dict[str, Any]:
+    """What settings say of a terrain space; a run of a user's own goes on with the name that it began with.
+
+    Several spaces are named beside their archives.
+    """
+    space, *others = {space.name: space for space in spaces}.values()
+    if others or space is SUPER_GAUSSIAN:  # the only one at first, which no settings name
         return {}
     there = {} if saved is None else saved["extra"]["settings"]
     moved = space.sha256 is not None and there.get("space_sha256") == space.sha256
@@ -370,7 +390,7 @@ def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, 
 
     The robot was compared when the checkpoint was read; an older one names no hash of it.
     """
-    free = ("iterations ", "archive.path ", "robot_sha256 ")
+    free = ("iterations ", "archive.path ", "archive.space ", "robot_sha256 ")
     different = [line for line in check_resumed(flags, saved, settings) if not line.startswith(free)]
     if different:
         raise ValueError(

@@ -238,7 +238,7 @@ def test_several_archives_are_trained_on_together(places):
     both = (places / "one.npz", places / "two.npz")
     job = job_of(config(places, archive=both, run_dir=places / "none"))
     # Of 10 and 30 elites 2 and 6 are in the test, 1 and 2 for validation.
-    assert len(job.mix.genes) == 7 + 22
+    assert [len(part) for part in job.mix.genes] == [7, 22]
     assert (job.mix.weights[:7].sum(), job.mix.weights[7:].sum()) == pytest.approx((1.0, 1.0))
     drawn = np.concatenate([rows_of_swap(job.mix, k) for k in range(400)])
     assert 0.4 < (drawn < 7).mean() < 0.6  # in equal shares, though the second has three times as many
@@ -257,11 +257,33 @@ def test_what_one_archive_holds_out_is_not_trained_on_from_another(places):
     assert not set(marks_of(held_out)) & set(job.trained_on)
 
 
-def test_archives_of_two_terrain_spaces_are_refused(places):
-    courses = np.zeros((10, spaces.COURSE.num_genes), np.float32)
-    write_archive(places / "course.npz", replace(make_archive(10), space="course", genes=courses))
-    both = (places / "archive" / "archive.npz", places / "course.npz")
-    with pytest.raises(ValueError, match=r"all archives must be of one terrain space, got .*of course"):
+def write_courses(path, ground: str = "") -> None:
+    space = spaces.get_space(f"course{ground}")
+    write_archive(path, replace(make_archive(10), space=space.name, genes=space.hard_random(10, 3)))
+
+
+def test_archives_of_two_terrain_spaces_are_trained_on_together(places):
+    write_courses(places / "course.npz")
+    both, run = (places / "archive" / "archive.npz", places / "course.npz"), places / "two-spaces"
+    assert finetune(config(places, archive=both, run_dir=run, iterations=1)) == 0
+    job = job_of(resumed(run, iterations=2))
+    assert [(space.name, len(part)) for space, part in zip(job.mix.spaces, job.mix.genes, strict=True)] == [
+        ("super_gaussian", 7),
+        ("course", 7),
+    ]
+    assert job.settings["archive"]["space"] == ["super_gaussian", "course"] and "space" not in job.settings
+    assert len(job.trained_on) == 14 and job.flags.archive == both
+    assert finetune(resumed(run, iterations=2)) == 0
+    alone = job_of(config(places, archive=both[1:], run_dir=places / "none"))
+    assert alone.settings["space"] == "course" and "space" not in alone.settings["archive"]
+
+
+def test_archives_whose_ground_has_maps_of_two_shapes_are_refused(places):
+    names = [f"course{ground}" for ground in ("+friction", "+element-friction")]
+    for name in names:
+        write_courses(places / f"{name}.npz", name.removeprefix("course"))
+    both = tuple(places / f"{name}.npz" for name in names)
+    with pytest.raises(ValueError, match=r"ground of all archives must differ by patch or by element, got both: .*"):
         job_of(config(places, archive=both, run_dir=places / "none"))
 
 
@@ -425,15 +447,15 @@ def test_which_elites_are_trained_on(places, judged):
     kinds = {"all": range(10), "failing": range(8), "certified": range(3), "uncertified": range(3, 8)}
     for only, expected in kinds.items():
         job = job_of(config(places, archive=(path,), only=only, held_out=False, run_dir=places / "none"))
-        rows = [int(np.flatnonzero((archive.genes == genes).all(axis=1))[0]) for genes in job.mix.genes]
+        rows = [int(np.flatnonzero((archive.genes == genes).all(axis=1))[0]) for genes in job.mix.genes[0]]
         assert sorted(rows) == list(expected), only
         held = job_of(config(places, archive=(path,), only=only, run_dir=places / "none"))
-        kept = {genes.tobytes() for genes in held.mix.genes}
+        kept = {genes.tobytes() for genes in held.mix.genes[0]}
         train = {archive.genes[row].tobytes() for row in split_elites(archive, "anymal").train}
-        assert kept == train & {genes.tobytes() for genes in job.mix.genes}
+        assert kept == train & {genes.tobytes() for genes in job.mix.genes[0]}
     assert job.settings["archive"]["only"] == "uncertified" and job.settings["archive"]["held_out"] is False
     learnable = job_of(config(places, archive=(path,), only="failing", draw="learnable", run_dir=places / "none"))
-    assert learnable.mix.success().tolist() == [0.1] * len(learnable.mix.genes)
+    assert learnable.mix.success().tolist() == [0.1] * learnable.mix.num_elites
 
 
 def test_all_elites_are_more_than_both_parts_of_a_split(places, monkeypatch):
@@ -443,7 +465,7 @@ def test_all_elites_are_more_than_both_parts_of_a_split(places, monkeypatch):
     archive = make_archive(10)
     write_archive(places / "ten.npz", archive)
     own = {"archive": (places / "ten.npz",), "run_dir": places / "none"}
-    marks = {held: marks_of(job_of(config(places, held_out=held, **own)).mix.genes) for held in (True, False)}
+    marks = {held: marks_of(job_of(config(places, held_out=held, **own)).mix.genes[0]) for held in (True, False)}
     assert len(marks[True]) == 4 and sorted(marks[False]) == sorted(marks_of(archive.genes))
 
 
@@ -511,6 +533,6 @@ def test_a_training_in_a_space_of_ones_own_goes_on_only_with_it(places, tmp_path
         job_of(resumed(tmp_path / "run", iterations=2))
     there = move(ridges, tmp_path / "elsewhere")
     job = job_of(resumed(tmp_path / "run", iterations=2, space=there))
-    assert job.mix.space.name == there and job.settings["space"] == ridges
+    assert job.mix.spaces[0].name == there and job.settings["space"] == ridges
     with pytest.raises(ValueError, match=r"begun with other settings .*space"):
         job_of(resumed(tmp_path / "run", iterations=2, space="course"))

@@ -66,14 +66,15 @@ class Mix:
     """
 
     cfg: MixCfg
-    genes: NDArray[np.float32]
-    """Elites to train on, shape (E, 64); none except with mix generated."""
+    genes: tuple[NDArray[np.float32], ...]
+    """Elites to train on, a part of each archive, shape (E, genes of its space); E sums up over the parts. None except
+    with mix generated."""
     crosses: bool
     """Whether robots cross; else they are told velocities in the middle."""
     seed: int
     device: str
-    space: TerrainSpace = SUPER_GAUSSIAN
-    """What the genes mean."""
+    spaces: tuple[TerrainSpace, ...] = (SUPER_GAUSSIAN,)
+    """What the genes of each part mean; the first is that of hard-random terrains."""
     goal_rate: NDArray[np.float64] | None = None
     """Goal rate of each elite as its archive has it, shape (E,), which stands in until it is trained on; None: 0."""
     weights: NDArray[np.float64] | None = None
@@ -88,11 +89,16 @@ class Mix:
     """How many of them reached the goal; where robots do not cross, the end of the time."""
 
     def __post_init__(self) -> None:
-        if self.cfg.mix == "generated" and len(self.genes) == 0:
+        if self.cfg.mix == "generated" and self.num_elites == 0:
             raise ValueError("mix generated needs elites to train on, got none: give an archive that has some")
-        self.episodes = np.zeros(len(self.genes), np.int64)
-        self.crossed = np.zeros(len(self.genes), np.int64)
-        self._before_resume = np.zeros((2, len(self.genes)), np.int64)
+        self.episodes = np.zeros(self.num_elites, np.int64)
+        self.crossed = np.zeros(self.num_elites, np.int64)
+        self._before_resume = np.zeros((2, self.num_elites), np.int64)
+
+    @property
+    def num_elites(self) -> int:
+        """E."""
+        return sum(map(len, self.genes))
 
     def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
         """The terrains of the next exchange.
@@ -112,8 +118,10 @@ class Mix:
         heights, types = self._hand_crafted(rng)
         if self.cfg.mix != "hand-crafted":
             count = self.cfg.terrains - self.cfg.hand_crafted
-            genes = self.genes[self.rows] if self.cfg.mix == "generated" else self.space.hard_random(count, rng)
-            others, ground = terrains_of(genes, self.space, device=self.device)
+            if self.cfg.mix == "generated":
+                others, ground = self._elites()
+            else:
+                others, ground = terrains_of(self.spaces[0].hard_random(count, rng), self.spaces[0], device=self.device)
             heights = np.concatenate([heights, others])
             types += (self.cfg.mix,) * count
             if ground is not None:
@@ -139,7 +147,7 @@ class Mix:
         Raises:
             ValueError: If the state is none of this mix.
         """
-        count = len(self.genes)
+        count = self.num_elites
         expected = self.cfg.terrains - self.cfg.hand_crafted if self.cfg.mix == "generated" else 0
         of_elites = ("episodes", "crossed", "present_episodes", "present_crossed")
         whole = {key: np.asarray(state.get(key, ()), np.int64) for key in ("rows", *of_elites)}
@@ -158,6 +166,22 @@ class Mix:
         """Share of the episodes on each elite that crossed it, shape (E,); without any what its archive says, or 0."""
         before = 0.0 if self.goal_rate is None else self.goal_rate
         return np.where(self.episodes > 0, self.crossed / np.maximum(self.episodes, 1), before)
+
+    def _elites(self) -> tuple[NDArray[np.float32], GroundMaps | None]:
+        """Heights of the present elites, shape (rows, NUM_ROWS, NUM_COLS), and their ground if any space has maps."""
+        heights = np.empty((len(self.rows), NUM_ROWS, NUM_COLS), np.float32)
+        shape = next((space.ground_shape for space in self.spaces if space.ground_shape is not None), None)
+        ground = None if shape is None else GroundMaps.plain(len(self.rows), shape)
+        first = 0
+        for genes, space in zip(self.genes, self.spaces, strict=True):
+            (there,) = np.nonzero((first <= self.rows) & (self.rows < first + len(genes)))
+            if len(there):
+                own = genes[self.rows[there] - first]
+                heights[there], maps = terrains_of(own, space, device=self.device)
+                if ground is not None and maps is not None:
+                    ground.friction[there], ground.time_constant_s[there] = maps.friction, maps.time_constant_s
+            first += len(genes)
+        return heights, ground
 
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([_MIX_KEY, self.seed, self.swap, stream])
@@ -182,7 +206,7 @@ class Mix:
         """Elites of the next exchange: none twice, unless there are too few."""
         if self.cfg.mix != "generated":
             return np.zeros(0, np.int64)
-        rng, count, wanted = self._rng(1), len(self.genes), self.cfg.terrains - self.cfg.hand_crafted
+        rng, count, wanted = self._rng(1), self.num_elites, self.cfg.terrains - self.cfg.hand_crafted
         whole = np.tile(np.arange(count), wanted // count)
         rate = self.success()
         preferred = {
@@ -211,5 +235,5 @@ class Mix:
             rows = self.rows[terrain[on_elite] - self.cfg.hand_crafted]
             valid = counts["episodes"] - counts["invalid"]
             for sums, part in zip(present, (valid, counts["goal" if self.crosses else "time_out"]), strict=True):
-                sums += np.bincount(rows, part[on_elite], len(self.genes)).astype(np.int64)
+                sums += np.bincount(rows, part[on_elite], self.num_elites).astype(np.int64)
         return present

@@ -15,7 +15,7 @@ ELITES = SUPER_GAUSSIAN.hard_random(7, 0)
 def make_mix(*, elites=ELITES, crosses=True, seed=0, **changes) -> Mix:
     cfg = MixCfg(**{"terrains": 6, "swap_every": 2, **changes})
     genes = elites if cfg.mix == "generated" else np.zeros((0, 64), np.float32)
-    return Mix(cfg=cfg, genes=genes, crosses=crosses, seed=seed, device="cpu")
+    return Mix(cfg=cfg, genes=(genes,), crosses=crosses, seed=seed, device="cpu")
 
 
 def heights_of(genes):
@@ -36,7 +36,7 @@ def counts(goals, episodes, time_outs=None, invalid=None):
 
 def test_hard_random_terrains_are_of_the_space():
     cfg = MixCfg(terrains=6, swap_every=2, mix="hard-random")
-    mix = Mix(cfg=cfg, genes=np.zeros((0, 36), np.float32), space=COURSE, crosses=True, seed=0, device="cpu")
+    mix = Mix(cfg=cfg, genes=(), spaces=(COURSE,), crosses=True, seed=0, device="cpu")
     own = mix.next().heights[3:]
     assert not own[:, :, :81].any() and np.abs(own).max() > 0.1  # flat up to x = 4 m
     assert (np.ptp(own[:, :, 240:], axis=(1, 2)) == 0).all()
@@ -203,7 +203,7 @@ def test_elites_bring_their_ground():
     space = get_space("super_gaussian+friction")
     genes = space.hard_random(4, 1)
     mix = Mix(
-        cfg=MixCfg(terrains=4, swap_every=2), genes=genes, space=space, crosses=True, seed=0, device="cpu"
+        cfg=MixCfg(terrains=4, swap_every=2), genes=(genes,), spaces=(space,), crosses=True, seed=0, device="cpu"
     )  # fmt: skip
     tiles = mix.next()
     assert tiles.ground is not None and (tiles.ground.friction[:2] == 1.0).all()
@@ -215,9 +215,41 @@ def test_elites_bring_the_ground_of_their_elements():
     space = get_space("course+element-friction")
     genes = space.hard_random(4, 1)
     cfg = MixCfg(terrains=4, swap_every=2)
-    mix = Mix(cfg=cfg, genes=genes, space=space, crosses=True, seed=0, device="cpu")
+    mix = Mix(cfg=cfg, genes=(genes,), spaces=(space,), crosses=True, seed=0, device="cpu")
     tiles = mix.next()
     assert tiles.ground is not None and tiles.ground.shape == (1, 320) and (tiles.ground.friction[:2] == 1.0).all()
     own = terrains_of(genes[mix.rows], space)[1]
     assert own is not None and (own.friction < 1.0).any()
     np.testing.assert_array_equal(tiles.ground.friction[2:], own.friction)
+
+
+def test_elites_of_several_spaces_are_drawn_together_each_with_its_own_ground():
+    parts = {"super_gaussian+friction": 3, "course": 4, "course+softness": 2}
+    spaces = tuple(map(get_space, parts))
+    genes = tuple(space.hard_random(count, 1) for space, count in zip(spaces, parts.values(), strict=True))
+    mix = Mix(
+        cfg=MixCfg(terrains=18, swap_every=2), genes=genes, spaces=spaces, crosses=True, seed=0, device="cpu"
+    )  # fmt: skip
+    tiles = mix.next()
+    assert mix.num_elites == 9 and sorted(mix.rows) == list(range(9)) and tiles.ground is not None
+    whole = [terrains_of(part, space) for part, space in zip(genes, spaces, strict=True)]
+    of_course = np.concatenate([heights for heights, _ in whole])[mix.rows]
+    np.testing.assert_array_equal(tiles.heights[9:], of_course)
+    slips, sinks = (tiles.ground.friction[9:] < 1).any((1, 2)), (tiles.ground.time_constant_s[9:] > 0).any((1, 2))
+    np.testing.assert_array_equal(slips, mix.rows < 3)
+    np.testing.assert_array_equal(sinks, mix.rows >= 7)
+    np.testing.assert_array_equal(tiles.ground.friction[9:][slips], whole[0][1].friction[mix.rows[slips]])
+    nothing = dict.fromkeys(("goal", "episodes", "invalid"), np.zeros(18, np.float32))
+    rested = mix.restore(mix.state(nothing))
+    np.testing.assert_array_equal(rested.heights, tiles.heights)
+    assert rested.ground is not None
+
+
+def test_a_part_that_is_not_drawn_still_leaves_maps_of_the_ground():
+    spaces = (SUPER_GAUSSIAN, get_space("course+friction"))
+    mix = Mix(
+        cfg=MixCfg(terrains=4, swap_every=2), genes=(ELITES, np.zeros((0, 68), np.float32)), spaces=spaces,
+        crosses=True, seed=0, device="cpu",
+    )  # fmt: skip
+    ground = mix.next().ground
+    assert ground is not None and (ground.friction == 1.0).all()
