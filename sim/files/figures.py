@@ -19,7 +19,11 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 def as_png(figure: "Figure") -> bytes:
-    """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold."""
+    """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold.
+
+    One of lines alone has 256 colours, which takes a quarter of the room. In a map they would show as contours.
+    """
+    from matplotlib.image import AxesImage
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
@@ -28,6 +32,15 @@ def as_png(figure: "Figure") -> bytes:
         text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or hold bytes that are no text
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
+    return buffer.getvalue() if figure.findobj(AxesImage) else _in_few_colours(buffer)
+
+
+def _in_few_colours(png: io.BytesIO) -> bytes:
+    from PIL import Image
+
+    image, buffer = Image.open(png).convert("RGB"), io.BytesIO()
+    few = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    few.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 

@@ -1,8 +1,27 @@
-"""Lengths of error bars."""
+"""Figures as PNG, and lengths of error bars."""
+
+import io
 
 import numpy as np
+import pytest
+from PIL import Image
 
-from sim.files.figures import bar_lengths
+from sim.files.figures import as_png, bar_lengths, new_figure
+
+
+@pytest.mark.parametrize("is_map", [False, True])
+def test_lines_have_few_colours_and_maps_all(is_map):
+    figure = new_figure(3.0, 2.0)
+    axes = figure.subplots()
+    heights = np.random.default_rng(0).random((20, 20))
+    if is_map:
+        axes.imshow(heights)
+    else:
+        axes.plot(heights, color="tab:orange", alpha=0.5)
+    image = Image.open(io.BytesIO(as_png(figure)))
+    assert image.size == (450, 300) and image.convert("RGB").getpixel((1, 1)) == (255, 255, 255)
+    colours = image.convert("RGB").getcolors(10**6)
+    assert colours is not None and (len(colours) <= 256) != is_map
 
 
 def test_bars_reach_from_the_value_to_its_limits():
