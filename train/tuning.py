@@ -14,7 +14,15 @@ from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, recorded_space, to_be_named
+from sim.space import (
+    SUPER_GAUSSIAN,
+    TerrainSpace,
+    load_space,
+    on_ground,
+    recorded_identity,
+    recorded_space,
+    to_be_named,
+)
 from train.evaluate.sets import (
     TRAINED_ON,
     EliteSplit,
@@ -114,16 +122,16 @@ class FineTuning(Training):
         Of one that was trained on all elites, none held out: the command that lets it certify.
         """
         settings = self.job.settings
-        newest = (archive_paths(settings) or [None])[-1]
+        newest, space = (archive_paths(settings) or [None])[-1], to_be_named(self.mix.spaces[-1].name)
         if newest is not None and not settings["archive"].get("held_out", True):
             by, run = f"S={self.job.run_dir / POLICY}", directory_of(Path(newest))
-            return command_line("certify", robot=self.job.robot.spec, run=run, by=[by])
+            return command_line("certify", robot=self.job.robot.spec, run=run, space=space, by=[by])
         return command_line(
             "evaluate",
             robot=self.job.robot.spec,
             policies=[f"base={settings['policy']}", f"tuned={self.job.run_dir / POLICY}"],
             archive=newest,
-            space=to_be_named(self.mix.spaces[-1].name),
+            space=space,
             split_seed=(settings["split_seed"] or None) if newest else None,
         )
 
@@ -178,7 +186,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
         run_dir=prepare_run_dir(flags, f"{robot.name}-{flags.mix}"),
         start=start,
         mix=Mix(
-            cfg=mix_cfg, genes=elites.genes, spaces=elites.spaces, weights=elites.weights, crosses=crosses,
+            cfg=mix_cfg, genes=elites.genes, spaces=elites.spaces, equal=flags.shares == "equal", crosses=crosses,
             seed=flags.seed, device=device, goal_rate=elites.goal_rate if draw == "learnable" else None,
         ),
     )  # fmt: skip
@@ -211,8 +219,6 @@ class _Elites(NamedTuple):
     """A part of each archive, shape (E, genes of its space); E sums up over the parts."""
     spaces: tuple[TerrainSpace, ...]
     """Of each part; without elites one, that of hard-random terrains."""
-    weights: np.ndarray | None = None
-    """How likely each is drawn, shape (E,); all alike if None."""
     goal_rate: np.ndarray | None = None
     """Of each, as its archive has it, shape (E,)."""
     about: dict[str, Any] | None = None
@@ -261,12 +267,11 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
     # The defaults are not named, so that a run of before there were others goes on.
     chosen = {"only": flags.only} if flags.only != "all" else {}
     chosen |= {} if flags.held_out else {"held_out": False}
-    chosen |= {"space": [space.name for space in spaces]} if len({space.name for space in spaces}) > 1 else {}
-    equal = len(parts) > 1 and flags.shares == "equal"
+    identities = [recorded_identity(one.space, one.space_sha256) for one in archives]
+    chosen |= {"space": identities} if len(set(identities)) > 1 else {}
     return _Elites(
         genes=tuple(parts),
         spaces=spaces,
-        weights=np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts]) if equal else None,
         goal_rate=np.concatenate(rates),
         about=(about[0] if len(about) == 1 else {key: [one[key] for one in about] for key in about[0]}) | chosen,
     )
@@ -390,7 +395,7 @@ def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, 
 
     The robot was compared when the checkpoint was read; an older one names no hash of it.
     """
-    free = ("iterations ", "archive.path ", "archive.space ", "robot_sha256 ")
+    free = ("iterations ", "archive.path ", "robot_sha256 ")
     different = [line for line in check_resumed(flags, saved, settings) if not line.startswith(free)]
     if different:
         raise ValueError(

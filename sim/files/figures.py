@@ -38,9 +38,9 @@ def as_png(figure: "Figure") -> bytes:
 def _in_few_colours(png: io.BytesIO) -> bytes:
     from PIL import Image
 
-    image, buffer = Image.open(png).convert("RGB"), io.BytesIO()
-    few = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    few.save(buffer, "PNG", optimize=True)
+    image, buffer = Image.open(png), io.BytesIO()
+    few = image.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    few.save(buffer, "PNG", optimize=True, dpi=image.info["dpi"])
     return buffer.getvalue()
 
 

@@ -19,6 +19,7 @@ from sim.policy.spec import is_same
 from sim.robots.identity import check_robot, robot_digest
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
+from sim.space import to_be_named
 from train.evaluate.sets import TRAINED_ON
 from train.ppo.cfg import PpoCfg, TrainingFlags, ppo_problems
 from train.ppo.learner import Learner, Ranks, check_entries, read_checkpoint
@@ -308,7 +309,8 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
         OSError: If a file cannot be written.
     """
     run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
-    again = {"resume": run_dir, "export": job.flags.export, "overwrite": job.flags.overwrite}
+    own = {"space": to_be_named(space)} if (space := getattr(job.flags, "space", None)) else {}
+    again = {"resume": run_dir, **own, "export": job.flags.export, "overwrite": job.flags.overwrite}
     go_on = f"Go on with: {command_line(job.flags.command, robot=job.robot.spec, **again)}"
     busy = f"another training works in {run_dir}: let it end, or name another --run-dir"
     with StopRequest() as stop, locked(run_dir, busy):

@@ -61,8 +61,8 @@ class MixCfg:
 class Mix:
     """Draws the terrains of each exchange, and remembers how often each elite was crossed when it was last trained on.
 
-    What is drawn follows from the seed, the number of the exchange and, for ``failing``, what was crossed before: a
-    resumed training goes on with the same terrains.
+    What is drawn follows from the seed, the number of the exchange and, for ``failing`` and ``learnable``, what was
+    crossed before, all of which a checkpoint keeps: a resumed training goes on with the same terrains.
     """
 
     cfg: MixCfg
@@ -77,8 +77,8 @@ class Mix:
     """What the genes of each part mean; the first is that of hard-random terrains."""
     goal_rate: NDArray[np.float64] | None = None
     """Goal rate of each elite as its archive has it, shape (E,), which stands in until it is trained on; None: 0."""
-    weights: NDArray[np.float64] | None = None
-    """How likely each elite is drawn beside the others, shape (E,), before ``draw`` is; all alike if None."""
+    equal: bool = True
+    """Whether a draw takes as much of each part as of the others, as far as it has so many; else each elite counts."""
     swap: int = -1
     """Number of the present exchange, from 0."""
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -134,6 +134,7 @@ class Mix:
         present = self._present(counts)
         return {
             "swap": self.swap,
+            "goal_rate": None if self.goal_rate is None else self.goal_rate.tolist(),
             "rows": self.rows.tolist(),
             "episodes": self.episodes.tolist(),
             "crossed": self.crossed.tolist(),
@@ -157,6 +158,11 @@ class Mix:
             raise ValueError(f"the terrains of the checkpoint are not those of a mix of {count} elites")
         if state["swap"] < 0 or (len(rows) and not 0 <= rows.min() <= rows.max() < count):
             raise ValueError(f"the terrains of the checkpoint name elites beyond the {count} there are")
+        rate = state.get("goal_rate")  # none in older ones: that of the archive, which may have changed
+        if rate is not None:
+            if np.shape(rate) != (count,):
+                raise ValueError(f"the terrains of the checkpoint have {np.shape(rate)} goal rates, expected {count}")
+            self.goal_rate = np.asarray(rate, np.float64)
         self.swap, self.rows = state["swap"], rows
         self.episodes, self.crossed = whole["episodes"], whole["crossed"]
         self._before_resume = np.stack([whole["present_episodes"], whole["present_crossed"]])
@@ -214,9 +220,14 @@ class Mix:
             "failing": 1.0 - rate + _LEAST_WEIGHT,
             "learnable": 4.0 * rate * (1.0 - rate) + _LEAST_WEIGHT,
         }[self.cfg.draw]
-        weights = preferred if self.weights is None else preferred * self.weights
+        weights = self._in_equal_shares(preferred) if self.equal and len(self.genes) > 1 else preferred
         rest = rng.choice(count, size=wanted - len(whole), replace=False, p=weights / weights.sum())
         return np.concatenate([whole, rest])
+
+    def _in_equal_shares(self, preferred: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same with a sum of 1 in each part that has elites, shape (E,)."""
+        parts = np.split(preferred, np.cumsum([len(part) for part in self.genes])[:-1])
+        return np.concatenate([part / part.sum() if len(part) else part for part in parts])
 
     def _remember(self, counts: dict[str, NDArray[Any]]) -> None:
         """What became of the present elites replaces what was known of them: the controller was another then."""

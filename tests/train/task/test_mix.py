@@ -245,6 +245,39 @@ def test_elites_of_several_spaces_are_drawn_together_each_with_its_own_ground():
     assert rested.ground is not None
 
 
+def test_parts_are_drawn_in_equal_shares_however_learnable_they_are():
+    genes = SUPER_GAUSSIAN.hard_random(60, 0)
+    rate = np.repeat([0.0, 0.5], [40, 20])
+    shares = {}
+    for equal in (True, False):
+        mix = Mix(
+            cfg=MixCfg(terrains=12, draw="learnable"), genes=(genes[:40], genes[40:]), spaces=(SUPER_GAUSSIAN,) * 2,
+            crosses=True, seed=0, device="cpu", goal_rate=rate, equal=equal,
+        )  # fmt: skip
+        rows = []
+        for mix.swap in range(300):
+            rows.append(mix._draw_rows())
+        shares[equal] = (np.concatenate(rows) < 40).mean()
+    assert 0.45 < shares[True] < 0.58 and shares[False] < 0.25
+
+
+def test_goal_rates_of_the_archive_stay_those_that_a_training_began_with():
+    def begun(rate):
+        mix = make_mix(draw="learnable", terrains=4)
+        mix.goal_rate = np.full(7, 0.0)
+        mix.goal_rate[rate] = 0.5
+        return mix
+
+    there, here = begun(2), begun(5)
+    there.next()
+    here.restore(there.state(counts([0] * 6, [0] * 6)))
+    assert here.goal_rate.tolist() == there.goal_rate.tolist()
+    older = {key: value for key, value in there.state(counts([0] * 6, [0] * 6)).items() if key != "goal_rate"}
+    begun(5).restore(older)
+    with pytest.raises(ValueError, match=r"have \(3,\) goal rates, expected 7"):
+        begun(5).restore({**older, "goal_rate": [0.1] * 3})
+
+
 def test_a_part_that_is_not_drawn_still_leaves_maps_of_the_ground():
     spaces = (SUPER_GAUSSIAN, get_space("course+friction"))
     mix = Mix(
