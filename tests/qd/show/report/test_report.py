@@ -113,6 +113,7 @@ def reported(run, monkeypatch):
     """Makes reports whose figures are a dot, without rendered pictures: drawing takes most of the time."""
     monkeypatch.setenv("MUJOCO_GL", "nothing")
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(DOT))
+    monkeypatch.setattr("sim.files.figures._in_few_colours", lambda png: png.getvalue())
     return reporter(run, monkeypatch)
 
 

@@ -31,6 +31,7 @@ def reported(run, monkeypatch):
     """Makes reports whose figures are a dot, without rendered pictures."""
     monkeypatch.setenv("MUJOCO_GL", "nothing")
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(DOT))
+    monkeypatch.setattr("sim.files.figures._in_few_colours", lambda png: png.getvalue())
     return reporter(run, monkeypatch)
 
 
