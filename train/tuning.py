@@ -267,7 +267,7 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
     # The defaults are not named, so that a run of before there were others goes on.
     chosen = {"only": flags.only} if flags.only != "all" else {}
     chosen |= {} if flags.held_out else {"held_out": False}
-    identities = [recorded_identity(one.space, one.space_sha256) for one in archives]
+    identities = _identities(spaces)
     chosen |= {"space": identities} if len(set(identities)) > 1 else {}
     return _Elites(
         genes=tuple(parts),
@@ -367,12 +367,17 @@ def chosen_elites(archive: Archive, only: str, path: Path) -> np.ndarray:
     return archive.certified if only == "certified" else archive.failing & ~archive.certified
 
 
+def _identities(spaces: Sequence[TerrainSpace]) -> list[str]:
+    """What the terrains of each space depend on, wherever its code lies."""
+    return [recorded_identity(space.name, space.sha256) for space in spaces]
+
+
 def _named(spaces: Sequence[TerrainSpace], saved: dict[str, Any] | None) -> dict[str, Any]:
     """What settings say of a terrain space; a run of a user's own goes on with the name that it began with.
 
     Several spaces are named beside their archives.
     """
-    space, *others = {space.name: space for space in spaces}.values()
+    space, *others = dict(zip(_identities(spaces), spaces, strict=True)).values()
     if others or space is SUPER_GAUSSIAN:  # the only one at first, which no settings name
         return {}
     there = {} if saved is None else saved["extra"]["settings"]

@@ -309,8 +309,9 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
         OSError: If a file cannot be written.
     """
     run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
-    own = {"space": to_be_named(space)} if (space := getattr(job.flags, "space", None)) else {}
-    again = {"resume": run_dir, **own, "export": job.flags.export, "overwrite": job.flags.overwrite}
+    space = getattr(job.flags, "space", None)
+    named = space and to_be_named(space)
+    again = {"resume": run_dir, "space": named, "export": job.flags.export, "overwrite": job.flags.overwrite}
     go_on = f"Go on with: {command_line(job.flags.command, robot=job.robot.spec, **again)}"
     busy = f"another training works in {run_dir}: let it end, or name another --run-dir"
     with StopRequest() as stop, locked(run_dir, busy):
