@@ -69,8 +69,8 @@ class Finetune(OnGround, TrainingFlags):
     """Robots start up to so far along the way, drawn uniformly [m]. The goal stays where it is. Only for task crossing.
     So robots also learn what lies behind a hard beginning. If left out: 8."""
     rewards: RewardCfg
-    """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 2 for tracking_lin_vel
-    (Cassie: 4). The rewards of an evaluation keep the robot's own."""
+    """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 6 for tracking_lin_vel
+    (Cassie: 4, a robot of your own: 2). The rewards of an evaluation keep the robot's own."""
     terrains: int | None = setting(None, least=1)
     """Terrains at a time; on CUDA 500 (Cassie: 100), on the CPU 12."""
     swap_every: int | None = setting(None, least=1)

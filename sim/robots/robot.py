@@ -218,6 +218,7 @@ ROBOTS = {
         penalties=(*_PENALTIES, "collision"),
         collision_bit=False,
         training=TrainingCfg(added_base_mass=(-5.0, 5.0)),
+        tuning=TuningCfg(tracking_lin_vel=6.0),
     ),
     "cassie": RobotCfg(
         name="cassie",

@@ -153,7 +153,7 @@ def test_a_normaliser_becomes_part_of_the_first_layer(places):
 
 def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
     own = job_of(config(places, run_dir=places / "own")).task.rewards
-    assert own == replace(ROBOT.training.rewards, termination=-200.0, tracking_lin_vel=2.0)
+    assert own == replace(ROBOT.training.rewards, termination=-200.0, tracking_lin_vel=6.0)
     run = places / "careful"
     careful = replace(ROBOT.training.rewards, termination=-100.0, tracking_ang_vel=2.0)
     assert finetune(config(places, run_dir=run, rewards=careful)) == 0
@@ -165,7 +165,7 @@ def test_rewards_may_be_weighted_otherwise_and_stay_so_after_a_resume(places):
 def test_it_says_which_rewards_weigh_otherwise_than_the_robots_own(places, capsys):
     own = ROBOT.training.rewards
     finetune(config(places, run_dir=places / "weights", iterations=1))
-    expected = f"Rewards: tracking_lin_vel=2, termination=-200 (the robot's own: {own.tracking_lin_vel:g}, "
+    expected = f"Rewards: tracking_lin_vel=6, termination=-200 (the robot's own: {own.tracking_lin_vel:g}, "
     assert f"{expected}{own.termination:g})\n" in capsys.readouterr().out
     finetune(config(places, run_dir=places / "own_weights", iterations=1, rewards=own))
     assert "Rewards: the robot's own\n" in capsys.readouterr().out
@@ -472,7 +472,7 @@ def test_all_elites_are_more_than_both_parts_of_a_split(places, monkeypatch):
 def test_what_is_left_out_is_the_robots_own_recipe(places, monkeypatch):
     weights = Finetune.defaults(["--robot", "cassie"]).rewards
     assert (weights.tracking_lin_vel, weights.termination, weights.orientation) == (4.0, -200.0, -1.0)
-    assert Finetune.defaults([]).rewards.tracking_lin_vel == 2.0
+    assert Finetune.defaults([]).rewards.tracking_lin_vel == 6.0
 
     def recipe(**changes):
         settings = job_of(config(places, run_dir=places / "none", **changes)).settings
