@@ -411,6 +411,9 @@ def draw_comparison(report: dict[str, Any]) -> "Figure":
             bounds = [point["interval"] or (math.nan, math.nan) for _, point in points]
             low, high = ([bound[side] for bound in bounds] for side in (0, 1))
             axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+            if key in AGAIN:  # a band has no width where there is one point
+                axes.vlines(x, low, high, color=color, alpha=0.5)
+        axes.set_xlim(left=0)
         axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:,g}")
         axes.set_xlabel("thousands of episodes of one seed")
         axes.set_ylabel(label)

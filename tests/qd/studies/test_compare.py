@@ -444,15 +444,19 @@ def test_the_table_begins_with_the_most_failing_elites(capsys):
 
 def test_figure_has_a_line_a_method_and_panel_with_bands():
     runs = {
-        name: [[{**rows[0], "elites": k + 1}, rows[1]] for k, rows in enumerate(seeds)] for name, seeds in RUNS.items()
+        name: [[{**rows[0], "elites": k + 1}, {**rows[1], "corrected_elites": k + 1}] for k, rows in enumerate(seeds)]
+        for name, seeds in RUNS.items()
     }
     figure = draw_comparison(reported(runs))
     elites, corrected, failing = figure.axes
     assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2]
     assert elites.lines[0].get_xydata().tolist() == [[40, 2], [80, 5]]
-    assert corrected.lines[0].get_xydata().tolist() == failing.lines[0].get_xydata().tolist() == [[80, 1]]
+    assert corrected.lines[0].get_xydata().tolist() == [[80, 2]]
+    assert failing.lines[0].get_xydata().tolist() == [[80, 1]]
     band = elites.collections[0].get_paths()[0].vertices
     assert band[:, 1].min() == pytest.approx(2 - HALF)
+    bar = corrected.collections[1].get_segments()[0]  # there one point alone shows its interval
+    assert bar.tolist() == [[80, pytest.approx(2 - HALF)], [80, pytest.approx(2 + HALF)]]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["CMA-MAE", "hard-random"]
     assert "80 episodes a run, 3 seeds a method at most" in figure.get_suptitle()
 
