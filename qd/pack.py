@@ -38,7 +38,7 @@ PACK_FOLDER = "pack"
 """Of a robot's published results."""
 NEAR_GOAL_RATE = 0.75
 """Goal rate of the searched controller from which on a terrain is no near-fault."""
-HEIGHT_UNIT_M = 1e-4
+HEIGHT_UNIT_M = 1e-3
 """Heights of a pack are whole numbers of it, in its file and where they are crossed [m]."""
 
 _MAX_BYTES = 1e9  # of an array that is read
@@ -245,7 +245,8 @@ def write_terrains(
         for name in _OF_A_TERRAIN
     }
     content = {
-        "rises": np.diff(whole, axis=2, prepend=np.int32(0)),  # along x, which packs into half of the bytes
+        # Of smooth ground the rise along x hardly changes along y, so that this packs into a third of the bytes.
+        "twists": np.diff(np.diff(whole, axis=2, prepend=np.int32(0)), axis=1, prepend=np.int32(0)),
         "height_unit_m": np.array(HEIGHT_UNIT_M),
         "genes": np.array([one.genes for one in chosen], np.float32),
         **columns,
@@ -291,8 +292,9 @@ def read_pack(folder: Path) -> Pack:
             raise ValueError(f"{PACK_FILE} lacks {', '.join(missing)}")
         if hashlib.sha256(file.read_bytes()).hexdigest() != content["terrains_sha256"]:
             raise ValueError(f"{TERRAINS_FILE} is not the one that {PACK_FILE} names")
-        arrays = read_arrays(file, ("rises", "height_unit_m", "genes"), max_bytes=_MAX_BYTES)
-        heights = (np.cumsum(arrays["rises"], axis=2) * float(arrays["height_unit_m"])).astype(np.float32)
+        arrays = read_arrays(file, ("twists", "height_unit_m", "genes"), max_bytes=_MAX_BYTES)
+        whole = np.cumsum(np.cumsum(arrays["twists"], axis=1), axis=2)
+        heights = (whole * float(arrays["height_unit_m"])).astype(np.float32)
         expected = (len(content["terrains"]), NUM_ROWS, NUM_COLS)
         if heights.shape != expected or not np.isfinite(heights).all() or not len(heights):
             raise ValueError(f"heights must be finite, of shape {expected}, got {heights.shape}")

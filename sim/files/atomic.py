@@ -4,7 +4,6 @@ import contextlib
 import fcntl
 import json
 import os
-import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 _TEMPORARY = ".tmp"
 _PROBE = ".write-test"
-_NUMBERS = re.compile(r"\[\n([^][{}\"]*)\]")  # a list without lists, objects or strings; no string holds a line break
+_LINE = 120  # columns
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -90,9 +89,35 @@ def prepare_output(file: Path) -> None:
 
 
 def to_json(content: dict[str, Any]) -> bytes:
-    """A dictionary as JSON, indented, lists of numbers on one line; a number that is not finite is an error."""
-    text = json.dumps(content, indent=2, allow_nan=False)
-    return (_NUMBERS.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n").encode()
+    """A dictionary as JSON, indented; what fits a line and lists of numbers stand on one.
+
+    Raises:
+        ValueError: If a number is not finite.
+    """
+    return (_as_json(content, "") + "\n").encode()
+
+
+def _as_json(value: Any, indent: str) -> str:
+    if not value or not isinstance(value, dict | list | tuple):
+        return json.dumps(value, allow_nan=False)
+    inner = f"{indent}  "
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(_key(name))}: {_as_json(one, inner)}" for name, one in value.items()]
+        opening, closing = "{}"
+    else:
+        parts = [_as_json(one, inner) for one in value]
+        opening, closing = "[]"
+    line = f"{opening}{', '.join(parts)}{closing}"
+    numbers = opening == "[" and not any(isinstance(one, str | dict | list | tuple) for one in value)
+    if numbers or ("\n" not in line and len(indent) + len(line) <= _LINE):
+        return line
+    rows = ",\n".join(f"{inner}{part}" for part in parts)
+    return f"{opening}\n{rows}\n{indent}{closing}"
+
+
+def _key(name: Any) -> Any:
+    """The name of a value as JSON has it, which knows words alone."""
+    return name if isinstance(name, str) else json.dumps(name, allow_nan=False)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def test_a_pack_is_read_as_it_was_written(pack):
     assert np.abs(found.heights - heights).max() <= HEIGHT_UNIT_M / 2 + 1e-6
     assert found.genes[:, 0].tolist() == pytest.approx([0.03, 0.07])
     with np.load(folder / "pack.npz") as content:  # any program may read it
-        own = np.cumsum(content["rises"], axis=2) * content["height_unit_m"]
+        own = np.cumsum(np.cumsum(content["twists"], axis=1), axis=2) * content["height_unit_m"]
         np.testing.assert_array_equal(own.astype(np.float32), found.heights)
         assert content["name"].tolist() == ["elite-3", "elite-7"] and content["more"].tolist() == [0, 1, 2]
 
