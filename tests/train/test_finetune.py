@@ -95,8 +95,8 @@ def test_the_critic_learns_alone_first(places):
         assert finetune(config(places, run_dir=run, iterations=iterations, critic_iterations=1)) == 0
         states.append(torch.load(run / "policy.pt", weights_only=True)["actor_state_dict"])
     start = torch.load(places / "start.pt", weights_only=True)["actor_state_dict"]
-    assert all(value.equal(start[key]) for key, value in states[0].items())
-    assert not any(value.equal(start[key]) for key, value in states[1].items())
+    assert all(value.equal(start[key].half()) for key, value in states[0].items())  # half precision is exported
+    assert not any(value.equal(start[key].half()) for key, value in states[1].items())
 
 
 def test_a_critic_that_comes_along_is_taken(places):
