@@ -67,7 +67,8 @@ def begin(job: "Hardening") -> None:
     sessions = [*content.pop("sessions", []), {name: now[name] for name in _SESSION}]
     write_atomically(file, to_json({**content, "sessions": sessions}))
     started = time.strftime("%H:%M")
-    print(f"Hardening '{job.robot.name}' for {job.flags.rounds} rounds in {job.path}, from {started}", flush=True)
+    rounds = f"{job.flags.rounds} round{'s' * (job.flags.rounds != 1)}"
+    print(f"Hardening '{job.robot.name}' for {rounds} in {job.path}, from {started}", flush=True)
 
 
 def record(job: "Hardening") -> None:
@@ -133,9 +134,9 @@ def _held_out(job: "Hardening", run: Path) -> TerrainSet:
 def tell(content: Mapping[str, Any]) -> None:
     """The rounds in a few lines."""
     goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
-    print("\n" + "".join(f"{title:<12}" for title in ("controller", "elites", "failing", "faults")) + "goal on")
+    print(f"\n{'controller':<14}{'elites':>8}{'failing':>9}{'faults':>8}  goal on")
     for row in [*content["rounds"], *content["comparisons"].values()]:
         who = row["controller"]
-        counts = ("-" if row[key] is None else row[key] for key in ("elites", "failing", "faults"))
+        elites, failing, faults = ("-" if row[key] is None else row[key] for key in ("elites", "failing", "faults"))
         rates = (f"{name} {value_words(goal[name].get(who), limits[name].get(who))}" for name in FIXED_SETS)
-        print("".join(f"{cell:<12}" for cell in (who, *counts)) + ", ".join(rates))
+        print(f"{who:<14}{elites:>8}{failing:>9}{faults:>8}  {', '.join(rates)}")

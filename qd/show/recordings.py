@@ -181,21 +181,14 @@ class Recordings:
         robot: The robot.
         device: Where missing ones are crossed.
         folder: Where they are kept.
-        published: Folder of recordings that came with the project, whatever code made them.
         cross: Crosses what is missing; by default a :class:`Simulation`.
     """
 
     def __init__(
-        self,
-        robot: "RobotCfg",
-        *,
-        device: str = "cpu",
-        folder: Path = FOLDER,
-        published: Path | None = None,
-        cross: Cross | None = None,
+        self, robot: "RobotCfg", *, device: str = "cpu", folder: Path = FOLDER, cross: Cross | None = None
     ) -> None:
         on_gpu = device.startswith("cuda")  # its last bits differ from a CPU's
-        self._robot, self._folder, self._published = robot, folder, published
+        self._robot, self._folder = robot, folder
         self._about = robot_identity(robot)
         self._code = f"{code_fingerprint(_ROOMS)}{' cuda' * on_gpu}"
         self._at_once = AT_ONCE if on_gpu else 1
@@ -215,19 +208,15 @@ class Recordings:
                 return recording
         if controller_hash(wanted.policy) is None:
             return None
-        for file in filter(None, (self.file_of(wanted), self.published_file(wanted))):
-            try:
-                recording = read_recording(file)
-            except (OSError, ValueError):
-                continue
-            if self._is(recording, wanted):
-                return replace(recording, labels=(wanted.label,))
-        return None
+        try:
+            recording = read_recording(self.file_of(wanted))
+        except (OSError, ValueError):
+            return None
+        return replace(recording, labels=(wanted.label,)) if self._is(recording, wanted) else None
 
     def may_keep(self, wanted: Wanted) -> bool:
         """Whether a recording of these crossings would be found again, and there is no file of them yet."""
-        files = filter(None, (self.file_of(wanted), self.published_file(wanted)))
-        return controller_hash(wanted.policy) is not None and not any(file.exists() for file in files)
+        return controller_hash(wanted.policy) is not None and not self.file_of(wanted).exists()
 
     def keep(self, wanted: Wanted, recording: "Recording") -> None:
         """Keeps a recording; prints a warning if it cannot be written."""
@@ -280,22 +269,16 @@ class Recordings:
 
     def file_of(self, wanted: Wanted) -> Path:
         """Where the recording of some crossings is kept; another file with other code or packages."""
-        return self._folder / f"{self._key(wanted, self._code)}.npz"
-
-    def published_file(self, wanted: Wanted) -> Path | None:
-        """Where a published recording of some crossings would be."""
-        return None if self._published is None else self._published / f"{self._key(wanted, '')}.npz"
-
-    def _key(self, wanted: Wanted, code: str) -> str:
         from sim.space import SUPER_GAUSSIAN, space_identity
 
         identity: list[Any] = [self._about, controller_hash(wanted.policy), [wanted.terrain_seed]]
-        identity += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), code]
+        identity += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), self._code]
         if wanted.ground is not None:
             identity += [wanted.ground.friction.tobytes().hex(), wanted.ground.time_constant_s.tobytes().hex()]
         if wanted.space != SUPER_GAUSSIAN.name:  # the only one at first, which no name says
             identity.append(space_identity(wanted.space))
-        return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:_KEY_LENGTH]
+        key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:_KEY_LENGTH]
+        return self._folder / f"{key}.npz"
 
     def _is(self, recording: "Recording", wanted: Wanted) -> bool:
         """Whether a recording is of just these crossings; a file may have been renamed."""

@@ -18,30 +18,36 @@ def new_figure(width: float, height: float) -> "Figure":
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def as_png(figure: "Figure") -> bytes:
-    """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold.
+_SHADES = 400  # colours of a map in shades of grey, with those of its marks and their edges
 
-    One of lines alone has 256 colours, which takes a quarter of the room. In a map they would show as contours.
-    """
-    from matplotlib.image import AxesImage
+
+def as_png(figure: "Figure") -> bytes:
+    """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold."""
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_parse_math(False)  # a file may be called $x$.npz, or something that is no formula
         text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or hold bytes that are no text
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
-    return buffer.getvalue() if figure.findobj(AxesImage) else _in_few_colours(buffer)
+    return _png_of(figure)
 
 
-def _in_few_colours(png: io.BytesIO) -> bytes:
+def _png_of(figure: "Figure") -> bytes:
+    """Of lines alone in 256 colours, which take a quarter of the room, and so a map in shades of grey.
+
+    In a map in colours they would show as contours.
+    """
+    from matplotlib.image import AxesImage
     from PIL import Image
 
-    image, buffer = Image.open(png), io.BytesIO()
-    few = image.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    few.save(buffer, "PNG", optimize=True, dpi=image.info["dpi"])
-    return buffer.getvalue()
+    whole, few = io.BytesIO(), io.BytesIO()
+    figure.savefig(whole, format="png", dpi=150)
+    image = Image.open(whole).convert("RGB")
+    if figure.findobj(AxesImage) and image.getcolors(_SHADES) is None:
+        return whole.getvalue()
+    small = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    small.save(few, "PNG", optimize=True, dpi=(150, 150))
+    return few.getvalue()
 
 
 def bar_lengths(values: ArrayLike, intervals: Sequence[Sequence[float] | None]) -> NDArray[np.float64]:

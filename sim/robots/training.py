@@ -83,7 +83,7 @@ MOST_SPREAD = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class TuningCfg:
-    """How the robot's controller is fine-tuned on terrains that break it; the defaults are those of a robot of your own."""
+    """How the robot's controller is fine-tuned on terrains that break it; the defaults suit a robot of your own."""
 
     termination: float = -200.0
     """Weight of :attr:`RewardCfg.termination` in place of the robot's own."""

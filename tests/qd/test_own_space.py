@@ -178,10 +178,8 @@ def test_a_recording_is_read_without_the_code(ridges, searched, tmp_path, monkey
 
 
 def test_a_page_about_it(ridges, searched, monkeypatch):
-    from matplotlib.figure import Figure
-
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(PICTURE))
-    monkeypatch.setattr("sim.files.figures._in_few_colours", lambda png: png.getvalue())
+    
+    monkeypatch.setattr("sim.files.figures._png_of", lambda figure: PICTURE)
     monkeypatch.setattr(command, "check_policy", lambda policy, robot, device: None)
     cfg = Report(run=searched, space=ridges, device="cpu", episodes=2, elites=1)
     page = command.html_report(cfg, cross=stand_in_cross([])).read_text()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qd.archive import goal_rates
-from qd.run.directory import RESULTS, RUNS
+from qd.run.directory import RUNS
 from qd.show.elites import Found, find_archive
 from qd.workers.evaluator import check_policy
 from sim.files.atomic import prepare_output
@@ -113,11 +113,6 @@ class Show:
         """Whose archive it is."""
         return self.found.robot
 
-    @property
-    def published(self) -> Path:
-        """Folder of the recordings that come with the project."""
-        return RESULTS / self.robot.name / "view"
-
 
 def serve(cfg: View) -> None:
     """Serves the page until Ctrl-C.
@@ -132,7 +127,7 @@ def serve(cfg: View) -> None:
     from qd.show.recordings import Recordings
     from qd.show.view.app import App
 
-    app = App(show, Recordings(show.robot, folder=cfg.cache, published=show.published))
+    app = App(show, Recordings(show.robot, folder=cfg.cache))
     try:
         took, count = time.perf_counter() - began, len(show.found.archive)
         print(f"{show.found.run}: {count:,} elites of {show.robot.name}, ready after {took:.1f} s.")

@@ -27,7 +27,7 @@ def recording(anymal, wanted):
 
 
 def opened(anymal, folder):
-    return Recordings(anymal, folder=folder / "cache", published=folder / "published")
+    return Recordings(anymal, folder=folder / "cache")
 
 
 def test_what_was_recorded_is_found_by_the_next_viewer(anymal, wanted, recording, tmp_path):
@@ -76,15 +76,6 @@ def test_a_recording_under_another_name_is_not_taken_for_it(anymal, wanted, reco
         assert opened(anymal, tmp_path).read(wanted) is None
 
 
-def test_published_recordings_are_found_with_any_code(anymal, wanted, recording, tmp_path):
-    recordings = opened(anymal, tmp_path)
-    assert recordings.published_file(wanted) != recordings.file_of(wanted)
-    recordings.published_file(wanted).parent.mkdir()
-    write_recording(recordings.published_file(wanted), recording)
-    assert recordings.read(wanted) is not None
-    assert Recordings(anymal, folder=tmp_path / "cache").read(wanted) is None
-
-
 def test_of_code_without_a_file_only_the_last_recording_is_known(anymal, wanted, recording, tmp_path):
     wanted = dataclasses.replace(wanted, policy="builtins:abs")
     recordings = opened(anymal, tmp_path)
@@ -121,22 +112,3 @@ def test_what_is_missing_is_crossed_in_batches_of_one_controller(anymal, tmp_pat
     assert crossed[5:] == ["elite 1 again"] and again[4].labels == ("elite 4 again",)
     Recordings(anymal, device="cpu", folder=tmp_path, cross=cross).all_of(wanted)  # whose last bits are others
     assert sizes == [3, 2, 1, *[1] * 5]
-
-
-def test_the_published_recordings_are_of_the_elite_that_the_viewer_opens_with(anymal, tmp_path):
-    from kernels.penalties import PENALTY_DEFINITION
-    from qd.archive import read_archive
-    from qd.run.directory import RESULTS
-    from qd.show.ranking import rank
-    from sim.files.provenance import without_machine
-    from sim.space import get_space
-
-    archive = read_archive(RESULTS.resolve() / "anymal" / "archive")
-    if archive.penalty_definition != PENALTY_DEFINITION:
-        pytest.skip("the published archive is of an older definition of the penalties")
-    recordings = Recordings(anymal, folder=tmp_path, published=RESULTS.resolve() / "anymal" / "view")
-    (worst,) = rank(archive, get_space(archive.space, archive.space_sha256)).worst(1)
-    assert archive.confirmed[worst] and archive.certified[worst]
-    found = recordings.read(on_elite(archive, worst, policy=str(anymal.policy_file), replicas=20))
-    assert found is not None and found.num_episodes == 20
-    assert str(found.origin["policy"]) == without_machine(str(found.origin["policy"]))

@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 import matplotlib.image
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from qd.archive import FaultCounts, read_archive, write_archive
 from qd.elites import elites_of
@@ -112,8 +111,7 @@ def run(tmp_path):
 def reported(run, monkeypatch):
     """Makes reports whose figures are a dot, without rendered pictures: drawing takes most of the time."""
     monkeypatch.setenv("MUJOCO_GL", "nothing")
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(DOT))
-    monkeypatch.setattr("sim.files.figures._in_few_colours", lambda png: png.getvalue())
+    monkeypatch.setattr("sim.files.figures._png_of", lambda figure: DOT)
     return reporter(run, monkeypatch)
 
 

@@ -7,7 +7,6 @@ import re
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from qd.archive import read_archive, write_archive
 from qd.show.report.evaluation import fates, most_mended
@@ -30,8 +29,7 @@ def run(tmp_path):
 def reported(run, monkeypatch):
     """Makes reports whose figures are a dot, without rendered pictures."""
     monkeypatch.setenv("MUJOCO_GL", "nothing")
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(DOT))
-    monkeypatch.setattr("sim.files.figures._in_few_colours", lambda png: png.getvalue())
+    monkeypatch.setattr("sim.files.figures._png_of", lambda figure: DOT)
     return reporter(run, monkeypatch)
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from PIL import Image
 
-from qd.run.directory import RESULTS
 from qd.show.elites import find_archive
 from qd.show.ranking import rank
 from qd.show.recordings import Recordings, on_elite
@@ -87,8 +86,7 @@ def film_picture(run: Path, elite: int) -> None:
     found = find_archive(None, run)
     archive, robot = found.archive, found.robot
     wanted = on_elite(archive, elite, policy=found.policy(None), replicas=20)
-    published = RESULTS / robot.name / "view"
-    (recording,) = Recordings(robot, published=published).all_of([wanted])
+    (recording,) = Recordings(robot).all_of([wanted])
     scales = dict(zip(archive.penalties, archive.scales, strict=True))
     shot = Shot(recording=recording, episode=typical_episode(recording, scales), ghosts=(0, 1), scales=scales)
     cameras = follow(shot, 4.6 * robot.default_base_height)
