@@ -94,30 +94,28 @@ def to_json(content: dict[str, Any]) -> bytes:
     Raises:
         ValueError: If a number is not finite.
     """
-    return (_as_json(content, "") + "\n").encode()
+    return (_as_json(content, "", 0) + "\n").encode()
 
 
-def _as_json(value: Any, indent: str) -> str:
-    if not value or not isinstance(value, dict | list | tuple):
+def _as_json(value: Any, indent: str, before: int) -> str:
+    """A value, before which so many columns of its line are taken beside the indent."""
+    if not isinstance(value, dict | list | tuple) or not value:
         return json.dumps(value, allow_nan=False)
     inner = f"{indent}  "
     if isinstance(value, dict):
-        parts = [f"{json.dumps(_key(name))}: {_as_json(one, inner)}" for name, one in value.items()]
+        names = json.loads(json.dumps(dict.fromkeys(value), allow_nan=False))  # as JSON has them, words alone
+        heads = [f"{json.dumps(name)}: " for name in names]
+        parts = [head + _as_json(one, inner, len(head)) for head, one in zip(heads, value.values(), strict=True)]
         opening, closing = "{}"
     else:
-        parts = [_as_json(one, inner) for one in value]
+        parts = [_as_json(one, inner, 0) for one in value]
         opening, closing = "[]"
     line = f"{opening}{', '.join(parts)}{closing}"
     numbers = opening == "[" and not any(isinstance(one, str | dict | list | tuple) for one in value)
-    if numbers or ("\n" not in line and len(indent) + len(line) <= _LINE):
+    if numbers or ("\n" not in line and len(indent) + before + len(line) < _LINE):  # a comma may follow
         return line
     rows = ",\n".join(f"{inner}{part}" for part in parts)
     return f"{opening}\n{rows}\n{indent}{closing}"
-
-
-def _key(name: Any) -> Any:
-    """The name of a value as JSON has it, which knows words alone."""
-    return name if isinstance(name, str) else json.dumps(name, allow_nan=False)
 
 
 def read_json(path: Path) -> dict[str, Any]:

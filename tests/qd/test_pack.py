@@ -1,5 +1,6 @@
 """What a pack takes, in which order, and its files."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -44,7 +45,8 @@ def pack(tmp_path):
     chosen = [candidate(3), candidate(7, fault=False)]
     digest = write_terrains(tmp_path, rounded(heights), chosen, {"more": np.arange(3)})
     content = dict.fromkeys(("robot", "robot_sha256", "penalty_definition", "rates", "seed", "episodes"), "x")
-    content |= {"terrains": [one.about for one in chosen], "terrains_sha256": digest}
+    terrains = [one.about | {"rates": {"base": {}}} for one in chosen]
+    content |= {"rates": {"base": {}}, "terrains": terrains, "terrains_sha256": digest}
     (tmp_path / "pack.json").write_text(json.dumps(content))
     return tmp_path, heights
 
@@ -70,6 +72,27 @@ def test_a_damaged_pack_is_said_to_be_one(pack, file):
         (pack[0] / file).write_bytes(data[:-9])
     with pytest.raises(ValueError, match="must be a pack, but it is damaged or unfinished"):
         read_pack(pack[0])
+
+
+def test_a_pack_of_an_older_version_is_said_to_be_one(pack):
+    folder, _ = pack
+    with np.load(folder / "pack.npz") as there:
+        old = {**{name: there[name] for name in there.files if name != "twists"}, "rises": there["twists"]}
+    np.savez(folder / "pack.npz", **old)
+    content = json.loads((folder / "pack.json").read_text())
+    content["terrains_sha256"] = hashlib.sha256((folder / "pack.npz").read_bytes()).hexdigest()
+    (folder / "pack.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"is of an older version.*make it again with `faultline pack`"):
+        read_pack(folder)
+
+
+def test_a_pack_without_rates_is_refused(pack):
+    file = pack[0] / "pack.json"
+    content = json.loads(file.read_text())
+    for changes in ({"rates": []}, {"terrains": [{"name": "a"}] * 2}):
+        file.write_text(json.dumps(content | changes))
+        with pytest.raises(ValueError, match="must have the rates of each controller, over all terrains and on each"):
+            read_pack(pack[0])
 
 
 def test_a_pack_without_all_that_is_known_is_refused(pack):

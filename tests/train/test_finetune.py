@@ -95,8 +95,19 @@ def test_the_critic_learns_alone_first(places):
         assert finetune(config(places, run_dir=run, iterations=iterations, critic_iterations=1)) == 0
         states.append(torch.load(run / "policy.pt", weights_only=True)["actor_state_dict"])
     start = torch.load(places / "start.pt", weights_only=True)["actor_state_dict"]
-    assert all(value.equal(start[key].half()) for key, value in states[0].items())  # half precision is exported
-    assert not any(value.equal(start[key].half()) for key, value in states[1].items())
+    start = {key: value.half() if value.ndim > 1 else value for key, value in start.items()}  # as is exported
+    assert all(value.equal(start[key]) and value.dtype == start[key].dtype for key, value in states[0].items())
+    assert not any(value.equal(start[key]) for key, value in states[1].items())
+
+
+def test_weights_that_half_precision_does_not_hold_are_exported_as_they_are(places):
+    run = places / "large"
+    state = torch.load(places / "start.pt", weights_only=True)
+    state["actor_state_dict"]["mlp.0.weight"][0, 0] = 70_000.0
+    torch.save(state, places / "large.pt")
+    assert finetune(config(places, run_dir=run, policy=places / "large.pt", iterations=1, critic_iterations=1)) == 0
+    there = torch.load(run / "policy.pt", weights_only=True)["actor_state_dict"]
+    assert there["mlp.0.weight"][0, 0] == 70_000.0 and there["mlp.2.weight"].dtype == torch.float16
 
 
 def test_a_critic_that_comes_along_is_taken(places):

@@ -179,10 +179,12 @@ def evaluate_pack(flags: "Evaluate", *, open_evaluator: Open = open_evaluator) -
     from train.evaluate.show import picture_of_pack, print_pack_test
 
     assert flags.pack is not None
-    if flags.makes_tables or flags.space is not None or flags.ground is not None:
+    of_terrains = (flags.space, flags.ground, flags.run_dir, flags.split_seed or None)
+    if flags.makes_tables or any(one is not None for one in of_terrains):
         raise ValueError(
             "a pack is crossed by one controller and has its own terrains, got another flag of tables or terrains "
-            "beside --pack: leave out --policies, --archive, --sets, --space and --ground, and give --policy"
+            "beside --pack: leave out --policies, --archive, --sets, --split-seed, --run-dir, --space and --ground, "
+            "and give --policy"
         )
     folder = pack_folder(flags.pack)
     pack = read_pack(folder)

@@ -294,15 +294,21 @@ class Training:
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     """Writes the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it.
 
-    In half precision, which takes half of the room and is finer than what training leaves to chance. All who read the
-    file compute in single precision, so that a controller is its file, wherever it is measured.
+    Layers are in half precision, which takes half of the room and is finer than what training leaves to chance. All
+    who read the file compute in single precision, so that a controller is its file, wherever it is measured.
     """
     buffer = io.BytesIO()
     marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
-    actor = {key: value.half() for key, value in learner.actor_state().items()}
+    actor = {key: _in_half(value) if value.ndim > 1 else value for key, value in learner.actor_state().items()}
     torch.save({"actor_state_dict": actor, "iter": learner.iteration, **marks}, buffer)
     write_atomically(path, buffer.getvalue())
     write_atomically(path.with_suffix(".train.json"), to_json(record))
+
+
+def _in_half(weights: torch.Tensor) -> torch.Tensor:
+    """In half precision; as they are where it has no such large numbers."""
+    half = weights.half()
+    return half if bool(half.isfinite().all()) else weights
 
 
 def run_training(job: Job, begin: Callable[[], Training]) -> int:

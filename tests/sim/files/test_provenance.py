@@ -5,6 +5,7 @@ import re
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from sim.files.atomic import to_json, write_atomically
@@ -38,11 +39,24 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_lists_of_numbers_take_one_line_and_mean_what_they_meant():
-    content = {"a": [0.1, -2e-30, None], "b": [[1, 2], []], "c": ["[\n 1,  2]", "x"], "e": [{"f": [3]}]}
+def test_what_fits_a_line_takes_one_and_means_what_it_meant():
+    content = {
+        "a": [0.1, -2e-30, None], "b": [[1, 2], []], "c": ["[\n 1,  2]", "x" * 90, "\u00e9"],
+        "e": [{"f": [3], "g": {}}],
+        "many": [k / 7 for k in range(50)], 3: (True, ()), "deep": [{"name": "x" * 50, "rate": [0.5, 1.0]}] * 3,
+    }  # fmt: skip
     text = to_json(content).decode()
-    assert json.loads(text) == content
-    assert '"a": [0.1, -2e-30, null],' in text and "[1, 2],\n" in text and '"f": [3]' in text
+    assert json.loads(text) == json.loads(json.dumps(content))
+    rows = text.splitlines()
+    assert {'  "a": [0.1, -2e-30, null],', '  "e": [{"f": [3], "g": {}}],', '  "3": [true, []],'} <= set(rows)
+    assert all(len(row) <= 120 for row in rows if not row.startswith('  "many": ['))
+    assert sum(row.startswith('    {"name": ') for row in rows) == 3 and rows[-1] == "}"
+
+
+@pytest.mark.parametrize("content", [{(1, 2): 3}, {"a": np.zeros(2)}, {"a": {1, 2}}])
+def test_what_json_does_not_know_is_refused(content):
+    with pytest.raises(TypeError):
+        to_json(content)
 
 
 def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):

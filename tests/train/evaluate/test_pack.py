@@ -185,8 +185,9 @@ def test_what_does_not_go_with_a_pack_is_refused(made, home):
     packed(made, size=1)
     with pytest.raises(ValueError, match="is of anymal, got --robot cassie: give that robot or another --pack"):
         evaluate_pack(Evaluate(pack="pack", robot="cassie", **HERE))
-    with pytest.raises(ValueError, match="leave out --policies, --archive, --sets, --space and --ground"):
-        evaluate_pack(Evaluate(pack="pack", policies=("base=shipped",), **HERE))
+    for flags in ({"policies": ("base=shipped",)}, {"run_dir": Path("x")}, {"split_seed": 1}, {"space": "course"}):
+        with pytest.raises(ValueError, match="leave out --policies, --archive, --sets, --split-seed, --run-dir"):
+            evaluate_pack(Evaluate(pack="pack", **flags, **HERE))
     with pytest.raises(FileNotFoundError, match="no pack at cassie"):
         evaluate_pack(Evaluate(pack="cassie", **HERE))
     content = json.loads(Path("pack/pack.json").read_text())
