@@ -294,8 +294,9 @@ def read_pack(folder: Path) -> Pack:
             raise ValueError(f"{TERRAINS_FILE} is not the one that {PACK_FILE} names")
         if not isinstance(content["rates"], dict) or not all("rates" in one for one in content["terrains"]):
             raise ValueError(f"{PACK_FILE} must have the rates of each controller, over all terrains and on each")
-        if "rises.npy" in zipfile.ZipFile(file).namelist():
-            raise ValueError(f"{TERRAINS_FILE} is of an older version, whose heights were other fractions of a metre")
+        with zipfile.ZipFile(file) as there:
+            if "rises.npy" in there.namelist():
+                raise ValueError(f"{TERRAINS_FILE} is of an older version, with other heights")
         arrays = read_arrays(file, ("twists", "height_unit_m", "genes"), max_bytes=_MAX_BYTES)
         whole = np.cumsum(np.cumsum(arrays["twists"], axis=1), axis=2)
         heights = (whole * float(arrays["height_unit_m"])).astype(np.float32)

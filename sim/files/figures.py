@@ -10,15 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_DPI = 150
+_SHADES = 400  # colours of a map in shades of grey, with those of its marks and their edges
+
 
 def new_figure(width: float, height: float) -> "Figure":
     """An empty figure of a size in inches that needs no screen and no global state."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
-
-
-_SHADES = 400  # colours of a map in shades of grey, with those of its marks and their edges
 
 
 def as_png(figure: "Figure") -> bytes:
@@ -41,12 +41,12 @@ def _png_of(figure: "Figure") -> bytes:
     from PIL import Image
 
     whole, few = io.BytesIO(), io.BytesIO()
-    figure.savefig(whole, format="png", dpi=150)
+    figure.savefig(whole, format="png", dpi=_DPI)
     image = Image.open(whole).convert("RGB")
     if figure.findobj(AxesImage) and image.getcolors(_SHADES) is None:
         return whole.getvalue()
     small = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    small.save(few, "PNG", optimize=True, dpi=(150, 150))
+    small.save(few, "PNG", optimize=True, dpi=(_DPI, _DPI))
     return few.getvalue()
 
 

@@ -178,7 +178,6 @@ def test_a_recording_is_read_without_the_code(ridges, searched, tmp_path, monkey
 
 
 def test_a_page_about_it(ridges, searched, monkeypatch):
-    
     monkeypatch.setattr("sim.files.figures._png_of", lambda figure: PICTURE)
     monkeypatch.setattr(command, "check_policy", lambda policy, robot, device: None)
     cfg = Report(run=searched, space=ridges, device="cpu", episodes=2, elites=1)
