@@ -13,7 +13,7 @@ from train.ppo.cfg import PpoCfg, TrainingFlags
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
-_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005)
+_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005, average=0.2)
 
 
 def shipped_space(settings: dict[str, Any]) -> str | None:

@@ -13,6 +13,7 @@ from qd.archive import FaultCounts, write_archive
 from sim import space as spaces
 from sim.files.atomic import locked
 from sim.files.command import run_command
+from sim.files.settings import built
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from sim.robots.training import TuningCfg
@@ -23,7 +24,7 @@ from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
 from train.evaluate.sets import marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
-from train.ppo.learner import read_checkpoint
+from train.ppo.learner import Learner, read_checkpoint
 from train.ppo.ppo import CapturedPPO
 from train.ppo.run import CommandTask, check_resumed, read_saved, sizes_of
 
@@ -78,6 +79,28 @@ def test_a_run_leaves_a_controller_and_its_record(places, finished):
     assert record["env_steps"] == 3 * 4 * 6
     same = load_policy(finished / "policy.onnx", ROBOT, "cpu")
     torch.testing.assert_close(same(rows), policy(rows), atol=1e-5, rtol=1e-5)
+
+
+def test_the_controller_is_the_mean_of_the_last_actors(places, monkeypatch):
+    assert Finetune.defaults([]).ppo.average == 0.2
+    run, actors, iterate = places / "mean", [], Learner.iterate
+
+    def remembered(learner):
+        step = iterate(learner)
+        actors.append(learner.actor_state())
+        return step
+
+    monkeypatch.setattr(Learner, "iterate", remembered)
+    flags = config(places, run_dir=run, iterations=4, critic_iterations=0, ppo=replace(PPO, average=0.5))
+    assert finetune(flags) == 0
+    assert json.loads((run / "policy.train.json").read_text())["averaged"] == 2
+    written = torch.load(run / "policy.pt", weights_only=True)["actor_state_dict"]
+    last = torch.load(run / "checkpoint.pt", weights_only=True)["actor_state_dict"]
+    for key, value in written.items():
+        assert last[key].equal(actors[3][key])  # a training goes on from the last one
+        assert torch.allclose(value.float(), (actors[2][key] + actors[3][key]) / 2, rtol=1e-3, atol=1e-6), key
+    assert finetune(resumed(run, iterations=10)) == 0  # its last five are others
+    assert json.loads((run / "policy.train.json").read_text())["averaged"] == 5
 
 
 def test_without_the_packages_for_onnx_it_says_how_to_make_the_file(places, finished, monkeypatch, capsys):
@@ -510,6 +533,15 @@ def test_a_specialist_trains_on_what_nobody_crosses_from_along_the_way_and_goes_
     assert finetune(flags) == 0
     with pytest.raises(ValueError, match=r"begun with other settings .*start_spread \(8.0 there, 2.0 wanted\)"):
         job_of(resumed(run, iterations=3, start_spread=2.0))
+
+
+def test_a_run_of_before_actors_were_averaged_goes_on_without(places, finished):
+    saved = read_saved(finished, ROBOT, "finetune")
+    settings = job_of(config(places, run_dir=places / "none")).settings
+    older = {**settings, "ppo": {key: value for key, value in settings["ppo"].items() if key != "average"}}
+    old = {**saved, "extra": {**saved["extra"], "settings": older}}
+    assert check_resumed(config(places), old, settings) == []
+    assert built(Finetune, Finetune.begun(ROBOT, older), "a training").ppo.average == 0.0
 
 
 def test_a_run_of_before_starts_were_spread_goes_on(places, finished):

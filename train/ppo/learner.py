@@ -122,6 +122,7 @@ class Learner:
 
     Attributes:
         iteration: Iterations done, those before a resume included.
+        averaged: Iterations whose actors are in the mean; 0: there is none.
         steps_per_iteration: Environment steps of an iteration, of all processes.
         ranks: Which process of a training this is.
     """
@@ -142,6 +143,8 @@ class Learner:
         self.cfg = cfg
         self._random_ages = random_ages
         self.iteration = 0
+        self.averaged = 0
+        self._mean: State = {}
         self.ranks = Ranks.of_environment()
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
@@ -199,6 +202,19 @@ class Learner:
         """The actor under rsl_rl's keys, on the CPU."""
         return {key: value.detach().cpu().clone() for key, value in self.alg.get_policy().state_dict().items()}
 
+    def mean_actor_state(self) -> State:
+        """The mean of the actors counted so far, likewise; the present one where there are none."""
+        return {**self.actor_state(), **{key: value.cpu().clone() for key, value in self._mean.items()}}
+
+    def count_into_mean(self, counts: bool) -> None:
+        """Count the present actor into the mean, or forget the mean where it does not count."""
+        self.averaged = self.averaged + 1 if counts else 0
+        if self.averaged <= 1:
+            self._mean = {}
+        for key, value in self.alg.get_policy().state_dict().items() if counts else ():
+            if value.is_floating_point():
+                self._mean.setdefault(key, value.detach().clone()).lerp_(value.detach(), 1.0 / self.averaged)
+
     def save(self, path: Path, extra: dict[str, Any]) -> None:
         """Write a checkpoint, whole or not at all; ``extra`` is plain data that comes back from a read."""
         task = self.env.task
@@ -209,6 +225,8 @@ class Learner:
             "iter": self.iteration,
             "levels": task.levels.to(torch.uint8),
             "counter": int(task.counter.item()),
+            "averaged": self.averaged,
+            "mean_actor_state_dict": {key: value.cpu() for key, value in self._mean.items()},
             "rng_cpu": torch.get_rng_state(),
             "rng_cuda": torch.cuda.get_rng_state(task.observation.device) if task.observation.is_cuda else None,
             "extra": extra,
@@ -258,6 +276,9 @@ class Learner:
         """Iteration, terrain levels and random numbers of a checkpoint."""
         task = self.env.task
         self.iteration = content["iter"]
+        self.averaged = content.get("averaged", 0)
+        there, mean = self.alg.get_policy().state_dict(), content.get("mean_actor_state_dict", {})
+        self._mean = {key: torch.empty_like(there[key]).copy_(value) for key, value in mean.items()}
         most = task.tiles.num_levels - 1
         if len(content["levels"]) == 0 or int(content["levels"].max()) > most:
             raise ValueError(f"levels must be at least one, and at most {most} each")

@@ -205,7 +205,8 @@ def check_resumed(flags: TrainingFlags, saved: dict[str, Any], settings: dict[st
     if saved["iter"] > settings["iterations"]:
         raise ValueError(f"{flags.resume} has done {saved['iter']} iterations already: give at least as many in all")
     there = saved["extra"]["settings"]
-    return differences({**there, "task": {"start_spread": 0.0, **there["task"]}}, settings)  # older ones have no spread
+    older = {"task": {"start_spread": 0.0, **there["task"]}, "ppo": {"average": 0.0, **there["ppo"]}}
+    return differences({**there, **older}, settings)  # older ones name neither
 
 
 # The training itself ---------------------------------------------------------------------------------------------
@@ -262,6 +263,7 @@ class Training:
         """Iterates until all is done, a stop is requested, or another iteration might end past the time limit."""
         learner, flags = self.learner, self.job.flags
         deadline = self.job.began + flags.max_seconds - _RESERVE_S if flags.max_seconds else float("inf")
+        averaged_from = round((1.0 - self.job.ppo.average) * self.job.iterations)
         slowest, last_save = 0.0, time.monotonic()
 
         def wanted() -> bool:
@@ -271,6 +273,7 @@ class Training:
         while learner.ranks.all_want(wanted(), learner.env.device):
             self.before_iteration()
             step = learner.iterate()
+            learner.count_into_mean(learner.iteration > averaged_from)
             if self.progress.warm:  # the first iteration compiles and is no measure
                 slowest = max(slowest, step.collection_s + step.learning_s)
             self.progress.add(step)
@@ -284,7 +287,7 @@ class Training:
         learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
         self.progress.close()
         self.save()
-        record = {**self.progress.record(), **self.extra}
+        record = {**self.progress.record(), "averaged": learner.averaged, **self.extra}
         export = self.job.flags.export
         for path in (self.job.run_dir / POLICY, *([export] if export else [])):
             export_policy(path, learner, record)
@@ -292,14 +295,14 @@ class Training:
 
 
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:
-    """Writes the actor under rsl_rl's keys, and the training record ``<stem>.train.json`` beside it.
+    """Writes the actor, or the mean of the last ones, and the training record ``<stem>.train.json`` beside it.
 
     Layers are in half precision, which takes half of the room and is finer than what training leaves to chance. All
     who read the file compute in single precision, so that a controller is its file, wherever it is measured.
     """
     buffer = io.BytesIO()
     marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
-    actor = {key: _in_half(value) if value.ndim > 1 else value for key, value in learner.actor_state().items()}
+    actor = {key: _in_half(value) if value.ndim > 1 else value for key, value in learner.mean_actor_state().items()}
     torch.save({"actor_state_dict": actor, "iter": learner.iteration, **marks}, buffer)
     write_atomically(path, buffer.getvalue())
     write_atomically(path.with_suffix(".train.json"), to_json(record))

@@ -72,6 +72,27 @@ def test_resumed_training_is_repeatable(learner, tmp_path):
     assert not (tmp_path / ".c.pt.part").exists()
 
 
+def test_the_mean_is_of_the_actors_that_count(learner, tmp_path):
+    seen = []
+    for counts in (True, False, True, True):
+        learner.iterate()
+        learner.count_into_mean(counts)
+        seen.append(learner.actor_state())
+        if learner.iteration == 2:
+            assert learner.averaged == 0
+            assert all(value.equal(seen[-1][key]) for key, value in learner.mean_actor_state().items())
+    learner.save(tmp_path / "c.pt", {})
+    again = Learner(learner.env, CFG, seed=99)
+    again.resume(read_checkpoint(tmp_path / "c.pt", "anymal"))
+    again.iterate()
+    again.count_into_mean(True)
+    seen.append(again.actor_state())
+    assert (learner.averaged, again.averaged) == (2, 3)
+    for key, value in again.mean_actor_state().items():
+        assert torch.allclose(value, torch.stack([actor[key] for actor in seen[2:]]).mean(dim=0), atol=1e-6), key
+        assert not value.equal(seen[-1][key])
+
+
 def test_levels_are_dealt_out_to_another_number_of_environments(learner, make_task, tmp_path):
     learner.env.task.restart_all(torch.tensor([0, 1, 2, 3, 4, 5]))
     learner.save(tmp_path / "c.pt", {})
