@@ -13,7 +13,7 @@ from train.ppo.cfg import PpoCfg, TrainingFlags
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
-_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005, average=0.2)
+_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005)
 
 
 def shipped_space(settings: dict[str, Any]) -> str | None:
@@ -87,7 +87,8 @@ class Finetune(OnGround, TrainingFlags):
         if settings is None:
             own = robot.tuning
             weights = {"termination": own.termination, "tracking_lin_vel": own.tracking_lin_vel}
-            return {"rewards": replace(robot.training.rewards, **weights)}
+            ppo = replace(_PPO, entropy=own.entropy, average=own.average)
+            return {"rewards": replace(robot.training.rewards, **weights), "ppo": ppo}
         same = ("seed", "num_envs", "iterations", "critic_iterations", "split_seed", "ppo")
         policy, task = settings["policy"], settings["task"]
         return {

@@ -244,13 +244,12 @@ def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> di
     flags, episodes = job.flags, search.episodes_per_iteration * job.search_iterations
     searched = {"preset": search.preset, "method": search.scheduler.method, **sizes, "episodes": episodes}
     recipe = {**vars(job.robot.tuning), **({"draw": flags.draw} if flags.draw else {})}
-    average = Finetune.defaults(["--robot", job.robot.spec]).ppo.average
     return {
         **identity(job.robot, flags.policy or job.robot.policy_file),
         "seed": flags.seed,
         "space": job.space.name,
         "search": searched,
-        "tune": {"iterations": job.tune_iterations, "shares": flags.shares, "average": average, **recipe},
+        "tune": {"iterations": job.tune_iterations, "shares": flags.shares, **recipe},
         "evaluation": {"terrains": job.evaluator.num_terrains, "episodes": job.evaluator.num_replicas},
     }
 

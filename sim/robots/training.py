@@ -93,3 +93,7 @@ class TuningCfg:
     """How elites are drawn."""
     start_spread: float = setting(8.0, least=0.0, most=MOST_SPREAD)
     """Robots start up to so far along the way [m]."""
+    entropy: float = setting(0.005, least=0.0)
+    """Weight of the entropy bonus. It widens the noise of the actions, which a further training begins with."""
+    average: float = setting(0.2, least=0.0, most=1.0)
+    """Share of all iterations, the last ones, whose actors are averaged into the controller."""

@@ -507,6 +507,9 @@ def test_what_is_left_out_is_the_robots_own_recipe(places, monkeypatch):
     weights = Finetune.defaults(["--robot", "cassie"]).rewards
     assert (weights.tracking_lin_vel, weights.termination, weights.orientation) == (4.0, -200.0, -1.0)
     assert Finetune.defaults([]).rewards.tracking_lin_vel == 6.0
+    for name in ("anymal", "cassie"):
+        ppo, own = Finetune.defaults(["--robot", name]).ppo, get_robot(name).tuning
+        assert (ppo.entropy, ppo.average, ppo.steps_per_env) == (own.entropy, own.average, 24)
 
     def recipe(**changes):
         settings = job_of(config(places, run_dir=places / "none", **changes)).settings
