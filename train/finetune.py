@@ -13,7 +13,7 @@ from train.ppo.cfg import PpoCfg, TrainingFlags
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
 
-_PPO = PpoCfg(steps_per_env=24, entropy=0.005, desired_kl=0.005)
+_PPO = PpoCfg(steps_per_env=24, desired_kl=0.005)  # beside it the robot's recipe
 
 
 def shipped_space(settings: dict[str, Any]) -> str | None:
@@ -38,7 +38,7 @@ class Finetune(OnGround, TrainingFlags):
     command: ClassVar[str] = "finetune"
     policy: Path | None = None
     """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one. The checkpoint.pt of a
-    training brings its critic too."""
+    training is its last actor, with its critic; its policy.pt is the mean of the last actors."""
     mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
     """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G) or hard-random ones (C-HR), or
     nothing else (C-HC)."""

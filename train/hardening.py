@@ -263,10 +263,13 @@ def _refuse_another(job: Hardening) -> None:
     path = job.path
     if (path / ROUNDS_FILE).exists():
         content = read_rounds(path)
-        different = differences(content.get("settings", {}), job.settings)
+        there = content.get("settings", {})
+        older = {"tune": {"entropy": 0.005, **there.get("tune", {})}}  # all had it before recipes named one
+        different = differences({**there, **older}, job.settings)
         if different:
             raise ValueError(
-                f"{path} holds a hardening of other settings: {', '.join(different)}: give those, or another --run-dir"
+                f"{path} holds a hardening of other settings: {', '.join(different)}: give those (a recipe's in tuning "
+                "of the robot's settings), or another --run-dir"
             )
         done = len(content.get("rounds", [])) - 1
         if job.flags.rounds < done:

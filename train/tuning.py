@@ -97,6 +97,11 @@ class FineTuning(Training):
         if iteration == self._alone:
             self.learner.alg.begin_actor()
 
+    @property
+    def averaged_from(self) -> int:
+        """Likewise; while the critic learns alone, the actor is what it was."""
+        return max(super().averaged_from, self._alone)
+
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps beside the learner, the terrains among it."""
         return {**super().state(), "mix": self.mix.state(self.task.counts())}

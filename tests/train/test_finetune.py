@@ -99,8 +99,18 @@ def test_the_controller_is_the_mean_of_the_last_actors(places, monkeypatch):
     for key, value in written.items():
         assert last[key].equal(actors[3][key])  # a training goes on from the last one
         assert torch.allclose(value.float(), (actors[2][key] + actors[3][key]) / 2, rtol=1e-3, atol=1e-6), key
-    assert finetune(resumed(run, iterations=10)) == 0  # its last five are others
-    assert json.loads((run / "policy.train.json").read_text())["averaged"] == 5
+    counts = []
+    for iterations in (10, 11):  # the last ones are others, also where the run was in the middle of them
+        assert finetune(resumed(run, iterations=iterations)) == 0
+        counts.append(json.loads((run / "policy.train.json").read_text())["averaged"])
+    assert counts == [5, 1]
+
+
+def test_an_actor_that_has_not_learned_yet_is_not_in_the_mean(places, capsys):
+    run, ppo = places / "whole", replace(PPO, average=1.0)
+    assert finetune(config(places, run_dir=run, iterations=4, critic_iterations=1, ppo=ppo)) == 0
+    assert json.loads((run / "policy.train.json").read_text())["averaged"] == 3
+    assert "Controller (the mean of the last 3 actors) and training record" in capsys.readouterr().out
 
 
 def test_without_the_packages_for_onnx_it_says_how_to_make_the_file(places, finished, monkeypatch, capsys):

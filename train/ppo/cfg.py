@@ -37,8 +37,8 @@ class PpoCfg(PaceCfg):
     clip: float = setting(0.2, above=0.0)
     """Clip range of the probability ratio and of the value."""
     average: float = setting(0.0, least=0.0, most=1.0)
-    """Share of all iterations, the last ones, whose actors' weights are averaged into the controller (Polyak and
-    Juditsky 1992); 0: it is the last actor. Single iterations differ by chance, their mean less."""
+    """Share of all iterations, the last ones, whose actors' weights are averaged into the controller; 0: it is the last
+    actor. Single iterations differ by chance, their mean less."""
 
     @classmethod
     def of(cls, robot: "RobotCfg") -> "PpoCfg":

@@ -276,9 +276,7 @@ class Learner:
         """Iteration, terrain levels and random numbers of a checkpoint."""
         task = self.env.task
         self.iteration = content["iter"]
-        self.averaged = content.get("averaged", 0)
-        there, mean = self.alg.get_policy().state_dict(), content.get("mean_actor_state_dict", {})
-        self._mean = {key: torch.empty_like(there[key]).copy_(value) for key, value in mean.items()}
+        self.averaged, self._mean = self._read_mean(content)
         most = task.tiles.num_levels - 1
         if len(content["levels"]) == 0 or int(content["levels"].max()) > most:
             raise ValueError(f"levels must be at least one, and at most {most} each")
@@ -290,6 +288,19 @@ class Learner:
             torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)
         if self.ranks.size > 1:  # the state is the first process's
             self._draw_apart(int(torch.initial_seed()) % 2**31)
+
+    def _read_mean(self, content: dict[str, Any]) -> tuple[int, State]:
+        """How many actors the mean of a checkpoint is of, and the mean; an older checkpoint has none."""
+        count, mean = content.get("averaged", 0), content.get("mean_actor_state_dict", {})
+        if type(count) is not int or not 0 <= count <= content["iter"]:
+            raise ValueError(f"averaged must be a number of iterations, at most {content['iter']}, got {count}")
+        floats = {key: value for key, value in self.actor_state().items() if value.is_floating_point()}
+        expected = {key: (value.shape, value.dtype) for key, value in floats.items() if count}
+        if {key: (value.shape, value.dtype) for key, value in mean.items()} != expected:
+            raise ValueError("mean_actor_state_dict must be none if averaged is 0, and else have the actor's weights")
+        if not all(bool(value.isfinite().all()) for value in mean.values()):
+            raise ValueError("mean_actor_state_dict has weights that are not finite")
+        return count, {key: value.to(self.alg.device) for key, value in mean.items()}
 
 
 def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:

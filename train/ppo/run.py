@@ -247,6 +247,11 @@ class Training:
     def before_iteration(self) -> None:
         """What a kind of training does before each iteration: nothing."""
 
+    @property
+    def averaged_from(self) -> int:
+        """The iteration after which actors count into the controller."""
+        return round((1.0 - self.job.ppo.average) * self.job.iterations)
+
     def next_command(self) -> str:
         """The command to look at the controller with."""
         return command_line("evaluate", robot=self.job.robot.spec, policy=self.job.run_dir / POLICY)
@@ -263,7 +268,8 @@ class Training:
         """Iterates until all is done, a stop is requested, or another iteration might end past the time limit."""
         learner, flags = self.learner, self.job.flags
         deadline = self.job.began + flags.max_seconds - _RESERVE_S if flags.max_seconds else float("inf")
-        averaged_from = round((1.0 - self.job.ppo.average) * self.job.iterations)
+        if learner.iteration - learner.averaged < self.averaged_from:  # of a shorter run: its last ones are others
+            learner.count_into_mean(False)
         slowest, last_save = 0.0, time.monotonic()
 
         def wanted() -> bool:
@@ -273,7 +279,7 @@ class Training:
         while learner.ranks.all_want(wanted(), learner.env.device):
             self.before_iteration()
             step = learner.iterate()
-            learner.count_into_mean(learner.iteration > averaged_from)
+            learner.count_into_mean(learner.iteration > self.averaged_from)
             if self.progress.warm:  # the first iteration compiles and is no measure
                 slowest = max(slowest, step.collection_s + step.learning_s)
             self.progress.add(step)
@@ -289,9 +295,10 @@ class Training:
         self.save()
         record = {**self.progress.record(), "averaged": learner.averaged, **self.extra}
         export = self.job.flags.export
+        of = f"the mean of the last {learner.averaged} actors" if learner.averaged > 1 else "the last actor"
         for path in (self.job.run_dir / POLICY, *([export] if export else [])):
             export_policy(path, learner, record)
-            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+            print(f"Controller ({of}) and training record written to {path} and {path.with_suffix('.train.json').name}")
 
 
 def export_policy(path: Path, learner: Learner, record: dict[str, Any]) -> None:

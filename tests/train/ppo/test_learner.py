@@ -93,6 +93,29 @@ def test_the_mean_is_of_the_actors_that_count(learner, tmp_path):
         assert not value.equal(seen[-1][key])
 
 
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda one: one.update(averaged="two"), "averaged must be a number of iterations, at most 1, got two"),
+        (lambda one: one.update(averaged=2), "averaged must be"),
+        (lambda one: one.pop("averaged"), "must be none if averaged is 0"),
+        (lambda one: one["mean_actor_state_dict"].clear(), "else have the actor's weights"),
+        (lambda one: one["mean_actor_state_dict"].update({"mlp.0.bias": torch.zeros(1)}), "else have the actor's"),
+        (lambda one: one["mean_actor_state_dict"]["mlp.0.bias"].fill_(torch.nan), "weights that are not finite"),
+        (lambda one: one.update(mean_actor_state_dict=None), "is damaged"),
+    ],
+)
+def test_a_damaged_mean_is_refused(learner, tmp_path, damage, message):
+    learner.iterate()
+    learner.count_into_mean(True)
+    learner.save(tmp_path / "c.pt", {})
+    content = read_checkpoint(tmp_path / "c.pt", "anymal")
+    damage(content)
+    with pytest.raises(ValueError, match=message) as error:
+        Learner(learner.env, CFG, seed=0).resume(content)
+    assert "\n" not in str(error.value)
+
+
 def test_levels_are_dealt_out_to_another_number_of_environments(learner, make_task, tmp_path):
     learner.env.task.restart_all(torch.tensor([0, 1, 2, 3, 4, 5]))
     learner.save(tmp_path / "c.pt", {})
@@ -183,7 +206,7 @@ def test_two_processes_train_one_controller_and_go_on(tmp_path):
     size = ["--device", "cpu", "--num-envs", "4", "--ppo.hidden-dims", "16", "--ppo.steps-per-env", "8"]
     first = torchrun("-m", "faultline", "train", *size, "--iterations", "2", "--run-dir", str(run))
     assert first.returncode == 0, first.stderr
-    assert first.stdout.count("Controller and training record written") == 1  # one of them speaks
+    assert first.stdout.count("training record written to") == 1  # one of them speaks
     record = json.loads((run / "policy.train.json").read_text())
     assert record["env_steps"] == 2 * 2 * 4 * 8
     assert record["settings"]["processes"] == 2
