@@ -38,7 +38,7 @@ class PpoCfg(PaceCfg):
     """Clip range of the probability ratio and of the value."""
     average: float = setting(0.0, least=0.0, most=1.0)
     """Share of all iterations, the last ones, whose actors' weights are averaged into the controller; 0: it is the last
-    actor. Single iterations differ by chance, their mean less."""
+    actor. The mean walks a little more smoothly."""
 
     @classmethod
     def of(cls, robot: "RobotCfg") -> "PpoCfg":
