@@ -14,7 +14,8 @@ class Harden(OfRobot, OnGround, Where):
     """Search for what breaks a controller, train it on all that was found, and search again, for some rounds.
 
     Each search counts the faults: terrains that a controller of the panel crosses and this one does not. Each training
-    is on hand-crafted terrains and on the archives of all searches so far. Every controller is evaluated on
+    is on hand-crafted terrains and on the archives of all searches so far, and its controller is kept if validation
+    terrains speak for it. Every controller is evaluated on
     hand-crafted and hard-random terrains and on the held-out elites of every archive. The last step is a search against
     the last controller. Every step is a run of its own under RUN_DIR: search-0, tune-1, search-1 and so on.
     RUN_DIR/rounds.json has the numbers, and `faultline report --run RUN_DIR` makes a page of them. After Ctrl-C or a
@@ -37,6 +38,13 @@ class Harden(OfRobot, OnGround, Where):
     CPU 100, enough to see that it runs."""
     max_seconds: float | None = setting(None, above=0.0)
     """Stop after so many seconds, as by Ctrl-C. A search loses its present iteration. A training finishes it."""
+    tune_num_envs: int | None = setting(None, least=1)
+    """Robots of each training; as of `faultline finetune`, the paper's 1,500 on CUDA (Cassie: 600), 24 on the CPU."""
+    tune_terrains: int | None = setting(None, least=1)
+    """Terrains of each training at a time; likewise, 500 on CUDA (Cassie: 100), 12 on the CPU."""
+    keep: Literal["best", "last"] = "best"
+    """Which controller to go on with after a training. best: the new one only if it is no worse on validation terrains,
+    and on ordinary ones no more than a point worse than the base; else the one before. last: always the new one."""
     preset: str | None = None
     """Size of a search's iteration: wide (the default on a GPU), paper, or small (the default on the CPU)."""
     emitters: int | None = setting(None, least=1)

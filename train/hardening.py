@@ -27,13 +27,14 @@ from sim.policy.spec import certifier_hash, controller_hash, controllers_of, is_
 from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, to_be_named
+from train.choice import choose, known_choice
 from train.evaluate.evaluate import Evaluate, evaluator_of
 from train.finetune import Finetune
 from train.harden import Harden
 from train.ppo.learner import read_start
 from train.ppo.run import CHECKPOINT, POLICY
 from train.rounds import FIXED_SETS, begin, divisible, read_rounds, record, tell
-from train.tuning import tuning_sizes
+from train.tuning import default_sizes, tuning_sizes
 
 BASE = "base"
 """Name of the controller that a hardening begins with."""
@@ -50,14 +51,23 @@ class Tune:
     start: Path | None
     """What it begins with: a controller, or the checkpoint of the training before, whose critic comes along; the
     shipped controller if None."""
+    before: str
+    """The controller that it begins with, as it is searched and evaluated."""
     archives: tuple[Path, ...]
     """Runs of the searches whose elites it trains on; of none: on hard-random terrains."""
     seed: int
+    kept: bool | None = None
+    """Whether the hardening goes on with what it makes, or with what was before; None where that is to be seen."""
 
     @property
     def policy(self) -> str:
         """The controller that it makes."""
         return str(self.run / POLICY)
+
+    @property
+    def after(self) -> str:
+        """The controller that the hardening goes on with."""
+        return self.before if self.kept is False else self.policy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,27 +100,24 @@ class Hardening:
     evaluator: EvaluatorCfg
     """What crosses the sets of the evaluation."""
     search_iterations: int
-    tune_iterations: int
+    tune_sizes: dict[str, int]
+    """Of each training: robots, terrains at a time, iterations, and how often terrains are exchanged."""
     settings: dict[str, Any]
     """What makes it what it is, as JSON values."""
     open_evaluator: Open
 
     @property
     def stages(self) -> list[Stage]:
-        """All controllers in order: the base, one a round, and those to compare with."""
-        rounds, shipped = self.flags.rounds, self.flags.policy
-        found = [
-            Stage(
-                controller=BASE, policy=str(shipped or self.robot.policy_file), tunes=(), search=self.search_run(0),
-                seed=self.seed(0),
-            )
-        ]  # fmt: skip
+        """All controllers in order, as far as is known which they are: the base, one a round, those to compare with."""
+        rounds = self.flags.rounds
+        base = Stage(controller=BASE, policy=self.base, tunes=(), search=self.search_run(0), seed=self.seed(0))
+        found = [base]
         archives = [self.search_run(number) for number in range(rounds)]
         chain = self._chain("tune", [tuple(archives[:number]) for number in range(1, rounds + 1)])
         for number, tune in enumerate(chain, start=1):
             found.append(
                 Stage(
-                    controller=f"round-{number}", policy=tune.policy, tunes=(tune,), search=self.search_run(number),
+                    controller=f"round-{number}", policy=tune.after, tunes=(tune,), search=self.search_run(number),
                     seed=self.seed(number),
                 )
             )  # fmt: skip
@@ -118,20 +125,27 @@ class Hardening:
             chain = self._chain(f"tune-{kind}", [() if kind == "hard_random" else (archives[0],)] * rounds)
             search = self.path / f"search-{kind}-{rounds}"
             stage = Stage(
-                controller=kind, policy=chain[-1].policy, tunes=chain, search=search, seed=self.seed(rounds),
+                controller=kind, policy=chain[-1].after, tunes=chain, search=search, seed=self.seed(rounds),
                 compared=kind,
             )  # fmt: skip
             found.append(stage)
         return found
 
     def _chain(self, name: str, archives: list[tuple[Path, ...]]) -> tuple[Tune, ...]:
-        """Trainings of which each begins where the one before it ended, by what they train on."""
-        found, start = [], self.flags.policy
+        """Trainings of which each begins where the last one that was kept ended, by what they train on."""
+        found, start, before = [], self.flags.policy, self.base
         for number, trained_on in enumerate(archives, start=1):
             run = self.path / f"{name}-{number}"
-            found.append(Tune(run=run, start=start, archives=trained_on, seed=self.seed(number)))
-            start = run / CHECKPOINT
+            tune = Tune(run=run, start=start, before=before, archives=trained_on, seed=self.seed(number))
+            tune = replace(tune, kept=True if self.flags.keep == "last" else known_choice(self, tune))
+            start, before = run / CHECKPOINT if tune.kept is not False else start, tune.after
+            found.append(tune)
         return tuple(found)
+
+    @property
+    def base(self) -> str:
+        """The controller that it begins with."""
+        return str(self.flags.policy or self.robot.policy_file)
 
     def search_run(self, number: int) -> Path:
         """Run of the search against the controller of a round; 0: of the base."""
@@ -175,7 +189,11 @@ class Hardening:
             done = read_json(Path(tune.policy).with_suffix(".train.json")).get("iterations")
         except (OSError, ValueError):
             return False
-        return Path(tune.policy).exists() and isinstance(done, int) and done >= self.tune_iterations
+        return Path(tune.policy).exists() and isinstance(done, int) and done >= self.tune_sizes["iterations"]
+
+    def is_settled(self, stage: Stage) -> bool:
+        """Whether its trainings are over, and it is known which of them were kept."""
+        return all(self.is_tuned(tune) and tune.kept is not None for tune in stage.tunes)
 
     @property
     def command(self) -> str:
@@ -205,7 +223,8 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     search = changed(preset(flags.preset or ("wide" if on_cuda else "small"), robot, str(policy)), sizes)
     an_iteration = search.episodes_per_iteration
     wanted = flags.search_episodes or (_GPU_EPISODES if on_cuda else search.iterations * an_iteration)
-    tuning = replace(Finetune.defaults(["--robot", robot.spec]), iterations=flags.tune_iterations)
+    tuned = {name: getattr(flags, f"tune_{name}") for name in ("iterations", "num_envs", "terrains")}
+    tuning = replace(Finetune.defaults(["--robot", robot.spec]), **tuned)
     names = ("terrains", "episodes", "device", "workers", "num_envs", "space")
     evaluation = Evaluate(robot=robot.spec, sets=FIXED_SETS, **{name: getattr(flags, name) for name in names})
     found = Hardening(
@@ -216,7 +235,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         space=space,
         evaluator=replace(evaluator_of(evaluation, robot), reward=True),
         search_iterations=-(-wanted // an_iteration),
-        tune_iterations=tuning_sizes(tuning, robot, device)["iterations"],
+        tune_sizes=tuning_sizes(tuning, robot, device),
         settings={},
         open_evaluator=open_evaluator,
     )
@@ -249,7 +268,8 @@ def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> di
         "seed": flags.seed,
         "space": job.space.name,
         "search": searched,
-        "tune": {"iterations": job.tune_iterations, "shares": flags.shares, **recipe},
+        "tune": {**job.tune_sizes, "shares": flags.shares, **recipe},
+        "keep": flags.keep,
         "evaluation": {"terrains": job.evaluator.num_terrains, "episodes": job.evaluator.num_replicas},
     }
 
@@ -264,7 +284,9 @@ def _refuse_another(job: Hardening) -> None:
     if (path / ROUNDS_FILE).exists():
         content = read_rounds(path)
         there = content.get("settings", {})
-        older = {"tune": {"entropy": 0.005, **there.get("tune", {})}}  # all had it before recipes named one
+        # What all had before it was a setting.
+        tune = {"entropy": 0.005, **default_sizes(job.robot, job.device), **there.get("tune", {})}
+        older = {"tune": tune, "keep": there.get("keep", "last")}
         different = differences({**there, **older}, job.settings)
         if different:
             raise ValueError(
@@ -324,8 +346,8 @@ def harden(flags: Harden, *, open_evaluator: Open = open_evaluator) -> int:
         try:
             with claimed(job.path), naming_what_is_next("what is finished is kept", lambda: go_on):
                 begin(job)
-                for stage in job.stages:
-                    _run(job, stage)
+                for number in range(len(job.stages)):
+                    _run(job, number)
         except Interrupted as stop:
             if not is_up():
                 raise
@@ -359,12 +381,16 @@ def _time_limit(seconds: float | None) -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _run(job: Hardening, stage: Stage) -> None:
+def _run(job: Hardening, number: int) -> None:
     """All that is left to be done for a controller."""
-    for tune in stage.tunes:
+    for place in range(len(job.stages[number].tunes)):
+        tune = job.stages[number].tunes[place]  # what it begins with follows from which of those before were kept
         if not job.is_tuned(tune):
-            print(f"\n=== {stage.controller}: training, in {tune.run}", flush=True)
+            print(f"\n=== {job.stages[number].controller}: training, in {tune.run}", flush=True)
             _tune(job, tune)
+        if job.stages[number].tunes[place].kept is None:
+            choose(job, tune)
+    stage = job.stages[number]
     if stage.tunes and not job.is_searched(stage):
         record(job)
     if not job.is_judged(stage):
@@ -377,12 +403,12 @@ def _run(job: Hardening, stage: Stage) -> None:
 def _tune(job: Hardening, tune: Tune) -> None:
     """Trains, or goes on; raises KeyboardInterrupt where it was asked to stop."""
     flags, robot = job.flags, job.robot.spec
-    own = {"device": flags.device, "iterations": job.tune_iterations, "archive": divisible(tune.archives)}
+    own = {"device": flags.device, "iterations": job.tune_sizes["iterations"], "archive": divisible(tune.archives)}
     if (tune.run / CHECKPOINT).exists():
         training = Finetune.defaults(["--robot", robot, "--resume", str(tune.run)])
     else:
         training = Finetune.defaults(["--robot", robot])
-        own |= {"run_dir": tune.run, "policy": tune.start, "seed": tune.seed, "shares": flags.shares}
+        own |= {"run_dir": tune.run, "policy": tune.start, "seed": tune.seed, "shares": flags.shares, **job.tune_sizes}
         own |= {"draw": flags.draw} if tune.archives else {"mix": "hard-random"}
     own["space"] = to_be_named(job.space.name) if tune.archives else job.space.name
     if replace(training, **own).execute():
@@ -422,4 +448,4 @@ def _where(job: Hardening) -> dict[str, Any]:
 
 def _named(job: Hardening, stage: Stage) -> str | None:
     """What a search calls its controller; None for the shipped one."""
-    return None if job.flags.policy is None and not stage.tunes else stage.policy
+    return None if job.flags.policy is None and stage.policy == job.base else stage.policy

@@ -16,7 +16,7 @@ from sim.policy.spec import about_controllers
 from sim.robots.identity import identity
 from train.evaluate.crossings import cross_all
 from train.evaluate.measures import measure
-from train.evaluate.sets import MIN_ELITES, TerrainSet, generated_set, make_sets, split_elites
+from train.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, split_elites
 from train.evaluate.tables import make_tables
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ _COUNTS = (
     "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "failing", "confirmed",
     "certified", "faults", "panel",
 )  # fmt: skip
-_KINDS = {"settings": dict, "sessions": list, "rounds": list, "comparisons": dict}  # of rounds.json
+_KINDS = {"settings": dict, "sessions": list, "rounds": list, "comparisons": dict, "choices": dict}  # of rounds.json
+_OF_ROWS = {"comparisons": "rounds", "choices": "kept"}  # what each of them has
 _SESSION = ("command", "commit", "device", "date")
 
 
@@ -42,8 +43,8 @@ def read_rounds(path: Path) -> dict[str, Any]:
     content = read_json(file) if file.exists() else {}
     for name, kind in _KINDS.items():
         value = content.get(name, kind())
-        rows = value.values() if name == "comparisons" and isinstance(value, dict) else ()
-        if not isinstance(value, kind) or not all(isinstance(row, dict) and "rounds" in row for row in rows):
+        rows = value.values() if name in _OF_ROWS and isinstance(value, dict) else ()
+        if not isinstance(value, kind) or not all(isinstance(row, dict) and _OF_ROWS[name] in row for row in rows):
             raise ValueError(f"{file} is damaged at {name}: put a copy of it back")
     return content
 
@@ -98,6 +99,7 @@ def _row(job: "Hardening", stage: "Stage") -> dict[str, Any]:
         "controller": stage.controller,
         **who,
         "tuned": [tune.run.name for tune in stage.tunes],
+        "kept": [tune.kept for tune in stage.tunes],
         "search": stage.search.name,
         **counts,
     }
@@ -108,11 +110,11 @@ def _tables(job: "Hardening") -> dict[str, Any]:
 
     The same keys as of ``tables.json``; what was crossed before is not crossed again.
     """
-    there = [stage for stage in job.stages if all(map(job.is_tuned, stage.tunes))]
+    there = list(filter(job.is_settled, job.stages))
     controllers = {stage.controller: stage.policy for stage in there}
     sets = dict(make_sets(FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space))
     searched = [stage.search for stage in there if not stage.compared and job.is_searched(stage)]
-    sets |= {run.name: _held_out(job, run) for run in divisible(searched)}
+    sets |= {run.name: held_out(job, run) for run in divisible(searched)}
     results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
     scales = job.robot.read_penalty_scales(None if job.flags.policy is None else str(job.flags.policy))
     crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
@@ -124,11 +126,11 @@ def _tables(job: "Hardening") -> dict[str, Any]:
     }
 
 
-def _held_out(job: "Hardening", run: Path) -> TerrainSet:
+def held_out(job: "Hardening", run: Path, part: Part = "test") -> TerrainSet:
     """Elites of an archive that no training draws."""
     archive = read_archive_of(job.robot, run, job.flags.space)
     split = split_elites(archive, job.robot.name, spec=job.robot.spec, run=run)
-    return replace(generated_set(archive, split, job.evaluator.num_terrains, 0), name=run.name)
+    return replace(generated_set(archive, split, job.evaluator.num_terrains, 0, part), name=run.name)
 
 
 def tell(content: Mapping[str, Any]) -> None:
@@ -140,3 +142,6 @@ def tell(content: Mapping[str, Any]) -> None:
         elites, failing, faults = ("-" if row[key] is None else row[key] for key in ("elites", "failing", "faults"))
         rates = (f"{name} {value_words(goal[name].get(who), limits[name].get(who))}" for name in FIXED_SETS)
         print(f"{who:<14}{elites:>8}{failing:>9}{faults:>8}  {', '.join(rates)}")
+    for name, choice in content.get("choices", {}).items():
+        if not choice["kept"]:
+            print(f"{name} was not kept: {choice['why']}")

@@ -212,6 +212,11 @@ def tuning_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int
     return sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
 
 
+def default_sizes(robot: RobotCfg, device: str) -> dict[str, int]:
+    """Sizes of a fine-tuning on a device where nothing else is asked for."""
+    return paper_sizes(robot.name) if device.startswith("cuda") else _SMALL
+
+
 def paper_sizes(robot: str) -> dict[str, int]:
     """Sizes of the paper's fine-tuning; of a robot that it does not have, those of its ANYmal."""
     return _PAPER.get(robot, _PAPER_OTHERS)

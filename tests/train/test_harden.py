@@ -19,13 +19,14 @@ from sim.robots.robot import get_robot
 from sim.rollout import RolloutResult
 from tests.train.results import result_of
 from tests.train.starts import write_actor
-from train import hardening, tuning
-from train.evaluate.sets import marks_of, recorded_marks, split_elites
+from train import choice, hardening, tuning
+from train.evaluate.sets import make_sets, marks_of, recorded_marks, split_elites
 from train.harden import Harden
 from train.hardening import harden, hardening_of
 
 ROBOT = get_robot("anymal")
 ITERATIONS = 3
+WORSE = set[str]()  # runs of trainings after which nobody arrives
 
 
 class Crossings:
@@ -53,6 +54,7 @@ class Crossings:
 def crossed(cfg, seeds) -> RolloutResult:
     shape = (len(seeds), cfg.num_replicas)
     share = 1.0 if "certifier" in cfg.policy else 0.0 if "start" in cfg.policy else 0.5
+    share *= cfg.policy.split("/")[-2] not in WORSE
     arrived = np.arange(shape[1]) < share * shape[1] * np.ones((shape[0], 1))
     outcomes = np.where(arrived, Outcome.GOAL, Outcome.BASE_COLLISION)
     rows = [np.random.default_rng(int(seed)).dirichlet(np.full(6, 0.3)) for seed in seeds]
@@ -70,7 +72,7 @@ def stub_tune(job, tune):
     state["mlp.0.bias"] = state["mlp.0.bias"] + 1.0 + len(tune.archives)
     torch.save(content, tune.run / "policy.pt")
     torch.save(content, tune.run / "checkpoint.pt")
-    record = {"iterations": job.tune_iterations, "archives": [str(run) for run in tune.archives]}
+    record = {"iterations": job.tune_sizes["iterations"], "archives": [str(run) for run in tune.archives]}
     (tune.run / "policy.train.json").write_bytes(to_json(record))
 
 
@@ -191,12 +193,114 @@ def test_stopped_in_a_training_it_goes_on_with_it(places, monkeypatch):
     assert begun == ["tune-1", "tune-1", "tune-2"]
 
 
+@pytest.fixture
+def worse():
+    """Names of trainings after which nobody arrives."""
+    yield WORSE
+    WORSE.clear()
+
+
+def test_a_training_that_makes_it_worse_is_not_kept(places, stubbed, worse, capsys):
+    worse.add("tune-2")
+    crossings = Crossings()
+    harden(config(places, rounds=3), open_evaluator=crossings.open)
+    content, run = rounds_of(places), places / "run"
+    assert {name: choice["kept"] for name, choice in content["choices"].items()} == {
+        "tune-1": True, "tune-2": False, "tune-3": True,
+    }  # fmt: skip
+    assert "tune-2 was not kept: its goal rate on validation is 0.000, before 0.500" in capsys.readouterr().out
+    first, second, third = content["rounds"][1:]
+    assert second["policy_sha256"] == first["policy_sha256"] != third["policy_sha256"]
+    assert (second["tuned"], second["kept"], second["search"]) == (["tune-2"], [False], "search-2")
+    job = hardening_of(config(places, rounds=3))
+    assert job.stages[3].tunes[0].start == run / "tune-1" / "checkpoint.pt"
+    assert read_archive(run / "search-2").policy_sha256 == first["policy_sha256"]
+    assert content["tables"]["goal"]["hand_crafted"]["round-2"] == 0.5
+    before = len(crossings.made)
+    harden(config(places, rounds=3), open_evaluator=crossings.open)
+    assert len(crossings.made) == before and numbers(rounds_of(places)) == numbers(content)
+
+
+def test_the_choice_is_by_terrains_that_are_not_reported(places, stubbed, monkeypatch):
+    seen = {}
+    real = choice.cross_all
+
+    def cross(controllers, sets, *args, **kwargs):
+        seen.update(sets)
+        return real(controllers, sets, *args, **kwargs)
+
+    monkeypatch.setattr(choice, "cross_all", cross)
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    assert list(seen) == ["hand_crafted", "hard_random", "search-0"]
+    assert list(rounds_of(places)["choices"]["tune-1"]["goal"]["after"]) == list(seen)
+    archive = read_archive(places / "run" / "search-0")
+    split = split_elites(archive, "anymal")
+    assert set(marks_of(seen["search-0"].terrains)) == set(marks_of(archive.genes[split.validation]))
+    reported = make_sets(("hand_crafted", "hard_random"), 3, 0)
+    assert not any(np.array_equal(seen[name].terrains, one.terrains) for name, one in reported.items())
+
+
+def test_the_last_is_kept_where_that_is_asked_for(places, stubbed, worse):
+    worse.add("tune-2")
+    harden(config(places, keep="last"), open_evaluator=Crossings().open)
+    content = rounds_of(places)
+    assert content.get("choices", {}) == {} and content["rounds"][2]["kept"] == [True]
+    assert content["tables"]["goal"]["hand_crafted"]["round-2"] == 0.0
+    with pytest.raises(ValueError, match="holds a hardening of other settings: keep"):
+        harden(config(places), open_evaluator=Crossings().open)
+
+
+def test_a_run_of_before_there_was_a_choice_kept_the_last(places, stubbed):
+    harden(config(places, rounds=1, keep="last"), open_evaluator=Crossings().open)
+    content = rounds_of(places)
+    del content["settings"]["keep"]
+    (places / "run" / "rounds.json").write_bytes(to_json(content))
+    assert harden(config(places, rounds=1, keep="last"), open_evaluator=Crossings().open) == 0
+    with pytest.raises(ValueError, match="other settings: keep"):
+        harden(config(places, rounds=1), open_evaluator=Crossings().open)
+
+
+def test_killed_before_the_choice_it_is_made_before_anything_is_told(places, stubbed):
+    job = hardening_of(config(places, rounds=1), open_evaluator=Crossings().open)
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    whole = rounds_of(places)
+    content = {name: value for name, value in whole.items() if name != "choices"}
+    (places / "run" / "rounds.json").write_bytes(to_json(content))
+    assert not job.is_settled(job.stages[1])
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    assert numbers(rounds_of(places)) == numbers(whole) and rounds_of(places)["choices"] == whole["choices"]
+
+
+def test_a_training_made_anew_is_judged_anew(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    job = hardening_of(config(places, rounds=1))
+    assert job.stages[1].tunes[0].kept
+    torch.save(torch.load(places / "certifier.pt", weights_only=True), places / "run" / "tune-1" / "policy.pt")
+    assert job.stages[1].tunes[0].kept is None
+
+
+@pytest.mark.parametrize(
+    ("after", "kept", "why"),
+    [
+        ((0.98, 0.96, 0.5, 0.5), True, "its goal rate on validation is 0.813, before 0.793"),
+        ((0.98, 0.96, 0.5, 0.3), False, "its goal rate on validation is 0.780, before 0.793"),
+        ((0.96, 0.97, 0.9, 0.9), False, "; on hand_crafted it is 0.020 below the base's"),
+        ((0.975, 0.93, 0.9, 0.9), False, "; on hard_random it is 0.030 below the base's"),
+    ],
+)
+def test_what_is_kept_is_no_worse_and_loses_nothing_on_ordinary_terrains(after, kept, why):
+    names = ("hand_crafted", "hard_random", "search-0", "search-1")
+    base, before = (dict(zip(names, row, strict=True)) for row in ((0.98, 0.96, 0.1, 0.1), (0.98, 0.96, 0.4, 0.48)))
+    found = choice.verdict(base, before, dict(zip(names, after, strict=True)))
+    assert found["kept"] is kept and why in found["why"]
+
+
 def test_a_training_that_is_cut_short_is_not_taken_for_whole(places, stubbed):
     job = hardening_of(config(places), open_evaluator=Crossings().open)
     tune = replace(job.stages[1].tunes[0], start=places / "start.pt")
     assert not job.is_tuned(tune)
     (places / "run").mkdir()
-    stub_tune(replace(job, tune_iterations=ITERATIONS - 1), tune)
+    stub_tune(replace(job, tune_sizes={"iterations": ITERATIONS - 1}), tune)
     assert not job.is_tuned(tune)
     (tune.run / "policy.train.json").write_bytes(to_json({"iterations": ITERATIONS}))
     assert job.is_tuned(tune)
@@ -213,7 +317,8 @@ def test_more_rounds_continue_a_finished_run(places, stubbed):
     harden(config(places, rounds=1), open_evaluator=Crossings().open)
     content = rounds_of(places)
     first = content["rounds"]
-    del content["settings"]["tune"]["entropy"]  # as of before recipes named one
+    for name in ("entropy", "num_envs", "terrains", "swap_every"):  # as of before they were named
+        del content["settings"]["tune"][name]
     (places / "run" / "rounds.json").write_bytes(to_json(content))
     crossings = Crossings()
     harden(config(places, rounds=2), open_evaluator=crossings.open)
@@ -268,7 +373,7 @@ def test_the_time_limit_stops_it_as_ctrl_c_does(places, monkeypatch, capsys):
 
 
 def test_the_time_limit_holds_in_the_background_where_ctrl_c_is_ignored(places, monkeypatch, capsys):
-    monkeypatch.setattr(hardening, "_run", lambda job, stage: time.sleep(60))
+    monkeypatch.setattr(hardening, "_run", lambda job, number: time.sleep(60))
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         assert harden(config(places, max_seconds=0.5), open_evaluator=Crossings().open) == 0

@@ -36,6 +36,7 @@ _LINES = (("#0072b2", "o"), ("#d55e00", "X"), ("#009e73", "s"), ("#cc79a7", "^")
           ("#000000", "P"))  # fmt: skip
 _COUNT = int | None
 _ROW = {"controller": str, "search": str, "episodes": _COUNT, "panel": [str], **dict.fromkeys(_COUNTS, _COUNT)}
+_CHOICE = {"kept": bool, "why": str}
 _SHAPES = {"robot": str, "rounds": [_ROW], "comparisons": {...: _ROW}, "tables": dict, "sessions": list}
 
 
@@ -58,6 +59,7 @@ def rounds_report(run: Path, robot: str | None, out: Path | None) -> Path:
     sections = [
         Section("Faults by round", "faults", _faults(content)),
         Section("Rates by round", "rates", _rates(content)),
+        *_choices(content),
         Section("What became of terrains", "changes", _changes(content)),
         Section("Where this comes from", "origin", _origin(content, run)),
     ]
@@ -73,7 +75,8 @@ def _read(run: Path, robot: str | None) -> dict[str, Any]:
     if not content.get("rounds"):
         go_on = "let it go on with the command that began it"
         raise ValueError(f"{file} must have a search that is over, got none: {go_on}")
-    damaged = unreadable({**content, **content.get("tables", {})}, _SHAPES)
+    shapes = _SHAPES | ({"choices": {...: _CHOICE}} if "choices" in content else {})
+    damaged = unreadable({**content, **content.get("tables", {})}, shapes)
     if damaged:
         raise ValueError(f"{file} must be of `faultline harden`, but its {damaged} cannot be read: put a copy back")
     if robot is not None and get_robot(robot).name != content["robot"]:
@@ -210,6 +213,22 @@ def _draw_lines(axes: "Axes", tables: dict[str, Any], measure: str, joined: list
     axes.set_xticks(range(len(controllers)), controllers, rotation=20 if len(controllers) > 5 else 0)
     axes.set_ylim(-3, 103)
     axes.grid(alpha=0.3)
+
+
+def _choices(content: dict[str, Any]) -> list[Section]:
+    """Which trainings were kept; nothing where all of them were kept unasked."""
+    choices = content.get("choices", {})
+    if not choices:
+        return []
+    text = (
+        "After each training the controller reached the goal on validation terrains, which are not those reported, "
+        "this often: the mean of hand-crafted ones, hard-random ones, and the archives trained on. A controller that "
+        "is worse there than the one before, or on ordinary terrains more than a point worse than the base, is not "
+        "kept. The next training then begins with the one before."
+    )
+    rows = [[name, "kept" if one["kept"] else "not kept", one["why"]] for name, one in choices.items()]
+    blocks = [paragraph(text), table(["training", "", "why"], rows, words=True)]
+    return [Section("Which trainings were kept", "choices", blocks)]
 
 
 def _changes(content: dict[str, Any]) -> list[Block]:

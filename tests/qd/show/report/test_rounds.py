@@ -68,6 +68,15 @@ def test_comparisons_stand_beside_the_rounds(run):
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["base", "round-1", "hard_random"]
 
 
+def test_it_says_which_trainings_were_kept(run):
+    assert "Which trainings were kept" not in Page(html_report(Report(run=run)).read_bytes()).text
+    kept = {"tune-1": {"kept": True, "why": "better"}, "tune-2": {"kept": False, "why": "<i>worse"}}
+    write(run, choices=kept)
+    page = Page(html_report(Report(run=run)).read_bytes())
+    assert "Which trainings were kept" in page.text
+    assert "tune-1 kept better tune-2 not kept <i>worse" in page.text
+
+
 def test_the_figures_show_the_numbers():
     bars = {bars.get_label(): [bar.get_height() for bar in bars] for bars in draw_faults(content()).axes[0].containers}
     assert bars == {"failing": [20, 20], "confirmed": [18, 18], "faults": [12, 3]}
@@ -87,6 +96,7 @@ def test_one_search_alone_makes_a_page(run):
     [
         ({"rounds": []}, {}, "must have a search that is over, got none"),
         ({"rounds": [{"controller": 3}]}, {}, "its rounds cannot be read"),
+        ({"choices": {"tune-1": {"kept": 1}}}, {}, "its choices cannot be read"),
         ({"tables": {"episodes": 20}}, {}, "its controllers cannot be read"),
         ({}, {"robot": "cassie"}, "is of robot anymal, got --robot cassie"),
         ({}, {"out": "page.txt"}, "out must be a file named"),
