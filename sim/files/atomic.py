@@ -101,7 +101,7 @@ def _as_json(value: Any, indent: str, before: int) -> str:
     """A value, before which so many columns of its line are taken beside the indent."""
     if not isinstance(value, dict | list | tuple) or not value:
         return json.dumps(value, allow_nan=False)
-    inner = f"{indent}  "
+    inner = f"{indent} "
     if isinstance(value, dict):
         names = json.loads(json.dumps(dict.fromkeys(value), allow_nan=False))  # as JSON has them, words alone
         heads = [f"{json.dumps(name)}: " for name in names]

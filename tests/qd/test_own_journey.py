@@ -172,7 +172,7 @@ def test_no_search_begins_wrongly(calibrated, home, wrong, robot, trot):
     wrong(*search, "--presett", "small", says=("--presett", "--preset"))
     with edited(home / "dog.scales.json", '"scales": {', '"scales": [{'):
         wrong(*search, says=(f"{home}/dog.scales.json must be a JSON file",))
-    with edited(home / "dog.scales.json", '"scales": {\n    "yaw_rate": ', '"scales": {\n    "yaw_rate": -'):
+    with edited(home / "dog.scales.json", '"scales": {\n  "yaw_rate": ', '"scales": {\n  "yaw_rate": -'):
         wrong(*search, says=("no positive scale for yaw_rate", "calibrate"))
     with edited(home / "dog.xml", 'kp="60"', 'kp="50"'):
         wrong(*search, says=("dog.scales.json is of robot 'dog' as it was", "calibrate"))

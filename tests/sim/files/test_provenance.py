@@ -48,9 +48,9 @@ def test_what_fits_a_line_takes_one_and_means_what_it_meant():
     text = to_json(content).decode()
     assert json.loads(text) == json.loads(json.dumps(content))
     rows = text.splitlines()
-    assert {'  "a": [0.1, -2e-30, null],', '  "e": [{"f": [3], "g": {}}],', '  "3": [true, []],'} <= set(rows)
-    assert all(len(row) <= 120 for row in rows if not row.startswith('  "many": ['))
-    assert sum(row.startswith('    {"name": ') for row in rows) == 3 and rows[-1] == "}"
+    assert {' "a": [0.1, -2e-30, null],', ' "e": [{"f": [3], "g": {}}],', ' "3": [true, []],'} <= set(rows)
+    assert all(len(row) <= 120 for row in rows if not row.startswith(' "many": ['))
+    assert sum(row.startswith('  {"name": ') for row in rows) == 3 and rows[-1] == "}"
 
 
 @pytest.mark.parametrize("content", [{(1, 2): 3}, {"a": np.zeros(2)}, {"a": {1, 2}}])
