@@ -39,6 +39,9 @@ class Finetune(OnGround, TrainingFlags):
     policy: Path | None = None
     """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one. The checkpoint.pt of a
     training is its last actor, with its critic; its policy.pt is the mean of the last actors."""
+    noise_of: Path | None = None
+    """Controller with whose noise of the actions to begin; that of --policy. Noise grows in a training, and a hardening
+    lets each begin with the base's."""
     mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
     """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G) or hard-random ones (C-HR), or
     nothing else (C-HC)."""
@@ -95,6 +98,7 @@ class Finetune(OnGround, TrainingFlags):
             **{name: settings[name] for name in same},
             **settings["mix"],
             "policy": None if policy == "shipped" else Path(policy),
+            "noise_of": Path(settings["noise_of"]) if settings.get("noise_of") else None,
             "archive": tuple(map(Path, archive_paths(settings))),
             "shares": settings.get("shares", "equal"),
             "space": shipped_space(settings),

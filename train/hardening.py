@@ -34,7 +34,7 @@ from train.harden import Harden
 from train.ppo.learner import read_start
 from train.ppo.run import CHECKPOINT, POLICY
 from train.rounds import FIXED_SETS, begin, divisible, read_rounds, record, tell
-from train.tuning import default_sizes, tuning_sizes
+from train.tuning import tuning_sizes
 
 BASE = "base"
 """Name of the controller that a hardening begins with."""
@@ -268,7 +268,7 @@ def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> di
         "seed": flags.seed,
         "space": job.space.name,
         "search": searched,
-        "tune": {**job.tune_sizes, "shares": flags.shares, **recipe},
+        "tune": {**job.tune_sizes, "shares": flags.shares, "noise_of": BASE, **recipe},
         "keep": flags.keep,
         "evaluation": {"terrains": job.evaluator.num_terrains, "episodes": job.evaluator.num_replicas},
     }
@@ -283,11 +283,7 @@ def _refuse_another(job: Hardening) -> None:
     path = job.path
     if (path / ROUNDS_FILE).exists():
         content = read_rounds(path)
-        there = content.get("settings", {})
-        # What all had before it was a setting.
-        tune = {"entropy": 0.005, **default_sizes(job.robot, job.device), **there.get("tune", {})}
-        older = {"tune": tune, "keep": there.get("keep", "last")}
-        different = differences({**there, **older}, job.settings)
+        different = differences(content.get("settings", {}), job.settings)
         if different:
             raise ValueError(
                 f"{path} holds a hardening of other settings: {', '.join(different)}: give those (a recipe's in tuning "
@@ -409,6 +405,7 @@ def _tune(job: Hardening, tune: Tune) -> None:
     else:
         training = Finetune.defaults(["--robot", robot])
         own |= {"run_dir": tune.run, "policy": tune.start, "seed": tune.seed, "shares": flags.shares, **job.tune_sizes}
+        own |= {"noise_of": Path(job.base)} if tune.start != flags.policy else {}
         own |= {"draw": flags.draw} if tune.archives else {"mix": "hard-random"}
     own["space"] = to_be_named(job.space.name) if tune.archives else job.space.name
     if replace(training, **own).execute():

@@ -155,6 +155,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     if saved is None:
         path = flags.policy or robot.policy_file
         start, before = read_start(path, robot), sorted(recorded_marks(str(path)))
+        start = start if flags.noise_of is None else start.with_noise_of(read_start(flags.noise_of, robot))
         ppo = replace(flags.ppo, hidden_dims=start.hidden_dims)
         alone = 0 if start.critic is not None else alone
     else:  # all of it is in the checkpoint: the file it began with may be gone
@@ -175,6 +176,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     settings = {
         **common,
         "policy": str(flags.policy or "shipped"),
+        **({} if flags.noise_of is None else {"noise_of": str(flags.noise_of)}),
         "mix": asdict(mix_cfg),
         "archive": elites.about,
         **({"shares": flags.shares} if len(flags.archive) > 1 else {}),
@@ -210,11 +212,6 @@ def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
 def tuning_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int]:
     """Robots, terrains, iterations and how often terrains are exchanged: what flags say, else what suits the device."""
     return sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
-
-
-def default_sizes(robot: RobotCfg, device: str) -> dict[str, int]:
-    """Sizes of a fine-tuning on a device where nothing else is asked for."""
-    return paper_sizes(robot.name) if device.startswith("cuda") else _SMALL
 
 
 def paper_sizes(robot: str) -> dict[str, int]:

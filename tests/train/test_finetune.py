@@ -155,6 +155,23 @@ def test_a_critic_that_comes_along_is_taken(places):
     assert float(tuned.learner.alg._lr) == pytest.approx(1e-4)  # a trained actor's first steps are small here too
 
 
+def test_it_begins_with_the_noise_of_another_controller_where_that_is_asked_for(places):
+    noisy = write_actor(places / "noisy.pt", critic=True, **{"distribution.std_param": torch.full((12,), 0.7)})
+    run, flags = places / "quiet", {"policy": noisy, "noise_of": places / "start.pt", "iterations": 1}
+    tuned = tuning.FineTuning(job_of(config(places, run_dir=run, **flags)))
+    assert tuned.learner.noise_std == pytest.approx(0.3)
+    assert tuned.learner.actor_state()["mlp.0.weight"].equal(
+        torch.load(noisy, weights_only=True)["actor_state_dict"]["mlp.0.weight"]
+    )
+    assert finetune(config(places, run_dir=run, **flags)) == 0
+    assert json.loads((run / "policy.train.json").read_text())["settings"]["noise_of"] == str(places / "start.pt")
+    assert finetune(resumed(run, iterations=2)) == 0
+    with pytest.raises(ValueError, match=r"noise_of"):
+        job_of(resumed(run, iterations=3, noise_of=noisy))
+    plain = tuning.FineTuning(job_of(config(places, run_dir=places / "none", policy=noisy)))
+    assert plain.learner.noise_std == pytest.approx(0.7)
+
+
 @pytest.mark.parametrize(("iterations", "alone"), [(1, 0), (3, 1), (10, 5), (99, 49), (1200, 50)])
 def test_left_out_the_critic_alone_has_at_most_half_of_the_iterations(iterations, alone, places):
     job = job_of(config(places, critic_iterations=None, iterations=iterations, run_dir=places / "none"))

@@ -250,13 +250,13 @@ def test_the_last_is_kept_where_that_is_asked_for(places, stubbed, worse):
         harden(config(places), open_evaluator=Crossings().open)
 
 
-def test_a_run_of_before_there_was_a_choice_kept_the_last(places, stubbed):
-    harden(config(places, rounds=1, keep="last"), open_evaluator=Crossings().open)
+def test_a_run_begun_with_another_recipe_is_refused(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
     content = rounds_of(places)
-    del content["settings"]["keep"]
+    for name in ("noise_of", "num_envs"):  # as of before they were named
+        del content["settings"]["tune"][name]
     (places / "run" / "rounds.json").write_bytes(to_json(content))
-    assert harden(config(places, rounds=1, keep="last"), open_evaluator=Crossings().open) == 0
-    with pytest.raises(ValueError, match="other settings: keep"):
+    with pytest.raises(ValueError, match=r"other settings: tune\.noise_of .*, tune\.num_envs "):
         harden(config(places, rounds=1), open_evaluator=Crossings().open)
 
 
@@ -315,11 +315,7 @@ def test_its_searches_begin_with_other_terrains_than_those_that_controllers_are_
 
 def test_more_rounds_continue_a_finished_run(places, stubbed):
     harden(config(places, rounds=1), open_evaluator=Crossings().open)
-    content = rounds_of(places)
-    first = content["rounds"]
-    for name in ("entropy", "num_envs", "terrains", "swap_every"):  # as of before they were named
-        del content["settings"]["tune"][name]
-    (places / "run" / "rounds.json").write_bytes(to_json(content))
+    first = rounds_of(places)["rounds"]
     crossings = Crossings()
     harden(config(places, rounds=2), open_evaluator=crossings.open)
     assert rounds_of(places)["rounds"][:2] == first and len(rounds_of(places)["rounds"]) == 3
@@ -351,6 +347,7 @@ def test_a_real_training_draws_from_all_archives_and_brings_its_critic_along(pla
     record = read_json(run / "tune-2" / "policy.train.json")
     assert record["settings"]["policy"] == str(run / "tune-1" / "checkpoint.pt")
     assert record["settings"]["critic_iterations"] == 0
+    assert record["settings"]["noise_of"] == str(places / "start.pt")
     assert record["settings"]["archive"]["path"] == [str(run / "search-0"), str(run / "search-1")]
     marks = recorded_marks(str(run / "tune-2" / "policy.pt"))
     for name in ("search-0", "search-1"):

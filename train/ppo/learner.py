@@ -7,7 +7,7 @@ import contextlib
 import io
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -348,6 +348,11 @@ class Start:
     critic: State | None
     hidden_dims: tuple[int, ...]
     """Hidden layers of both."""
+
+    def with_noise_of(self, other: "Start") -> "Start":
+        """The same with another's standard deviation of the actions, where that is known."""
+        noise = {_STD: other.actor[_STD]} if _STD in other.actor else {}
+        return replace(self, actor={**self.actor, **noise})
 
 
 def read_start(path: Path, robot: RobotCfg) -> Start:
