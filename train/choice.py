@@ -42,6 +42,7 @@ def choose(job: "Hardening", tune: "Tune") -> None:
 
     Raises:
         EvaluatorError: If a worker is lost; what is crossed is kept.
+        AllInvalidError: If no episode on a set is valid.
     """
     goal = _goal_rates(job, tune)
     choice = {**verdict(goal["base"], goal["before"], goal["after"]), "goal": goal, "sha256": _hashes(job, tune)}
@@ -60,35 +61,36 @@ def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, f
         after: Of the one after it.
 
     Returns:
-        ``kept``, ``score`` of both (:func:`score`), and ``why``, in words.
+        ``kept``, ``score`` of both, which is the mean over the sets, and ``why``, in words.
     """
-    scores = {"before": score(before), "after": score(after)}
+    scores = {"before": fmean(before.values()), "after": fmean(after.values())}
     why = f"its goal rate on validation is {scores['after']:.3f}, before {scores['before']:.3f}"
-    lost = {name: base[name] - after[name] for name in FIXED_SETS if base[name] - after[name] > MOST_LOST}
+    lost = {name: base[name] - after[name] for name in FIXED_SETS if base[name] - after[name] > MOST_LOST + 1e-9}
     if lost:
         why += "".join(f"; on {name} it is {points:.3f} below the base's" for name, points in lost.items())
     return {"kept": not lost and scores["after"] >= scores["before"], "why": why, "score": scores}
 
 
-def score(goal: dict[str, float]) -> float:
-    """Mean goal rate over hand-crafted terrains, hard-random ones, and all archives together, by rates of sets."""
-    archives = [rate for name, rate in goal.items() if name not in FIXED_SETS]
-    return fmean([*(goal[name] for name in FIXED_SETS), *([fmean(archives)] if archives else [])])
-
-
 def _goal_rates(job: "Hardening", tune: "Tune") -> dict[str, dict[str, float]]:
-    """Goal rate of the base and of the controllers before and after a training, by validation set."""
+    """Goal rate of the base and of the controllers before and after a training, by validation set.
+
+    The elites of all archives are one set, since a small archive has few for validation.
+    """
     sets = make_sets(FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space, part="validation")
-    sets |= {run.name: held_out(job, run, "validation") for run in divisible(tune.archives)}
+    archives = divisible(tune.archives)
+    sets |= {run.name: held_out(job, run, "validation") for run in archives}
     named = {"base": job.base, "before": tune.before, "after": tune.policy}
     names = {policy: "base" if policy == job.base else Path(policy).parent.name for policy in named.values()}
     controllers = {name: policy for policy, name in names.items()}
     print("\nOn validation terrains:", flush=True)
     results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
-    return {
-        when: {name: float(np.nanmean(terrain_rates(row[names[policy]])["goal"])) for name, row in results.items()}
-        for when, policy in named.items()
-    }
+    found: dict[str, dict[str, float]] = {}
+    for when, policy in named.items():
+        rates = {name: terrain_rates(row[names[policy]])["goal"] for name, row in results.items()}
+        elites = [rates.pop(run.name) for run in archives]
+        rates |= {"elites": np.concatenate(elites)} if elites else {}
+        found[when] = {name: float(np.nanmean(values)) for name, values in rates.items()}
+    return found
 
 
 def _hashes(job: "Hardening", tune: "Tune") -> list[str | None]:

@@ -40,8 +40,8 @@ class Finetune(OnGround, TrainingFlags):
     """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one. The checkpoint.pt of a
     training is its last actor, with its critic; its policy.pt is the mean of the last actors."""
     noise_of: Path | None = None
-    """Controller with whose noise of the actions to begin; that of --policy. Noise grows in a training, and a hardening
-    lets each begin with the base's."""
+    """Controller with whose noise of the actions to begin, if its file says it; that of --policy. Noise grows in a
+    training, and a hardening lets each begin with the base's."""
     mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
     """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G) or hard-random ones (C-HR), or
     nothing else (C-HC)."""

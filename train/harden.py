@@ -43,8 +43,9 @@ class Harden(OfRobot, OnGround, Where):
     tune_terrains: int | None = setting(None, least=1)
     """Terrains of each training at a time; likewise, 500 on CUDA (Cassie: 100), 12 on the CPU."""
     keep: Literal["best", "last"] = "best"
-    """Which controller to go on with after a training. best: the new one only if it is no worse on validation terrains,
-    and on ordinary ones no more than a point worse than the base; else the one before. last: always the new one."""
+    """Which controller to go on with after a training. best: the new one only if it reaches the goal no less often on
+    validation terrains, and on hand-crafted and hard-random ones at most a point less than the base; else the one
+    before. last: always the new one."""
     preset: str | None = None
     """Size of a search's iteration: wide (the default on a GPU), paper, or small (the default on the CPU)."""
     emitters: int | None = setting(None, least=1)
@@ -61,9 +62,9 @@ class Harden(OfRobot, OnGround, Where):
     """Certifiers as NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt. The controller that is
     searched never certifies itself."""
     terrains: int | None = setting(None, least=1)
-    """Terrains a set of the evaluation; 300 on CUDA (Cassie: 180), 24 on the CPU."""
+    """Terrains a set of evaluation and validation; 300 on CUDA (Cassie: 180), 24 on the CPU."""
     episodes: int | None = setting(None, least=1)
-    """Episodes a terrain of the evaluation; 20 on CUDA, 4 on the CPU."""
+    """Episodes a terrain of evaluation and validation; 20 on CUDA, 4 on the CPU."""
     space: str | None = None
     """Terrain space: super_gaussian, course, or one of your own, file.py:CLASS; super_gaussian if left out."""
     against: tuple[Literal["hard_random", "first_archive"], ...] = ()

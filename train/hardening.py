@@ -1,7 +1,8 @@
 """A hardening at work: which steps there are, which of them are done, and what they say together.
 
 Every step is a run of its own: a search with its verdicts, or a training. What is done is read off these runs, so that
-a hardening that was killed anywhere goes on where it was. ``rounds.json`` follows from them.
+a hardening that was killed anywhere goes on where it was. ``rounds.json`` follows from them, but for which trainings
+were kept: that is written there, and decided again from the crossings if it is lost.
 """
 
 import signal
@@ -240,11 +241,15 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         open_evaluator=open_evaluator,
     )
     found = replace(found, settings=_settings_of(found, search, sizes))
+    robots, terrains = (found.tune_sizes[name] for name in ("num_envs", "terrains"))
+    if robots < terrains:
+        raise ValueError(f"tune_num_envs must be at least as many as tune_terrains, {terrains}, got {robots}")
     for certifier in found.certifiers(str(policy)).values():
         check_policy(certifier, robot, device)
     _refuse_another(found)
     for stage in found.stages:
-        _refuse_changed(found, stage)
+        if found.is_settled(stage):
+            _refuse_changed(found, stage)
     return found
 
 
@@ -287,7 +292,7 @@ def _refuse_another(job: Hardening) -> None:
         if different:
             raise ValueError(
                 f"{path} holds a hardening of other settings: {', '.join(different)}: give those (a recipe's in tuning "
-                "of the robot's settings), or another --run-dir"
+                "of the robot's settings; what is null was begun by an older version), or another --run-dir"
             )
         done = len(content.get("rounds", [])) - 1
         if job.flags.rounds < done:
@@ -350,6 +355,7 @@ def harden(flags: Harden, *, open_evaluator: Open = open_evaluator) -> int:
             print(f"The time is up. {stop}")
             return 0
     tell(read_json(job.path / ROUNDS_FILE))
+    print(f"The hardened controller:  {job.stages[flags.rounds].policy}")
     print(f"Next, see it on one page:  {command_line('report', robot=job.robot.spec, run=job.path)}")
     return 0
 
@@ -387,6 +393,7 @@ def _run(job: Hardening, number: int) -> None:
         if job.stages[number].tunes[place].kept is None:
             choose(job, tune)
     stage = job.stages[number]
+    _refuse_changed(job, stage)  # a training made anew, or a choice
     if stage.tunes and not job.is_searched(stage):
         record(job)
     if not job.is_judged(stage):

@@ -29,7 +29,7 @@ _COUNTS = (
     "certified", "faults", "panel",
 )  # fmt: skip
 _KINDS = {"settings": dict, "sessions": list, "rounds": list, "comparisons": dict, "choices": dict}  # of rounds.json
-_OF_ROWS = {"comparisons": "rounds", "choices": "kept"}  # what each of them has
+_OF_ROWS = {"comparisons": {"rounds"}, "choices": {"kept", "why"}}  # what each of them has
 _SESSION = ("command", "commit", "device", "date")
 
 
@@ -44,7 +44,8 @@ def read_rounds(path: Path) -> dict[str, Any]:
     for name, kind in _KINDS.items():
         value = content.get(name, kind())
         rows = value.values() if name in _OF_ROWS and isinstance(value, dict) else ()
-        if not isinstance(value, kind) or not all(isinstance(row, dict) and _OF_ROWS[name] in row for row in rows):
+        whole = all(isinstance(row, dict) and row.keys() >= _OF_ROWS[name] for row in rows)
+        if not isinstance(value, kind) or not whole:
             raise ValueError(f"{file} is damaged at {name}: put a copy of it back")
     return content
 
@@ -76,7 +77,8 @@ def record(job: "Hardening") -> None:
     """Writes ``rounds.json``: the counts of all searches that are over, and the tables of all controllers there are."""
     file = job.path / ROUNDS_FILE
     content = read_json(file)
-    rows = {stage.controller: (stage, _row(job, stage)) for stage in job.stages if job.is_judged(stage)}
+    judged = [stage for stage in job.stages if job.is_settled(stage) and job.is_judged(stage)]
+    rows = {stage.controller: (stage, _row(job, stage)) for stage in judged}
     known = dict(content.get("comparisons") or {})  # those of this session and of sessions before
     known |= {stage.compared: {"rounds": job.flags.rounds, **row} for stage, row in rows.values() if stage.compared}
     written = {
@@ -142,6 +144,7 @@ def tell(content: Mapping[str, Any]) -> None:
         elites, failing, faults = ("-" if row[key] is None else row[key] for key in ("elites", "failing", "faults"))
         rates = (f"{name} {value_words(goal[name].get(who), limits[name].get(who))}" for name in FIXED_SETS)
         print(f"{who:<14}{elites:>8}{failing:>9}{faults:>8}  {', '.join(rates)}")
+    tuned = {name for row in [*content["rounds"], *content["comparisons"].values()] for name in row["tuned"]}
     for name, choice in content.get("choices", {}).items():
-        if not choice["kept"]:
+        if name in tuned and not choice["kept"]:
             print(f"{name} was not kept: {choice['why']}")

@@ -140,6 +140,9 @@ def cross_all(
     with tqdm(total=episodes, file=sys.stderr, dynamic_ncols=True, bar_format=_FORMAT, disable=None) as bar:
         for who, names in todo.items():
             own = replace(evaluator, policy=controllers[who])
+            twins = [other for other, policy in controllers.items() if policy == controllers[who]]
+            found |= {(who, name): found[other, name] for name in names for other in twins if (other, name) in found}
+            names = [name for name in names if (who, name) not in found]
             for name, result in _cross_missing(who, own, {name: whole[name] for name in names}, bar, open_evaluator):
                 kept.write(controllers[who], whole[name], result)
                 found[who, name] = result

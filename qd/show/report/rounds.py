@@ -222,9 +222,9 @@ def _choices(content: dict[str, Any]) -> list[Section]:
         return []
     text = (
         "After each training the controller reached the goal on validation terrains, which are not those reported, "
-        "this often: the mean of hand-crafted ones, hard-random ones, and the archives trained on. A controller that "
-        "is worse there than the one before, or on ordinary terrains more than a point worse than the base, is not "
-        "kept. The next training then begins with the one before."
+        "this often: the mean of hand-crafted ones, hard-random ones, and elites of the archives trained on. A "
+        "controller that is worse there than the one before, or on ordinary terrains more than a point worse than the "
+        "base, is not kept. The next training then begins with the one before."
     )
     rows = [[name, "kept" if one["kept"] else "not kept", one["why"]] for name, one in choices.items()]
     blocks = [paragraph(text), table(["training", "", "why"], rows, words=True)]
