@@ -4,7 +4,6 @@ Two trainings of one recipe differ by several points, and one may end worse than
 the kinds that are reported, but none of those (:mod:`train.evaluate.sets`).
 """
 
-from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -79,14 +78,12 @@ def _goal_rates(job: "Hardening", tune: "Tune") -> dict[str, dict[str, float]]:
     sets = make_sets(FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space, part="validation")
     archives = divisible(tune.archives)
     sets |= {run.name: held_out(job, run, "validation") for run in archives}
-    named = {"base": job.base, "before": tune.before, "after": tune.policy}
-    names = {policy: "base" if policy == job.base else Path(policy).parent.name for policy in named.values()}
-    controllers = {name: policy for policy, name in names.items()}
-    print("\nOn validation terrains:", flush=True)
+    controllers = {"base": job.base, "before": tune.before, "after": tune.policy}
+    print(f"\nOn validation terrains, before {tune.run.name} and after:", flush=True)
     results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
     found: dict[str, dict[str, float]] = {}
-    for when, policy in named.items():
-        rates = {name: terrain_rates(row[names[policy]])["goal"] for name, row in results.items()}
+    for when in controllers:
+        rates = {name: terrain_rates(row[when])["goal"] for name, row in results.items()}
         elites = [rates.pop(run.name) for run in archives]
         rates |= {"elites": np.concatenate(elites)} if elites else {}
         found[when] = {name: float(np.nanmean(values)) for name, values in rates.items()}

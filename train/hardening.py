@@ -35,7 +35,7 @@ from train.harden import Harden
 from train.ppo.learner import read_start
 from train.ppo.run import CHECKPOINT, POLICY
 from train.rounds import FIXED_SETS, begin, divisible, read_rounds, record, tell
-from train.tuning import tuning_sizes
+from train.tuning import check_sizes, tuning_sizes
 
 BASE = "base"
 """Name of the controller that a hardening begins with."""
@@ -241,9 +241,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         open_evaluator=open_evaluator,
     )
     found = replace(found, settings=_settings_of(found, search, sizes))
-    robots, terrains = (found.tune_sizes[name] for name in ("num_envs", "terrains"))
-    if robots < terrains:
-        raise ValueError(f"tune_num_envs must be at least as many as tune_terrains, {terrains}, got {robots}")
+    check_sizes(found.tune_sizes, "tune_")
     for certifier in found.certifiers(str(policy)).values():
         check_policy(certifier, robot, device)
     _refuse_another(found)
@@ -269,7 +267,7 @@ def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> di
     searched = {"preset": search.preset, "method": search.scheduler.method, **sizes, "episodes": episodes}
     recipe = {**vars(job.robot.tuning), **({"draw": flags.draw} if flags.draw else {})}
     return {
-        **identity(job.robot, flags.policy or job.robot.policy_file),
+        **identity(job.robot, job.base),
         "seed": flags.seed,
         "space": job.space.name,
         "search": searched,

@@ -168,8 +168,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     task = TaskCfg.of(robot, crosses=crosses, rewards=flags.rewards, start_spread=spread)
     common = settings_of(flags, robot, size, task, ppo)
     mix_cfg = MixCfg(mix=flags.mix, terrains=size["terrains"], swap_every=size["swap_every"], draw=draw)
-    if size["num_envs"] < mix_cfg.terrains:
-        raise ValueError(f"num_envs must be at least as many as terrains, {mix_cfg.terrains}, got {size['num_envs']}")
+    check_sizes(size)
     if saved is not None:
         _check_space(flags, saved["extra"]["settings"])
     elites = _elites(flags, robot, keep_validation=_keeps_validation(saved))
@@ -212,6 +211,17 @@ def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
 def tuning_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int]:
     """Robots, terrains, iterations and how often terrains are exchanged: what flags say, else what suits the device."""
     return sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
+
+
+def check_sizes(sizes: dict[str, int], prefix: str = "") -> None:
+    """Refuses fewer robots than terrains; ``prefix`` is of the flags that say them.
+
+    Raises:
+        ValueError: If a terrain would have no robot.
+    """
+    robots, terrains = sizes["num_envs"], sizes["terrains"]
+    if robots < terrains:
+        raise ValueError(f"{prefix}num_envs must be at least as many as {prefix}terrains, {terrains}, got {robots}")
 
 
 def paper_sizes(robot: str) -> dict[str, int]:

@@ -127,26 +127,27 @@ def cross_all(
     """
     whole = {name: chosen for name, chosen in sets.items() if name != "generated_far" or "generated" not in sets}
     kept, found = KeptCrossings(folder, evaluator), {}
-    for who, policy in controllers.items():
+    first: dict[str, str] = {}
+    for who, policy in controllers.items():  # a controller with two names crosses once, under the first of them
+        first.setdefault(policy, who)
+    alone = {who: policy for policy, who in first.items()}
+    for who, policy in alone.items():
         for name in whole:
             if (result := kept.read(policy, whole[name])) is not None:
                 found[who, name] = result
-    todo = {who: [name for name in whole if (who, name) not in found] for who in controllers}
+    todo = {who: [name for name in whole if (who, name) not in found] for who in alone}
     if found:
-        count = len(controllers) * len(whole)
+        count = len(alone) * len(whole)
         how = _HOW * evaluator.resolved
         print(f"{len(found)} of {count} crossings of a set{how} are kept from before in {folder}", flush=True)
     episodes = evaluator.num_replicas * sum(len(whole[name]) for names in todo.values() for name in names)
     with tqdm(total=episodes, file=sys.stderr, dynamic_ncols=True, bar_format=_FORMAT, disable=None) as bar:
         for who, names in todo.items():
             own = replace(evaluator, policy=controllers[who])
-            twins = [other for other, policy in controllers.items() if policy == controllers[who]]
-            found |= {(who, name): found[other, name] for name in names for other in twins if (other, name) in found}
-            names = [name for name in names if (who, name) not in found]
             for name, result in _cross_missing(who, own, {name: whole[name] for name in names}, bar, open_evaluator):
                 kept.write(controllers[who], whole[name], result)
                 found[who, name] = result
-    results = {name: {who: found[who, name] for who in controllers} for name in whole}
+    results = {name: {who: found[first[policy], name] for who, policy in controllers.items()} for name in whole}
     if "generated_far" in sets and "generated_far" not in whole:
         far = np.flatnonzero(np.isin(whole["generated"].numbers, sets["generated_far"].numbers))
         results["generated_far"] = {who: take_terrains(one, far) for who, one in results["generated"].items()}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from qd.workers.evaluator import EvaluatorCfg
 from sim.policy.spec import controller_hash
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-from train.evaluate.crossings import KeptCrossings, take_terrains
+from train.evaluate.crossings import KeptCrossings, cross_all, take_terrains
 from train.evaluate.sets import plain_set
 
 TERRAINS = plain_set("hard_random", 3, 0)
@@ -137,3 +138,25 @@ def test_some_terrains_can_be_taken():
     assert part.outcome.tolist() == [[GOAL, GOAL], [GOAL, HIT]]
     assert part.reward.tolist() == [[21.0, 22.0], [20.0, 2.0]]
     assert part.penalties.shape == (2, 2, 2) and part.penalty_names == RESULT.penalty_names
+
+
+def test_a_controller_with_two_names_crosses_once(tmp_path, policy, capsys):
+    other, crossed = tmp_path / "other.pt", []
+    other.write_bytes(b"other weights")
+
+    @contextmanager
+    def opened(cfg):
+        def evaluate(terrains, seeds, progress=None):
+            crossed.append(cfg.policy)
+            return RESULT if cfg.policy == policy else take_terrains(RESULT, np.array([2, 1, 0]))
+
+        yield evaluate
+
+    controllers = {"a": policy, "b": str(other), "again": policy}
+    cfg = EvaluatorCfg(robot="anymal", policy="", num_terrains=3, num_replicas=2, device="cpu")
+    for _ in range(2):
+        sets = {"hard_random": TERRAINS}
+        row = cross_all(controllers, sets, cfg, tmp_path / "all", open_evaluator=opened)["hard_random"]
+        assert list(row) == ["a", "b", "again"] and same(row["a"], RESULT) and same(row["again"], RESULT)
+        assert crossed == [policy, str(other)]  # the second time all is kept
+    assert "2 of 2 crossings of a set are kept" in capsys.readouterr().out
