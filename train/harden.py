@@ -39,9 +39,10 @@ class Harden(OfRobot, OnGround, Where):
     max_seconds: float | None = setting(None, above=0.0)
     """Stop after so many seconds, as by Ctrl-C. A search loses its present iteration. A training finishes it."""
     tune_num_envs: int | None = setting(None, least=1)
-    """Robots of each training; as of `faultline finetune`, the paper's 1,500 on CUDA (Cassie: 600), 24 on the CPU."""
+    """Robots of each training: 8,192 on CUDA, more than `faultline finetune` has (Cassie: the paper's 600), 24 on the
+    CPU."""
     tune_terrains: int | None = setting(None, least=1)
-    """Terrains of each training at a time; likewise, 500 on CUDA (Cassie: 100), 12 on the CPU."""
+    """Terrains of each training at a time: 2,000 on CUDA (Cassie: the paper's 100), 12 on the CPU."""
     keep: Literal["best", "last"] = "best"
     """Which controller to go on with after a training. best: the new one only if it reaches the goal no less often on
     validation terrains, and on hand-crafted and hard-random ones at most a point less than the base; else the one

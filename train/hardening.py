@@ -35,7 +35,7 @@ from train.harden import Harden
 from train.ppo.learner import read_start
 from train.ppo.run import CHECKPOINT, POLICY
 from train.rounds import FIXED_SETS, begin, divisible, read_rounds, record, tell
-from train.tuning import check_sizes, tuning_sizes
+from train.tuning import check_sizes, hardening_sizes
 
 BASE = "base"
 """Name of the controller that a hardening begins with."""
@@ -236,7 +236,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         space=space,
         evaluator=replace(evaluator_of(evaluation, robot), reward=True),
         search_iterations=-(-wanted // an_iteration),
-        tune_sizes=tuning_sizes(tuning, robot, device),
+        tune_sizes=hardening_sizes(tuning, robot, device),
         settings={},
         open_evaluator=open_evaluator,
     )

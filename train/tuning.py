@@ -50,6 +50,8 @@ from train.task.mix import Mix, MixCfg
 
 _PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
 _PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}  # the paper's ANYmal
+_HARDENING = {"cassie": {}}  # what a training of a hardening has otherwise, on CUDA
+_HARDENING_OTHERS = {"num_envs": 8192, "terrains": 2000}  # leaves ANYmal a third of the faults that the paper's leave
 _SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain: episodes end
 _CRITIC_ITERATIONS = 50
 _VALIDATION = "validation"  # key of the settings with the number of elites that are for validation
@@ -211,6 +213,12 @@ def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
 def tuning_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int]:
     """Robots, terrains, iterations and how often terrains are exchanged: what flags say, else what suits the device."""
     return sizes_of(flags, paper_sizes(robot.name), _SMALL, device=device)
+
+
+def hardening_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int]:
+    """As :func:`tuning_sizes`, of a training of a hardening: on CUDA of more robots, but for Cassie."""
+    on_gpu = paper_sizes(robot.name) | _HARDENING.get(robot.name, _HARDENING_OTHERS)
+    return sizes_of(flags, on_gpu, _SMALL, device=device)
 
 
 def check_sizes(sizes: dict[str, int], prefix: str = "") -> None:

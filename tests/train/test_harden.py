@@ -22,6 +22,7 @@ from tests.train.results import result_of
 from tests.train.starts import write_actor
 from train import choice, hardening, tuning
 from train.evaluate.sets import make_sets, marks_of, recorded_marks, split_elites
+from train.finetune import Finetune
 from train.harden import Harden
 from train.hardening import harden, hardening_of
 
@@ -365,6 +366,15 @@ def test_comparisons_spend_as_many_trainings_otherwise(places, stubbed):
     assert "search-hard_random-2" not in content["tables"]["goal"]
     harden(config(places, rounds=2), open_evaluator=Crossings().open)  # what was compared stays in the tables
     assert numbers(rounds_of(places)) == numbers(content)
+
+
+@pytest.mark.parametrize(("robot", "sizes"), [("anymal", (8192, 2000, 1200)), ("cassie", (600, 100, 3000))])
+def test_on_a_gpu_trainings_of_anymal_are_larger_than_the_papers(robot, sizes):
+    flags = Finetune.defaults(["--robot", robot])
+    found = tuning.hardening_sizes(flags, get_robot(robot), "cuda:0")
+    assert (found["num_envs"], found["terrains"], found["iterations"]) == sizes
+    found = tuning.hardening_sizes(replace(flags, num_envs=70, terrains=60), get_robot(robot), "cuda:0")
+    assert (found["num_envs"], found["terrains"], found["iterations"]) == (70, 60, sizes[2])
 
 
 def test_a_real_training_draws_from_all_archives_and_brings_its_critic_along(places, monkeypatch):
