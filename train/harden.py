@@ -70,7 +70,8 @@ class Harden(OfRobot, OnGround, Where):
     """Terrain space: super_gaussian, course, or one of your own, file.py:CLASS; super_gaussian if left out."""
     against: tuple[Literal["hard_random", "first_archive"], ...] = ()
     """What to compare the rounds with, after them. hard_random: as many trainings of the same length on hard-random
-    terrains. first_archive: the same on the first archive alone. A search against the outcome follows."""
+    terrains. first_archive: the same on the first archive alone, of which the first training is that of the first
+    round. A search against the outcome follows."""
 
     def execute(self) -> int:
         """Runs what is left; returns the exit status 0, also where the time is up.

@@ -359,7 +359,7 @@ def test_comparisons_spend_as_many_trainings_otherwise(places, stubbed):
     for kind, archives in (("hard_random", []), ("first_archive", [str(places / "run" / "search-0")])):
         row = content["comparisons"][kind]
         assert (row["controller"], row["rounds"], row["episodes"]) == (kind, 2, 24)
-        assert row["tuned"] == [f"tune-{kind}-1", f"tune-{kind}-2"]
+        assert row["tuned"] == ["tune-1" if archives else f"tune-{kind}-1", f"tune-{kind}-2"]
         records = [read_json(places / "run" / name / "policy.train.json") for name in row["tuned"]]
         assert [record["archives"] for record in records] == [archives, archives]
     assert list(content["tables"]["controllers"]) == ["base", "round-1", "round-2", "hard_random", "first_archive"]

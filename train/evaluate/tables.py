@@ -194,8 +194,8 @@ def difference(
 
     Returns:
         As JSON values: ``compared`` terrains (valid for both); for each of :data:`KINDS` their ``count``, ``share``,
-        the 95 % ``interval`` of the share, their numbers as ``terrains``, and of those mended or newly broken
-        how many are ``clear``; and ``gain``: measure -> mean difference with its interval, terrain by terrain.
+        the 95 % ``interval`` of the share, the numbers of all but the fine ones as ``terrains``, and of those mended or
+        newly broken how many are ``clear``; and ``gain``: measure -> mean difference with its interval, terrain by terrain.
     """
     both = before.valid & after.valid
     fails = [np.where(both, one.values["goal"] < FAILING_GOAL_RATE, False) for one in (before, after)]
@@ -212,6 +212,7 @@ def difference(
         found[kind] = _counted(member, both, numbers, seed, families)
         if kind in ("mended", "newly_broken"):
             found[kind]["clear"] = int((member & apart).sum())
+    del found["fine"]["terrains"]  # the most, and nothing is to be seen on them
     gains = {name: (after.values[name] - before.values[name])[both] for name in MEASURES}
     found["gain"] = {
         name: {"mean": mean_of(gain), "interval": interval_of(gain, seed, of_terrains(families, both))}

@@ -89,7 +89,7 @@ def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     yield "episodes", int
     yield "controllers", {...: {"policy": str, "sha256": str | None}}
     yield "terrains", {...: int}
-    yield "differences", {...: {...: {"compared": int, **dict.fromkeys(CHANGES, terrains)}}}
+    yield "differences", {...: {...: {"compared": int, **dict.fromkeys(CHANGES[:-1], terrains), "fine": {"count": int}}}}
     values, intervals = (
         dict.fromkeys(tables["terrains"], dict.fromkeys(tables["controllers"], kind)) for kind in (_NUMBER, list | None)
     )
