@@ -195,7 +195,8 @@ def difference(
     Returns:
         As JSON values: ``compared`` terrains (valid for both); for each of :data:`KINDS` their ``count``, ``share``,
         the 95 % ``interval`` of the share, the numbers of all but the fine ones as ``terrains``, and of those mended or
-        newly broken how many are ``clear``; and ``gain``: measure -> mean difference with its interval, terrain by terrain.
+        newly broken how many are ``clear``; and ``gain``: measure -> mean difference with its interval, terrain by
+        terrain.
     """
     both = before.valid & after.valid
     fails = [np.where(both, one.values["goal"] < FAILING_GOAL_RATE, False) for one in (before, after)]

@@ -86,10 +86,11 @@ def unreadable(tables: dict[str, Any], more: dict[str, Any]) -> str | None:
 def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Every key of the tables that is read, with its shape for :func:`_fits`; later shapes need earlier keys to fit."""
     terrains = {"count": int, "terrains": [int]}
+    changes = {**dict.fromkeys(CHANGES, terrains), "fine": {"count": int}}
     yield "episodes", int
     yield "controllers", {...: {"policy": str, "sha256": str | None}}
     yield "terrains", {...: int}
-    yield "differences", {...: {...: {"compared": int, **dict.fromkeys(CHANGES[:-1], terrains), "fine": {"count": int}}}}
+    yield "differences", {...: {...: {"compared": int, **changes}}}
     values, intervals = (
         dict.fromkeys(tables["terrains"], dict.fromkeys(tables["controllers"], kind)) for kind in (_NUMBER, list | None)
     )
