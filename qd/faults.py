@@ -383,7 +383,7 @@ def verdict_of(archive: Archive, number: int) -> str:
 def rate_of(counts: NDArray[np.int64]) -> dict[str, Any]:
     """Goal rate of episodes, shape (4,), with its 95 % interval (Wilson); a rate of None: too many are invalid."""
     valid, rate = int(counts.sum() - counts[OUTCOMES.index("invalid")]), float(goal_rates(counts))
-    interval = list(wilson_interval(int(counts[0]), valid))
+    interval = [round(limit, 4) for limit in wilson_interval(int(counts[0]), valid)]
     return {"goal_rate": None if np.isnan(rate) else rate, "goal_interval": interval, "valid_episodes": valid}
 
 

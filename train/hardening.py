@@ -123,8 +123,9 @@ class Hardening:
                 )
             )  # fmt: skip
         for kind in self.flags.against:
-            on_first = kind == "first_archive"  # as the first round's training, which is not done again
-            known = trained[:1] if on_first else ()
+            on_first = kind == "first_archive"
+            own = (self.path / "tune-first_archive-1").exists()  # older ones began with a training of their own
+            known = trained[:1] if on_first and not own else ()
             chain = self._chain(f"tune-{kind}", [(archives[0],) if on_first else ()] * rounds, known)
             search = self.path / f"search-{kind}-{rounds}"
             stage = Stage(
@@ -218,6 +219,8 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         ValueError: If robot, controller, certifiers, device, a size or the directory is not as it must be.
     """
     check(flags)
+    if "first_archive" in flags.against and flags.rounds < 2:
+        raise ValueError("against first_archive needs rounds of at least 2, got 1: with 1 it is the first round itself")
     flags = _with_known_comparisons(flags)
     robot, device = get_robot(flags.robot), resolve_device(flags.device, flags.workers)
     policy = flags.policy or robot.policy_file
@@ -323,7 +326,7 @@ def _refuse_changed(job: Hardening, stage: Stage) -> None:
     if digest is not None and digest != archive.policy_sha256:
         raise ValueError(
             f"{stage.policy} must be the controller that {stage.search} was searched with, got another: put it back, "
-            "or give another --run-dir"
+            f"or what choices in {ROUNDS_FILE} said, or give another --run-dir"
         )
     asked = {certifier_hash(*one) for one in job.certifiers(stage.policy).items()}
     there = archive.faults and dict(zip(archive.faults.certifiers, archive.faults.certifier_sha256, strict=True))

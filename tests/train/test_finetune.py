@@ -168,6 +168,9 @@ def test_it_begins_with_the_noise_of_another_controller_where_that_is_asked_for(
     assert finetune(resumed(run, iterations=2)) == 0
     with pytest.raises(ValueError, match=r"noise_of"):
         job_of(resumed(run, iterations=3, noise_of=noisy))
+    own = config(places, run_dir=places / "own_noise", policy=noisy, noise_of=ROBOT.policy_file, iterations=1)
+    assert job_of(own).settings["noise_of"] == "shipped"  # not where it lies on this machine
+    assert finetune(own) == 0 and finetune(resumed(places / "own_noise", iterations=2)) == 0
     plain = tuning.FineTuning(job_of(config(places, run_dir=places / "none", policy=noisy)))
     assert plain.learner.noise_std == pytest.approx(0.7)
 

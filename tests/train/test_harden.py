@@ -368,6 +368,17 @@ def test_comparisons_spend_as_many_trainings_otherwise(places, stubbed):
     assert numbers(rounds_of(places)) == numbers(content)
 
 
+def test_a_comparison_that_began_with_a_training_of_its_own_goes_on_so(places):
+    flags = config(places, rounds=2, against=("first_archive",))
+    job = hardening_of(flags, open_evaluator=Crossings().open)
+    assert [tune.run.name for tune in job.stages[-1].tunes] == ["tune-1", "tune-first_archive-2"]
+    assert job.stages[-1].tunes[1].start == places / "run" / "tune-1" / "checkpoint.pt"
+    (places / "run" / "tune-first_archive-1").mkdir(parents=True)
+    tunes = job.stages[-1].tunes
+    assert [tune.run.name for tune in tunes] == ["tune-first_archive-1", "tune-first_archive-2"]
+    assert tunes[1].start == places / "run" / "tune-first_archive-1" / "checkpoint.pt"
+
+
 @pytest.mark.parametrize(("robot", "sizes"), [("anymal", (8192, 2000, 1200)), ("cassie", (600, 100, 3000))])
 def test_on_a_gpu_trainings_of_anymal_are_larger_than_the_papers(robot, sizes):
     flags = Finetune.defaults(["--robot", robot])
@@ -428,6 +439,7 @@ def test_the_time_limit_holds_in_the_background_where_ctrl_c_is_ignored(places, 
         ({"by": ("C=start.pt",)}, "by must name a certifier other than start.pt, got C"),
         ({"by": ()}, "panel must hold certifiers of anymal"),
         ({"preset": "huge"}, "unknown preset 'huge'"),
+        ({"rounds": 1, "against": ("first_archive",)}, "needs rounds of at least 2, got 1"),
         ({"tune_num_envs": 5}, "tune_num_envs must be at least as many as tune_terrains, 12, got 5"),
         ({"run_dir": "full"}, "is not empty and holds no rounds.json"),
         ({"run_dir": "other"}, "holds a hardening of other settings: "),
