@@ -96,6 +96,13 @@ def test_the_main_tables_are_held_to_results():
     assert sum(len(list(numbers_of(page))) for page in PAGES) >= 300
 
 
+def test_results_name_no_path_of_the_machine_that_made_them():
+    files = [file for kind in ("*.json", "*.jsonl") for file in (ROOT / "results").rglob(kind)]
+    assert len(files) >= 100
+    place = re.compile(r"(?<![\w.])/(tmp|home|root|work|opt|mnt|usr)/")
+    assert [str(file) for file in files if place.search(file.read_text())] == []
+
+
 @pytest.mark.parametrize(("digits", "off", "agrees"), [(3, 0, True), (2, 0, True), (3, 6e-3, False), (2, -1e-2, False)])
 def test_a_wrong_number_is_found(digits, off, agrees):
     number = next(iter(numbers_of("README.md")))._replace(
