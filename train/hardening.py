@@ -114,8 +114,9 @@ class Hardening:
         base = Stage(controller=BASE, policy=self.base, tunes=(), search=self.search_run(0), seed=self.seed(0))
         found = [base]
         archives = [self.search_run(number) for number in range(rounds)]
-        trained = self._chain("tune", [tuple(archives[:number]) for number in range(1, rounds + 1)])
-        for number, tune in enumerate(trained, start=1):
+        numbers = range(1, rounds + 1)
+        chain = self._chain([(f"tune-{number}", tuple(archives[:number])) for number in numbers])
+        for number, tune in enumerate(chain, start=1):
             found.append(
                 Stage(
                     controller=f"round-{number}", policy=tune.after, tunes=(tune,), search=self.search_run(number),
@@ -123,10 +124,12 @@ class Hardening:
                 )
             )  # fmt: skip
         for kind in self.flags.against:
-            on_first = kind == "first_archive"
-            own = (self.path / "tune-first_archive-1").exists()  # older ones began with a training of their own
-            known = trained[:1] if on_first and not own else ()
-            chain = self._chain(f"tune-{kind}", [(archives[0],) if on_first else ()] * rounds, known)
+            names, trained_on = [f"tune-{kind}-{number}" for number in numbers], ()
+            if kind == "first_archive":
+                trained_on = (archives[0],)
+                if not (self.path / names[0]).exists():  # as that of comparisons begun by older versions
+                    names[0] = "tune-1"  # the first round's training is the same
+            chain = self._chain([(name, trained_on) for name in names])
             search = self.path / f"search-{kind}-{rounds}"
             stage = Stage(
                 controller=kind, policy=chain[-1].after, tunes=chain, search=search, seed=self.seed(rounds),
@@ -135,19 +138,15 @@ class Hardening:
             found.append(stage)
         return found
 
-    def _chain(self, name: str, archives: list[tuple[Path, ...]], known: tuple[Tune, ...] = ()) -> tuple[Tune, ...]:
-        """Trainings of which each begins where the last one that was kept ended, by what they train on.
-
-        The first of them may be ``known``.
-        """
-        found, start, before = list(known), self.flags.policy, self.base
-        for number, trained_on in enumerate(archives, start=1):
-            if number > len(known):
-                run = self.path / f"{name}-{number}"
-                tune = Tune(run=run, start=start, before=before, archives=trained_on, seed=self.seed(number))
-                found.append(replace(tune, kept=True if self.flags.keep == "last" else known_choice(self, tune)))
-            tune = found[number - 1]
-            start, before = tune.run / CHECKPOINT if tune.kept is not False else start, tune.after
+    def _chain(self, trainings: list[tuple[str, tuple[Path, ...]]]) -> tuple[Tune, ...]:
+        """Trainings of which each begins where the last one that was kept ended, by name and what they train on."""
+        found, start, before = [], self.flags.policy, self.base
+        for number, (name, archives) in enumerate(trainings, start=1):
+            run = self.path / name
+            tune = Tune(run=run, start=start, before=before, archives=archives, seed=self.seed(number))
+            tune = replace(tune, kept=True if self.flags.keep == "last" else known_choice(self, tune))
+            start, before = run / CHECKPOINT if tune.kept is not False else start, tune.after
+            found.append(tune)
         return tuple(found)
 
     @property

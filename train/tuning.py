@@ -12,7 +12,7 @@ from qd.archive import Archive
 from qd.run.directory import directory_of, published_or_newest, read_archive_of
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
-from sim.policy.spec import is_same
+from sim.policy.spec import SHIPPED, is_same
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from sim.space import (
@@ -51,7 +51,6 @@ from train.task.mix import Mix, MixCfg
 
 _PAPER = {"cassie": {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}}
 _PAPER_OTHERS = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}  # the paper's ANYmal
-_HARDENING = {"cassie": {}}  # what a training of a hardening has otherwise, on CUDA
 _HARDENING_OTHERS = {"num_envs": 8192, "terrains": 2000}  # left ANYmal a third of the faults that the paper's left
 _SMALL = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain: episodes end
 _CRITIC_ITERATIONS = 50
@@ -177,7 +176,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     elites = _elites(flags, robot, keep_validation=_keeps_validation(saved))
     settings = {
         **common,
-        "policy": str(flags.policy or "shipped"),
+        "policy": str(flags.policy or SHIPPED),
         **({} if flags.noise_of is None else {"noise_of": _named_file(flags.noise_of, robot)}),
         "mix": asdict(mix_cfg),
         "archive": elites.about,
@@ -203,7 +202,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
 
 def _named_file(file: Path, robot: RobotCfg) -> str:
     """A controller as settings name it: the robot's own lies elsewhere on each machine."""
-    return "shipped" if is_same(str(file), str(robot.policy_file)) else str(file)
+    return SHIPPED if is_same(str(file), str(robot.policy_file)) else str(file)
 
 
 def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:
@@ -223,7 +222,7 @@ def tuning_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int
 
 def hardening_sizes(flags: Finetune, robot: RobotCfg, device: str) -> dict[str, int]:
     """As :func:`tuning_sizes`, of a training of a hardening: on CUDA of more robots, but for Cassie."""
-    on_gpu = paper_sizes(robot.name) | _HARDENING.get(robot.name, _HARDENING_OTHERS)
+    on_gpu = _PAPER.get(robot.name, _PAPER_OTHERS | _HARDENING_OTHERS)
     return sizes_of(flags, on_gpu, _SMALL, device=device)
 
 
