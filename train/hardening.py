@@ -105,6 +105,8 @@ class Hardening:
     """Of each training: robots, terrains at a time, iterations, and how often terrains are exchanged."""
     settings: dict[str, Any]
     """What makes it what it is, as JSON values."""
+    compared: dict[str, int]
+    """What the rounds are compared with, and of how many trainings each comparison is."""
     open_evaluator: Open
 
     @property
@@ -123,16 +125,16 @@ class Hardening:
                     seed=self.seed(number),
                 )
             )  # fmt: skip
-        for kind in self.flags.against:
-            names, trained_on = [f"tune-{kind}-{number}" for number in numbers], ()
+        for kind, trainings in self.compared.items():
+            names, trained_on = [f"tune-{kind}-{number}" for number in range(1, trainings + 1)], ()
             if kind == "first_archive":
                 trained_on = (archives[0],)
                 if not (self.path / names[0]).exists():  # as that of comparisons begun by older versions
                     names[0] = "tune-1"  # the first round's training is the same
             chain = self._chain([(name, trained_on) for name in names])
-            search = self.path / f"search-{kind}-{rounds}"
+            search = self.path / f"search-{kind}-{trainings}"
             stage = Stage(
-                controller=kind, policy=chain[-1].after, tunes=chain, search=search, seed=self.seed(rounds),
+                controller=kind, policy=chain[-1].after, tunes=chain, search=search, seed=self.seed(trainings),
                 compared=kind,
             )  # fmt: skip
             found.append(stage)
@@ -220,7 +222,6 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     check(flags)
     if "first_archive" in flags.against and flags.rounds < 2:
         raise ValueError("against first_archive needs rounds of at least 2, got 1: with 1 it is the first round itself")
-    flags = _with_known_comparisons(flags)
     robot, device = get_robot(flags.robot), resolve_device(flags.device, flags.workers)
     policy = flags.policy or robot.policy_file
     read_start(policy, robot)
@@ -246,6 +247,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         search_iterations=-(-wanted // an_iteration),
         tune_sizes=hardening_sizes(tuning, robot, device),
         settings={},
+        compared={**_known_comparisons(flags), **dict.fromkeys(flags.against, flags.rounds)},
         open_evaluator=open_evaluator,
     )
     found = replace(found, settings=_settings_of(found, search, sizes))
@@ -263,11 +265,9 @@ def _path_of(flags: Harden) -> Path:
     return flags.run_dir or Path("runs") / f"{get_robot(flags.robot).name}-harden-{flags.seed}"
 
 
-def _with_known_comparisons(flags: Harden) -> Harden:
-    """The flags with what the rounds were compared with before: it stays in the tables."""
-    known = read_rounds(_path_of(flags)).get("comparisons", {})
-    there = (kind for kind, row in known.items() if row["rounds"] == flags.rounds)
-    return replace(flags, against=tuple(dict.fromkeys([*there, *flags.against])))
+def _known_comparisons(flags: Harden) -> dict[str, int]:
+    """What the rounds were compared with before, and of how many trainings: it stays in the tables."""
+    return {kind: row["rounds"] for kind, row in read_rounds(_path_of(flags)).get("comparisons", {}).items()}
 
 
 def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> dict[str, Any]:

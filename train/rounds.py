@@ -45,6 +45,7 @@ def read_rounds(path: Path) -> dict[str, Any]:
         value = content.get(name, kind())
         rows = value.values() if name in _OF_ROWS and isinstance(value, dict) else ()
         whole = all(isinstance(row, dict) and row.keys() >= _OF_ROWS[name] for row in rows)
+        whole = whole and all(row.get("rounds", 1) in range(1, 10_000) for row in rows)
         if not isinstance(value, kind) or not whole:
             raise ValueError(f"{file} is damaged at {name}: put a copy of it back")
     return content
@@ -80,7 +81,7 @@ def record(job: "Hardening") -> None:
     judged = [stage for stage in job.stages if job.is_settled(stage) and job.is_judged(stage)]
     rows = {stage.controller: (stage, _row(job, stage)) for stage in judged}
     known = dict(content.get("comparisons") or {})  # those of this session and of sessions before
-    known |= {stage.compared: {"rounds": job.flags.rounds, **row} for stage, row in rows.values() if stage.compared}
+    known |= {one: {"rounds": job.compared[one], **row} for stage, row in rows.values() if (one := stage.compared)}
     written = {
         **content,
         **{name: job.settings[name] for name in ("robot", "robot_sha256", "penalty_definition")},

@@ -12,7 +12,7 @@ from qd.archive import Archive
 from qd.run.directory import directory_of, published_or_newest, read_archive_of
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
-from sim.policy.spec import SHIPPED, is_same
+from sim.policy.spec import SHIPPED, name_of
 from sim.robots.robot import RobotCfg, get_robot
 from sim.robots.training import RewardCfg
 from sim.space import (
@@ -177,7 +177,7 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
     settings = {
         **common,
         "policy": str(flags.policy or SHIPPED),
-        **({} if flags.noise_of is None else {"noise_of": _named_file(flags.noise_of, robot)}),
+        **({} if flags.noise_of is None else {"noise_of": name_of(flags.noise_of, robot)}),
         "mix": asdict(mix_cfg),
         "archive": elites.about,
         **({"shares": flags.shares} if len(flags.archive) > 1 else {}),
@@ -198,11 +198,6 @@ def job_of(flags: Finetune, began: float) -> TuningJob:
             seed=flags.seed, device=device, goal_rate=elites.goal_rate if draw == "learnable" else None,
         ),
     )  # fmt: skip
-
-
-def _named_file(file: Path, robot: RobotCfg) -> str:
-    """A controller as settings name it: the robot's own lies elsewhere on each machine."""
-    return SHIPPED if is_same(str(file), str(robot.policy_file)) else str(file)
 
 
 def other_weights(rewards: RewardCfg, own: RewardCfg) -> str:

@@ -75,6 +75,14 @@ def spec_of(policy: str, robot: "RobotCfg") -> str:
     return str(robot.policy_file) if policy == SHIPPED else policy
 
 
+def name_of(policy: str | Path, robot: "RobotCfg") -> str:
+    """How files of results and settings name a controller, the inverse of :func:`spec_of`.
+
+    The robot's own is :data:`SHIPPED` there, since its file lies elsewhere on each machine.
+    """
+    return SHIPPED if is_same(str(policy), str(robot.policy_file)) else str(policy)
+
+
 def controller_hash(policy: str | Path) -> str | None:
     """SHA-256 of a controller: of its file, or of the code's file, the controller's and the callable's name.
 
@@ -228,9 +236,8 @@ def about_controllers(controllers: Mapping[str, str], robot: "RobotCfg") -> dict
         controllers: Policy of each by its name.
         robot: The robot.
     """
-    own = str(robot.policy_file)
     return {
-        who: {"policy": SHIPPED if policy == own else policy, "sha256": controller_hash(policy)}
+        who: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
         for who, policy in controllers.items()
     }
 

@@ -368,6 +368,21 @@ def test_comparisons_spend_as_many_trainings_otherwise(places, stubbed):
     assert numbers(rounds_of(places)) == numbers(content)
 
 
+def test_a_comparison_of_fewer_rounds_stays_in_the_tables(places, stubbed):
+    harden(config(places, rounds=1, against=("hard_random",)), open_evaluator=Crossings().open)
+    before, crossings = rounds_of(places), Crossings()
+    harden(config(places, rounds=2), open_evaluator=crossings.open)
+    content = rounds_of(places)
+    assert content["comparisons"] == before["comparisons"] and content["comparisons"]["hard_random"]["rounds"] == 1
+    assert [row["controller"] for row in content["rounds"]] == ["base", "round-1", "round-2"]
+    goal = content["tables"]["goal"]
+    assert goal["hand_crafted"]["hard_random"] == before["tables"]["goal"]["hand_crafted"]["hard_random"]
+    assert "hard_random" in goal["search-1"]  # on what the rounds found since, too
+    assert not (places / "run" / "search-hard_random-2").exists()
+    harden(config(places, rounds=2, against=("hard_random",)), open_evaluator=Crossings().open)
+    assert rounds_of(places)["comparisons"]["hard_random"]["rounds"] == 2
+
+
 def test_a_comparison_that_began_with_a_training_of_its_own_goes_on_so(places):
     flags = config(places, rounds=2, against=("first_archive",))
     job = hardening_of(flags, open_evaluator=Crossings().open)
@@ -516,8 +531,11 @@ def test_killed_between_an_archive_and_its_numbers_it_makes_them_again(places, s
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("comparisons", {"hard_random": 3}), ("comparisons", []), ("rounds", 3), ("settings", 1), ("sessions", {})],
-)
+    [
+        ("comparisons", {"hard_random": 3}), ("comparisons", {"hard_random": {"rounds": "2"}}), ("comparisons", []),
+        ("rounds", 3), ("settings", 1), ("sessions", {}),
+    ],
+)  # fmt: skip
 def test_a_damaged_file_of_rounds_is_said(places, key, value):
     (places / "run").mkdir()
     (places / "run" / "rounds.json").write_bytes(to_json({key: value}))
