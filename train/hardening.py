@@ -256,8 +256,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         check_policy(certifier, robot, device)
     _refuse_another(found)
     for stage in found.stages:
-        if found.is_settled(stage):
-            _refuse_changed(found, stage)
+        _refuse_changed(found, stage)
     return found
 
 
@@ -321,8 +320,10 @@ def _refuse_changed(job: Hardening, stage: Stage) -> None:
             f"{stage.search} must have {job.search_iterations} iterations, as all searches of its hardening, got "
             f"{archive.iterations}: put a copy of it back, or give another --run-dir"
         )
-    digest = controller_hash(stage.policy)
-    if digest is not None and digest != archive.policy_sha256:
+    unsettled = () if job.is_settled(stage) else stage.tunes  # a choice that is to be made again may fall on each
+    candidates = {stage.policy} | {policy for tune in unsettled for policy in (tune.before, tune.policy)}
+    digests = set(map(controller_hash, candidates))
+    if None not in digests and archive.policy_sha256 not in digests:
         raise ValueError(
             f"{stage.policy} must be the controller that {stage.search} was searched with, got another: put it back, "
             f"or what choices in {ROUNDS_FILE} said, or give another --run-dir"
