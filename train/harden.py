@@ -8,6 +8,9 @@ from sim.files.command import OfRobot, OnGround, Where
 from sim.files.settings import setting
 from sim.robots.training import Draw
 
+Comparison = Literal["hard_random", "first_archive"]
+"""What else the trainings of a hardening could be spent on."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Harden(OfRobot, OnGround, Where):
@@ -68,7 +71,7 @@ class Harden(OfRobot, OnGround, Where):
     """Episodes a terrain of evaluation and validation; 20 on CUDA, 4 on the CPU."""
     space: str | None = None
     """Terrain space: super_gaussian, course, or one of your own, file.py:CLASS; super_gaussian if left out."""
-    against: tuple[Literal["hard_random", "first_archive"], ...] = ()
+    against: tuple[Comparison, ...] = ()
     """What to compare the rounds with, after them. hard_random: as many trainings of the same length on hard-random
     terrains. first_archive: the same on the first archive alone, of which the first training is that of the first
     round. A search against the outcome follows."""

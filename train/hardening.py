@@ -79,8 +79,10 @@ class Stage:
     """Its name in ``rounds.json``."""
     policy: str
     """Its file."""
+    chain: tuple[Tune, ...]
+    """All trainings from the base to it; none of the base."""
     tunes: tuple[Tune, ...]
-    """The trainings since the stage before; none of the base."""
+    """Those since the stage before."""
     search: Path
     """Run of the search."""
     seed: int
@@ -113,16 +115,16 @@ class Hardening:
     def stages(self) -> list[Stage]:
         """All controllers in order, as far as is known which they are: the base, one a round, those to compare with."""
         rounds = self.flags.rounds
-        base = Stage(controller=BASE, policy=self.base, tunes=(), search=self.search_run(0), seed=self.seed(0))
-        found = [base]
+        search = self.search_run(0)
+        found = [Stage(controller=BASE, policy=self.base, chain=(), tunes=(), search=search, seed=self.seed(0))]
         archives = [self.search_run(number) for number in range(rounds)]
         numbers = range(1, rounds + 1)
         chain = self._chain([(f"tune-{number}", tuple(archives[:number])) for number in numbers])
         for number, tune in enumerate(chain, start=1):
             found.append(
                 Stage(
-                    controller=f"round-{number}", policy=tune.after, tunes=(tune,), search=self.search_run(number),
-                    seed=self.seed(number),
+                    controller=f"round-{number}", policy=tune.after, chain=chain[:number], tunes=(tune,),
+                    search=self.search_run(number), seed=self.seed(number),
                 )
             )  # fmt: skip
         for kind, trainings in self.compared.items():
@@ -134,8 +136,8 @@ class Hardening:
             chain = self._chain([(name, trained_on) for name in names])
             search = self.path / f"search-{kind}-{trainings}"
             stage = Stage(
-                controller=kind, policy=chain[-1].after, tunes=chain, search=search, seed=self.seed(trainings),
-                compared=kind,
+                controller=kind, policy=chain[-1].after, chain=chain, tunes=chain, search=search,
+                seed=self.seed(trainings), compared=kind,
             )  # fmt: skip
             found.append(stage)
         return found
@@ -247,10 +249,11 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         search_iterations=-(-wanted // an_iteration),
         tune_sizes=hardening_sizes(tuning, robot, device),
         settings={},
-        compared={**_known_comparisons(flags), **dict.fromkeys(flags.against, flags.rounds)},
+        compared=dict.fromkeys(flags.against, flags.rounds),
         open_evaluator=open_evaluator,
     )
     found = replace(found, settings=_settings_of(found, search, sizes))
+    found = replace(found, compared={**_known_comparisons(found), **found.compared})
     check_sizes(found.tune_sizes, "tune_")
     for certifier in found.certifiers(str(policy)).values():
         check_policy(certifier, robot, device)
@@ -264,9 +267,15 @@ def _path_of(flags: Harden) -> Path:
     return flags.run_dir or Path("runs") / f"{get_robot(flags.robot).name}-harden-{flags.seed}"
 
 
-def _known_comparisons(flags: Harden) -> dict[str, int]:
-    """What the rounds were compared with before, and of how many trainings: it stays in the tables."""
-    return {kind: row["rounds"] for kind, row in read_rounds(_path_of(flags)).get("comparisons", {}).items()}
+def _known_comparisons(job: Hardening) -> dict[str, int]:
+    """What the rounds were compared with before, and of how many trainings: it stays in the tables.
+
+    Of one whose runs are no longer all there only the row is kept.
+    """
+    rows = read_rounds(job.path).get("comparisons", {})
+    known = replace(job, compared={kind: row["rounds"] for kind, row in rows.items()})
+    there = [stage for stage in known.stages if stage.compared and known.is_searched(stage)]
+    return {stage.compared: len(stage.chain) for stage in there if all(map(job.is_tuned, stage.chain))}
 
 
 def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> dict[str, Any]:
@@ -310,7 +319,8 @@ def _refuse_changed(job: Hardening, stage: Stage) -> None:
     """Refuses a search that is no longer the hardening's: its numbers would not compare with those of the others.
 
     Raises:
-        ValueError: If it was made longer, its controller is another now, or one certified that is not asked elsewhere.
+        ValueError: If it was made longer, its controller is another now, a training before it is gone, or one certified
+            that is not asked elsewhere.
     """
     archive = RunDirectory(stage.search).fresh_archive()
     if archive is None:
@@ -320,8 +330,15 @@ def _refuse_changed(job: Hardening, stage: Stage) -> None:
             f"{stage.search} must have {job.search_iterations} iterations, as all searches of its hardening, got "
             f"{archive.iterations}: put a copy of it back, or give another --run-dir"
         )
-    unsettled = () if job.is_settled(stage) else stage.tunes  # a choice that is to be made again may fall on each
-    candidates = {stage.policy} | {policy for tune in unsettled for policy in (tune.before, tune.policy)}
+    lost = [tune.run for tune in stage.chain if not job.is_tuned(tune)]
+    if lost:
+        raise ValueError(
+            f"{lost[0]} must be there, whole, as {stage.search} was searched after it: put a copy of it back, or give "
+            "another --run-dir"
+        )
+    # Choices that are to be made again may fall on any of its trainings.
+    is_known = all(tune.kept is not None for tune in stage.chain)
+    candidates = [stage.policy] if is_known else [job.base, *(tune.policy for tune in stage.chain)]
     digests = set(map(controller_hash, candidates))
     if None not in digests and archive.policy_sha256 not in digests:
         raise ValueError(

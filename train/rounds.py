@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from qd.archive import read_archive
 from qd.faults import fault_numbers
@@ -18,6 +18,7 @@ from train.evaluate.crossings import cross_all
 from train.evaluate.measures import measure
 from train.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, split_elites
 from train.evaluate.tables import make_tables
+from train.harden import Comparison
 
 if TYPE_CHECKING:
     from train.hardening import Hardening, Stage
@@ -45,7 +46,8 @@ def read_rounds(path: Path) -> dict[str, Any]:
         value = content.get(name, kind())
         rows = value.values() if name in _OF_ROWS and isinstance(value, dict) else ()
         whole = all(isinstance(row, dict) and row.keys() >= _OF_ROWS[name] for row in rows)
-        whole = whole and all(row.get("rounds", 1) in range(1, 10_000) for row in rows)
+        if name == "comparisons" and whole and isinstance(value, dict):
+            whole = value.keys() <= set(get_args(Comparison)) and all(_is_count(row["rounds"]) for row in rows)
         if not isinstance(value, kind) or not whole:
             raise ValueError(f"{file} is damaged at {name}: put a copy of it back")
     return content
@@ -60,6 +62,10 @@ def divisible(runs: Sequence[Path]) -> tuple[Path, ...]:
             "give more --search-episodes and another --run-dir"
         )
     return enough
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and value > 0
 
 
 def begin(job: "Hardening") -> None:
@@ -87,7 +93,7 @@ def record(job: "Hardening") -> None:
         **{name: job.settings[name] for name in ("robot", "robot_sha256", "penalty_definition")},
         "rounds": [row for stage, row in rows.values() if not stage.compared],
         "comparisons": known,
-        "tables": _tables(job),
+        "tables": _tables(job, known),
     }
     write_atomically(file, to_json(written))
 
@@ -108,12 +114,15 @@ def _row(job: "Hardening", stage: "Stage") -> dict[str, Any]:
     }
 
 
-def _tables(job: "Hardening") -> dict[str, Any]:
+def _tables(job: "Hardening", known: Mapping[str, Any]) -> dict[str, Any]:
     """Every controller there is on the fixed sets and on the held-out elites of every archive.
 
-    The same keys as of ``tables.json``; what was crossed before is not crossed again.
+    The same keys as of ``tables.json``; what was crossed before is not crossed again. A comparison that goes on to more
+    rounds is left out until its row, one of those ``known``, is that of the same controller.
     """
     there = list(filter(job.is_settled, job.stages))
+    others = [one for one, row in known.items() if row["rounds"] != job.compared.get(one)]
+    there = [stage for stage in there if stage.compared not in others]
     controllers = {stage.controller: stage.policy for stage in there}
     sets = dict(make_sets(FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space))
     searched = [stage.search for stage in there if not stage.compared and job.is_searched(stage)]

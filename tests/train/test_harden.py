@@ -296,6 +296,27 @@ def test_a_lost_choice_is_made_again_from_the_crossings(places, stubbed, worse):
     assert numbers(rounds_of(places)) == numbers(whole)
 
 
+def test_a_lost_choice_between_rounds_may_fall_on_any_controller(places, stubbed, worse):
+    worse.update(("tune-2", "tune-3"))
+    harden(config(places, rounds=3), open_evaluator=Crossings().open)
+    whole = rounds_of(places)
+    content = {**whole, "choices": {"tune-1": whole["choices"]["tune-1"]}}
+    (places / "run" / "rounds.json").write_bytes(to_json(content))
+    harden(config(places, rounds=3), open_evaluator=Crossings().open)  # the third search is of the first training
+    assert numbers(rounds_of(places)) == numbers(whole) and rounds_of(places)["choices"] == whole["choices"]
+
+
+def test_a_training_that_is_gone_is_refused_before_it_is_made_again(places, stubbed):
+    harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    whole = rounds_of(places)
+    (places / "run" / "tune-1").rename(places / "elsewhere")
+    with pytest.raises(ValueError, match=r"tune-1 must be there, whole, as .*search-1 was searched after it: put a"):
+        harden(config(places, rounds=1), open_evaluator=Crossings().open)
+    assert rounds_of(places) == whole
+    (places / "elsewhere").rename(places / "run" / "tune-1")
+    assert harden(config(places, rounds=1), open_evaluator=Crossings().open) == 0
+
+
 def test_trainings_of_a_comparison_are_chosen_too(places, stubbed, worse, capsys):
     worse.update(("tune-hard_random-2", "tune-2"))
     harden(config(places, against=("hard_random",)), open_evaluator=Crossings().open)
@@ -379,8 +400,31 @@ def test_a_comparison_of_fewer_rounds_stays_in_the_tables(places, stubbed):
     assert goal["hand_crafted"]["hard_random"] == before["tables"]["goal"]["hand_crafted"]["hard_random"]
     assert "hard_random" in goal["search-1"]  # on what the rounds found since, too
     assert not (places / "run" / "search-hard_random-2").exists()
-    harden(config(places, rounds=2, against=("hard_random",)), open_evaluator=Crossings().open)
-    assert rounds_of(places)["comparisons"]["hard_random"]["rounds"] == 2
+    (places / "run" / "search-hard_random-1").rename(places / "elsewhere")
+    harden(config(places, rounds=2), open_evaluator=crossings.open)  # which is no reason to make it again
+    assert rounds_of(places)["comparisons"] == before["comparisons"]
+    assert "hard_random" not in rounds_of(places)["tables"]["controllers"]
+
+
+def test_a_comparison_that_grows_is_one_controller_at_a_time(places, stubbed, monkeypatch):
+    harden(config(places, rounds=1, against=("hard_random",)), open_evaluator=Crossings().open)
+    before = rounds_of(places)["comparisons"]
+    longer, search = config(places, rounds=2, against=("hard_random",)), hardening._search
+
+    def stop(job, stage):
+        if stage.compared:
+            raise KeyboardInterrupt
+        search(job, stage)
+
+    with monkeypatch.context() as stopped, pytest.raises(Interrupted):
+        stopped.setattr(hardening, "_search", stop)
+        harden(longer, open_evaluator=Crossings().open)
+    content = rounds_of(places)
+    assert content["comparisons"] == before and "hard_random" not in content["tables"]["controllers"]
+    harden(longer, open_evaluator=Crossings().open)
+    content = rounds_of(places)
+    row, about = content["comparisons"]["hard_random"], content["tables"]["controllers"]["hard_random"]
+    assert (row["rounds"], row["policy_sha256"]) == (2, about["sha256"])
 
 
 def test_a_comparison_that_began_with_a_training_of_its_own_goes_on_so(places):
@@ -533,6 +577,7 @@ def test_killed_between_an_archive_and_its_numbers_it_makes_them_again(places, s
     ("key", "value"),
     [
         ("comparisons", {"hard_random": 3}), ("comparisons", {"hard_random": {"rounds": "2"}}), ("comparisons", []),
+        ("comparisons", {"hard_random": {"rounds": True}}), ("comparisons", {"another": {"rounds": 1}}),
         ("rounds", 3), ("settings", 1), ("sessions", {}),
     ],
 )  # fmt: skip
