@@ -81,14 +81,17 @@ class Stage:
     """Its file."""
     chain: tuple[Tune, ...]
     """All trainings from the base to it; none of the base."""
-    tunes: tuple[Tune, ...]
-    """Those since the stage before."""
     search: Path
     """Run of the search."""
     seed: int
     """Of the search."""
     compared: str = ""
     """Key in ``comparisons``; empty for a round."""
+
+    @property
+    def tunes(self) -> tuple[Tune, ...]:
+        """The trainings since the stage before."""
+        return self.chain if self.compared else self.chain[-1:]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,15 +118,13 @@ class Hardening:
     def stages(self) -> list[Stage]:
         """All controllers in order, as far as is known which they are: the base, one a round, those to compare with."""
         rounds = self.flags.rounds
-        search = self.search_run(0)
-        found = [Stage(controller=BASE, policy=self.base, chain=(), tunes=(), search=search, seed=self.seed(0))]
+        found = [Stage(controller=BASE, policy=self.base, chain=(), search=self.search_run(0), seed=self.seed(0))]
         archives = [self.search_run(number) for number in range(rounds)]
-        numbers = range(1, rounds + 1)
-        chain = self._chain([(f"tune-{number}", tuple(archives[:number])) for number in numbers])
+        chain = self._chain([(f"tune-{number}", tuple(archives[:number])) for number in range(1, rounds + 1)])
         for number, tune in enumerate(chain, start=1):
             found.append(
                 Stage(
-                    controller=f"round-{number}", policy=tune.after, chain=chain[:number], tunes=(tune,),
+                    controller=f"round-{number}", policy=tune.after, chain=chain[:number],
                     search=self.search_run(number), seed=self.seed(number),
                 )
             )  # fmt: skip
@@ -136,8 +137,8 @@ class Hardening:
             chain = self._chain([(name, trained_on) for name in names])
             search = self.path / f"search-{kind}-{trainings}"
             stage = Stage(
-                controller=kind, policy=chain[-1].after, chain=chain, tunes=chain, search=search,
-                seed=self.seed(trainings), compared=kind,
+                controller=kind, policy=chain[-1].after, chain=chain, search=search, seed=self.seed(trainings),
+                compared=kind,
             )  # fmt: skip
             found.append(stage)
         return found
