@@ -124,7 +124,8 @@ def _told(first: dict[str, Any], last: dict[str, Any]) -> str:
     same = "" if first["episodes"] == last["episodes"] else " The searches had different budgets."
     return (
         f"The search against {first['controller']} found {counted(first['faults'], 'fault')}, that against "
-        f"{last['controller']} {counted(last['faults'], 'fault')}{share}.{same}"
+        f"{last['controller']} {counted(last['faults'], 'fault')}{share}.{same} Two searches of one controller may "
+        "find numbers of faults that differ several times over: read the counts beside the rates below."
     )
 
 
@@ -132,7 +133,7 @@ def _compared(content: dict[str, Any]) -> str:
     """What the rounds are compared with."""
     words = {"hard_random": "hard-random terrains", "first_archive": "the first archive alone"}
     told = [
-        f"{row['controller']} had as many trainings of the same length as {row['rounds']} rounds on "
+        f"{row['controller']} had as many trainings of the same length as {counted(row['rounds'], 'round')} on "
         f"{words.get(kind, kind)}"
         for kind, row in content["comparisons"].items()
     ]

@@ -54,6 +54,7 @@ def test_the_page_says_what_the_rounds_brought(run):
     assert page.open == [] and all(source.startswith("data:") for source in page.resources)
     assert "anymal hardened: 1 round of search and training" in page.text
     assert "against base found 12 faults, that against round-1 3 faults, 0.25 times as many." in page.text
+    assert "Two searches of one controller may find numbers of faults that differ several times over" in page.text
     assert "search-0: base -> round-1 7 2 1 3 13" in page.text
     assert "hand-crafted 25 % (10 % to 40 %) 75 % (60 % to 90 %)" in page.text
     assert "worked on in 2 sessions" in page.text and "faultline harden <b>" in page.text
@@ -63,7 +64,7 @@ def test_the_page_says_what_the_rounds_brought(run):
 def test_comparisons_stand_beside_the_rounds(run):
     write(run, comparisons={"hard_random": {**row("hard_random", 9), "rounds": 1}})
     page = Page(html_report(Report(run=run, out=run / "own.html")).read_bytes())
-    assert "hard_random had as many trainings of the same length as 1 rounds on hard-random terrains" in page.text
+    assert "hard_random had as many trainings of the same length as 1 round on hard-random terrains" in page.text
     figure = draw_faults(read_json(run / "rounds.json"))
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["base", "round-1", "hard_random"]
 
