@@ -243,7 +243,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     found = Hardening(
         flags=flags,
         robot=robot,
-        path=_path_of(flags),
+        path=flags.run_dir or Path("runs") / f"{robot.name}-harden-{flags.seed}",
         device=device,
         space=space,
         evaluator=replace(evaluator_of(evaluation, robot), reward=True),
@@ -262,10 +262,6 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     for stage in found.stages:
         _refuse_changed(found, stage)
     return found
-
-
-def _path_of(flags: Harden) -> Path:
-    return flags.run_dir or Path("runs") / f"{get_robot(flags.robot).name}-harden-{flags.seed}"
 
 
 def _known_comparisons(job: Hardening) -> dict[str, int]:

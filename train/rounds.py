@@ -10,7 +10,7 @@ from qd.archive import read_archive
 from qd.faults import fault_numbers
 from qd.run.directory import ROUNDS_FILE, RunDirectory, read_archive_of
 from qd.workers.evaluator import origin_of
-from sim.files.atomic import read_json, to_json, write_atomically
+from sim.files.atomic import has_shape, read_json, to_json, write_atomically
 from sim.files.intervals import value_words
 from sim.policy.spec import about_controllers
 from sim.robots.identity import identity
@@ -29,8 +29,10 @@ _COUNTS = (
     "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "failing", "confirmed",
     "certified", "faults", "panel",
 )  # fmt: skip
-_KINDS = {"settings": dict, "sessions": list, "rounds": list, "comparisons": dict, "choices": dict}  # of rounds.json
-_OF_ROWS = {"comparisons": {"rounds"}, "choices": {"kept", "why"}}  # what each of them has
+_SHAPES = {  # of what is read of rounds.json
+    "settings": dict, "sessions": list, "rounds": list, "comparisons": {...: {"rounds": int}},
+    "choices": {...: {"kept": object, "why": object}},
+}  # fmt: skip
 _SESSION = ("command", "commit", "device", "date")
 
 
@@ -42,15 +44,17 @@ def read_rounds(path: Path) -> dict[str, Any]:
     """
     file = path / ROUNDS_FILE
     content = read_json(file) if file.exists() else {}
-    for name, kind in _KINDS.items():
-        value = content.get(name, kind())
-        rows = value.values() if name in _OF_ROWS and isinstance(value, dict) else ()
-        whole = all(isinstance(row, dict) and row.keys() >= _OF_ROWS[name] for row in rows)
-        if name == "comparisons" and whole and isinstance(value, dict):
-            whole = value.keys() <= set(get_args(Comparison)) and all(_is_count(row["rounds"]) for row in rows)
-        if not isinstance(value, kind) or not whole:
-            raise ValueError(f"{file} is damaged at {name}: put a copy of it back")
+    damaged = [name for name, shape in _SHAPES.items() if name in content and not has_shape(content[name], shape)]
+    if not damaged and not all(_is_known(kind, row["rounds"]) for kind, row in content.get("comparisons", {}).items()):
+        damaged = ["comparisons"]
+    if damaged:
+        raise ValueError(f"{file} is damaged at {damaged[0]}: put a copy of it back")
     return content
+
+
+def _is_known(kind: str, rounds: int) -> bool:
+    """Whether there is such a comparison; JSON's true is an int in Python, but no number of rounds."""
+    return kind in get_args(Comparison) and rounds is not True and rounds > 0
 
 
 def divisible(runs: Sequence[Path]) -> tuple[Path, ...]:
@@ -62,10 +66,6 @@ def divisible(runs: Sequence[Path]) -> tuple[Path, ...]:
             "give more --search-episodes and another --run-dir"
         )
     return enough
-
-
-def _is_count(value: object) -> bool:
-    return type(value) is int and value > 0
 
 
 def begin(job: "Hardening") -> None:

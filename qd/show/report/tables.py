@@ -8,7 +8,7 @@ from typing import Any
 
 from qd.archive import Archive, read_archive
 from qd.run.directory import check_space
-from sim.files.atomic import read_json
+from sim.files.atomic import has_shape, read_json
 from sim.files.command import command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
 from sim.robots.identity import check_robot
@@ -80,11 +80,11 @@ def unreadable(tables: dict[str, Any], more: dict[str, Any]) -> str | None:
         more: Shapes of other keys that must be there.
     """
     shapes = itertools.chain(more.items(), _shapes(tables))
-    return next((key for key, shape in shapes if not _fits(shape, tables.get(key))), None)
+    return next((key for key, shape in shapes if not has_shape(tables.get(key), shape)), None)
 
 
 def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Every key of the tables that is read, with its shape for :func:`_fits`; later shapes need earlier keys to fit."""
+    """Every key of the tables that is read, with its shape for :func:`has_shape`; later shapes need earlier keys to fit."""
     terrains = {"count": int, "terrains": [int]}
     changes = {**dict.fromkeys(CHANGES, terrains), "fine": {"count": int}}
     yield "episodes", int
@@ -107,19 +107,6 @@ def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     rates = {f"goal{what}": kind for what, kind in (("", _NUMBER), ("_bias", _NUMBER), ("_bias_interval", list | None))}
     known = (key for key in RESOLVED if tables.get(key))
     yield from ((key, {...: {...: {"terrains": int, **rates, "intervals": {"goal": list | None}}}}) for key in known)
-
-
-def _fits(shape: Any, value: Any) -> bool:
-    """Whether a JSON value has a shape: a type, [shape of every item], {key: shape} or {...: shape of every value}."""
-    if isinstance(shape, list):
-        return isinstance(value, list) and all(_fits(shape[0], item) for item in value)
-    if not isinstance(shape, dict):
-        return isinstance(value, shape)
-    if not isinstance(value, dict):
-        return False
-    if ... in shape:
-        return all(_fits(shape[...], item) for item in value.values())
-    return all(key in value and _fits(part, value[key]) for key, part in shape.items())
 
 
 def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
