@@ -84,7 +84,7 @@ def unreadable(tables: dict[str, Any], more: dict[str, Any]) -> str | None:
 
 
 def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Every key of the tables that is read, with its shape for :func:`has_shape`; later shapes need earlier keys to fit."""
+    """Every key of the tables read, with its shape for :func:`has_shape`; later shapes need earlier keys to fit."""
     terrains = {"count": int, "terrains": [int]}
     changes = {**dict.fromkeys(CHANGES, terrains), "fine": {"count": int}}
     yield "episodes", int
