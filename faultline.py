@@ -21,9 +21,9 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "confirm": Command("qd.run.judge:Confirm", "cross the failing elites again with contact resolved"),
         "certify": Command("qd.run.judge:Certify", "which failing elites other controllers cross: faults"),
         "minimise": Command("qd.run.minimise:Minimise", "which parts of a failing terrain it takes to fail"),
-        "pack": Command("train.evaluate.pack:MakePack", "faults of a run as a pack to test any controller on"),
-        "evaluate": Command("train.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
-        "dose": Command("train.evaluate.dose:MeasureDose", "which real obstacle at which size stops a controller"),
+        "pack": Command("qd.evaluate.pack:MakePack", "faults of a run as a pack to test any controller on"),
+        "evaluate": Command("qd.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
+        "dose": Command("qd.evaluate.dose:MeasureDose", "which real obstacle at which size stops a controller"),
         "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
     },
     "Look at it": {
@@ -49,8 +49,8 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "beside": Command("qd.studies.beside:Beside", "searches side by side: controllers, or spaces"),
         "agreement": Command("qd.studies.agreement:Agreement", "rates at finer contact and in MuJoCo C"),
         "penalty-ratios": Command("qd.studies.penalty_ratios:PenaltyRatios", "how well penalties see failures"),
-        "distances": Command("train.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
-        "tables": Command("train.evaluate.publish:Tables", "the published numbers beside the paper's"),
+        "distances": Command("qd.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
+        "tables": Command("qd.evaluate.publish:Tables", "the published numbers beside the paper's"),
     },
     "Measure speed": {
         "bench": Command("sim.commands:Bench", "every kernel against torch and the device's ceiling"),

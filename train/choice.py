@@ -1,7 +1,7 @@
 """Which controller a hardening goes on with after a training: the new one, if validation terrains speak for it.
 
 Two trainings of one recipe differ by several points, and one may end worse than it began. Validation terrains are of
-the kinds that are reported, but none of those (:mod:`train.evaluate.sets`).
+the kinds that are reported, but none of those (:mod:`qd.evaluate.sets`).
 """
 
 from statistics import fmean
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qd.evaluate.crossings import cross_all
+from qd.evaluate.measures import terrain_rates
+from qd.evaluate.sets import make_sets
 from qd.run.directory import ROUNDS_FILE
 from sim.files.atomic import to_json, write_atomically
 from sim.policy.spec import controller_hash
-from train.evaluate.crossings import cross_all
-from train.evaluate.measures import terrain_rates
-from train.evaluate.sets import make_sets
 from train.rounds import FIXED_SETS, divisible, held_out, read_rounds
 
 if TYPE_CHECKING:

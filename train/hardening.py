@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.archive import read_archive
+from qd.evaluate.evaluate import Evaluate, evaluator_of
 from qd.faults import is_judged
 from qd.fresh import Open
 from qd.run.arguments import Archive, job_of
@@ -29,7 +30,6 @@ from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, to_be_named
 from train.choice import choose, known_choice
-from train.evaluate.evaluate import Evaluate, evaluator_of
 from train.finetune import Finetune
 from train.harden import Harden
 from train.ppo.learner import read_start

@@ -7,6 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from qd.archive import read_archive
+from qd.evaluate.crossings import cross_all
+from qd.evaluate.measures import measure
+from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, split_elites
+from qd.evaluate.tables import make_tables
 from qd.faults import fault_numbers
 from qd.run.directory import ROUNDS_FILE, RunDirectory, read_archive_of
 from qd.workers.evaluator import origin_of
@@ -14,10 +18,6 @@ from sim.files.atomic import has_shape, read_json, to_json, write_atomically
 from sim.files.intervals import value_words
 from sim.policy.spec import about_controllers
 from sim.robots.identity import identity
-from train.evaluate.crossings import cross_all
-from train.evaluate.measures import measure
-from train.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, split_elites
-from train.evaluate.tables import make_tables
 from train.harden import Comparison
 
 if TYPE_CHECKING:

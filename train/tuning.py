@@ -9,6 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qd.archive import Archive
+from qd.evaluate.sets import (
+    TRAINED_ON,
+    EliteSplit,
+    elites_sha256,
+    marks_of,
+    recorded_marks,
+    space_of,
+    split_elites,
+)
 from qd.run.directory import directory_of, published_or_newest, read_archive_of
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
@@ -23,15 +32,6 @@ from sim.space import (
     recorded_identity,
     recorded_space,
     to_be_named,
-)
-from train.evaluate.sets import (
-    TRAINED_ON,
-    EliteSplit,
-    elites_sha256,
-    marks_of,
-    recorded_marks,
-    space_of,
-    split_elites,
 )
 from train.finetune import Finetune, archive_paths
 from train.ppo.learner import Start, read_start

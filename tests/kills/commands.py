@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from kernels.episode import Outcome
+from qd.evaluate import evaluate, measures
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.show import recordings, replay
 from qd.studies import calibrate
@@ -19,7 +20,6 @@ from sim.files import command
 from tests.kills import searches, trainings
 from tests.qd import stand_in
 from tests.qd.recordings import recording_of
-from train.evaluate import evaluate, measures
 
 SCALES = {"scales": dict.fromkeys(stand_in.PENALTIES, 1.0)}
 

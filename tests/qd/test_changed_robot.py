@@ -12,6 +12,10 @@ import torch
 
 from kernels import penalties
 from qd.archive import read_archive, write_archive
+from qd.evaluate.crossings import KeptCrossings
+from qd.evaluate.distances import Distances
+from qd.evaluate.evaluate import Evaluate
+from qd.evaluate.sets import plain_set
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.arguments import Archive, job_of
 from qd.search import run_search
@@ -34,10 +38,6 @@ from tests.qd import stand_in
 from tests.qd.show.view.made import make_recording
 from tests.sim.dogs import KINDS, write_dog
 from train.base import Train
-from train.evaluate.crossings import KeptCrossings
-from train.evaluate.distances import Distances
-from train.evaluate.evaluate import Evaluate
-from train.evaluate.sets import plain_set
 from train.finetune import Finetune
 from train.ppo.learner import CHECKPOINT_FORMAT
 from train.ppo.run import read_saved

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from qd.archive import write_archive
+from qd.evaluate.sets import TRAINED_ON, marks_of
 from tests.train.archives import make_archive
-from train.evaluate.sets import TRAINED_ON, marks_of
 from train.ppo.cfg import PpoCfg
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from qd.archive import FaultCounts, write_archive
+from qd.evaluate.sets import marks_of, recorded_marks, split_elites
 from sim import space as spaces
 from sim.files.atomic import locked
 from sim.files.command import run_command
@@ -22,7 +23,6 @@ from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
 from tests.train.starts import PPO, make_places, write_actor, write_bad_starts
 from train import tuning
-from train.evaluate.sets import marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
 from train.ppo.learner import Learner, read_checkpoint
 from train.ppo.ppo import CapturedPPO
@@ -524,8 +524,8 @@ def test_which_elites_are_trained_on(places, judged):
 
 def test_all_elites_are_more_than_both_parts_of_a_split(places, monkeypatch):
     """A split takes 750 and 300 of a large archive; here 4 and 2 of ten."""
-    monkeypatch.setattr("train.evaluate.sets.PAPER_TRAINING_ELITES", 4)
-    monkeypatch.setattr("train.evaluate.sets.PAPER_TERRAINS", {"anymal": 2})
+    monkeypatch.setattr("qd.evaluate.sets.PAPER_TRAINING_ELITES", 4)
+    monkeypatch.setattr("qd.evaluate.sets.PAPER_TERRAINS", {"anymal": 2})
     archive = make_archive(10)
     write_archive(places / "ten.npz", archive)
     own = {"archive": (places / "ten.npz",), "run_dir": places / "none"}

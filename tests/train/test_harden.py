@@ -13,6 +13,7 @@ import torch
 
 from kernels.episode import Outcome
 from qd.archive import read_archive, write_archive
+from qd.evaluate.sets import make_sets, marks_of, recorded_marks, split_elites
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
 from sim.policy.spec import controller_hash
@@ -21,7 +22,6 @@ from sim.rollout import RolloutResult
 from tests.train.results import result_of
 from tests.train.starts import write_actor
 from train import choice, hardening, tuning
-from train.evaluate.sets import make_sets, marks_of, recorded_marks, split_elites
 from train.finetune import Finetune
 from train.harden import Harden
 from train.hardening import harden, hardening_of

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from qd.evaluate.sets import TRAINED_ON
 from qd.run.settings import differences
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import command_line
@@ -20,7 +21,6 @@ from sim.robots.identity import check_robot, robot_digest
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
 from sim.space import to_be_named
-from train.evaluate.sets import TRAINED_ON
 from train.ppo.cfg import PpoCfg, TrainingFlags, ppo_problems
 from train.ppo.learner import Learner, Ranks, check_entries, read_checkpoint
 from train.ppo.progress import STATE, Progress

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
+from qd.evaluate.measures import measure
+from qd.evaluate.sets import TerrainSet
+from qd.evaluate.tables import make_tables
 from qd.show.report.evaluation import fates, most_mended
 from qd.show.report.tables import by_kind, changes_of, read_tables
 from sim.files.atomic import to_json
 from sim.robots.robot import get_robot
 from tests.qd.show.report.test_report import DOT, Page, make_run, reporter
 from tests.train.results import GOAL, LATE, result_of
-from train.evaluate.measures import measure
-from train.evaluate.sets import TerrainSet
-from train.evaluate.tables import make_tables
 
 
 @pytest.fixture

@@ -10,6 +10,9 @@ import pytest
 import torch
 
 from qd.archive import write_archive
+from qd.evaluate.crossings import cross_all
+from qd.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, evaluator_of
+from qd.evaluate.sets import FROM_ARCHIVE, SETS, make_sets, split_elites
 from qd.workers.evaluator import EvaluatorCfg
 from sim.crossing import CrossingCfg
 from sim.files.command import run_command, split_words
@@ -18,9 +21,6 @@ from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from tests.train.archives import make_archive
 from tests.train.starts import write_trained
-from train.evaluate.crossings import cross_all
-from train.evaluate.evaluate import Evaluate, evaluate_rates, evaluate_tables, evaluator_of
-from train.evaluate.sets import FROM_ARCHIVE, SETS, make_sets, split_elites
 
 PROTOTYPE = "tests.sim.policies:stretch"
 STANDER = "tests.sim.policies:stand"
@@ -155,7 +155,7 @@ def test_settings_are_chosen_on_terrains_that_are_not_reported(tmp_path, archive
 def test_rates_of_one_controller_go_under_runs(tmp_path, monkeypatch, capsys):
     # Never under results/, where the published ones stand.
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("train.evaluate.evaluate.open_evaluator", Crossings().open)
+    monkeypatch.setattr("qd.evaluate.evaluate.open_evaluator", Crossings().open)
     report = evaluate_rates(Evaluate(policy=STANDER, device="cpu", terrains=2, episodes=1))
     # A controller other than the shipped one has a file of its own.
     written = "runs/anymal-tests.sim.policies-stand-rates.json"
@@ -306,8 +306,8 @@ def test_errors_come_before_any_work_in_one_line(flags, message, tmp_path, monke
     layers = {"mlp.0.weight": torch.zeros(12, 48), "mlp.0.bias": torch.zeros(12)}
     torch.save({"actor_state_dict": layers}, tmp_path / "small.pt")
     # Crossing anything would fail with another error.
-    monkeypatch.setattr("train.evaluate.evaluate.open_evaluator", None)
-    monkeypatch.setattr("train.evaluate.crossings.cross_all", None)
+    monkeypatch.setattr("qd.evaluate.evaluate.open_evaluator", None)
+    monkeypatch.setattr("qd.evaluate.crossings.cross_all", None)
     flags = [flag.format(folder=tmp_path) for flag in flags]
     home = [] if "--run-dir" in flags else ["--run-dir", str(tmp_path / "tables")]
     device = [] if "--device" in flags else ["--device", "cpu"]
@@ -329,7 +329,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     def stop(cfg):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("train.evaluate.evaluate.evaluate_tables", stop)
+    monkeypatch.setattr("qd.evaluate.evaluate.evaluate_tables", stop)
     assert run_command(Evaluate, ["--device", "cpu", "--sets", "hard_random"], name="evaluate") == 130
     said = capsys.readouterr().err
     assert "Stopped; what is crossed is kept" in said and "the same command" in said.lower()

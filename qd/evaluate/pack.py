@@ -34,9 +34,9 @@ from sim.policy.spec import controller_hash, controllers_of, is_same, who_crosse
 from sim.robots.identity import identity
 
 if TYPE_CHECKING:
+    from qd.evaluate.evaluate import Evaluate
+    from qd.evaluate.sets import TerrainSet
     from sim.robots.robot import RobotCfg
-    from train.evaluate.evaluate import Evaluate
-    from train.evaluate.sets import TerrainSet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,11 +85,11 @@ def make_pack(args: MakePack, *, open_evaluator: Open = open_evaluator) -> dict[
         Interrupted: On Ctrl-C; what was crossed is kept.
         EvaluatorError: If a worker is lost; likewise.
     """
+    from qd.evaluate.crossings import cross_all
+    from qd.evaluate.pack_rates import grouped, over_all, rows_of
+    from qd.evaluate.show import picture_of_pack, print_pack
     from sim.bank import heights_of
     from sim.space import get_space
-    from train.evaluate.crossings import cross_all
-    from train.evaluate.pack_rates import grouped, over_all, rows_of
-    from train.evaluate.show import picture_of_pack, print_pack
 
     path, cfg, robot = config_of(args, args.run, args.space)
     policy = searched_policy(path, cfg, robot, args.policy, "packed")
@@ -172,11 +172,11 @@ def evaluate_pack(flags: "Evaluate", *, open_evaluator: Open = open_evaluator) -
         Interrupted: On Ctrl-C.
         EvaluatorError: If a worker is lost.
     """
+    from qd.evaluate.crossings import cross_all
+    from qd.evaluate.evaluate import evaluator_of
+    from qd.evaluate.pack_rates import grouped, over_all, rows_of
+    from qd.evaluate.show import picture_of_pack, print_pack_test
     from sim.robots.robot import robot_of
-    from train.evaluate.crossings import cross_all
-    from train.evaluate.evaluate import evaluator_of
-    from train.evaluate.pack_rates import grouped, over_all, rows_of
-    from train.evaluate.show import picture_of_pack, print_pack_test
 
     assert flags.pack is not None
     of_terrains = (flags.space, flags.ground, flags.run_dir, flags.split_seed or None)
@@ -272,7 +272,7 @@ def _kept(robot: "RobotCfg") -> Path:
 
 def _set_of(heights: NDArray[np.float32], count: int, seed: int) -> "TerrainSet":
     """The first terrains of a pack, with episodes that nothing else has."""
-    from train.evaluate.sets import TerrainSet, set_rng
+    from qd.evaluate.sets import TerrainSet, set_rng
 
     seeds = set_rng("pack", seed).integers(2**32, size=len(heights), dtype=np.uint32)
     return TerrainSet(name="pack", terrains=heights[:count], seeds=seeds[:count], numbers=np.arange(count))

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from qd.evaluate.crossings import KeptCrossings, cross_all, take_terrains
+from qd.evaluate.sets import plain_set
 from qd.workers.evaluator import EvaluatorCfg
 from sim.policy.spec import controller_hash
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-from train.evaluate.crossings import KeptCrossings, cross_all, take_terrains
-from train.evaluate.sets import plain_set
 
 TERRAINS = plain_set("hard_random", 3, 0)
 RESULT = result_of([[GOAL, HIT], [LATE, BAD], [GOAL, GOAL]], reward=[[20.0, 2.0], [8.0, 0.0], [21.0, 22.0]], vel_x=0.5)

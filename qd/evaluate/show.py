@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.evaluate.measures import invalid_lines
+from qd.evaluate.pack_rates import fails
+from qd.evaluate.publish import resolved_cells, role_words
 from sim.files.command import command_line
 from sim.files.figures import as_png, bar_lengths, new_figure
 from sim.files.intervals import value_words
 from sim.maps.picture import draw_heights
 from sim.policy.spec import firsts, kind_of
-from train.evaluate.measures import invalid_lines
-from train.evaluate.pack_rates import fails
-from train.evaluate.publish import resolved_cells, role_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -43,11 +43,7 @@ def distances(flags: Distances) -> dict[str, Any]:
     """
     import numpy as np
 
-    from qd.run.directory import published_or_newest, read_archive_of
-    from sim.files.provenance import provenance
-    from sim.robots.identity import robot_identity
-    from sim.robots.robot import get_robot
-    from train.evaluate.sets import (
+    from qd.evaluate.sets import (
         INDEPENDENT,
         far_part,
         make_sets,
@@ -57,6 +53,10 @@ def distances(flags: Distances) -> dict[str, Any]:
         space_of,
         split_elites,
     )
+    from qd.run.directory import published_or_newest, read_archive_of
+    from sim.files.provenance import provenance
+    from sim.robots.identity import robot_identity
+    from sim.robots.robot import get_robot
 
     check(flags)
     found = get_robot(flags.robot)

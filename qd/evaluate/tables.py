@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.evaluate.measures import MEASURES, Families, Measured, interval_of, mean_of, of_terrains
+from qd.evaluate.publish import published
+from qd.evaluate.sets import FROM_ARCHIVE, TerrainSet
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.intervals import MAX_T_VALUES, t_interval, wilson_interval
 from sim.policy.spec import MARK, controller_hash, firsts, kind_of
 from sim.robots.robot import RobotCfg
-from train.evaluate.measures import MEASURES, Families, Measured, interval_of, mean_of, of_terrains
-from train.evaluate.publish import published
-from train.evaluate.sets import FROM_ARCHIVE, TerrainSet
 
 KINDS = ("mended", "still_failing", "newly_broken", "fine")
 """What may have become of a terrain."""
@@ -159,7 +159,7 @@ def split_by_goal(
 
     Returns:
         ``crossed`` and ``never_crossed``: their ``count``, ``share`` with ``interval``, numbers as ``terrains``, and
-        each of :data:`train.evaluate.measures.MEASURES` as controller -> mean, with ``intervals``; terrains that are
+        each of :data:`qd.evaluate.measures.MEASURES` as controller -> mean, with ``intervals``; terrains that are
         invalid with every controller are in neither.
     """
     judged = np.any([one.valid for one in row.values()], axis=0)

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from qd.evaluate.measures import measure
+from qd.evaluate.publish import published
+from qd.evaluate.sets import Certificates, plain_set
+from qd.evaluate.show import draw_tables, picture_of, print_tables
+from qd.evaluate.tables import KINDS, check_seeds, difference, differences, make_tables, over_seeds, split_by_goal
 from sim.policy.spec import firsts
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-from train.evaluate.measures import measure
-from train.evaluate.publish import published
-from train.evaluate.sets import Certificates, plain_set
-from train.evaluate.show import draw_tables, picture_of, print_tables
-from train.evaluate.tables import KINDS, check_seeds, difference, differences, make_tables, over_seeds, split_by_goal
 
 SEED = 0
 

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
+from qd.evaluate.evaluate import Evaluate
+from qd.evaluate.pack import MakePack, evaluate_pack, make_pack
+from qd.evaluate.pack_rates import grouped, over_all, rows_of
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run
 from qd.run.minimise import Minimise, minimise_run
 from qd.show import figures
 from qd.show.export import Export, export
 from sim.files.command import Interrupted
+from tests.qd.evaluate.test_evaluate import Crossings
 from tests.qd.searches import found_and_fresh
 from tests.qd.stand_in import make_result
-from tests.train.evaluate.test_evaluate import Crossings
 from tests.train.results import GOAL, HIT, LATE, result_of
-from train.evaluate.evaluate import Evaluate
-from train.evaluate.pack import MakePack, evaluate_pack, make_pack
-from train.evaluate.pack_rates import grouped, over_all, rows_of
 
 RESULTS = Path(__file__).parents[3] / "results"
 OTHER = f"C-G={RESULTS}/anymal/C-G.pt"

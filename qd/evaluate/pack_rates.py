@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from qd.evaluate.measures import terrain_rates
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.intervals import bootstrap_interval, wilson_interval
 from sim.rates import counted_episodes
 from sim.rollout import RolloutResult
-from train.evaluate.measures import terrain_rates
 
 GROUPS = ("verdict", "mode", "cause", "kind")
 """What terrains are grouped by."""

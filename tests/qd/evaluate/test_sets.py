@@ -12,14 +12,9 @@ import pytest
 import torch
 
 from qd.archive import Archive, read_archive, write_archive
-from sim.bank import heights_of
-from sim.space import SUPER_GAUSSIAN
-from sim.spaces.course import COURSE
-from tests.train.archives import certified_archive, make_archive
-from tests.train.starts import PPO, write_actor, write_trained
-from train.evaluate.distances import Distances, distances
-from train.evaluate.evaluate import Evaluate, evaluate_tables
-from train.evaluate.sets import (
+from qd.evaluate.distances import Distances, distances
+from qd.evaluate.evaluate import Evaluate, evaluate_tables
+from qd.evaluate.sets import (
     SETS,
     TRAINED_ON,
     check_held_out,
@@ -37,6 +32,11 @@ from train.evaluate.sets import (
     set_rng,
     split_elites,
 )
+from sim.bank import heights_of
+from sim.space import SUPER_GAUSSIAN
+from sim.spaces.course import COURSE
+from tests.train.archives import certified_archive, make_archive
+from tests.train.starts import PPO, write_actor, write_trained
 from train.finetune import Finetune
 from train.tuning import job_of
 
@@ -266,7 +266,7 @@ def test_distance_is_the_root_mean_square_over_all_nodes(monkeypatch):
     # Maps of 2 x 2 nodes; (0, 0, 0, 0) lies sqrt((1 + 1 + 1 + 1) / 4) = 1 from one and sqrt(.36 / 4) = .3 from another.
     maps = {0: [0, 0, 0, 0], 1: [1, -1, 1, -1], 2: [0, 0.6, 0, 0]}
     monkeypatch.setattr(
-        "train.evaluate.sets._heights", lambda genes, space: np.array([maps[int(row[0])] for row in genes], float)
+        "qd.evaluate.sets._heights", lambda genes, space: np.array([maps[int(row[0])] for row in genes], float)
     )
     training = np.repeat([[1], [2]], 60, axis=0)  # more than are compared at once
     np.testing.assert_allclose(nearest_distance(np.array([[0], [1]]), training), [0.3, 0.0], atol=1e-9)

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sim.files.intervals import bootstrap_interval
-from sim.robots.robot import get_robot
-from sim.rollout import CrossingCfg, Rollout
-from tests.train.results import BAD, GOAL, HIT, LATE, OUT, result_of
-from train.evaluate.measures import (
+from qd.evaluate.measures import (
     base_rates,
     count_outcomes,
     invalid_lines,
@@ -19,6 +15,10 @@ from train.evaluate.measures import (
     terrain_rates,
     velocity_error,
 )
+from sim.files.intervals import bootstrap_interval
+from sim.robots.robot import get_robot
+from sim.rollout import CrossingCfg, Rollout
+from tests.train.results import BAD, GOAL, HIT, LATE, OUT, result_of
 
 
 def test_rates_of_a_terrain():

@@ -6,9 +6,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from qd.evaluate.dose import MeasureDose, half_of, measure_dose, rows_of, set_of
 from sim.spaces.dose import chosen_doses
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-from train.evaluate.dose import MeasureDose, half_of, measure_dose, rows_of, set_of
 
 STRONG, WEAK = "tests.sim.policies:stand", "tests.sim.policies:stretch"
 LIMITS = {STRONG: 0.27, WEAK: 0.12}

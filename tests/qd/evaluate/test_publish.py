@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from train.evaluate.publish import BEGIN, END, PAGE, Tables, numbers_of
+from qd.evaluate.publish import BEGIN, END, PAGE, Tables, numbers_of
 
 ROOT = Path(__file__).parents[3]
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.evaluate.evaluate import sized_evaluator
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import Open
 from qd.workers.evaluator import check_policy, open_evaluator, origin_of
@@ -17,14 +18,13 @@ from sim.files.intervals import value_words, wilson_interval
 from sim.files.settings import setting
 from sim.policy.spec import about_controllers, controllers_of
 from sim.robots.identity import robot_identity
-from train.evaluate.evaluate import sized_evaluator
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from qd.evaluate.sets import TerrainSet
     from sim.rollout import RolloutResult
     from sim.spaces.dose import Dose
-    from train.evaluate.sets import TerrainSet
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
@@ -83,9 +83,9 @@ def measure_dose(flags: MeasureDose, *, open_evaluator: Open = open_evaluator) -
         ValueError: If a flag's value cannot be used; raised before any long work.
         EvaluatorError: If a worker is lost; what was crossed is kept.
     """
+    from qd.evaluate.crossings import cross_all
     from sim.robots.robot import get_robot
     from sim.spaces.dose import chosen_doses
-    from train.evaluate.crossings import cross_all
 
     robot = get_robot(flags.robot)
     evaluator = replace(sized_evaluator(flags, robot, _FULL, _SMALL, "a value"), resolved=flags.resolved)
@@ -155,9 +155,9 @@ def set_of(name: str, dose: "Dose", num_terrains: int, seed: int) -> "TerrainSet
         num_terrains: Terrains a value.
         seed: Draws their episodes, the same ones for all doses.
     """
+    from qd.evaluate.sets import TerrainSet, set_rng
     from sim.space import SUPER_GAUSSIAN
     from sim.spaces.dose import LEVEL_SPACE
-    from train.evaluate.sets import TerrainSet, set_rng
 
     rng = set_rng("dose", seed)
     seeds = rng.integers(2**32, size=num_terrains, dtype=np.uint32).repeat(len(dose.values))
@@ -291,8 +291,8 @@ def _picture_of(report: dict[str, Any]) -> bytes:
 
 def draw_dose(report: dict[str, Any]) -> "Figure":
     """Goal rate over the dose with its interval, small axes an element, a line a controller; harder is to the right."""
+    from qd.evaluate.show import COLOURS, MARKERS
     from sim.files.figures import new_figure
-    from train.evaluate.show import COLOURS, MARKERS
 
     doses = _by_element(report["dose"])
     columns = min(_COLUMNS, len(doses))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
+from qd.evaluate.sets import plain_set
 from qd.run.progress import share_bar
 from qd.workers.evaluator import Evaluate
 from qd.workers.invalid import tell_invalid
@@ -16,7 +17,6 @@ from sim.rates import counted_episodes, terrain_means
 from sim.rollout import RolloutResult
 from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import CROSSING_TYPES
-from train.evaluate.sets import plain_set
 
 MEASURES = ("success", "goal", "fallen", "reward")
 """Names of the measures beside the penalties: three rates as fractions, and the reward in 20 s."""

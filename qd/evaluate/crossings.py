@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from qd.evaluate.measures import terrain_rates
+from qd.evaluate.sets import TerrainSet
 from qd.fresh import Open
 from qd.workers.evaluator import Evaluate, EvaluatorCfg
 from qd.workers.invalid import tell_invalid
 from qd.workers.kept import Kept, key_of
 from qd.workers.shards import flaw_of
 from sim.rollout import RolloutResult
-from train.evaluate.measures import terrain_rates
-from train.evaluate.sets import TerrainSet
 
 _MOST_TERRAINS = 2_000  # under way at once: 400 MB of height maps
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
+from qd.evaluate.evaluate import Evaluate, evaluate_tables
+from qd.evaluate.resolved import PLAIN_EPISODES, check_resolved, compared, drawn_sets
+from qd.evaluate.sets import make_sets, part_of
+from qd.evaluate.show import draw_tables
 from sim.files.command import Interrupted, run_command
 from sim.robots.robot import get_robot
-from tests.train.evaluate.test_evaluate import PROTOTYPE, STANDER, Crossings, config
+from tests.qd.evaluate.test_evaluate import PROTOTYPE, STANDER, Crossings, config
 from tests.train.results import BAD, GOAL, HIT, LATE
-from train.evaluate.evaluate import Evaluate, evaluate_tables
-from train.evaluate.resolved import PLAIN_EPISODES, check_resolved, compared, drawn_sets
-from train.evaluate.sets import make_sets, part_of
-from train.evaluate.show import draw_tables
 
 
 def in_mujoco_c(asked, stop_after=99):
@@ -114,7 +114,7 @@ def test_ctrl_c_in_mujoco_c_says_how_to_go_on(tmp_path, walker, monkeypatch):
     monkeypatch.setattr("sim.mujoco_c.crossing.cross_plain", in_mujoco_c([], stop_after=0))
     crossings = Crossings()
     monkeypatch.setattr(
-        "train.evaluate.evaluate.evaluate_tables", lambda flags: evaluate_tables(flags, open_evaluator=crossings.open)
+        "qd.evaluate.evaluate.evaluate_tables", lambda flags: evaluate_tables(flags, open_evaluator=crossings.open)
     )
     cfg = config(tmp_path, policies=(f"base={walker}",), sets=("hard_random",), resolved=("base",), mujoco_c=1)
     with pytest.raises(Interrupted, match=r"what is crossed is kept\. The same command goes on"):
@@ -135,7 +135,7 @@ def test_ctrl_c_in_mujoco_c_says_how_to_go_on(tmp_path, walker, monkeypatch):
     ],
 )
 def test_what_cannot_be_crossed_so_is_refused(flags, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("train.evaluate.evaluate.open_evaluator", None)
+    monkeypatch.setattr("qd.evaluate.evaluate.open_evaluator", None)
     named = ["--policies", f"base={STANDER}", f"C-G={PROTOTYPE}", "--sets", "hard_random", "--device", "cpu"]
     given = [*named, "--run-dir", str(tmp_path / "tables"), "--terrains", "2", *flags]
     assert run_command(Evaluate, given, name="evaluate") == 2

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.evaluate.crossings import kept_crossings
+from qd.evaluate.measures import interval_of, mean_of
+from qd.evaluate.sets import TerrainSet, part_of
 from qd.workers.evaluator import EvaluatorCfg, parse_workers
 from sim.rates import KINDS, agreement, crossing_rates
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import RolloutResult
 from sim.space import get_space
-from train.evaluate.crossings import kept_crossings
-from train.evaluate.measures import interval_of, mean_of
-from train.evaluate.sets import TerrainSet, part_of
 
 PLAIN_EPISODES = 10
 """Episodes on each terrain in plain MuJoCo C."""

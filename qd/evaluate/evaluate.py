@@ -19,11 +19,11 @@ from sim.policy.spec import about_controllers, controllers_of, who_crossed
 from sim.robots.identity import identity, robot_identity
 
 if TYPE_CHECKING:
+    from qd.evaluate.dose import MeasureDose
+    from qd.evaluate.sets import EliteSplit, TerrainSet
     from sim.robots.robot import RobotCfg
     from sim.rollout import RolloutResult
     from sim.space import TerrainSpace
-    from train.evaluate.dose import MeasureDose
-    from train.evaluate.sets import EliteSplit, TerrainSet
 
 _FULL = (300, 20)  # terrains a set and episodes a terrain of the published rates; tables take the paper's terrains
 _SMALL = (24, 4)  # on a machine without a GPU
@@ -94,7 +94,7 @@ class Evaluate(Who, OnGround, Where):
             ValueError: If a flag's value cannot be used; raised before any long work.
         """
         if self.pack is not None:
-            from train.evaluate.pack import evaluate_pack
+            from qd.evaluate.pack import evaluate_pack
 
             evaluate_pack(self)
             return
@@ -116,7 +116,7 @@ def evaluator_of(flags: Evaluate, robot: "RobotCfg", full: tuple[int, int] | Non
     Raises:
         ValueError: If the device is unknown, or a number is out of range.
     """
-    from train.evaluate.sets import paper_terrains
+    from qd.evaluate.sets import paper_terrains
 
     full = full or ((paper_terrains(robot.name), _FULL[1]) if flags.makes_tables else _FULL)
     sized = sized_evaluator(flags, robot, full, (min(full[0], _SMALL[0]), _SMALL[1]), "a set")
@@ -171,9 +171,9 @@ def evaluate_rates(flags: Evaluate) -> dict[str, Any]:
     Raises:
         ValueError: If a flag's value cannot be used; raised before any long work.
     """
+    from qd.evaluate.measures import VELOCITY_FROM_S, base_rates
+    from qd.evaluate.show import print_rates
     from sim.robots.robot import get_robot
-    from train.evaluate.measures import VELOCITY_FROM_S, base_rates
-    from train.evaluate.show import print_rates
 
     robot = get_robot(flags.robot)
     policy = str(flags.policy or robot.policy_file)
@@ -203,7 +203,7 @@ def evaluate_tables(flags: Evaluate, *, open_evaluator: Open = open_evaluator) -
         FileNotFoundError: If there is no archive; likewise.
         EvaluatorError: If a worker is lost; what was crossed is kept.
     """
-    from train.evaluate.show import picture_of, print_tables
+    from qd.evaluate.show import picture_of, print_tables
 
     job = tables_job(flags)
     prepare_output(job.kept / "any")  # last: what is refused leaves no folder
@@ -243,10 +243,10 @@ class TablesJob:
 
 def tables_job(flags: Evaluate) -> TablesJob:
     """What a command line asks for, checked; errors as of :func:`evaluate_tables`."""
+    from qd.evaluate.resolved import check_resolved
+    from qd.evaluate.sets import make_sets
+    from qd.evaluate.tables import check_seeds
     from sim.robots.robot import get_robot
-    from train.evaluate.resolved import check_resolved
-    from train.evaluate.sets import make_sets
-    from train.evaluate.tables import check_seeds
 
     if flags.policy is not None:
         raise ValueError(f"tables are of named controllers: give --policies own={flags.policy} instead of --policy")
@@ -289,7 +289,7 @@ class _Sources(NamedTuple):
 
 
 def _sources(flags: Evaluate, robot: "RobotCfg") -> _Sources:
-    from train.evaluate.sets import read_independent, split_elites
+    from qd.evaluate.sets import read_independent, split_elites
 
     archive = split = independent = None
     if flags.archive is not None:
@@ -309,7 +309,7 @@ def _sources(flags: Evaluate, robot: "RobotCfg") -> _Sources:
 
 def _set_names(flags: Evaluate, robot: "RobotCfg", sources: _Sources) -> list[str]:
     """Sets that are asked for, or all that can be had."""
-    from train.evaluate.sets import HELD_OUT, INDEPENDENT, SETS
+    from qd.evaluate.sets import HELD_OUT, INDEPENDENT, SETS
 
     lacking = [name for name in HELD_OUT if sources.archive is None]
     asked = split_words(flags.sets)
@@ -326,7 +326,7 @@ def _refuse_trained_on(
     flags: Evaluate, controllers: dict[str, str], sets: "dict[str, TerrainSet]", sources: _Sources
 ) -> None:
     """Refuses controllers that were trained on what they are to be tested on, as far as their records say."""
-    from train.evaluate.sets import HELD_OUT, check_held_out, check_untrained
+    from qd.evaluate.sets import HELD_OUT, check_held_out, check_untrained
 
     for name in HELD_OUT:
         if name in sets:
@@ -359,9 +359,9 @@ def _file_sha256(run: Path) -> str:
 
 def _tables(job: TablesJob, open_evaluator: Open) -> dict[str, Any]:
     """Crosses what is not kept yet; returns what ``tables.json`` says."""
-    from train.evaluate.crossings import cross_all
-    from train.evaluate.measures import measure
-    from train.evaluate.tables import make_tables
+    from qd.evaluate.crossings import cross_all
+    from qd.evaluate.measures import measure
+    from qd.evaluate.tables import make_tables
 
     flags, evaluator, seed = job.flags, job.evaluator, job.flags.seed
     results = cross_all(job.controllers, job.sets, evaluator, job.kept, open_evaluator=open_evaluator)
@@ -381,8 +381,8 @@ def _tables(job: TablesJob, open_evaluator: Open) -> dict[str, Any]:
 
 def _resolved(job: TablesJob, results: "dict[str, dict[str, RolloutResult]]", open_evaluator: Open) -> dict[str, Any]:
     """The same terrains with contact resolved, here and in plain MuJoCo C; None of what is not asked for."""
-    from train.evaluate.crossings import cross_all
-    from train.evaluate.resolved import compared, cross_in_mujoco_c, drawn_sets, outcomes_of
+    from qd.evaluate.crossings import cross_all
+    from qd.evaluate.resolved import compared, cross_in_mujoco_c, drawn_sets, outcomes_of
 
     sets, seed, in_c = job.sets, job.flags.seed, job.flags.mujoco_c
     found: dict[str, Any] = {"resolved": None, "mujoco_c": None}
