@@ -364,22 +364,6 @@ def search_words(archive: Archive) -> list[str]:
     ]
 
 
-VERDICTS = ("", "failing", "confirmed", "certified", "fault")
-"""What an elite is, in a word."""
-
-
-def verdicts_of(archive: Archive) -> NDArray[np.int64]:
-    """The verdicts on all elites as places in :data:`VERDICTS`, shape (N,)."""
-    confirmed, certified = archive.confirmed, archive.certified
-    unconfirmed = np.where(certified, VERDICTS.index("certified"), archive.failing.astype(np.int64))
-    return np.where(confirmed, np.where(certified, VERDICTS.index("fault"), VERDICTS.index("confirmed")), unconfirmed)
-
-
-def verdict_of(archive: Archive, number: int) -> str:
-    """The verdict on an elite: empty if it does not fail."""
-    return VERDICTS[int(verdicts_of(archive)[number])]
-
-
 def rate_of(counts: NDArray[np.int64]) -> dict[str, Any]:
     """Goal rate of episodes, shape (4,), with its 95 % interval (Wilson); a rate of None: too many are invalid."""
     valid, rate = int(counts.sum() - counts[OUTCOMES.index("invalid")]), float(goal_rates(counts))

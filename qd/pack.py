@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, FaultCounts
-from qd.elites import elites_of
-from qd.families import families_of
-from qd.faults import judgement, rate_of, verdict_of
+from qd.faults import judgement, rate_of
 from qd.fitness import FAILING_GOAL_RATE
+from qd.groups import Modes, elites_of, families_of, find_modes, verdict_of
 from qd.minimal import fresh_counts
-from qd.modes import Modes, find_modes
 from qd.run.directory import RESULTS
 from qd.run.minimise import minimal_of_run
 from sim.files.atomic import read_json, write_atomically

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.families import families_of, rms_distances
+from qd.groups import families_of, rms_distances
 from qd.run.directory import directory_of, read_archive_of, search_seed
 from sim.bank import heights_of
 from sim.files.atomic import read_json
@@ -302,7 +302,7 @@ def nearest_distance(
 
 
 def _heights(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:
-    """Height maps [m] as rows, as :func:`qd.families.rms_distances` takes them."""
+    """Height maps [m] as rows, as :func:`qd.groups.rms_distances` takes them."""
     return heights_of(genes, space).reshape(len(genes), -1).astype(np.float64)
 
 

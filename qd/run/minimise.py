@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import OUTCOMES, Archive
-from qd.faults import Work, certify, confirm, fault_numbers, fault_words, judgement, known_names, rate_of, verdict_of
+from qd.faults import Work, certify, confirm, fault_numbers, fault_words, judgement, known_names, rate_of
 from qd.fresh import Open
+from qd.groups import verdict_of
 from qd.minimal import MOST_PARTS, Case, How, Minimal, Trial, fresh_counts, genes_of, goal_rate, minimise
 from qd.run.arguments import evaluator_of
 from qd.run.judge import certifiers_of, config_of, judged_run, searched_policy

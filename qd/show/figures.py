@@ -9,6 +9,7 @@ import numpy as np
 from qd.archive import Archive
 from qd.faults import fault_numbers
 from qd.fresh import FRESH_EPISODES, numbers_of
+from qd.groups import Mode
 from qd.run.directory import episodes_in
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, bar_lengths, new_figure
@@ -61,6 +62,11 @@ def look_of(penalty: str) -> PenaltyLook:
 def label_of(penalty: str) -> str:
     """A penalty in words, on one line; a word broken at a hyphen stays one."""
     return look_of(penalty).label.replace("-\n", "-").replace("\n", " ")
+
+
+def mode_words(mode: Mode) -> str:
+    """A failure mode in a few words: how its crossings end, and the penalty that stands out."""
+    return f"{mode.ending} · {label_of(mode.marked_by)}"
 
 
 def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, Any]]) -> list[Path]:

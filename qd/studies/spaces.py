@@ -7,10 +7,9 @@ from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import Archive, read_archive
-from qd.elites import elites_of
 from qd.faults import fault_numbers
 from qd.fresh import numbers_of
-from qd.modes import failure_modes
+from qd.groups import elites_of, failure_modes
 from qd.run.directory import RunDirectory, check_space, named_by
 from qd.run.minimal_file import NUMBERS_FILE
 from sim.files.atomic import read_json
@@ -116,7 +115,7 @@ def space_numbers(search: Searched) -> dict[str, Any]:
         looked at), ``modes``: how many elites fail in which way, with the most typical terrain in words, and
         ``causes``: how many minimal terrains are of which shape, None without any.
     """
-    from qd.show.ranking import mode_words
+    from qd.show.figures import mode_words
     from sim.space import get_space
 
     archive, summary = search.archive, search.summary

@@ -19,9 +19,9 @@ from qd.faults import (
     fault_words,
     is_judged,
     outcome_counts,
-    verdict_of,
     with_certifiers,
 )
+from qd.groups import verdict_of
 from qd.workers.evaluator import EvaluatorCfg
 from sim.mujoco_c import crossing
 from tests.builders import fresh_values, judged_archive, small_archive

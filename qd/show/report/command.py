@@ -62,9 +62,8 @@ def html_report(cfg: Report, *, cross: "Cross | None" = None) -> Path:
         ValueError: If something is not as it must be; raised before any long work.
         Interrupted: On Ctrl-C; what was crossed is kept.
     """
-    from qd.elites import elites_of
+    from qd.groups import elites_of, rank
     from qd.show.elites import Found
-    from qd.show.ranking import rank
     from qd.show.report.material import Shown, gather
     from qd.show.report.rounds import rounds_report
 

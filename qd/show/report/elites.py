@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 
-from qd.elites import Elites
-from qd.faults import VERDICTS, elite_words
-from qd.modes import MAX_MODES, TOLERANCE, Mode
+from qd.faults import elite_words
+from qd.groups import MAX_MODES, TOLERANCE, VERDICTS, Elites, Mode
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
 from qd.show.crossing_figures import draw_crossing
-from qd.show.figures import label_of, look_of
-from qd.show.ranking import mode_words
+from qd.show.figures import label_of, look_of, mode_words
 from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, Cards, Folded, Picture, absent, counted, paragraph, percent, picture, table

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.elites import Elites
-from qd.modes import TOLERANCE, Modes
+from qd.groups import TOLERANCE, Elites, Modes
 from qd.show.figures import label_of, look_of
 from sim.files.figures import new_figure
 

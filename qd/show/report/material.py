@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive
-from qd.elites import Elites
-from qd.modes import Modes
+from qd.groups import Elites, Modes, Ranking
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
 from qd.show.elites import find_archive
 from qd.show.figures import summary
 from qd.show.minima import MinimalFound, read_minimal_numbers
-from qd.show.ranking import Ranking
 from qd.show.report.pdf import find_browser
 from qd.show.report.tables import Change, Changes, read_tables
 from sim.files.atomic import prepare_output

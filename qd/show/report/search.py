@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from qd.archive import Archive
-from qd.elites import Elites
 from qd.faults import any_of, fault_numbers, fault_words
 from qd.fitness import FAILING_GOAL_RATE
 from qd.fresh import FRESH_EPISODES
+from qd.groups import Elites
 from qd.run.progress import clock
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
 from qd.show.report.elites import failures

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from qd.show.ranking import ORDERS
+from qd.groups import ORDERS
 from qd.show.view.legend import legend_html
 from qd.show.view.plots import FITNESS_WORDS, Axes, Choice, axes_svg
 from qd.show.view.scene import PHONE, first_view_of

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.elites import Elites
-from qd.faults import VERDICTS, elite_words
+from qd.faults import elite_words
+from qd.groups import ORDERS, VERDICTS, Elites, Ranking, rank
 from qd.show.crossed import ARRIVED, Rate
-from qd.show.figures import label_of, look_of
-from qd.show.ranking import ORDERS, Ranking, mode_words, rank
+from qd.show.figures import label_of, look_of, mode_words
 from sim.files.intervals import rate_words
 from sim.space import TerrainSpace
 
@@ -141,7 +140,7 @@ class Axes:
         return f"{number}: {f'{verdict} · ' * bool(verdict)}goal {goal} · collision {collided:.0%}"
 
     def verdict(self, number: int) -> str:
-        """What an elite is, one of :data:`qd.faults.VERDICTS`."""
+        """What an elite is, one of :data:`qd.groups.VERDICTS`."""
         return VERDICTS[int(self.elites.verdict[number])]
 
     def hint(self, number: int) -> str:

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.elites import elites_of
-from qd.modes import MAX_MODES, failure_modes, find_modes
+from qd.groups import MAX_MODES, elites_of, failure_modes, find_modes, rank
 from qd.show.crossed import crossed_of, penalties_by_place
-from qd.show.ranking import rank
 from qd.show.report.elites import choice_told
 from qd.show.report.page import percent
 from sim.space import SUPER_GAUSSIAN

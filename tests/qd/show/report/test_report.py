@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from qd.archive import FaultCounts, read_archive, write_archive
-from qd.elites import elites_of
+from qd.groups import elites_of, rank
 from qd.minimal import Case, Minimal
 from qd.run.minimal_file import write_minimal
 from qd.run.settings import as_settings, preset
 from qd.show.figures import summary
-from qd.show.ranking import rank
 from qd.show.report import command, pdf
 from qd.show.report import page as page_module
 from qd.show.report.command import Report

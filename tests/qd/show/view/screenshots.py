@@ -12,8 +12,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from qd.groups import rank
 from qd.show.elites import find_archive
-from qd.show.ranking import rank
 from qd.show.recordings import Recordings, on_elite
 from qd.show.report.command import Report, html_report
 from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode

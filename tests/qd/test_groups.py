@@ -1,11 +1,11 @@
-"""Orders of elites: faults before costs, and no kind of failure twice among the first."""
+"""Elites in families and in orders: faults before costs, and no kind of failure twice among the first."""
 
 import dataclasses
 
 import numpy as np
 
-from qd.elites import elites_of
-from qd.show.ranking import ORDERS, rank
+from qd.groups import KIN_M, ORDERS, elites_of, families_of, joined, rank, rms_distances
+from sim.bank import heights_of
 from sim.space import SUPER_GAUSSIAN
 from tests.builders import judged_archive, small_archive
 from tests.qd.show.report.test_numbers import grouped_archive
@@ -54,3 +54,25 @@ def test_without_failing_elites_nothing_leads():
     archive = dataclasses.replace(small_archive(4), goal_rate=np.ones(4))
     ranking = rank(archive, SUPER_GAUSSIAN)
     assert ranking.leaders() == [] and sorted(ranking.worst(4)) == [0, 1, 2, 3]
+
+
+def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():
+    kin = np.eye(5, dtype=bool)
+    for one, other in ((4, 1), (1, 3)):  # 4 and 3 are not kin themselves
+        kin[one, other] = kin[other, one] = True
+    assert joined(kin).tolist() == [0, 1, 2, 1, 1]
+
+
+def test_a_distance_is_the_root_of_the_mean_square():
+    assert rms_distances(np.array([[0.0, 0.0]]), np.array([[3.0, 4.0], [0.0, 0.0]])).tolist() == [[12.5**0.5, 0.0]]
+
+
+def test_a_child_is_kin_and_strangers_are_not():
+    strangers = SUPER_GAUSSIAN.hard_random(4, 0)
+    child = strangers[2].copy()
+    child[7] = 0.97 * child[7] - 0.01  # one bump's height
+    genes = np.clip(np.concatenate([strangers, child[None]]), -1.0, 1.0).astype(np.float32)
+    heights = heights_of(genes[[2, 4]])
+    assert 0.0 < np.sqrt(((heights[0] - heights[1]) ** 2).mean()) < KIN_M
+    assert families_of(genes, SUPER_GAUSSIAN).tolist() == [0, 1, 2, 3, 2]
+    assert families_of(genes[:0], SUPER_GAUSSIAN).tolist() == []

@@ -1,0 +1,398 @@
+"""The elites of an archive by what is known best of each, in groups and in orders to show them in.
+
+Elites are grouped in two ways. Families: terrains that are much alike, so that they are not independent of each other.
+Modes: failing elites on which the controller struggles in the same way and whose crossings end in the same way.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import pdist, squareform
+from sklearn.metrics import silhouette_score
+
+from qd.archive import Archive
+from qd.fitness import FAILING_GOAL_RATE
+from sim.bank import heights_of
+from sim.space import TerrainSpace
+
+VERDICTS = ("", "failing", "confirmed", "certified", "fault")
+"""What an elite is, in a word."""
+
+KIN_M = 0.06
+"""Terrains whose heights differ by less (root mean square) are kin [m]. Of 850 hard-random terrains no two are."""
+_EVERY = 2  # nodes; distances are compared at 0.1 m
+_BANK = 50  # height maps that are made at once
+
+MAX_MODES = 7
+"""Most groups that are tried: as many as colours and markers stay apart."""
+TOLERANCE = 0.05
+"""How far below the best silhouette that of a finer division may lie."""
+_COMMON = 0.25  # share of the crossings from which on an end is named
+_MEANS = ("goal_rate", "collision_rate", "other_rate", "fallen_rate", "fitness")
+_MIN_ELITES = 10  # of fewer a silhouette says nothing
+
+ORDERS = {
+    "modes": "each way of failing once first",
+    "fault": "faults first",
+    "goal_rate": "goal rate, the lowest first",
+    "collision_rate": "base collision, the most first",
+    "fallen_rate": "fallen, the most first",
+    "fitness": "fitness, the highest first",
+    "family": "families of like terrains",
+}
+"""Orders of elites, in words."""
+
+
+def verdicts_of(archive: Archive) -> NDArray[np.int64]:
+    """The verdict on each elite as its place in :data:`VERDICTS`, shape (N,)."""
+    failing, confirmed, certified = archive.failing, archive.confirmed, archive.certified
+    conditions = [confirmed & certified, certified, confirmed, failing]
+    return np.select(conditions, [4, 3, 2, 1], 0).astype(np.int64)
+
+
+def verdict_of(archive: Archive, number: int) -> str:
+    """The verdict on one elite: empty if it does not fail."""
+    return VERDICTS[int(verdicts_of(archive)[number])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Elites:
+    """N elites by what fresh episodes say of each where it has valid ones, else as they were found.
+
+    Penalties are scaled. Lower numbers have a higher fitness.
+    """
+
+    penalties: tuple[str, ...]
+    """Names of the P penalties."""
+    numbers: NDArray[np.int64]
+    """Number of each elite in the archive, shape (N,), ascending."""
+    fresh: NDArray[np.bool_]
+    """Whether the values are of fresh episodes, shape (N,)."""
+    cell: NDArray[np.int64]
+    """Cell that these episodes fall into, shape (N,); elites whose luck put them apart may share one."""
+    fitness: NDArray[np.float64]
+    """Shape (N,)."""
+    ratios: NDArray[np.float64]
+    """Shape (N, P)."""
+    variation: NDArray[np.float64]
+    """Standard deviation of the penalties over the episodes, summed, as a share of their mean, shape (N,)."""
+    counted: NDArray[np.int64]
+    """Valid episodes, shape (N,)."""
+    goal_rate: NDArray[np.float64]
+    """Share of them that reached the goal, shape (N,)."""
+    collision_rate: NDArray[np.float64]
+    """Share that ended in a base collision, shape (N,)."""
+    fallen_rate: NDArray[np.float64]
+    """Share that ended tilted by more than 60 degrees, shape (N,)."""
+    reproduced: NDArray[np.bool_]
+    """Whether fresh episodes landed in its cell or a neighbour; True where there are none; shape (N,)."""
+    verdict: NDArray[np.int64]
+    """Place in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found it say whether it fails."""
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.numbers)
+
+    @property
+    def failing(self) -> NDArray[np.bool_]:
+        """Whether under half of the robots reach the goal, shape (N,)."""
+        return self.goal_rate < FAILING_GOAL_RATE
+
+    @property
+    def failing_cells(self) -> int:
+        """Different ways to fail: cells that the failing elites fall into."""
+        return len(np.unique(self.cell[self.failing]))
+
+    @property
+    def other_rate(self) -> NDArray[np.float64]:
+        """Share that neither arrived nor collided: out of time or off the terrain, shape (N,)."""
+        return np.clip(1.0 - self.goal_rate - self.collision_rate, 0.0, 1.0)
+
+    def rows(self, chosen: NDArray[np.int64]) -> "Elites":
+        """The elites in some rows, in their order."""
+        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: v[chosen] for name, v in values.items() if isinstance(v, np.ndarray)})
+
+    def place_of(self, number: int) -> int:
+        """Row of an elite by its number in the archive."""
+        return int(np.searchsorted(self.numbers, number))
+
+    def hits(self, rate: str, place: int) -> int:
+        """Episodes of the elite in a row that a rate counts."""
+        return round(float(getattr(self, rate)[place]) * int(self.counted[place]))
+
+    def by_severity(self) -> NDArray[np.int64]:
+        """Rows by how badly the robot fares, shape (N,), the worst first.
+
+        Faults come before certified, confirmed, failing and other elites, of these the ones with the lowest goal rate,
+        the most base collisions, the most falls and the highest fitness. Fitness alone does not order by failure: it
+        prizes trouble that is the same in every episode.
+        """
+        return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
+
+    def most_reproducible(self, count: int) -> list[int]:
+        """Numbers of the terrains whose penalties vary least between episodes, for their size; the steadiest first.
+
+        A terrain on which the controller fails comes before one that it crosses, and one whose fresh episodes landed in
+        its cell or beside it before one where they did not.
+        """
+        order = np.lexsort((self.variation, ~self.reproduced, ~self.failing))
+        return self.numbers[order[:count]].tolist()
+
+
+_FROM_FRESH = ("cell", "fitness", "ratios", "penalty_mean", "penalty_std", "episodes", "invalid_episodes", "goal_rate",
+               "collision_rate", "fallen_rate")  # fmt: skip
+
+
+def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
+    """The elites of an archive, in its order.
+
+    Args:
+        archive: The archive.
+        judged: Leaves out elites whose fresh episodes are invalid.
+    """
+    values = {name: np.asarray(getattr(archive, name)) for name in _FROM_FRESH}
+    is_fresh, reproduced = np.zeros(len(archive), bool), np.ones(len(archive), bool)
+    rows = np.arange(len(archive))
+    if (fresh := archive.fresh) is not None:
+        is_fresh, reproduced = fresh.valid, fresh.reproduced | ~fresh.valid
+        for name, found in values.items():
+            values[name] = np.where(is_fresh.reshape(-1, *[1] * (found.ndim - 1)), getattr(fresh, name), found)
+        rows = np.flatnonzero(is_fresh) if judged else rows
+    values = {name: value[rows] for name, value in values.items()}
+    means, stds = (values.pop(name).sum(axis=1) for name in ("penalty_mean", "penalty_std"))
+    counted = values.pop("episodes") - values.pop("invalid_episodes")
+    return Elites(
+        penalties=archive.penalties,
+        numbers=rows.astype(np.int64),
+        fresh=is_fresh[rows],
+        variation=stds / np.maximum(means, np.finfo(float).tiny),
+        counted=counted,
+        reproduced=reproduced[rows],
+        verdict=np.maximum(verdicts_of(archive)[rows], values["goal_rate"] < FAILING_GOAL_RATE),
+        **values,
+    )
+
+
+def families_of(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
+    """Number of the family of each terrain, from 0 in the order of its first member, shape (N,).
+
+    Who descends from whom is not recorded. Terrains within :data:`KIN_M` are kin, and kin of kin are one family.
+
+    Args:
+        genes: Shape (N, num_genes).
+        space: What they mean.
+    """
+    banks = [heights_of(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
+    if not banks:
+        return np.zeros(0, np.int64)
+    maps = np.concatenate([bank.reshape(len(bank), -1).astype(np.float64) for bank in banks])
+    return joined(rms_distances(maps, maps) < KIN_M)
+
+
+def joined(kin: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of the group that each of N belongs to, from 0 in the order of its first member, shape (N,).
+
+    Args:
+        kin: Which are joined directly, shape (N, N).
+    """
+    _, labels = connected_components(kin, directed=False)
+    _, first, places = np.unique(labels, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[places].astype(np.int64)
+
+
+def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Root mean square distances of height maps to others [m], shape (T, N).
+
+    Args:
+        maps: Heights [m] as rows, shape (T, num_nodes); double, since their squares are subtracted from each other.
+        others: Heights [m] as rows, shape (N, num_nodes).
+    """
+    squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
+    return np.sqrt(np.maximum(squares, 0.0) / maps.shape[1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mode:
+    """A group of elites."""
+
+    number: int
+    """From 1, the group with the lowest goal rate first."""
+    members: NDArray[np.int64]
+    """Rows of the elites, shape (num_members,)."""
+    typical: int
+    """Number, in the archive, of the elite nearest to all others of the group (its medoid)."""
+    ratios: NDArray[np.float64]
+    """Mean share of each penalty, shape (P,)."""
+    goal_rate: float
+    """Mean over the members, as are the next four."""
+    collision_rate: float
+    other_rate: float
+    """Neither at the goal nor ended by a collision."""
+    fallen_rate: float
+    fitness: float
+    marked_by: str
+    """Penalty whose share stands out most against all elites that were grouped."""
+
+    @property
+    def ending(self) -> str:
+        """How most of its crossings end, in words; both ways of two that are common, the goal only where it leads."""
+        ends = {
+            "reaches the goal": self.goal_rate,
+            "topples" if self.fallen_rate >= 0.5 else "strikes the terrain": self.collision_rate,
+            "gets stuck": self.other_rate,
+        }
+        first, *others = sorted(ends, key=lambda end: -ends[end])
+        second = next(end for end in others if end != "reaches the goal")
+        return first if ends[second] < _COMMON else f"{first} or {second}"
+
+    @property
+    def deed(self) -> str:
+        """The same of the robot, in a sentence."""
+        return self.ending.replace("strikes the terrain", "strikes the terrain with its base")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Modes:
+    """All groups, and how well each number of them separates."""
+
+    modes: list[Mode]
+    labels: NDArray[np.int64]
+    """Number of the group of each elite, 0 of one in no group, shape (N,)."""
+    silhouettes: Mapping[int, float]
+    """Mean silhouette by number of groups; empty of too few elites to divide."""
+
+
+def failure_modes(elites: Elites) -> Modes:
+    """Groups the failing elites; a terrain that is crossed is in no group."""
+    failing = np.flatnonzero(elites.failing)
+    labels = np.zeros(len(elites), np.int64)
+    if not len(failing):
+        return Modes(modes=[], labels=labels, silhouettes={})
+    of_failing = find_modes(elites.rows(failing))
+    labels[failing] = of_failing.labels
+    modes = [replace(mode, members=failing[mode.members]) for mode in of_failing.modes]
+    return replace(of_failing, modes=modes, labels=labels)
+
+
+def find_modes(elites: Elites) -> Modes:
+    """Groups all of some elites, at least one.
+
+    Ward's agglomerative clustering on the shares of the penalties and the rates of goal, base collision and fall: all
+    fractions, none weighted. The number of groups is the largest whose mean silhouette (Rousseeuw 1987) is within
+    :data:`TOLERANCE` of the best: of divisions that separate about as well, the finer one says more.
+    """
+    features = np.column_stack([elites.ratios, elites.goal_rate, elites.collision_rate, elites.fallen_rate])
+    distances = squareform(pdist(features))
+    labels, silhouettes = np.ones(len(elites), np.int64), {}
+    if len(elites) >= _MIN_ELITES and distances.any():
+        tree = linkage(features, "ward")
+        divisions = {count: fcluster(tree, count, "maxclust") for count in range(2, MAX_MODES + 1)}
+        silhouettes = {
+            count: float(silhouette_score(distances, division, metric="precomputed"))
+            for count, division in divisions.items()
+            if len(np.unique(division)) == count
+        }
+        enough = max(silhouettes.values(), default=0.0) - TOLERANCE
+        good = [count for count, value in silhouettes.items() if value >= enough]
+        labels = divisions[max(good)] if good else labels  # ties may leave no division to judge
+    groups = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+    groups.sort(key=lambda rows: float(elites.goal_rate[rows].mean()))
+    modes = [_mode(number, rows, elites, distances) for number, rows in enumerate(groups, start=1)]
+    numbers = np.zeros(len(elites), np.int64)
+    for mode in modes:
+        numbers[mode.members] = mode.number
+    return Modes(modes=modes, labels=numbers, silhouettes=silhouettes)
+
+
+def _mode(number: int, rows: NDArray[np.int64], elites: Elites, distances: NDArray[np.float64]) -> Mode:
+    ratios = elites.ratios[rows].mean(axis=0)
+    spread = np.maximum(elites.ratios.std(axis=0), np.finfo(float).tiny)
+    alone = len(rows) == len(elites)  # nothing to stand out against but its own mean: the largest share then
+    standing_out = ratios if alone else (ratios - elites.ratios.mean(axis=0)) / spread
+    return Mode(
+        number=number,
+        members=rows,
+        typical=int(elites.numbers[rows[distances[np.ix_(rows, rows)].sum(axis=1).argmin()]]),
+        ratios=ratios,
+        marked_by=elites.penalties[int(standing_out.argmax())],
+        **{name: float(getattr(elites, name)[rows].mean()) for name in _MEANS},
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranking:
+    """N elites, their failure modes and their families, in orders to show them in."""
+
+    elites: Elites
+    modes: Modes
+    """Groups of those that fail, by how the robot struggles."""
+    families: NDArray[np.int64]
+    """Family of each, shape (N,), numbered from 1 by its worst member."""
+
+    @cached_property
+    def _severity(self) -> NDArray[np.int64]:
+        return self.elites.by_severity()
+
+    def order(self, by: str = "modes") -> NDArray[np.int64]:
+        """Rows of all elites, shape (N,), in one of the :data:`ORDERS`; ties are by severity.
+
+        ``modes`` begins with the worst terrain of each mode that has one on which the controller fails, no two of one
+        family where that can be had. The worst failing terrain of each other family follows, then the rest.
+        """
+        severity = self._severity
+        if by == "fault":
+            return severity
+        if by == "modes":
+            return self._leading(severity)
+        values = self.families if by == "family" else np.asarray(getattr(self.elites, by))
+        sign = 1 if by in ("family", "goal_rate") else -1
+        return severity[np.argsort(sign * values[severity], kind="stable")]
+
+    def _leading(self, severity: NDArray[np.int64]) -> NDArray[np.int64]:
+        failing = severity[self.elites.failing[severity]]
+        labels, families = self.modes.labels, set[int]()
+        leading: list[int] = []
+        for mode in dict.fromkeys(labels[failing].tolist()):
+            of_mode = failing[labels[failing] == mode].tolist()
+            leading.append(next((row for row in of_mode if int(self.families[row]) not in families), of_mode[0]))
+            families.add(int(self.families[leading[-1]]))
+        for row in failing.tolist():
+            if int(self.families[row]) not in families:
+                leading.append(row)
+                families.add(int(self.families[row]))
+        return np.array([*leading, *np.setdiff1d(severity, leading, assume_unique=True)], dtype=np.int64)
+
+    def mode_of(self, place: int) -> Mode | None:
+        """The mode of the elite in a row; None of one that does not fail."""
+        number = int(self.modes.labels[place])
+        return self.modes.modes[number - 1] if number else None
+
+    def leaders(self) -> list[int]:
+        """Numbers of the terrains that stand for a way of failing, one for each mode in which terrains fail."""
+        return self.worst(len(np.unique(self.modes.labels[self.elites.failing])))
+
+    def worst(self, count: int) -> list[int]:
+        """Numbers of the first terrains of the order ``modes``."""
+        return self.elites.numbers[self.order()[:count]].tolist()
+
+
+def rank(archive: Archive, space: TerrainSpace, *, judged: bool = False) -> Ranking:
+    """The ranking of an archive that has elites.
+
+    Args:
+        archive: The archive.
+        space: What its genes mean.
+        judged: Leaves out elites whose fresh episodes are invalid.
+    """
+    elites = elites_of(archive, judged=judged)
+    families = families_of(archive.genes[elites.numbers], space)
+    places = {int(family): place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()]), start=1)}
+    numbers = np.array([places[int(family)] for family in families], dtype=np.int64)
+    return Ranking(elites=elites, modes=failure_modes(elites), families=numbers)
