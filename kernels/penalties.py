@@ -11,9 +11,6 @@ import warp as wp
 
 from kernels.state import base_ang_vel_b, base_lin_vel_b
 
-PENALTY_DEFINITION = "squared"
-"""How yaw_rate, vel_x and vel_y measure an error; runs, scales and recordings name it, and none of another is read."""
-
 BASE = 1
 FOOT = 2
 LIMB = 4

@@ -17,8 +17,8 @@ from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
 from sim.files.intervals import wilson_interval
 from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.files.records import PENALTY_DEFINITION
 from sim.rates import MAX_INVALID_SHARE
-from sim.robots.identity import FIRST_DEFINITION
 
 ARCHIVE_FILE = "archive.npz"
 """Name of the archive in a run directory."""
@@ -186,8 +186,8 @@ class Archive(Evaluation):
     """Hash of its controller; None where it has no file."""
     space_sha256: str | None = None
     """Hash of the code of the terrain space; None of a shipped one."""
-    penalty_definition: str = FIRST_DEFINITION
-    """How its penalties are defined (:data:`kernels.penalties.PENALTY_DEFINITION`)."""
+    penalty_definition: str = PENALTY_DEFINITION
+    """How its penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
     fresh: FreshValues | None = None
     """What fresh episodes say of the elites; None if there were none."""
     faults: FaultCounts | None = None
@@ -196,7 +196,7 @@ class Archive(Evaluation):
     """What certifiers did in a search for certified failures; None of any other."""
 
     def named(self) -> dict[str, Any]:
-        """Robot, controller and definition of the penalties, as :func:`sim.robots.identity.identity` names them."""
+        """Robot, controller and definition of the penalties, as :func:`sim.files.records.identity` names them."""
         return {name: getattr(self, name) for name in ("robot", *_OF_IDENTITY)}
 
     def __len__(self) -> int:

@@ -26,8 +26,8 @@ from qd.workers.invalid import tell_invalid
 from qd.workers.shards import taken
 from sim.files.command import InSpace, Where, Who, command_line, naming_what_is_next
 from sim.files.intervals import bootstrap_interval, wilson_interval
+from sim.files.records import identity
 from sim.policy.spec import spec_of
-from sim.robots.identity import identity
 
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""

@@ -95,7 +95,7 @@ class Bench(OfRobot, OnDevice):
     def execute(self) -> None:
         """Measures, prints the table, writes the file."""
         from sim.bench.report import file_of, measure, table
-        from sim.files.provenance import provenance
+        from sim.files.records import provenance
         from sim.robots.robot import get_robot
         from sim.simulation import resolve_device
 

@@ -14,9 +14,9 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
-from kernels.penalties import PENALTY_DEFINITION
 from qd.archive import ARCHIVE_FILE, FRESH, Archive, FaultCounts, FreshValues, read_archive, write_archive
 from qd.run.directory import CONFIG_FILE
+from sim.files.records import PENALTY_DEFINITION
 
 SPACING = 0.05
 RNG_SEED = 5

@@ -16,7 +16,7 @@ import warp as wp
 from qd.run.directory import RESULTS
 from sim.bank import TerrainBank
 from sim.files.command import publish
-from sim.files.provenance import provenance
+from sim.files.records import provenance
 from sim.robots.robot import ROBOTS, get_robot
 from sim.simulation import Simulation, resolve_device
 from tests.builders import as_of_now

@@ -24,9 +24,9 @@ from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, resolve_device
 from sim.files.atomic import is_leftover, read_json
 from sim.files.command import Interrupted, command_line, naming_what_is_next
+from sim.files.records import identity
 from sim.files.settings import check
 from sim.policy.spec import certifier_hash, controller_hash, controllers_of, is_same
-from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, to_be_named
 from train.choice import choose, known_choice

@@ -16,8 +16,8 @@ from qd.run.directory import ROUNDS_FILE, RunDirectory, read_archive_of
 from qd.workers.evaluator import origin_of
 from sim.files.atomic import has_shape, read_json, to_json, write_atomically
 from sim.files.intervals import value_words
+from sim.files.records import identity
 from sim.policy.spec import about_controllers
-from sim.robots.identity import identity
 from train.harden import Comparison
 
 if TYPE_CHECKING:

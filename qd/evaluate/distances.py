@@ -54,8 +54,7 @@ def distances(flags: Distances) -> dict[str, Any]:
         split_elites,
     )
     from qd.run.directory import published_or_newest, read_archive_of
-    from sim.files.provenance import provenance
-    from sim.robots.identity import robot_identity
+    from sim.files.records import provenance, robot_identity
     from sim.robots.robot import get_robot
 
     check(flags)

@@ -15,9 +15,9 @@ from qd.workers.evaluator import check_policy, open_evaluator, origin_of
 from sim.files.atomic import prepare_output
 from sim.files.command import OfRobot, Where, naming_what_is_next, publish, split_words
 from sim.files.intervals import value_words, wilson_interval
+from sim.files.records import robot_identity
 from sim.files.settings import setting
 from sim.policy.spec import about_controllers, controllers_of
-from sim.robots.identity import robot_identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,9 +14,9 @@ from qd.run.directory import newest_or_published, read_archive_of, search_seed
 from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import OnGround, Where, Who, naming_what_is_next, publish, split_words
+from sim.files.records import identity, robot_identity
 from sim.files.settings import check, setting
 from sim.policy.spec import about_controllers, controllers_of, who_crossed
-from sim.robots.identity import identity, robot_identity
 
 if TYPE_CHECKING:
     from qd.evaluate.dose import MeasureDose

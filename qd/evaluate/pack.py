@@ -29,9 +29,9 @@ from qd.run.judge import PANEL_FOLDER, config_of, judged_run, searched_policy
 from qd.workers.evaluator import check_policy, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import prepare_output
 from sim.files.command import InSpace, Where, Who, naming_what_is_next, publish
+from sim.files.records import identity
 from sim.files.settings import setting
 from sim.policy.spec import controller_hash, controllers_of, is_same, who_crossed
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.evaluate.evaluate import Evaluate

@@ -19,7 +19,7 @@ from qd.run.progress import clock
 from qd.run.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, locked, read_json, to_json, write_atomically
 from sim.files.command import command_line
-from sim.robots.identity import check_identity
+from sim.files.records import check_identity
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler
@@ -98,7 +98,7 @@ def directory_of(run: Path) -> Path:
 
 
 def named_by(run: Path, archive: Archive) -> dict[str, Any]:
-    """What an archive is of (:func:`sim.robots.identity.identity`), or the config beside it where the file names none.
+    """What an archive is of (:func:`sim.files.records.identity`), or the config beside it where the file names none.
 
     Args:
         run: Run directory or archive file.

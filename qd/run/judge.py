@@ -18,9 +18,9 @@ from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.atomic import read_json
 from sim.files.command import InSpace, OfRobot, Where, Who, chosen_elites, command_line, naming_what_is_next
 from sim.files.intervals import rate_words
+from sim.files.records import identity
 from sim.files.settings import setting
 from sim.policy.spec import controllers_of, spec_of
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.show.recordings import Cross

@@ -23,7 +23,7 @@ from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import InSpace, Where, Who, command_line, naming_what_is_next
 from sim.files.intervals import rate_words
-from sim.robots.identity import identity
+from sim.files.records import identity
 
 if TYPE_CHECKING:
     from qd.causes import Shape

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from sim.files.command import split_words
+from sim.files.records import PENALTY_DEFINITION, robot_identity
 from sim.files.settings import built, check, setting
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, label_suffix, spec_of
-from sim.robots.identity import FIRST_DEFINITION, robot_identity
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -133,8 +133,8 @@ class SearchCfg:
     """Hash of its code if it is a user's own."""
     robot_sha256: str | None = None
     """Hash of the robot's settings, model and meshes; None in a run of a version before there was one."""
-    penalty_definition: str = FIRST_DEFINITION
-    """How the penalties are defined (:data:`kernels.penalties.PENALTY_DEFINITION`)."""
+    penalty_definition: str = PENALTY_DEFINITION
+    """How the penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
     reevaluate_every: int = setting(50, least=0)
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
     certified_by: tuple[str, ...] = ()

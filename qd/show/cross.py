@@ -17,8 +17,8 @@ from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OnDevice, Who, split_words
 from sim.files.intervals import rate_words, wilson_interval
+from sim.files.records import identity
 from sim.policy.spec import who_crossed
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.show.crossed import Crossed

@@ -17,7 +17,7 @@ from qd.run.directory import RUNS, folder_for
 from qd.show.elites import find_archive
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import OfRobot, Which, chosen_elites, split_words
-from sim.files.provenance import provenance
+from sim.files.records import provenance
 
 if TYPE_CHECKING:
     from sim.ground import GroundMaps

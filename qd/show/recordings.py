@@ -19,9 +19,8 @@ from qd.archive import Archive
 from qd.run.directory import RUNS
 from qd.run.progress import share_bar
 from qd.workers.evaluator import episode_seeds
-from sim.files.provenance import code_fingerprint
+from sim.files.records import code_fingerprint, robot_identity
 from sim.policy.spec import controller_hash
-from sim.robots.identity import robot_identity
 
 if TYPE_CHECKING:
     from sim.ground import GroundMaps

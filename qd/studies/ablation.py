@@ -21,7 +21,7 @@ from qd.studies.study import LOOKS, StudyFlags, run_study, study_of
 from qd.workers.evaluator import open_evaluator, resolve_device
 from sim.files.command import publish
 from sim.files.intervals import value_words
-from sim.robots.identity import identity
+from sim.files.records import identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

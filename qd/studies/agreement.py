@@ -28,7 +28,7 @@ from qd.workers.invalid import refuse_all_invalid
 from qd.workers.kept import Kept
 from sim.files.command import InSpace, Where, Who, chosen_elites, naming_what_is_next, publish
 from sim.files.intervals import value_words
-from sim.files.provenance import without_machine
+from sim.files.records import without_machine
 from sim.files.settings import check, setting
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class Agreement(Who, InSpace, Where):
             Interrupted: On Ctrl-C; what was crossed is kept.
             EvaluatorError: If a worker is lost; likewise.
         """
-        from sim.robots.identity import identity
+        from sim.files.records import identity
 
         check(self)
         terrains = drawn(self)

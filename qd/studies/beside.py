@@ -50,7 +50,7 @@ class Beside(InSpace):
             ValueError: If runs cannot be compared, or a file cannot be written.
         """
         from sim.files.figures import as_png
-        from sim.files.provenance import provenance
+        from sim.files.records import provenance
 
         if bool(self.runs) == bool(self.spaces) or (self.dose and not self.spaces):
             raise ValueError("name either --runs, or --spaces and to these --dose: NAME=DIR each")
@@ -68,7 +68,7 @@ class Beside(InSpace):
     def _lay_spaces(self) -> dict[str, Any]:
         from qd.studies.spaces import MOST_SPACES, draw_spaces, joined_dose, print_spaces, searches_of, space_numbers
         from sim.files.figures import as_png
-        from sim.files.provenance import provenance
+        from sim.files.records import provenance
 
         searches = searches_of(_named(self.spaces, "spaces", 1, MOST_SPACES), self.space)
         named = next(iter(searches.values())).named

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from qd.workers.invalid import tell_invalid
 from qd.workers.kept import Kept
 from sim.files.command import OnGround, Where, Who, naming_what_is_next, publish
+from sim.files.records import identity
 from sim.files.settings import check, setting
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.fresh import Open

@@ -22,9 +22,9 @@ from qd.workers.evaluator import open_evaluator, parse_workers, resolve_device
 from qd.workers.kept_open import kept_open
 from sim.files.command import publish
 from sim.files.intervals import MAX_T_VALUES, t_interval, value_words
+from sim.files.records import identity
 from sim.files.settings import check, setting
 from sim.policy.spec import certifier_hash, controllers_of, named_file
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.files.command import Who, publish
-from sim.files.provenance import provenance
+from sim.files.records import identity, provenance
 from sim.files.settings import setting
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from sim.rollout import Rollout, RolloutResult

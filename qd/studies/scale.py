@@ -15,9 +15,8 @@ from qd.run.arguments import evaluator_of
 from qd.run.settings import preset
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device, worker_status
 from sim.files.command import OfRobot, OnDevice, publish, show_json
-from sim.files.provenance import provenance
+from sim.files.records import identity, provenance
 from sim.files.settings import check, setting
-from sim.robots.identity import identity
 
 _PAPER_ITERATIONS = 1000
 

@@ -20,9 +20,8 @@ from qd.search import begin, search_terrains
 from qd.workers.evaluator import EvaluatorCfg, build_rollout, episode_seeds, open_evaluator, resolve_device
 from sim.files.atomic import read_json
 from sim.files.command import OfRobot, OnDevice, publish, show_json
-from sim.files.provenance import provenance
+from sim.files.records import identity, provenance
 from sim.files.settings import check, setting
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:
     from qd.scheduler import Scheduler

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
 from qd.workers.shards import MIN_ROWS, checked_count, merged, taken
-from sim.files.provenance import provenance
+from sim.files.records import provenance
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg

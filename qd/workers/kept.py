@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
-from sim.files.provenance import code_fingerprint
+from sim.files.records import code_fingerprint, robot_identity
 from sim.policy.spec import controller_hash
-from sim.robots.identity import robot_identity
 
 if TYPE_CHECKING:
     from qd.workers.evaluator import EvaluatorCfg

@@ -8,7 +8,7 @@ from typing import Any
 import ray
 from ray.exceptions import RayError
 
-from sim.files.provenance import device_name
+from sim.files.records import device_name
 
 _CONNECT_LIMIT_S = 10.0
 

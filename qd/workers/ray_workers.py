@@ -29,7 +29,7 @@ from qd.workers.process import Crosser, EvaluatorError
 from qd.workers.ray_cluster import connect, num_devices, resources
 from qd.workers.shards import MIN_ROWS, checked_count, flaw_of, merged, taken
 from sim.files.command import debugging
-from sim.files.provenance import code_fingerprint
+from sim.files.records import code_fingerprint
 from sim.policy.spec import ControllerSpec
 
 if TYPE_CHECKING:

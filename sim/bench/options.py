@@ -10,9 +10,8 @@ from tqdm import tqdm
 
 from sim.commands import SolverOptions
 from sim.files.intervals import value_words
-from sim.files.provenance import provenance
+from sim.files.records import identity, provenance
 from sim.rates import KINDS, agreement
-from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolve_device, resolved

@@ -17,8 +17,8 @@ from sim.bench.physics import measure_step
 from sim.bench.scene import build_scene
 from sim.bench.timing import TimingCfg, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns
 from sim.commands import Bench
+from sim.files.records import identity
 from sim.policy.loaders import prepare_torch, reason_of
-from sim.robots.identity import identity
 from sim.robots.robot import RobotCfg
 
 _FLUSH_BYTES = 256 << 20

@@ -20,7 +20,7 @@ from types import FrameType
 from typing import Any, Protocol, get_args, get_origin, get_type_hints, runtime_checkable
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.provenance import without_machine
+from sim.files.records import without_machine
 from sim.files.settings import check, setting
 
 _ALL = "all"

@@ -1,8 +1,11 @@
 """Controllers as black boxes: a batch of observation rows to a batch of actions."""
 
+import functools
 import inspect
+import multiprocessing
 import os
 import re
+import sys
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -12,12 +15,12 @@ from typing import Any, Protocol
 import torch
 import warp as wp
 
-from sim.files.atomic import check_zip
+from sim.files.atomic import check_zip, read_json
+from sim.files.records import robot_digest
 from sim.policy.onnx_file import load_onnx
 from sim.policy.runner import action_problem, with_rows_of_zeros
 from sim.policy.spec import ControllerSpec, find_named, in_one_line, place_of_code
-from sim.robots.identity import warn_if_trained_otherwise
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, get_robot
 
 _CALLED_WITH = {"factory": "robot, device", "adapter": "controller, robot"}
 _FORMATS = (
@@ -134,6 +137,29 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     if named.file is not None:
         warn_if_trained_otherwise(Path(named.file), robot)
     return policy
+
+
+def warn_if_trained_otherwise(policy: Path, robot: RobotCfg) -> None:
+    """Warns where the training record beside a controller names another robot than the one it is to walk."""
+    record = policy.with_suffix(".train.json")
+    try:
+        settings = read_json(record).get("settings")
+    except (OSError, ValueError):  # no record, or a damaged one, of which nothing is known
+        return
+    trained = settings.get("robot_sha256") if isinstance(settings, dict) else None
+    if trained is None or trained == robot_digest(robot):
+        return
+    now = robot_digest(get_robot(robot.spec))  # a command may have changed its time step or capacities by itself
+    if trained != now and multiprocessing.parent_process() is None:  # a worker's parent warns
+        _print_once(
+            f"warning: {policy} was trained with a robot of other settings, model or meshes (SHA-256 {trained[:12]} in "
+            f"{record.name}) than {robot.spec} has now ({now[:12]})"
+        )
+
+
+@functools.cache
+def _print_once(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from kernels.penalties import COLLISION_FORCE, PENALTIES
-from sim.files.provenance import provenance
+from sim.files.records import identity, provenance
 from sim.ground import GroundMaps
-from sim.robots.identity import identity
 
 if TYPE_CHECKING:  # who reads a recording has no simulation to wait for
     from sim.rollout import Rollout, RolloutResult
@@ -81,7 +80,7 @@ class Recording:
     command: NDArray[np.float32]
     """Command of the coming control step: v_x, v_y [m/s], yaw rate [rad/s], yaw frame; 0 once ended; (T, K, F, 3)."""
     origin: dict[str, Any]
-    """Where it comes from: :func:`sim.robots.identity.identity`, command, commit, device, versions, seed, date."""
+    """Where it comes from: :func:`sim.files.records.identity`, command, commit, device, versions, seed, date."""
     geom_names: tuple[str, ...] = ()
     """Of the G geoms whose touch is known: base, limbs and feet; none in the first files."""
     friction: NDArray[np.float32] | None = None

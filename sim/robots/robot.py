@@ -10,9 +10,9 @@ import numpy as np
 
 from sim.files.atomic import read_json
 from sim.files.command import command_line
+from sim.files.records import check_identity
 from sim.files.settings import setting
 from sim.policy.spec import controller_hash
-from sim.robots.identity import check_identity
 from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg, TuningCfg
 
 _ROBOTS_DIR = Path(__file__).parent
@@ -300,7 +300,7 @@ def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Pat
     file names.
 
     Args:
-        there: What the file says: ``robot``, its name, and the rest of :func:`sim.robots.identity.identity`.
+        there: What the file says: ``robot``, its name, and the rest of :func:`sim.files.records.identity`.
         given: What the command line names, if anything.
         file: The file, for errors.
         flag: The flag that names it, likewise.

@@ -13,7 +13,7 @@ from typing import Any
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import run_command
-from sim.files.provenance import provenance
+from sim.files.records import provenance
 from tests.kills import searches
 from tests.kills.campaign import Kill, Killable, RealSearch, kill_and_resume
 from tests.kills.children import Child

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from kernels.penalties import PENALTY_DEFINITION
 from qd.fitness import FitnessCfg
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.arguments import Job
@@ -16,7 +15,7 @@ from qd.run.settings import SchedulerCfg, SearchCfg
 from qd.search import run_search
 from qd.show import figures
 from qd.workers.evaluator import EvaluatorCfg
-from sim.files.provenance import provenance
+from sim.files.records import PENALTY_DEFINITION, provenance
 from sim.policy.spec import controller_hash
 from sim.robots.robot import get_robot
 from tests.qd import stand_in

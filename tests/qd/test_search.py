@@ -20,7 +20,7 @@ from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, Pipeline, open_ev
 from qd.workers.invalid import AllInvalidError
 from sim.files import atomic as files
 from sim.files.command import Interrupted
-from sim.files.provenance import provenance
+from sim.files.records import provenance
 from tests.qd import crossers, stand_in
 from tests.qd.searches import CFG, make_job, rows_of, run
 

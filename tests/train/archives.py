@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from kernels.penalties import PENALTY_DEFINITION
 from qd.archive import Archive, FaultCounts
+from sim.files.records import PENALTY_DEFINITION
 from sim.space import SUPER_GAUSSIAN
 from tests.builders import fresh_values
 

@@ -14,10 +14,9 @@ from qd.evaluate.sets import TRAINED_ON
 from qd.run.settings import differences
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import command_line
-from sim.files.provenance import provenance
+from sim.files.records import check_robot, provenance, robot_digest
 from sim.files.settings import problems
 from sim.policy.spec import is_same
-from sim.robots.identity import check_robot, robot_digest
 from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
 from sim.space import to_be_named

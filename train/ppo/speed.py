@@ -36,7 +36,7 @@ class TrainSpeed(OfRobot, OnDevice):
         Raises:
             ValueError: If a flag's value cannot be used; raised before any long work.
         """
-        from sim.files.provenance import provenance
+        from sim.files.records import provenance
         from sim.robots.robot import get_robot
         from sim.simulation import resolve_device
         from train.ppo.learner import Ranks

@@ -9,7 +9,7 @@ from qd.run.directory import ROUNDS_FILE
 from qd.run.settings import own_policy
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.command import InSpace, OnDevice, Who, naming_what_is_next
-from sim.files.provenance import without_machine
+from sim.files.records import without_machine
 from sim.files.settings import check, setting
 from sim.policy.spec import spec_of
 

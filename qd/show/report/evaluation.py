@@ -10,7 +10,7 @@ from qd.show.report.page import Block, Folded, Picture, absent, counted, heading
 from qd.show.report.tables import CERTIFIED, CHANGES, GENERATED, LABELS, MEASURES, RESOLVED, Change, Changes, by_kind
 from sim.files.command import plain_command
 from sim.files.intervals import value_words
-from sim.files.provenance import without_machine
+from sim.files.records import without_machine
 
 _TRAINED_ON = {
     "C-HC": "hand-crafted terrains alone",

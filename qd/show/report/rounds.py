@@ -23,7 +23,7 @@ from qd.show.report.tables import LABELS, MEASURES, by_kind, unreadable
 from sim.files.atomic import prepare_output, read_json
 from sim.files.command import plain_command
 from sim.files.figures import bar_lengths, new_figure
-from sim.files.provenance import without_machine
+from sim.files.records import without_machine
 from sim.robots.robot import get_robot
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from qd.show.report.page import (
 )
 from sim.files.command import plain_command
 from sim.files.intervals import bootstrap_interval
-from sim.files.provenance import without_machine
+from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec
 
 _AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes

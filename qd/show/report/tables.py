@@ -10,8 +10,8 @@ from qd.archive import Archive, read_archive
 from qd.run.directory import check_space
 from sim.files.atomic import has_shape, read_json
 from sim.files.command import command_line
+from sim.files.records import check_robot
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
-from sim.robots.identity import check_robot
 from sim.robots.robot import RobotCfg
 
 MEASURES = {

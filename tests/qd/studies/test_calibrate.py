@@ -9,7 +9,7 @@ import pytest
 from qd.studies.calibrate import Calibrate, Crossed, penalty_scales
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
-from sim.robots.identity import identity
+from sim.files.records import identity
 from sim.space import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.stand_in import make_result

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
-from sim.robots.identity import robot_digest
+from sim.files.records import robot_digest
 from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot

@@ -9,6 +9,7 @@ import pytest
 
 from kernels.penalties import BASE, FOOT, LIMB
 from sim.bench import oracle
+from sim.files.records import robot_identity
 from sim.robots.model import build_robot, leaf_name
 from sim.robots.robot import ROBOTS, get_robot
 from tests.sim import plain_mujoco
@@ -230,8 +231,8 @@ def test_penalty_scales_are_read(anymal, monkeypatch, tmp_path):
     with pytest.raises(ValueError, match="calibrate --robot anymal"):
         anymal.read_penalty_scales()
     scales = {name: 0.5 + k for k, name in enumerate(anymal.penalties)}
-    file.write_text(json.dumps({"scales": scales, "penalty_definition": "squared"}))
+    file.write_text(json.dumps({"scales": scales, **robot_identity(anymal)}))
     assert anymal.read_penalty_scales() == (0.5, 1.5, 2.5, 3.5, 4.5, 5.5)
-    file.write_text(json.dumps({"scales": scales | {"stumble": 0.0}, "penalty_definition": "squared"}))
+    file.write_text(json.dumps({"scales": scales | {"stumble": 0.0}, **robot_identity(anymal)}))
     with pytest.raises(ValueError, match="no positive scale for stumble"):
         anymal.read_penalty_scales()

@@ -3,8 +3,8 @@
 import numpy as np
 
 from kernels.episode import Outcome
+from sim.files.records import robot_identity
 from sim.recording.recorder import Recording
-from sim.robots.identity import robot_identity
 
 FRAMES = 6
 OUTCOMES = (Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.INVALID)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from sim.files.atomic import to_json, write_atomically
-from sim.files.provenance import code_fingerprint, provenance
+from sim.files.records import code_fingerprint, provenance
 
 
 def test_provenance_has_its_keys(monkeypatch):
     monkeypatch.setenv("FAULTLINE_COMMIT", "abc123")
     origin = provenance("cpu", 7)
-    assert list(origin) == ["command", "commit", "device", "versions", "seed", "date"]
+    assert list(origin) == ["command", "commit", "sources_sha256", "dirty", "device", "versions", "seed", "date"]
     assert origin["commit"] == "abc123" and origin["seed"] == 7
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", origin["date"])
     assert all(re.match(r"\d+\.", number) for number in origin["versions"].values())
@@ -60,7 +60,7 @@ def test_what_json_does_not_know_is_refused(content):
 
 
 def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):
-    monkeypatch.setattr("sim.files.provenance._ROOT", tmp_path)
+    monkeypatch.setattr("sim.files.records._ROOT", tmp_path)
     for room in ("one", "two"):
         (tmp_path / room).mkdir()
         (tmp_path / room / "a.py").write_text("x = 1")
@@ -70,7 +70,7 @@ def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):
     assert code_fingerprint(["one"]) == before != code_fingerprint(["one", "two"])
     (tmp_path / "one" / "robot.xml").write_text("<mujoco/>")
     with_robot = code_fingerprint(["one"])
-    monkeypatch.setattr("sim.files.provenance.versions", lambda: {"torch": "0"})
+    monkeypatch.setattr("sim.files.records.versions", lambda: {"torch": "0"})
     assert len({before, with_robot, code_fingerprint(["one"])}) == 3
 
 

@@ -1,0 +1,185 @@
+"""What every results file says of where it comes from and what it is of: command, code, device, robot, controller."""
+
+import hashlib
+import json
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, fields
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from sim.policy.spec import ControllerSpec, controller_hash
+from sim.robots.model_files import read_model_files
+
+PENALTY_DEFINITION = "squared"
+"""How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
+ROOMS = ("kernels", "sim", "qd", "train")
+"""Folders of the source code."""
+
+_ROOT = Path(__file__).resolve().parents[2]
+_PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
+_SOURCES = (".py", ".cu", ".xml")
+_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning")
+_SHOWN = 12  # digits of a hash in a message
+
+
+class RecordedRobot(Protocol):
+    """What a record needs of a robot's settings, a dataclass (:class:`sim.robots.robot.RobotCfg`)."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def name(self) -> str:
+        """What files are called after it."""
+        ...
+
+    @property
+    def model_file(self) -> Path:
+        """MJCF or URDF."""
+        ...
+
+    @property
+    def spec(self) -> str:
+        """Name or settings file."""
+        ...
+
+
+def provenance(device: str, seed: int) -> dict[str, Any]:
+    """Command, commit, hash of the sources, device, versions, seed and date of the running program."""
+    changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "--", *(_ROOT / name for name in ROOMS)])
+    commit = _output(["git", "rev-parse", "HEAD"])
+    return {
+        "command": _command(),
+        "commit": os.environ.get("FAULTLINE_COMMIT") or commit or None,
+        "sources_sha256": sources_sha256(),
+        "dirty": None if changed is None else changed != "",
+        "device": device_name(device),
+        "versions": versions(),
+        "seed": seed,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python and of the packages that results depend on; None of one that is not installed."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
+
+
+def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:
+    """SHA-256 of the source files of rooms: Python, CUDA and robot models."""
+    digest = hashlib.sha256()
+    for room in rooms:
+        for path in sorted((_ROOT / room).rglob("*")):
+            if path.suffix in _SOURCES:
+                digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def code_fingerprint(rooms: Sequence[str]) -> str:
+    """SHA-256 of the sources of rooms and of all package versions: equal ones compute the same."""
+    return hashlib.sha256(json.dumps([sources_sha256(rooms), versions()], sort_keys=True).encode()).hexdigest()
+
+
+def _command() -> str:
+    """The running command as a user types it; a path outside the working folder is cut to its name."""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    module = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
+    program = ["faultline"] if module == "faultline" else ["python", "-m", module]
+    return shlex.join([*program, *map(without_machine, sys.argv[1:])])
+
+
+def without_machine(word: str) -> str:
+    """A word of a command line, or a path, without where on this machine it lies: an absolute path's last name."""
+    here = f"{Path.cwd()}{os.sep}"
+    return re.sub(r"(?<![\w.~-])/(?:[^/=:\s]+/)+(?=[^/])", "", word.replace(here, ""))
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except ModuleNotFoundError:  # a checkout on the path without being installed
+        return None
+
+
+def device_name(device: str) -> str:
+    """What a Warp device is, in words; its own name where this machine cannot tell."""
+    if not device.startswith("cuda"):
+        return f"CPU ({platform.machine()}, {os.cpu_count()} cores)"
+    index = device.partition(":")[2] or "0"
+    return _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader", f"--id={index}"]) or device
+
+
+def _output(command: Sequence[str | Path]) -> str | None:
+    """What a program prints, run in the checkout; None where it is missing or fails."""
+    try:
+        done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def robot_digest(robot: RecordedRobot) -> str:
+    """SHA-256 of a robot: its settings without those of training, its model and its meshes.
+
+    A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
+    """
+    values = {field.name: (getattr(robot, field.name), _default(field)) for field in fields(robot)}
+    settings = {
+        name: value for name, (value, default) in values.items() if name not in _NOT_IN_DIGEST and value != default
+    }
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for file in read_model_files(robot.model_file).files:
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _default(setting: Field[Any]) -> Any:
+    return setting.default if setting.default_factory is MISSING else setting.default_factory()
+
+
+def robot_identity(robot: RecordedRobot) -> dict[str, str]:
+    """The keys ``robot_sha256`` and ``penalty_definition``, which every record of a robot has."""
+    return {"robot_sha256": robot_digest(robot), "penalty_definition": PENALTY_DEFINITION}
+
+
+def identity(robot: RecordedRobot, policy: str | Path) -> dict[str, str | None]:
+    """What a record of a robot under a controller names, as JSON values.
+
+    Returns:
+        ``robot`` (its name), ``robot_sha256``, ``penalty_definition``, ``policy`` (a name without folders) and
+        ``policy_sha256``, None for a controller without a file.
+    """
+    controller = {"policy": ControllerSpec.parse(policy).label, "policy_sha256": controller_hash(str(policy))}
+    return {"robot": robot.name, **robot_identity(robot), **controller}
+
+
+def check_robot(record: Mapping[str, Any], robot: RecordedRobot, file: Path, remedy: str) -> None:
+    """Refuses a record of a robot that has changed since.
+
+    Args:
+        record: What the file names.
+        robot: The robot of that name, as it is now.
+        file: The record, for the message.
+        remedy: What to do about it, other than putting back the robot.
+    """
+    expected, now = record.get("robot_sha256"), robot_digest(robot)
+    if expected != now:
+        raise ValueError(
+            f"{file} is of robot '{robot.name}' as it was before its settings, model or meshes changed (expected "
+            f"SHA-256 {str(expected)[:_SHOWN]}, got {now[:_SHOWN]} of {robot.spec}): put that back, or {remedy}"
+        )
+
+
+def check_identity(record: Mapping[str, Any], robot: RecordedRobot, file: Path, remedy: str) -> None:
+    """Refuses a record of a robot that has changed since (:func:`check_robot`) or of penalties defined otherwise."""
+    definition = record.get("penalty_definition")
+    if definition != PENALTY_DEFINITION:
+        raise ValueError(f"{file} is of penalties by {definition} errors, expected {PENALTY_DEFINITION} ones; {remedy}")
+    check_robot(record, robot, file, remedy)
