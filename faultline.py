@@ -44,19 +44,12 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "calibrate": Command("qd.studies.calibrate:Calibrate", "measure the penalty scales of a robot"),
     },
     "Study the search": {
-        "compare": Command("qd.studies.compare:Compare", "the search and its baselines on the same number of terrains"),
-        "ablation": Command("qd.studies.ablation:Ablation", "with and without standard deviations in the fitness"),
-        "beside": Command("qd.studies.beside:Beside", "searches side by side: controllers, or spaces"),
-        "agreement": Command("qd.studies.agreement:Agreement", "rates at finer contact and in MuJoCo C"),
-        "penalty-ratios": Command("qd.studies.penalty_ratios:PenaltyRatios", "how well penalties see failures"),
         "distances": Command("qd.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
         "tables": Command("qd.evaluate.publish:Tables", "the published numbers beside the paper's"),
     },
     "Measure speed": {
         "bench": Command("sim.commands:Bench", "every kernel against torch and the device's ceiling"),
-        "speed": Command("qd.studies.speed:Speed", "the search beside the bare physics it is made of"),
         "train-speed": Command("train.ppo.speed:TrainSpeed", "environment steps a second of training"),
-        "scale": Command("qd.studies.scale:Scale", "what more devices bring"),
         "solver-options": Command("sim.commands:SolverOptions", "what solver options cost and change"),
     },
 }

@@ -115,27 +115,6 @@ class FaultCounts:
         return np.all([goal_rates(counts) >= FAILING_GOAL_RATE for counts in both], axis=0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SearchCertificates:
-    """What certifiers did while N elites were searched for; :class:`FaultCounts` has the certificates that count."""
-
-    certifiers: tuple[str, ...]
-    """Names of C other controllers."""
-    certifier_sha256: tuple[str, ...]
-    """Their hashes."""
-    goal_rate: NDArray[np.float64]
-    """Their goal rates, shape (N, C); NaN of an elite that the controller crossed then, on which nobody was asked."""
-
-    @property
-    def certified(self) -> NDArray[np.bool_]:
-        """Whether one of them reached the goal in at least half of its episodes, shape (N,)."""
-        return np.any(self.goal_rate >= FAILING_GOAL_RATE, axis=1)
-
-    def rows(self, chosen: NDArray[np.int64]) -> "SearchCertificates":
-        """Those of some of the elites alone, in the order given."""
-        return replace(self, goal_rate=self.goal_rate[chosen])
-
-
 COUNTS = tuple(field.name for field in fields(FaultCounts) if field.name.endswith("_outcomes"))
 """Names of the arrays of counts, which have one row an elite."""
 
@@ -192,8 +171,6 @@ class Archive(Evaluation):
     """What fresh episodes say of the elites; None if there were none."""
     faults: FaultCounts | None = None
     """What became of those that fail under other conditions; only beside fresh values."""
-    certificates: SearchCertificates | None = None
-    """What certifiers did in a search for certified failures; None of any other."""
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and definition of the penalties, as :func:`sim.files.records.identity` names them."""
@@ -261,9 +238,8 @@ class Archive(Evaluation):
         """The archive with some of its elites alone, in the order given."""
         fresh = None if self.fresh is None else self.fresh.rows(chosen)
         faults = None if self.faults is None else self.faults.rows(chosen)
-        certificates = None if self.certificates is None else self.certificates.rows(chosen)
         own = {name: getattr(self, name)[chosen] for name in PER_ELITE}
-        return replace(self, fresh=fresh, faults=faults, certificates=certificates, **own)
+        return replace(self, fresh=fresh, faults=faults, **own)
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with what fresh episodes say, by descending corrected fitness, the invalid elites last."""
@@ -282,16 +258,14 @@ _HASHES = (*_OF_IDENTITY, "space_sha256")  # which a file may lack
 _SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations", *_HASHES)
 _PREFIX = "fresh_"
 _CERTIFIERS = ("certifiers", "certifier_sha256")
-_IN_SEARCH = "search_"  # before the names of what certifiers did in the search
-_CERTIFICATES = (*(_IN_SEARCH + name for name in _CERTIFIERS), _IN_SEARCH + "certifier_goal_rate")
 _KINDS = {
     **dict.fromkeys(("robot", "space", "penalties", *_HASHES), "U"),
-    **dict.fromkeys((*_CERTIFIERS, *(_IN_SEARCH + name for name in _CERTIFIERS)), "U"),
+    **dict.fromkeys(_CERTIFIERS, "U"),
     **dict.fromkeys(("collision_bit", "reproduced", "confirmed", "certified"), "b"),
     **dict.fromkeys(COUNTS, "i"),
     **dict.fromkeys(("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"),
 }
-_BESIDE = ("fresh", "faults", "certificates")
+_BESIDE = ("fresh", "faults")
 _MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
 PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, *_BESIDE))
 """Names of the arrays that have one row an elite."""
@@ -306,7 +280,7 @@ def write_archive(path: Path, archive: Archive) -> None:
     """
     settings = {name: getattr(archive, name) for name in _SETTINGS}
     content: dict[str, Any] = {name: np.asarray(value) for name, value in settings.items() if value is not None}
-    content |= _arrays(archive) | _fault_arrays(archive) | _certificate_arrays(archive)
+    content |= _arrays(archive) | _fault_arrays(archive)
     write_atomically(path, npz_bytes(content))
 
 
@@ -320,7 +294,7 @@ def _arrays(archive: Archive) -> dict[str, NDArray[Any]]:
 
 _RATES = tuple(name.replace("_outcomes", ending) for name in COUNTS for ending in ("_goal_rate", "_goal_interval"))
 _FAULT_NAMES = (*_CERTIFIERS, *COUNTS, *_RATES, "confirmed", "certified")
-_KNOWN = {*_SETTINGS, *PER_ELITE, *(_PREFIX + name for name in FRESH), *_CERTIFICATES, *_FAULT_NAMES}
+_KNOWN = {*_SETTINGS, *PER_ELITE, *(_PREFIX + name for name in FRESH), *_FAULT_NAMES}
 
 
 def _fault_arrays(archive: Archive) -> dict[str, NDArray[Any]]:
@@ -334,16 +308,6 @@ def _fault_arrays(archive: Archive) -> dict[str, NDArray[Any]]:
         arrays |= {name: counts, f"{what}_goal_rate": goal_rates(counts)}
         arrays[f"{what}_goal_interval"] = _goal_intervals(counts)
     return arrays | {"confirmed": archive.confirmed, "certified": archive.certified}
-
-
-def _certificate_arrays(archive: Archive) -> dict[str, NDArray[Any]]:
-    """What certifiers did in the search, by its names in the file; nothing where none were asked."""
-    own = archive.certificates
-    if own is None:
-        return {}
-    return dict(
-        zip(_CERTIFICATES, (np.array(own.certifiers), np.array(own.certifier_sha256), own.goal_rate), strict=True)
-    )
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -372,19 +336,14 @@ def read_archive(path: str | Path) -> Archive:
             names += [_PREFIX + name for name in FRESH]
         if not there.isdisjoint(_FAULT_NAMES):  # likewise
             names += _FAULT_NAMES
-        if not there.isdisjoint(_CERTIFICATES):
-            names += _CERTIFICATES
         content = read_arrays(file, names)
         _check_kinds(content)
-        asked = [content.pop(name) for name in _CERTIFICATES if name in content]
         judged = {name: content.pop(name) for name in _FAULT_NAMES if name in content}
         fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
         found = {name: _from_array(name, value) for name, value in content.items()}
         archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
         _check_shapes(archive)
         _check_values(archive)
-        if asked:
-            archive = replace(archive, certificates=_certificates_of(len(archive), *asked))
         if judged:
             archive = _with_faults(archive, judged)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
@@ -437,21 +396,6 @@ def _check_values(archive: Archive) -> None:
     cells = [archive.cell] if archive.fresh is None else [archive.cell, archive.fresh.cell]
     if not all(((cell >= 0) & (cell < num_cells)).all() for cell in cells):
         raise ValueError(f"cell must lie in 0 to {num_cells - 1}")
-
-
-def _certificates_of(
-    num_elites: int, certifiers: NDArray[np.str_], hashes: NDArray[np.str_], goal_rate: NDArray[np.float64]
-) -> SearchCertificates:
-    if goal_rate.shape != (num_elites, len(certifiers)) or len(hashes) != len(certifiers):
-        raise ValueError(
-            f"{_CERTIFICATES[-1]} must have shape {(num_elites, len(certifiers))}, and every certifier a hash, got "
-            f"{goal_rate.shape}"
-        )
-    if ((goal_rate < 0.0) | (goal_rate > 1.0)).any():
-        raise ValueError(f"{_CERTIFICATES[-1]} must hold shares, or NaN where nobody was asked")
-    return SearchCertificates(
-        certifiers=tuple(certifiers.tolist()), certifier_sha256=tuple(hashes.tolist()), goal_rate=goal_rate
-    )
 
 
 def _with_faults(archive: Archive, judged: dict[str, NDArray[Any]]) -> Archive:

@@ -353,17 +353,6 @@ def fault_words(archive: Archive, *, what: str = "failing elite") -> list[str]:
     return told
 
 
-def search_words(archive: Archive) -> list[str]:
-    """What certifiers did in a search for certified failures, in a sentence; nothing of any other search."""
-    own = archive.certificates
-    if own is None:
-        return []
-    return [
-        f"{int(own.certified.sum()):,} of {len(archive):,} elites were certified in the search: terrains that the "
-        f"controller did not cross then and {any_of(own.certifiers)} did. `faultline certify` lets them cross again."
-    ]
-
-
 def rate_of(counts: NDArray[np.int64]) -> dict[str, Any]:
     """Goal rate of episodes, shape (4,), with its 95 % interval (Wilson); a rate of None: too many are invalid."""
     valid, rate = int(counts.sum() - counts[OUTCOMES.index("invalid")]), float(goal_rates(counts))
@@ -394,9 +383,9 @@ def judgement(archive: Archive, number: int) -> dict[str, Any]:
 
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
-    faults, told = archive.faults, _in_search(archive, number)
+    faults = archive.faults
     if faults is None:
-        return told
+        return []
     kinds = {
         "With contact resolved": faults.resolved_outcomes[number],
         "In MuJoCo C": faults.mujoco_c_outcomes[number],
@@ -405,9 +394,9 @@ def elite_words(archive: Archive, number: int) -> list[str]:
         kinds[name] = faults.certifier_outcomes[number, place]
         kinds[f"{name} with contact resolved"] = faults.certifier_resolved_outcomes[number, place]
     known = [f"{what}: {_goals(counts)} reach the goal." for what, counts in kinds.items() if counts.any()]
-    told += known
     if not known:
-        return told
+        return []
+    told = known
     by = [name for name, certifies in zip(faults.certifiers, faults.certificates()[number], strict=True) if certifies]
     if not archive.failing[number]:
         told.append("It does not fail by its fresh episodes.")
@@ -418,17 +407,6 @@ def elite_words(archive: Archive, number: int) -> list[str]:
     else:
         told.append(f"It is {'' if archive.confirmed[number] else 'not '}confirmed, and not known to be passable.")
     return told
-
-
-def _in_search(archive: Archive, number: int) -> list[str]:
-    """What certifiers did on an elite while it was searched for; nothing where none was asked."""
-    own = archive.certificates
-    if own is None or np.isnan(own.goal_rate[number]).all():
-        return []
-    rates = zip(own.certifiers, own.goal_rate[number], strict=True)
-    return [
-        f"In the search: {', '.join(f'{name} reached the goal in {rate:.0%} of its episodes' for name, rate in rates)}."
-    ]
 
 
 def _goals(counts: NDArray[np.int64]) -> str:

@@ -18,7 +18,6 @@ FITNESS_FLOOR = -20.0
 """Fitness an invalid terrain is told with; an elite's is above it, so that every elite adds to the QD score."""
 FAILING_GOAL_RATE = 0.5
 """A controller fails a terrain on which it reaches the goal less often."""
-_SHORTFALL_WEIGHT = 10.0  # fitness that a goal rate of the certifiers 1 lower costs where they fail too
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,22 +110,6 @@ def paper_fitness(
     """
     inconsistency = np.where(collision_rate > 0.0, 1.0 - collision_rate, 0.0)
     return mean.sum(axis=1) - cfg.alpha * std.sum(axis=1) - cfg.lam * inconsistency
-
-
-def gated_fitness(fitness: NDArray[np.float64], certifier_goal_rate: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The fitness that emitters are told in a search for failures that other controllers can cross.
-
-    Where no certifier reaches the goal in half of its episodes, it is at most 0, less 10 times what the best of them
-    lacks to half. So a terrain that nobody crosses is worth less than one that somebody does, and emitters are still
-    told which way certificates lie; refusing such terrains outright tells them nothing.
-
-    Args:
-        fitness: Of the controller that is searched, shape (T,).
-        certifier_goal_rate: Of the best certifier, shape (T,); NaN where none was asked since the controller crosses,
-            which leaves the fitness as it is.
-    """
-    lacks = FAILING_GOAL_RATE - certifier_goal_rate
-    return np.where(lacks > 0.0, np.minimum(fitness, 0.0) - _SHORTFALL_WEIGHT * lacks, fitness)
 
 
 def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Evaluation:

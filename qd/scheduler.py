@@ -15,7 +15,7 @@ from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd.descriptors import Cells
-from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, gated_fitness
+from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.run.settings import SchedulerCfg
 from sim.space import SUPER_GAUSSIAN, TerrainSpace, clipped, get_space
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from qd.surrogate import Surrogate
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
-_CERTIFIED_LEAD = 1e6  # more than fitnesses differ by: in a cell certified beats uncertified, then fitness decides
 
 
 class RandomEmitter:
@@ -87,7 +86,6 @@ class Scheduler:
         space: What genes mean.
         cells: The reachable cells.
         seed: Seed of emitters and archives.
-        num_certifiers: Certifiers whose goal rates it is told.
     """
 
     def __init__(
@@ -97,13 +95,12 @@ class Scheduler:
         cells: Cells,
         seed: int,
         space: TerrainSpace = SUPER_GAUSSIAN,
-        num_certifiers: int = 0,
     ) -> None:
         *streams, shared = np.random.SeedSequence(seed).spawn(cfg.emitters + 3)
         learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
-        shapes = space.num_genes, cells.num_cells, cells.num_ratios, num_certifiers
+        shapes = space.num_genes, cells.num_cells, cells.num_ratios
         self.result = _make_archive(*shapes, streams[1], {})
         in_turn = list(zip(cycle(cfg.methods), streams[2:], strict=False))
         learns = any(name == "cma_mae" for name, _ in in_turn)
@@ -185,13 +182,10 @@ class Scheduler:
         if self.surrogate is None or not emitters:
             return iter(())
         data: Any = self.result.data()
-        best = data["objective"]
-        if "certifier_goal_rate" in data:
-            best = gated_fitness(data["fitness"], data["certifier_goal_rate"].max(axis=1))
         under_way = [clipped(genes) for genes in self._asked if genes is not None]
         sizes = [emitter.batch_size for emitter in emitters]
         genes = self.surrogate.propose(
-            sum(sizes), data["genes"], data["index"], best, np.concatenate([data["genes"][:0], *under_way])
+            sum(sizes), data["genes"], data["index"], data["objective"], np.concatenate([data["genes"][:0], *under_way])
         )
         return iter(np.split(genes, np.cumsum(sizes)[:-1]))
 
@@ -200,21 +194,13 @@ class Scheduler:
         if self.surrogate is not None:
             self.surrogate.compute_on(device)
 
-    def tell(
-        self,
-        evaluation: Evaluation,
-        iteration: int,
-        group: int = 0,
-        certifier_goal_rate: NDArray[np.float64] | None = None,
-    ) -> None:
+    def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
         """What became of the terrains that a group last asked for.
 
         Args:
             evaluation: One row a terrain, in the order asked.
             iteration: Number of the iteration, from 1.
             group: Number of the group.
-            certifier_goal_rate: In a search for certified failures, of each certifier, shape (rows, num_certifiers);
-                NaN in rows that the controller crosses.
 
         Raises:
             RuntimeError: If it asked for nothing.
@@ -225,17 +211,12 @@ class Scheduler:
             raise RuntimeError("tell() must follow ask(), got no terrains asked for")
         if len(evaluation.fitness) != len(asked):
             raise ValueError(f"evaluation must have {len(asked)} rows, got {len(evaluation.fitness)}")
-        told, ranked = _rows(asked, evaluation, iteration), evaluation.fitness
-        if certifier_goal_rate is not None:
-            best = certifier_goal_rate.max(axis=1)
-            told |= {"objective": gated_fitness(evaluation.fitness, best), "fitness": evaluation.fitness}
-            told["certifier_goal_rate"] = certifier_goal_rate
-            ranked = ranked + _CERTIFIED_LEAD * (best >= FAILING_GOAL_RATE)
+        told = _rows(asked, evaluation, iteration)
         self._asked[group] = None
         if self.surrogate is not None:
             self.surrogate.learn(asked, evaluation, told["objective"])
         accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
-        plain = self._add({**told, "objective": ranked}, accepted)
+        plain = self._add(told, accepted)
         learned = plain if self.archive is self.result else self.archive.add(**told)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
@@ -259,15 +240,11 @@ class Scheduler:
         return added
 
     def elites(self) -> dict[str, NDArray[Any]]:
-        """The elites in order of descending fitness, as the arrays of an :class:`qd.archive.Archive`.
-
-        Of a search for certified failures with ``certifier_goal_rate``, shape (N, num_certifiers).
-        """
+        """The elites in order of descending fitness, as the arrays of an :class:`qd.archive.Archive`."""
         data: Any = self.result.data()
-        data["fitness"] = data.get("fitness", data["objective"])
-        order = np.lexsort((data["index"], -data["fitness"]))
-        names = (*_FIELDS, "fitness", *(("certifier_goal_rate",) if "certifier_goal_rate" in data else ()))
-        return {name: data[name][order] for name in names} | {"cell": data["index"][order].astype(np.int64)}
+        order = np.lexsort((data["index"], -data["objective"]))
+        elites = {name: data[name][order] for name in _FIELDS}
+        return elites | {"fitness": data["objective"][order], "cell": data["index"][order].astype(np.int64)}
 
     def state(self) -> dict[str, Any]:
         """Everything a resumed search needs; what was asked for and not told stays asked for."""
@@ -310,7 +287,6 @@ def _make_archive(
     num_genes: int,
     num_cells: int,
     num_ratios: int,
-    num_certifiers: int,
     stream: np.random.SeedSequence,
     learning: dict[str, Any],
 ) -> GridArchive:
@@ -318,8 +294,6 @@ def _make_archive(
     rate, count = ((), np.float64), ((), np.int64)
     shapes = ((num_genes,), np.float32), per_ratio, per_ratio, per_ratio, rate, rate, rate, count, count, count
     own: dict[str, Any] = dict(zip(_FIELDS, shapes, strict=True))
-    if num_certifiers:
-        own |= {"fitness": rate, "certifier_goal_rate": ((num_certifiers,), np.float64)}
     return GridArchive(
         solution_dim=num_genes,
         dims=[num_cells],

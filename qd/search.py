@@ -1,35 +1,23 @@
 """The search: ask for terrains, let robots cross them, tell the emitters what became of them."""
 
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.faults import confirm_all, fault_words, search_words
+from qd.faults import confirm_all, fault_words
 from qd.fitness import Evaluation, concatenated, evaluation_of
 from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
-from qd.gate import Gate, certifier_seeds, groups_behind, open_gate, rates_of
 from qd.run.arguments import Job
-from qd.run.directory import (
-    CONFIG_FILE,
-    Metrics,
-    RunDirectory,
-    archive_of,
-    claimed,
-    episodes_in,
-    reached,
-    write_results,
-)
+from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, reached, write_results
 from qd.run.progress import ProgressBar, plan
 from qd.run.settings import SearchCfg, code_of
 from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, pipeline_of, worker_status
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
-from qd.workers.shards import merged, taken
+from qd.workers.shards import merged
 from sim.files.command import command_line, naming_what_is_next
 
 if TYPE_CHECKING:
@@ -40,221 +28,105 @@ MOST_DRAWN = 200
 """Elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)."""
 
 
-class Crossed(NamedTuple):
-    """Terrains of one search that the controller has crossed, of a group or of a whole iteration."""
-
-    result: "RolloutResult"
-    evaluation: Evaluation
-    search_s: float = 0.0
-    """Time that the search took to learn of them and to ask again, without crossing anything [s]."""
-
-
 def search_terrains(
-    cfg: SearchCfg,
-    run: RunDirectory,
-    search: "Scheduler",
-    metrics: Metrics,
-    evaluate: Evaluate,
-    bar: ProgressBar,
-    gate: Gate | None = None,
+    cfg: SearchCfg, run: RunDirectory, scheduler: "Scheduler", metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
 ) -> None:
-    """The loop: runs the iterations that are left, and saves each.
+    """Runs the iterations that are left, and saves each.
+
+    A group of emitters that was told asks again at once, and its next terrains wait in the queue while those of the
+    other groups are crossed. The order is fixed, and what a group has asked for is part of the saved state: a search
+    that goes on where it was stopped is the same as one that was not.
 
     Args:
         cfg: The search.
         run: Where it is saved.
-        search: Its state, told so far.
+        scheduler: Its state, told so far.
         metrics: Rows so far; one more an iteration.
         evaluate: Crosses terrains.
         bar: Shows progress.
-        gate: The certifiers of a search for certified failures.
-
-    Raises:
-        AllInvalidError: If no episode of a group is valid; the iterations before are saved.
     """
-    left = range(len(metrics) + 1, cfg.iterations + 1)
-    began = time.perf_counter()
-    for iteration, (crossed,) in crossed_iterations([(cfg, search)], left, evaluate, bar, gate):
-        found = archive_of(cfg, search, iteration)
-        row = row_of(cfg, found, crossed, iteration)
-        if looks_again(cfg, iteration):
-            row |= _look_again(cfg, found, evaluate)
-        ended = time.perf_counter()
-        wall_s = ended - began  # from the end of the iteration before, so saving counts
-        workers = worker_status(evaluate)
-        counts = {"workers": workers.workers, "retries": workers.retries} if workers else {}
-        metrics.append({**row, "wall_s": wall_s, "episodes_per_s": episodes_in(row) / wall_s, **counts})
-        began = ended
-        run.save(cfg, search, metrics, found)
-        bar.show(metrics[-1], None if workers is None else str(workers))
-
-
-def crossed_iterations(
-    searches: "Sequence[tuple[SearchCfg, Scheduler]]",
-    iterations: range,
-    evaluate: Evaluate,
-    bar: ProgressBar,
-    gate: Gate | None = None,
-) -> "Iterator[tuple[int, list[Crossed]]]":
-    """Lets the groups of some searches ask, have their terrains crossed, and tells them, in turn.
-
-    A group that was told asks again at once, and its next terrains wait in the queue while those of the other groups
-    are crossed. The order is fixed, and what a group has asked for is part of the saved state: a search that goes on
-    where it was stopped is the same as one that was not.
-
-    In a search for certified failures a group is told when its certifiers have come back too, which is some groups
-    later: those are crossed by the controller meanwhile.
-
-    Args:
-        searches: Settings and states; all have as many groups and episodes a terrain. They are crossed together.
-        iterations: Which to run.
-        evaluate: Crosses terrains.
-        bar: Shows progress.
-        gate: The certifiers, if one of the searches has some.
-
-    Yields:
-        Number of an iteration whose groups were all told, and what each search crossed in it. Nothing is under way
-        before an iteration at whose end elites cross fresh episodes (:func:`looks_again`) goes on.
-    """
-    cfg, pipeline = searches[0][0], pipeline_of(evaluate)
-    groups, under_way = range(cfg.scheduler.groups), 0
-    behind = 0 if gate is None else groups_behind(len(groups))
+    pipeline, num_groups = pipeline_of(evaluate), cfg.scheduler.groups
     pipeline.clear()
-    if gate is not None:
-        gate.clear()
-
-    def put(iteration: int, group: int) -> None:
-        parts = [_group_terrains(own, search, iteration, group) for own, search in searches]
-        pipeline.put(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-    for iteration in iterations:
-        for group in groups[under_way:]:
-            put(iteration, group)
-        ahead = iteration + 1 in iterations and not looks_again(cfg, iteration)
-        results: list[list[Crossed]] = []
-        waiting: deque[int] = deque()
-        for group in groups:
-            result = pipeline.take(bar.within(iteration, group, len(groups)))
-            results.append(_crossed(searches, result, group))
-            if gate is not None:
-                _ask_certifiers(gate, searches, results[group], iteration, group)
-            waiting.append(group)
-            while len(waiting) > (behind if group < groups[-1] else 0):
-                done = waiting.popleft()
-                results[done] = _tell(searches, results[done], gate, iteration, done)
-                if ahead:
-                    put(iteration + 1, done)
-        under_way = len(groups) if ahead else 0
-        yield iteration, [_joined(own) for own in zip(*results, strict=True)]
-
-
-def _group_terrains(
-    cfg: SearchCfg, search: "Scheduler", iteration: int, group: int
-) -> "tuple[NDArray[np.float32], NDArray[np.uint32]]":
-    """Genes that a group asks for, and their seeds, which are those of their place in the iteration."""
-    seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)
-    return search.ask(group), seeds[search.places(group)]
+    num_under_way, began = 0, time.perf_counter()
+    for iteration in range(len(metrics) + 1, cfg.iterations + 1):
+        for group in range(num_under_way, num_groups):
+            pipeline.put(scheduler.ask(group), _group_seeds(cfg, scheduler, iteration, group))
+        samples = samples_elites(cfg, iteration)
+        goes_ahead = iteration < cfg.iterations and not samples  # a sample is crossed with nothing else under way
+        results, evaluations, search_s = [], [], 0.0
+        for group in range(num_groups):
+            result = pipeline.take(bar.within(iteration, group, num_groups))
+            refuse_all_invalid(result)
+            evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
+            told_at = time.perf_counter()
+            scheduler.tell(evaluation, iteration, group)
+            genes = scheduler.ask(group)
+            search_s += time.perf_counter() - told_at
+            if goes_ahead:
+                pipeline.put(genes, _group_seeds(cfg, scheduler, iteration + 1, group))
+            results.append(result)
+            evaluations.append(evaluation)
+        num_under_way = num_groups if goes_ahead else 0
+        archive = archive_of(cfg, scheduler, iteration)
+        row = metrics_row(archive, merged(results, join=1), concatenated(evaluations), iteration, search_s)
+        if samples:
+            row |= _sample_elites(cfg, archive, evaluate)
+        ended = time.perf_counter()
+        row |= _timing(row, ended - began, evaluate)  # from the end of the iteration before, so saving counts
+        began = ended
+        metrics.append(row)
+        run.save(cfg, scheduler, metrics, archive)
+        status = worker_status(evaluate)
+        bar.show(row, None if status is None else str(status))
 
 
-def _crossed(searches: "Sequence[tuple[SearchCfg, Scheduler]]", result: "RolloutResult", group: int) -> list[Crossed]:
-    """What the controller made of a group's terrains, one a search."""
-    found, first = [], 0
-    for cfg, search in searches:
-        places = search.places(group)
-        own = taken(result, places.stop - places.start, first=first)
-        first += places.stop - places.start
-        refuse_all_invalid(own)
-        found.append(Crossed(own, evaluation_of(own, cfg.cells, cfg.fitness)))
-    return found
+def _group_seeds(cfg: SearchCfg, scheduler: "Scheduler", iteration: int, group: int) -> NDArray[np.uint32]:
+    """Seeds of a group's terrains, which are those of their places in the iteration."""
+    return episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
 
 
-def _joined(groups: Sequence[Crossed]) -> Crossed:
-    """The groups of an iteration, one after the other."""
-    evaluation = concatenated([one.evaluation for one in groups])
-    return Crossed(merged([one.result for one in groups], join=1), evaluation, sum(one.search_s for one in groups))
+def _timing(row: dict[str, Any], wall_s: float, evaluate: Evaluate) -> dict[str, Any]:
+    status = worker_status(evaluate)
+    workers = {"workers": status.workers, "retries": status.retries} if status else {}
+    return {"wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **workers}
 
 
-def _ask_certifiers(
-    gate: Gate,
-    searches: "Sequence[tuple[SearchCfg, Scheduler]]",
-    crossed: Sequence[Crossed],
-    iteration: int,
-    group: int,
-) -> None:
-    """Lets certifiers cross what a group's terrains the controller did not, those of all searches together."""
-    parts = [
-        (search.ask(group)[asked], certifier_seeds(cfg, iteration, search.places(group))[asked])
-        for (cfg, search), one in zip(searches, crossed, strict=True)
-        if cfg.certified_by
-        for asked in [one.evaluation.not_crossed]
-    ]
-    gate.put(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def _tell(
-    searches: "Sequence[tuple[SearchCfg, Scheduler]]",
-    crossed: Sequence[Crossed],
-    gate: Gate | None,
-    iteration: int,
-    group: int,
-) -> list[Crossed]:
-    """Tells a group of emitters of each search what became of its terrains, lets it ask again, and takes the time."""
-    counts, first, told = None if gate is None else gate.take(), 0, []
-    for (cfg, search), one in zip(searches, crossed, strict=True):
-        rates = None
-        if cfg.certified_by and counts is not None:
-            asked = one.evaluation.not_crossed
-            last = first + int(asked.sum())
-            rates, first = rates_of(asked, counts[first:last]), last
-        began = time.perf_counter()
-        search.tell(one.evaluation, iteration, group, rates)
-        search.ask(group)
-        told.append(one._replace(search_s=time.perf_counter() - began))
-    return told
-
-
-def looks_again(cfg: SearchCfg, iteration: int) -> bool:
-    """Whether elites cross fresh episodes at the end of an iteration."""
+def samples_elites(cfg: SearchCfg, iteration: int) -> bool:
+    """Whether some elites cross fresh episodes at the end of an iteration."""
     return bool(cfg.reevaluate_every) and iteration % cfg.reevaluate_every == 0
 
 
-def row_of(cfg: SearchCfg, found: Archive, crossed: Crossed, iteration: int) -> dict[str, Any]:
+def metrics_row(
+    archive: Archive, result: "RolloutResult", evaluation: Evaluation, iteration: int, search_s: float
+) -> dict[str, Any]:
     """An iteration's row of metrics without its timing.
 
     Args:
-        cfg: The search.
-        found: What it has found.
-        crossed: The iteration's crossings.
+        archive: What the search has found.
+        result: The iteration's crossings.
+        evaluation: What the emitters were told of them.
         iteration: Number of the iteration, from 1.
+        search_s: Time that the search took to learn of them and to ask again, without crossing anything [s].
     """
-    result, evaluation = crossed.result, crossed.evaluation
-    certified = {}
-    if found.certificates is not None:
-        asked = int(evaluation.not_crossed.sum()) * len(cfg.certified_by)
-        certified = {
-            "certifier_episodes": asked * cfg.certify_episodes,
-            "certified_elites": int(found.certificates.certified.sum()),
-        }
     return {
         "iteration": iteration,
-        **found.scores(),
+        **archive.scores(),
         **evaluation.means(),
-        **certified,
         "invalid_reasons": invalid_reasons(result),
         "physics_steps": int(result.physics_steps),
         "robot_steps": int(result.robot_steps),
         "idle_share": result.idle_share,
         "rollout_s": float(result.wall_s),
-        "search_s": crossed.search_s,
+        "search_s": search_s,
         "mean_duration_s": float(result.duration_s.mean()),
     }
 
 
-def _look_again(cfg: SearchCfg, found: Archive, evaluate: Evaluate) -> dict[str, Any]:
+def _sample_elites(cfg: SearchCfg, archive: Archive, evaluate: Evaluate) -> dict[str, Any]:
     """How reliable some elites of this iteration are, in fresh episodes (the paper's mean STD over iterations)."""
-    some = drawn_elites(found, MOST_DRAWN, cfg.seed)
-    again = reevaluate([some], evaluate, cfg.fitness, num_replicas=cfg.replicas, seeds=[cfg.seed])[0]
-    return numbers_of(again, cfg.cells, sampled=True)
+    sample = drawn_elites(archive, MOST_DRAWN, cfg.seed)
+    fresh = reevaluate([sample], evaluate, cfg.fitness, num_replicas=cfg.replicas, seeds=[cfg.seed])[0]
+    return numbers_of(fresh, cfg.cells, sampled=True)
 
 
 def begin(
@@ -281,7 +153,6 @@ def _new(cfg: SearchCfg) -> "Scheduler":
         space=get_space(cfg.space, cfg.space_sha256),
         cells=cfg.cells,
         seed=cfg.seed,
-        num_certifiers=len(cfg.certified_by),
     )
 
 
@@ -316,14 +187,13 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
         origin = {**job.origin, "sessions": [*reached(job.origin["sessions"], done), *own]}
         with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(job)):
             with ExitStack() as opened:
-                evaluate = gate = None
+                evaluate = None
                 if done < cfg.iterations:
                     evaluate = opened.enter_context(open_evaluator(job.evaluator))
-                    gate = opened.enter_context(open_gate(cfg, job.certifiers, job.evaluator, open_evaluator))
                 run.write_config(cfg, origin)
                 if evaluate is not None:
                     with ProgressBar(cfg.iterations, done) as bar:
-                        search_terrains(cfg, run, search, metrics, evaluate, bar, gate)
+                        search_terrains(cfg, run, search, metrics, evaluate, bar)
             found = archive_of(cfg, search, len(metrics))
             archive = run.with_fresh_values(found)
             write_results(run, archive, metrics, origin)
@@ -338,7 +208,7 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
             later = f"Go on with:  {job.confirm_command}"
             with naming_what_is_next("what was crossed is kept", lambda: later):
                 archive = confirm_all(run, archive, job.evaluator, open_evaluator, cfg.seed)
-        for line in (*search_words(archive), *fault_words(archive)):
+        for line in fault_words(archive):
             print(line)
     invalid = invalid_iterations(metrics)
     if invalid is not None:

@@ -114,15 +114,10 @@ CHANGED: dict[str, dict[str, str | None]] = {
 }
 """What differs where a command has these words."""
 LEFT_OUT = {
-    "faultline compare --robot anymal$": "nine searches take long; the one that names its methods runs",
-    "faultline compare .* --certify": "searches and certifies for an hour; tests/qd/studies/test_compare.py runs it",
     "faultline harden .* --against": "trains and searches three times as much",
-    "faultline compare .* emitters=80": "one of its iterations has more terrains than a small run of the others",
     "faultline bench": "compiles torch kernels for minutes; tests/sim/bench runs it small",
-    "faultline speed": "measures a GPU",
     "faultline train-speed": "measures a GPU",
     "faultline solver-options": "measures a GPU",
-    "faultline scale": "needs several GPUs",
     "faultline train --robot anymal": "by torchrun, needs several GPUs",
     "make test": "runs tests",
     "make lint": "checks style",

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +16,6 @@ from qd.run.settings import (
     is_searched,
     kept_penalties,
     measured_now,
-    moved_certifiers,
     moved_policy,
     policy_spec,
     preset,
@@ -24,10 +23,10 @@ from qd.run.settings import (
     refuse_unnamed_code,
     resumed,
 )
-from qd.workers.evaluator import EvaluatorCfg, check_policy, origin_of, parse_workers, resolve_device
+from qd.workers.evaluator import EvaluatorCfg, check_policy, origin_of, resolve_device
 from sim.files.atomic import is_leftover
 from sim.files.command import OnGround, Where, Who, command_line
-from sim.policy.spec import ControllerSpec, certifier_hash, controller_hash, controllers_of, named_file
+from sim.policy.spec import controller_hash
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
@@ -84,11 +83,6 @@ class Archive(Who, OnGround, Where):
     """Weight of the standard deviations in the fitness."""
     lam: float | None = None
     """Weight in the fitness of u, the share of episodes without base collision; u is 0 if none collided."""
-    certified_by: tuple[str, ...] | None = None
-    """Search for failures that other controllers can cross: FILE or NAME=FILE of each, as --policy takes it. They try
-    the terrains that the controller does not cross. A terrain that none of them crosses is worth less."""
-    certify_episodes: int | None = None
-    """Episodes of each of them on such a terrain; 10."""
     reevaluate_every: int | None = None
     """After every so many iterations up to 200 elites cross 40 fresh episodes each. 0: never."""
     reproduce: Literal["auto", "yes", "no"] = "auto"
@@ -103,10 +97,6 @@ class Archive(Who, OnGround, Where):
         run_search(job_of(self))
 
 
-NOT_ON_RAY = (
-    "a search for certified failures runs in this process or in processes of this machine, not on Ray, whose workers "
-    "have one controller each"
-)
 _NOT_SETTINGS = (
     "device", "workers", "num_envs", "robot", "resume", "run_dir", "without", "reproduce", "confirm", "ground",
 )  # fmt: skip
@@ -131,8 +121,6 @@ class Job:
     """Provenance of the run's beginning, and the sessions before this one."""
     session: dict[str, Any]
     """Command, commit and device of this session."""
-    certifiers: dict[str, str] = field(default_factory=dict)
-    """Controllers of a search for certified failures, by name; none of any other."""
     resume_command: str
     """How to go on with it."""
     reevaluate_command: str
@@ -176,8 +164,6 @@ def job_of(args: Archive) -> Job:
     changes = {name: value for name, value in asdict(args).items() if name not in _NOT_SETTINGS}
     space, of_space = _space_of(args, there)
     changes |= of_space
-    certifiers, of_certifiers = _certifiers_of(args, there, robot)
-    changes |= of_certifiers
     if args.without is not None:
         changes["penalties"] = kept_penalties(robot, args.without)
     moved = None
@@ -192,7 +178,6 @@ def job_of(args: Archive) -> Job:
         path = _free_path(args, cfg, robot)
         if told := robot.scaled_by_another(policy_spec(cfg, robot)):
             print(told)
-    check_certifiers(certifiers, cfg, robot, device)
     now = origin_of(device, cfg.seed, args.workers)
     named = moved or code_of(cfg)
     at_end = {name: _at_end(getattr(args, name), cfg) for name in ("reproduce", "confirm")}
@@ -204,7 +189,6 @@ def job_of(args: Archive) -> Job:
         cfg=cfg,
         path=path,
         resumes=there is not None,
-        certifiers=certifiers,
         evaluator=evaluator_of(
             cfg, robot, moved or policy_spec(cfg, robot), device, args.workers, num_envs=args.num_envs
         ),
@@ -238,41 +222,6 @@ def _space_of(args: Archive, there: SearchCfg | None) -> "tuple[TerrainSpace, di
     if given is not None and given.name != there.space and not moved:
         return given, {"space": given.name, "space_sha256": given.sha256}  # which the run refuses
     return get_space(there.space, there.space_sha256, file=args.resume), {"space": None}
-
-
-def _certifiers_of(args: Archive, there: SearchCfg | None, robot: "RobotCfg") -> tuple[dict[str, str], dict[str, Any]]:
-    """The certifiers of a search by name, and what they change of the settings.
-
-    Raises:
-        ValueError: If one has no name, two have the same, the run's are code that the command line does not name, or
-            they are to work on Ray.
-    """
-    named = args.certified_by
-    if named is None and there is not None:
-        for text in there.certified_by:
-            refuse_unnamed_code(text.partition("=")[2], None, args.resume or Path(), flag="certified-by")
-        named = there.certified_by
-    if not named:
-        return {}, {"certified_by": None}
-    if parse_workers(args.workers).on_ray:
-        raise ValueError(f"{NOT_ON_RAY}, got --workers {args.workers}: leave out one of --workers and --certified-by")
-    certifiers = controllers_of([named_file(text) for text in named], robot, flag="certified-by")
-    settings = certifier_settings(certifiers)
-    if there is not None and moved_certifiers(there, settings["certified_by"], settings["certifier_sha256"]):
-        settings["certified_by"] = there.certified_by
-    return certifiers, settings
-
-
-def certifier_settings(certifiers: Mapping[str, str]) -> dict[str, Any]:
-    """What certifiers are called in the settings of a search.
-
-    Raises:
-        ValueError: If one has no hash.
-    """
-    return {
-        "certified_by": tuple(f"{name}={policy}" for name, policy in certifiers.items()),
-        "certifier_sha256": tuple(certifier_hash(name, policy) for name, policy in certifiers.items()),
-    }
 
 
 def check_certifiers(certifiers: Mapping[str, str], cfg: SearchCfg, robot: "RobotCfg", device: str) -> None:
@@ -313,12 +262,6 @@ def own_file(robot: "RobotCfg") -> dict[str, Any]:
     return {} if robot.settings_file is None else {"robot_file": str(robot.settings_file)}
 
 
-def _code_among(certified_by: tuple[str, ...] | None) -> tuple[str, ...] | None:
-    """The certifiers, if one of them is code, which every command that goes on with the run must name."""
-    texts = [named_file(text) for text in certified_by or ()]
-    return certified_by if any(ControllerSpec.parse(text.partition("=")[2]).runs_code for text in texts) else None
-
-
 def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | None) -> str:
     from sim.space import to_be_named
 
@@ -326,7 +269,6 @@ def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | 
     return command_line(
         "archive", robot=robot.spec, resume=path, policy=policy, space=args.space and to_be_named(args.space),
         device=args.device, workers=args.workers, num_envs=args.num_envs, **at_end,
-        certified_by=_code_among(args.certified_by),
     )  # fmt: skip
 
 
@@ -338,7 +280,6 @@ def evaluator_of(
     workers: str | None,
     *,
     num_envs: int | None = None,
-    runs: int = 1,
 ) -> EvaluatorCfg:
     """What evaluates an iteration's terrains all at once, with a controller that was tried.
 
@@ -349,7 +290,6 @@ def evaluator_of(
         device: Warp device name.
         workers: Who crosses them, as on a command line.
         num_envs: Robots at once; as many as the device is good for if None.
-        runs: Searches whose terrains are crossed together.
 
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot.
@@ -360,7 +300,7 @@ def evaluator_of(
     return EvaluatorCfg(
         robot=robot,
         policy=policy,
-        num_terrains=cfg.scheduler.num_terrains * runs,
+        num_terrains=cfg.scheduler.num_terrains,
         num_replicas=cfg.replicas,
         device=device,
         workers=workers,

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qd.archive import ARCHIVE_FILE, Archive, SearchCertificates, read_archive, write_archive
+from qd.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.progress import clock
 from qd.run.settings import SearchCfg, as_settings, differences, from_settings
@@ -374,18 +374,8 @@ class RunDirectory:
             raise ValueError(f"{file} is no checkpoint of a search: {error}; {_REMEDY}") from None
 
 
-def episodes_in(row: dict[str, Any]) -> int:
-    """Episodes of an iteration by its row of metrics, those of certifiers included."""
-    return row["episodes"] + row.get("certifier_episodes", 0)
-
-
 def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
     """What a search has found after a number of iterations."""
-    elites: dict[str, Any] = search.elites()
-    rates, names = elites.pop("certifier_goal_rate", None), tuple(name.partition("=")[0] for name in cfg.certified_by)
-    certificates = None
-    if rates is not None:
-        certificates = SearchCertificates(certifiers=names, certifier_sha256=cfg.certifier_sha256, goal_rate=rates)
     return Archive(
         robot=cfg.robot,
         space=cfg.space,
@@ -398,8 +388,7 @@ def archive_of(cfg: SearchCfg, search: "Scheduler", iterations: int) -> Archive:
         policy_sha256=cfg.policy_sha256,
         space_sha256=cfg.space_sha256,
         penalty_definition=cfg.penalty_definition,
-        certificates=certificates,
-        **elites,
+        **search.elites(),
     )
 
 

@@ -45,8 +45,6 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> st
     iterations = f"{left:,} iterations" + (f" after {done:,} done" if done else "")
     steps_per_s = workers * _STEPS_PER_S["cuda" if on_gpu else "cpu"]
     duration = clock(left * cfg.episodes_per_iteration * _EPISODE_STEPS / steps_per_s)
-    certifiers = ", ".join(name.partition("=")[0] for name in cfg.certified_by)
-    asked = f"{certifiers} cross it {cfg.certify_episodes} times each; those episodes come on top"
     return "\n".join(
         [
             f"Searching for terrains that break {cfg.robot} with {controller}, each in its own way.",
@@ -55,7 +53,6 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> st
             f"  {left * cfg.episodes_per_iteration:,} episodes on {where}: about {duration}, and a minute or two more "
             "where kernels must be compiled",
             f"  {cfg.cells.num_cells:,} reachable cells of {len(cfg.fitness.penalties)} penalties; results in {path}",
-            *([f"  where the controller does not cross a terrain, {asked}"] if certifiers else []),
         ]
     )
 

@@ -137,13 +137,6 @@ class SearchCfg:
     """How the penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
     reevaluate_every: int = setting(50, least=0)
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
-    certified_by: tuple[str, ...] = ()
-    """Certifiers of a search for certified failures, NAME=FILE each, as :func:`sim.policy.spec.controllers_of` takes
-    it; none in any other."""
-    certifier_sha256: tuple[str, ...] = ()
-    """Their hashes."""
-    certify_episodes: int = setting(10, least=1)
-    """Episodes of each certifier on a terrain that the controller does not cross."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -363,12 +356,6 @@ def moved_policy(there: SearchCfg, given: str | None) -> str | None:
     """The file given for a run's controller, if it is the run's own in another place."""
     same = given is not None and there.policy_sha256 is not None and controller_hash(given) == there.policy_sha256
     return given if same else None
-
-
-def moved_certifiers(there: SearchCfg, given: Sequence[str], sha256: Sequence[str]) -> bool:
-    """Whether certifiers, as settings name them, are a run's own by name and hash, wherever their files are now."""
-    names = [[text.partition("=")[0] for text in texts] for texts in (given, there.certified_by)]
-    return tuple(sha256) == there.certifier_sha256 and names[0] == names[1]
 
 
 def is_searched(cfg: SearchCfg, policy: str, robot: "RobotCfg") -> bool:

@@ -10,7 +10,6 @@ from qd.archive import Archive
 from qd.faults import fault_numbers
 from qd.fresh import FRESH_EPISODES, numbers_of
 from qd.groups import Mode
-from qd.run.directory import episodes_in
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, bar_lengths, new_figure
 
@@ -252,22 +251,6 @@ _CORRECTED = (
 )  # fmt: skip
 
 
-def _in_search(archive: Archive, metrics: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of a search for certified failures: whose episodes were how many, and what certifiers crossed."""
-    own = archive.certificates
-    if own is None:
-        return {}
-    by_certifiers = sum(row.get("certifier_episodes", 0) for row in metrics)
-    return {
-        "controller_episodes": sum(row["episodes"] for row in metrics),
-        "certifier_episodes": by_certifiers,
-        "certified_in_search": {
-            "certifiers": dict(zip(own.certifiers, own.certifier_sha256, strict=True)),
-            "elites": int(own.certified.sum()),
-        },
-    }
-
-
 def summary(
     archive: Archive, metrics: Sequence[dict[str, Any]], *, gpus: int, origin: dict[str, Any]
 ) -> dict[str, Any]:
@@ -291,8 +274,7 @@ def summary(
         "space_sha256": archive.space_sha256,
         "iterations": archive.iterations,
         "terrains_evaluated": sum(row["terrains"] for row in metrics),
-        "episodes": sum(map(episodes_in, metrics)),
-        **_in_search(archive, metrics),
+        "episodes": sum(row["episodes"] for row in metrics),
         "elites": len(archive),
         "elites_reproduced": corrected.get("reproduced"),
         "reachable_cells": archive.cells.num_cells,

@@ -19,7 +19,6 @@ import torch
 from qd.archive import Archive, read_archive, write_archive
 from qd.run.checkpoint import load_checkpoint
 from qd.run.directory import RunDirectory
-from qd.studies.speed import training_rates
 from sim.maps.heightmap import as_terrain, read_heightmap
 from sim.maps.terrain_files import write_terrain
 from sim.policy.export import to_onnx
@@ -205,7 +204,6 @@ JSON_LOADERS = {
         lambda made: made / "search/config.json",
         lambda file: RunDirectory(file.parent).read_cfg(),
     ),
-    "the rates of a training": (lambda made: None, lambda file: training_rates((file,))),
 }
 
 
@@ -213,8 +211,7 @@ JSON_LOADERS = {
 def test_mutated_json(made, tmp_path, what):
     find, read = JSON_LOADERS[what]
     source = find(made)
-    rates = {"training": [{"num_envs": count, "gpus": 1, "train_env_steps_per_s": 1e5} for count in (4096, 8192)]}
-    whole = source.read_bytes() if source else json.dumps(rates).encode()
+    whole = source.read_bytes()
     file = tmp_path / "config.json"
     assert load(what, read, file, whole) is not None
     for number in range(600):

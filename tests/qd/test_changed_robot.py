@@ -26,7 +26,6 @@ from qd.show.recordings import Recordings, on_elite
 from qd.show.replay import ReplayElite
 from qd.show.report.command import Report
 from qd.show.view.command import View
-from qd.studies.ablation import Ablation
 from qd.workers.evaluator import EvaluatorCfg
 from sim.files.command import run_command
 from sim.files.records import identity, robot_digest
@@ -102,7 +101,6 @@ READERS = {
     "replay": (ReplayElite, ("--run", "runs/dog", "--device", "cpu", "--policy")),
     "film": (Film, ("--run", "runs/dog", "--device", "cpu", "--policy")),
     "report": (Report, ("--run", "runs/dog", "--device", "cpu", "--policy")),
-    "ablation": (Ablation, ("--run", "runs/dog", "--device", "cpu", "--policy")),
     "view": (View, ("--run", "runs/dog")),
     "export": (Export, ("--run", "runs/dog")),
     "an archive alone": (Export, ("--run", "alone.npz")),

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from qd.descriptors import Cells
-from qd.fitness import FitnessCfg, evaluation_of, gated_fitness
+from qd.fitness import FitnessCfg, evaluation_of
 from tests.qd.stand_in import make_result
 
 CFG = FitnessCfg(penalties=("yaw_rate", "vel_x"), scales=(1.0, 10.0))
@@ -98,10 +98,3 @@ def test_scales_must_be_positive_one_a_penalty(scales):
 def test_weights_must_be_finite(weight):
     with pytest.raises(ValueError, match="must be a finite number"):
         FitnessCfg(penalties=("a", "b"), scales=(1.0, 1.0), **weight)
-
-
-def test_the_gate_by_hand():
-    fitness = np.array([8.0, 8.0, 8.0, -3.0, -3.0, -3.0])
-    best = np.array([np.nan, 0.5, 0.4, np.nan, 0.9, 0.0])
-    # nobody asked and somebody crosses: as it is; else at most 0, less 10 times what is lacking to half
-    assert gated_fitness(fitness, best).tolist() == pytest.approx([8.0, 8.0, -1.0, -3.0, -3.0, -8.0])

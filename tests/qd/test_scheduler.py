@@ -69,33 +69,6 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
     assert np.array_equal(elites["genes"][0], genes[0])
 
 
-def test_in_a_cell_certified_beats_uncertified_then_fitness_decides(tmp_path):
-    search = Scheduler(SMALL, cells=CELLS, seed=0, num_certifiers=2)
-    nobody, no, yes = [np.nan, np.nan], [0.4, 0.0], [0.2, 0.5]
-    genes = search.ask()
-    rows = [(7, 9.0, no), (7, 1.0, yes), (8, 9.0, nobody), (8, -1.0, yes), (8, 1.0, yes), (9, 2.0, no), (9, 3.0, no)]
-    rows += [(9, 1.0, no), (10, 5.0, no), (10, 0.5, nobody), (11, 4.0, nobody), (11, 6.0, nobody)]
-    cells, fitness, rates = map(list, zip(*rows, strict=True))
-    search.tell(told(cells, fitness), 1, certifier_goal_rate=np.array(rates))
-    elites = search.elites()
-    assert elites["cell"].tolist() == [11, 10, 9, 7, 8]
-    assert elites["fitness"].tolist() == [6.0, 5.0, 3.0, 1.0, 1.0]
-    assert np.array_equal(elites["genes"], genes[[11, 8, 6, 1, 4]])
-    np.testing.assert_array_equal(elites["certifier_goal_rate"], [nobody, no, no, yes, yes])
-    # CMA-MAE's emitters go by the soft gate: in cell 7 the 9 that nobody crosses is told as 0 less 10 times .1; the 9
-    # of cell 8, which the controller crosses, as it is.
-    learned = search.archive.data()
-    assert sorted(learned["objective"][np.isin(learned["index"], [7, 8])].tolist()) == [1.0, 9.0]
-    search.ask()
-    search.tell(told([7] * 12, [0.5] * 6 + [50.0] * 6), 2, certifier_goal_rate=np.array([yes] * 6 + [no] * 6))
-    assert search.elites()["fitness"].tolist() == [6.0, 5.0, 3.0, 1.0, 1.0]
-    save_checkpoint(tmp_path / "saved", search.state())
-    again = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
-    again.ask()
-    again.tell(told([7] * 12, [2.0] * 12), 3, certifier_goal_rate=np.array([yes] * 12))
-    assert again.elites()["fitness"].tolist() == [6.0, 5.0, 3.0, 2.0, 1.0]
-
-
 def test_an_invalid_terrain_is_never_an_elite():
     search = make_search()
     search.ask()

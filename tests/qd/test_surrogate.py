@@ -342,16 +342,3 @@ def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
         assert np.array_equal(rows, cut.elites()[name]), name
     for group in range(2):
         assert np.array_equal(straight.ask(group), cut.ask(group))
-
-
-def test_in_a_search_for_certified_failures_it_learns_the_gated_fitness():
-    search = Scheduler(CFG, cells=CELLS, seed=0, num_certifiers=1)
-    rates = np.full((32, 1), 0.2)
-    for iteration in (1, 2, 3):
-        told = crossed(search.ask(), iteration)
-        search.tell(told, iteration, certifier_goal_rate=rates)
-    # Nobody crosses them: at most 0, less 10 times the .3 that are lacking to half.
-    fitness = np.sinh(search.surrogate._targets[-32:, 18])
-    np.testing.assert_allclose(fitness, np.minimum(told.fitness, 0.0) - 3.0, rtol=1e-5)
-    assert np.sinh(search.surrogate._targets[:, 18]).max() < -2.9
-    assert search.ask().shape == (32, 64)

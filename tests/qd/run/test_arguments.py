@@ -168,53 +168,6 @@ def test_a_controller_that_moved_is_asked_for_and_taken_where_it_is_now(capsys):
     assert run_main("--resume", "a", "--iterations", "3") == 0
 
 
-def test_certifiers_that_cannot_be(capsys):
-    own, other = (str(get_robot(name).policy_file) for name in ("anymal", "cassie"))
-    Path("copy.pt").write_bytes(Path(own).read_bytes())
-    for given, message in (
-        (["copy.pt"], "certifier copy (copy.pt) is the controller that is searched, expected another"),
-        (["C-G=lost.pt"], "certifier C-G must have a file, which its certificates name by hash, got lost.pt"),
-        ([f"C-G={other}"], "certifier C-G does not fit anymal: "),
-        (["a b.pt"], "certified-by must be NAME=FILE each"),
-        (["C-G=a.pt", "C-G=b.pt"], "certified-by must have different names, got 'C-G' twice"),
-    ):
-        assert message in fails(capsys, *TINY, "--certified-by", *given)
-    same = [f"a={__name__}:fine_policy", f"b={__name__}:fine_policy"]
-    assert "certifiers a and b are the same controller" in fails(capsys, *TINY, "--certified-by", *same)
-    assert not Path("runs").exists()
-    certifier = f"{__name__}:fine_policy"
-    assert "not on Ray" in fails(capsys, *TINY, "--certified-by", certifier, "--workers", "ray:2")
-
-
-def test_a_run_goes_on_with_its_own_certifiers(capsys):
-    certifier = f"me={__name__}:fine_policy"
-    assert run_main(*TINY, "--certified-by", certifier, "--run-dir", "a") == 0
-    settings = json.loads(Path("a/config.json").read_text())["settings"]
-    assert settings["certified_by"] == [certifier] and len(settings["certifier_sha256"][0]) == 64
-    before = everything_in("a")
-    assert "which is code: name it again (--certified-by" in fails(capsys, "--resume", "a", "--iterations", "2")
-    other = fails(capsys, "--resume", "a", "--iterations", "2", "--certified-by", f"me={__name__}:other_policy")
-    assert "certifier_sha256 (" in other
-    some = fails(capsys, "--resume", "a", "--certified-by", certifier, "--certify-episodes", "3")
-    assert "certify_episodes (10 there, 3 wanted)" in some
-    again = fails(capsys, *TINY, "--certified-by", certifier, "--run-dir", "a")
-    assert f"--resume a --device cpu --certified-by {certifier}`" in again
-    assert everything_in("a") == before
-    assert run_main("--resume", "a", "--iterations", "2", "--certified-by", certifier) == 0
-    assert json.loads(Path("a/archive.json").read_text())["iterations"] == 2
-
-
-def test_certifiers_may_move_but_not_change(capsys):
-    shutil.copy(get_robot("anymal").policy_file, "base.pt")
-    assert run_main(*TINY, "--policy", f"{__name__}:fine_policy", "--certified-by", "base.pt", "--run-dir", "a") == 0
-    fine = ("--policy", f"{__name__}:fine_policy")
-    Path("base.pt").rename("moved.pt")
-    assert "certifier base must have a file" in fails(capsys, "--resume", "a", "--iterations", "2", *fine)
-    assert run_main("--resume", "a", "--iterations", "2", *fine, "--certified-by", "base=moved.pt") == 0
-    shutil.copy("moved.pt", "base.pt")
-    assert run_main("--resume", "a", "--iterations", "3", *fine) == 0
-
-
 def test_code_runs_only_if_it_is_named_again(capsys):
     fine = f"{__name__}:fine_policy"
     assert run_main(*TINY, "--policy", fine, "--run-dir", "a") == 0
