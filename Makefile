@@ -71,7 +71,7 @@ view: setup ## Show an archive in the browser
 	$(call faultline,view)
 
 bench: setup ## Time every kernel against torch and against the device's ceiling
-	$(call faultline,bench)
+	$(BIN)/python -m tests.bench $(if $(ROBOT),--robot $(call quoted,$(ROBOT))) $(ARGS)
 
 test: setup ## Run the quick tests: about five minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray and not kills' $(ARGS)

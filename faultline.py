@@ -48,9 +48,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "tables": Command("qd.evaluate.publish:Tables", "the published numbers beside the paper's"),
     },
     "Measure speed": {
-        "bench": Command("sim.commands:Bench", "every kernel against torch and the device's ceiling"),
         "train-speed": Command("train.ppo.speed:TrainSpeed", "environment steps a second of training"),
-        "solver-options": Command("sim.commands:SolverOptions", "what solver options cost and change"),
     },
 }
 """What can be done, by what it is for."""

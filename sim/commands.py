@@ -6,7 +6,7 @@ Modules with Warp, torch or Newton are imported inside ``execute``, so that ``--
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim.files.command import OfRobot, OnDevice, Who, command_line, publish
+from sim.files.command import OfRobot, OnDevice, Who, command_line
 from sim.files.settings import setting
 
 
@@ -63,78 +63,3 @@ class ExportPolicy(Who):
         print(f"Written to {self.out}: {sizes}, {self.out.stat().st_size / 1e6:.2f} MB.")
         print(f"Loaded back, its actions are within {apart:.1g} of the original's. Next:")
         print(f"  {command_line('evaluate', robot=self.robot, policy=self.out)}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bench(OfRobot, OnDevice):
-    """Time every kernel against torch, torch.compile and the device's ceilings, and the step against bare physics.
-
-    First the shipped controller walks robots into terrains. Every output is compared with a float64 oracle before it is
-    timed.
-    """
-
-    out: Path | None = None
-    """File to write; runs/bench/<device>.json if left out."""
-    num_envs: int | None = setting(None, least=1)
-    """Robots: 4,096 on CUDA, 16 on the CPU."""
-    num_terrains: int | None = setting(None, least=1)
-    """Terrains they stand on: 200 on CUDA, 8 on the CPU."""
-    rounds: int | None = setting(None, least=1)
-    """Replays of each variant, of which the median counts: 20 on CUDA, 10 on the CPU."""
-    duration_s: float = setting(20.0, above=0)
-    """Simulated length of the crossings that time the whole step."""
-    walk_s: float = setting(8.0, above=0)
-    """Simulated time the robots walk before the kernels are timed: at 0.75 m/s, 6 m, where the bumps are."""
-    compile: bool = True
-    """Measure torch.compile too: a minute or two of compiling."""
-    heightfield: bool = True
-    """Measure the solver's own heightfield collision too."""
-    seed: int = setting(0, least=0)
-    """Seed of terrains and starts."""
-
-    def execute(self) -> None:
-        """Measures, prints the table, writes the file."""
-        from sim.bench.report import file_of, measure, table
-        from sim.files.records import provenance
-        from sim.robots.robot import get_robot
-        from sim.simulation import resolve_device
-
-        robot, device = get_robot(self.robot), resolve_device(self.device)
-        origin = provenance(device, self.seed)
-        out = self.out or file_of(origin["device"])
-        publish(out, lambda: {**origin, **measure(robot, self, device)}, lambda report: print(table(report)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolverOptions(Who, OnDevice):
-    """Cross the same hard-random terrains under several caps and capacities of the solver.
-
-    It prints wall time, rates and mean penalties of each choice.
-    """
-
-    terrains: int = setting(200, least=1)
-    """Hard-random terrains."""
-    episodes: int = setting(20, least=1)
-    """Episodes a terrain."""
-    iterations: tuple[int, ...] = setting((3, 4, 5, 6, 8, 50), least=1)
-    """Caps on the Newton iterations to try."""
-    ls_iterations: tuple[int, ...] = setting((10,), least=1)
-    """Caps on the line search to try with each."""
-    njmax: tuple[int, ...] = setting((), least=1)
-    """Constraint rows an environment to try with the shipped caps, beside the robot's own."""
-    nconmax: tuple[int, ...] = setting((), least=1)
-    """Contacts an environment to try with each of them, as many as --njmax."""
-    resolved: bool = False
-    """Cross with contact resolved too (steps of 1 ms), and say how far each choice's rates of terrains lie from it."""
-    rounds: int = setting(3, least=1)
-    """Rollouts of each choice; the median counts."""
-    seed: int = setting(0, least=0)
-    """Draws terrains and starts."""
-    out: Path | None = None
-    """File to write; the numbers are only printed if left out."""
-
-    def execute(self) -> None:
-        """Measures, prints the table, writes the file."""
-        from sim.bench.options import measure, print_rows
-
-        publish(self.out, lambda: measure(self), print_rows)

@@ -5,10 +5,10 @@ import pytest
 import warp as wp
 
 from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
-from sim.bench import oracle
 from sim.space import SUPER_GAUSSIAN
 from sim.terrain import SPACING, crossing_terrain
 from tests.builders import make_terrain
+from tests.kernels import oracle
 
 RADII = (0.0175, 0.03, 0.06, 0.1)
 UNDECIDED = 1e-5  # a sphere this close to touching may go either way in float32

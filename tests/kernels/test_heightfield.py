@@ -13,8 +13,8 @@ from kernels.heightfield import (
     nearest_surface_point,
     normal_at,
 )
-from sim.bench import oracle
 from tests.builders import RNG_SEED, SPACING, make_terrain, rough
+from tests.kernels import oracle
 
 
 def surface_normal(grid, spacing, x, y):

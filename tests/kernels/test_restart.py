@@ -9,9 +9,9 @@ from kernels.observation import Sensors
 from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import clear_rows, restart_episodes
 from kernels.rewards import Rewards, make_rewards
-from sim.bench import oracle
 from sim.crossing import CrossingCfg, make_start_ranges
 from tests.builders import make_terrain, rough
+from tests.kernels import oracle
 
 BASE_COM = (-0.02, 0.01, 0.03)
 

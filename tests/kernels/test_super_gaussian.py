@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER, rasterise
-from sim.bench import oracle
+from tests.kernels import oracle
 
 SPACING = 0.05
 

@@ -9,7 +9,6 @@ import torch
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.bench import oracle
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.crossing import _Episodes, cross, draw_starts, join, run_plain
 from sim.mujoco_c.model import (
@@ -25,6 +24,7 @@ from sim.rollout import Rollout
 from sim.simulation import GROUND_FRICTION, SolverCfg
 from sim.space import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from tests.kernels import oracle
 from tests.sim.policies import stand
 
 EPISODES = 3

@@ -8,7 +8,6 @@ import pytest
 import torch
 import warp as wp
 
-from sim.bench import oracle
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import surface_heights, to_mujoco
 from sim.policy.adapters import read_row
@@ -17,6 +16,7 @@ from sim.policy.spec import ControllerSpec, controller_hash
 from sim.rollout import Rollout
 from sim.space import SUPER_GAUSSIAN
 from tests.builders import rsl_rl_actor, save_checkpoint
+from tests.kernels import oracle
 from tests.sim.policies import stretch
 from tests.sim.scenes import positions, velocities
 

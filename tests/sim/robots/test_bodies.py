@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sim.bench import oracle
 from sim.terrain import SPACING
+from tests.kernels import oracle
 from tests.sim.scenes import NODE_X, Stepper, free_body, lying, positions, put, simulate, slope, velocities
 
 GRAVITY = 9.81

@@ -8,7 +8,6 @@ import warp as wp
 
 from kernels.episode import Outcome
 from sim.bank import TerrainBank
-from sim.bench import oracle
 from sim.mujoco_c.model import crossing_model
 from sim.robots.model import build_robot, geom_names, joint_names
 from sim.robots.model_files import read_model_files
@@ -16,6 +15,7 @@ from sim.robots.probes import make_probes
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from sim.simulation import Simulation
+from tests.kernels import oracle
 from tests.sim.dogs import GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, urdf, with_mesh, write_dog
 from tests.sim.robots.test_drops import above_ground, measure_gaps, mixed_ground
 from tests.sim.scenes import Stepper, put, velocities

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.bench import oracle
 from sim.robots.model import build_robot
 from sim.simulation import GROUND_FRICTION, SolverCfg
 from sim.space import SUPER_GAUSSIAN
 from sim.terrain import SPACING
+from tests.kernels import oracle
 from tests.sim import plain_mujoco
 from tests.sim.scenes import ONLY_ANYMAL, PHYSICS_DT, Stepper, lying, positions, put, slope
 

@@ -1,6 +1,6 @@
 """Terrain, contact and contact forces written a second time: float64 NumPy, from the definitions, slow and plain.
 
-The tests and :mod:`sim.bench` hold the kernels against it, and against :mod:`sim.mujoco_c.model` for observation,
+The tests hold the kernels against it, and against :mod:`sim.mujoco_c.model` for observation,
 command and penalties; nothing in either is shared with the kernels or ported from them. Vectors are world-local.
 """
 

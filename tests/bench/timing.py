@@ -12,7 +12,7 @@ MAX_LAUNCHES = 200
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimingCfg:
+class Timing:
     """How long to time."""
 
     rounds: int = 20
@@ -84,7 +84,7 @@ def time_once(variant: Variant, device: str) -> float:
     return (time.perf_counter() - began) / variant.launches
 
 
-def fit_launches(make: Callable[[int], Variant], device: str, cfg: TimingCfg) -> Variant:
+def fit_launches(make: Callable[[int], Variant], device: str, cfg: Timing) -> Variant:
     """A variant with as many launches as fill ``cfg.replay_s``; ``make`` builds it for a number of them."""
     single = make(1)
     seconds = min(time_once(single, device) for _ in range(3))
@@ -92,7 +92,7 @@ def fit_launches(make: Callable[[int], Variant], device: str, cfg: TimingCfg) ->
     return single if launches == 1 else make(launches)
 
 
-def time_in_turns(variants: dict[str, Variant], device: str, cfg: TimingCfg) -> dict[str, float]:
+def time_in_turns(variants: dict[str, Variant], device: str, cfg: Timing) -> dict[str, float]:
     """Median seconds a launch of each variant; all are replayed in every round, so that they share its conditions."""
     for variant in variants.values():
         time_once(variant, device)

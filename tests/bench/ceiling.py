@@ -5,9 +5,6 @@ fastest copy of at least as many bytes as it must move: as near to the processor
 launch, which would hold back a small copy as it does a small kernel.
 """
 
-# Kernels are compiled by Warp, whose types these are.
-# pyright: reportIndexIssue=false, reportArgumentType=false
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,8 +12,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from sim.bench.cases import Work
-from sim.bench.timing import TimingCfg, fit_launches, repeat_torch, repeat_warp, time_in_turns
+from tests.bench.timing import Timing, fit_launches, repeat_torch, repeat_warp, time_in_turns
 
 FLOPS_PER_STEP = 2 * 8 * 16
 """Multiplications and additions that :func:`multiply_add` does a step and thread."""
@@ -73,16 +69,17 @@ def exponentials(steps: int, out: wp.array[float]):
 
 
 BOUND_SHARE = 0.25
-"""A kernel that reaches this share of a ceiling is bound by it."""
 LAUNCH_SHARE = 0.5
-"""A kernel that reaches none is bound by launching if an empty launch takes this share of its time."""
-
-BOUND_BY_RULE = (
-    f"the ceiling with the largest share, if that is at least {BOUND_SHARE}; else launch, if an empty launch takes at "
-    f"least {LAUNCH_SHARE} of the time; else latency: waiting for dependent loads, threads that part ways, or "
-    "instructions beyond the work counted"
-)
 _STEPS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """What must be done in one launch."""
+
+    bytes: int
+    flops: int
+    specials: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,31 +99,22 @@ class Ceiling:
         """Rate of the fastest copy of at least ``moved`` bytes."""
         return max([rate for size, rate in self.copies.items() if size >= moved] or [self.copies[max(self.copies)]])
 
-    def judge(self, work: Work, seconds: float) -> dict[str, Any]:
-        """How near work done in ``seconds`` comes to the ceilings; a share of 1 is at the ceiling.
+    def judge(self, work: Work, seconds: float) -> tuple[float, str]:
+        """How near work done in ``seconds`` comes to its nearest ceiling (1 is at it), and what bounds it.
 
-        Returns:
-            ``bandwidth_share``, ``arithmetic_share`` and ``special_share``, the largest of them as ``ceiling_share``;
-            ``launch_share``, the time of an empty launch by the kernel's own, which is no ceiling, but what a small
-            kernel cannot get under; and ``bound_by``: memory, arithmetic, special functions, launch or latency
-            (:data:`BOUND_BY_RULE`).
+        That is the ceiling itself (memory, arithmetic, special functions) from a share of ``BOUND_SHARE``; else launch
+        if an empty launch takes at least ``LAUNCH_SHARE`` of the time; else latency: dependent loads, threads that
+        part ways, or instructions beyond the work counted.
         """
         shares = {
             "memory": work.bytes / self.bytes_per_s(work.bytes) / seconds,
             "arithmetic": work.flops / self.flops_per_s / seconds,
             "special functions": work.specials / self.specials_per_s / seconds,
         }
-        launch_share = self.launch_s / seconds
         nearest = max(shares, key=lambda name: shares[name])
-        bound_by = "launch" if launch_share >= LAUNCH_SHARE else "latency"
-        return {
-            "ceiling_share": shares[nearest],
-            "bandwidth_share": shares["memory"],
-            "arithmetic_share": shares["arithmetic"],
-            "special_share": shares["special functions"],
-            "launch_share": launch_share,
-            "bound_by": nearest if shares[nearest] >= BOUND_SHARE else bound_by,
-        }
+        if shares[nearest] >= BOUND_SHARE:
+            return shares[nearest], nearest
+        return shares[nearest], "launch" if self.launch_s / seconds >= LAUNCH_SHARE else "latency"
 
 
 def launch(kernel: Any, out: Any, *inputs: float) -> None:
@@ -134,7 +122,7 @@ def launch(kernel: Any, out: Any, *inputs: float) -> None:
     wp.launch(kernel, dim=out.shape[0], inputs=inputs, outputs=[out], device=out.device)
 
 
-def measure_ceiling(device: str, timing: TimingCfg) -> Ceiling:
+def measure_ceiling(device: str, timing: Timing) -> Ceiling:
     """Measures the best rates of a device, all in turns; torch works on Warp's stream already."""
     threads = 1 << 20 if device.startswith("cuda") else 64
     out: Any = wp.zeros(threads, dtype=float, device=device)

@@ -1,1 +1,0 @@
-"""Microbenchmarks: every kernel against torch and against what the device can do at best."""

@@ -1,0 +1,123 @@
+"""Times every kernel against torch and against what the device can do at best, and writes results/bench/<device>.json.
+
+Each result in torch is compared with the kernel's before anything is timed.
+"""
+
+import argparse
+import json
+import re
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.table import Table
+
+from sim.files.records import provenance
+from sim.policy.loaders import prepare_torch
+from sim.robots.robot import get_robot
+from sim.simulation import resolve_device
+from tests.bench.cases import Case, build_scene, make_cases
+from tests.bench.ceiling import Ceiling, measure_ceiling
+from tests.bench.timing import Timing, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns
+
+
+def torch_variants(case: Case, device: str, timing: Timing, *, compiled: bool) -> dict[str, Variant]:
+    """The counterpart as it is, and through ``torch.compile`` where that works."""
+    functions = {"torch": case.counterpart}
+    if compiled:
+        functions["torch_compile"] = torch.compile(case.counterpart, dynamic=False, fullgraph=True)
+    variants = {}
+    for name, function in functions.items():
+        call = partial(function, *case.arguments)
+        try:
+            variants[name] = fit_launches(partial(repeat_torch, call, device=device), device, timing)
+        except Exception as error:  # the compiler may fail with anything: it may lack a C++ compiler
+            if name == "torch":
+                raise
+            print(f"no torch.compile of {case.name}: {type(error).__name__}: {error}"[:300], file=sys.stderr)
+    return variants
+
+
+def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *, compiled: bool) -> dict[str, Any]:
+    """One row of the results; what was not measured is None."""
+    variants = torch_variants(case, device, timing, compiled=compiled)
+    for variant in variants.values():
+        variant.replay()
+        case.compare(variant.outputs[0])
+    variants["ours"] = fit_launches(partial(repeat_warp, case.launch, device=device), device, timing)
+    ms = {name: 1e3 * seconds for name, seconds in time_in_turns(variants, device, timing).items()}
+    ceiling_share, bound_by = ceiling.judge(case.work, 1e-3 * ms["ours"])
+    return {
+        "kernel": case.name,
+        "ours_ms": ms["ours"],
+        "torch_ms": ms["torch"],
+        "torch_compile_ms": ms.get("torch_compile"),
+        "speedup": ms["torch"] / ms["ours"],
+        "ceiling_share": ceiling_share,
+        "bound_by": bound_by,
+    }
+
+
+def print_table(report: dict[str, Any]) -> None:
+    """Prints the rows."""
+    table = Table(
+        title=f"{report['device']}: {report['num_envs']} robots on {report['num_terrains']} terrains",
+        box=SIMPLE,
+        pad_edge=False,
+        padding=(0, 1),
+    )
+    for heading in ("kernel", "ours ms", "torch", "compiled", "speed-up", "of ceiling", "bound by"):
+        table.add_column(heading, no_wrap=True, justify="left" if heading in ("kernel", "bound by") else "right")
+    for row in report["rows"]:
+        ms = [row[name] for name in ("ours_ms", "torch_ms", "torch_compile_ms")]
+        table.add_row(
+            row["kernel"], *("-" if value is None else f"{value:.4g}" for value in ms), f"{row['speedup']:.1f}x",
+            f"{row['ceiling_share']:.1%}", row["bound_by"],
+        )  # fmt: skip
+    Console().print(table)
+
+
+def file_name(device_name: str) -> str:
+    """``nvidia-h200.json`` for an NVIDIA H200, ``cpu.json`` for any CPU."""
+    name = "cpu" if device_name.startswith("CPU") else re.sub(r"[^a-z0-9]+", "-", device_name.lower()).strip("-")
+    return f"{name}.json"
+
+
+def main(argv: list[str]) -> None:
+    """Measures, prints the table, writes the file."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser.add_argument("--robot", default="anymal")
+    parser.add_argument("--device", help="a CUDA device if there is one")
+    parser.add_argument("--num-envs", type=int, help="robots: 4,096 on CUDA, 16 on the CPU")
+    parser.add_argument("--out", type=Path, help="file to write; results/bench/<device>.json if left out")
+    parser.add_argument("--small", action="store_true", help="a trial: every kernel once, without torch.compile")
+    args = parser.parse_args(argv)
+
+    robot, device = get_robot(args.robot), resolve_device(args.device)
+    on_gpu = device.startswith("cuda")
+    num_envs = args.num_envs or (4096 if on_gpu else 16)
+    num_terrains = min(num_envs, 200 if on_gpu else 8)
+    timing = Timing(rounds=20, replay_s=2e-3) if on_gpu else Timing(rounds=10, replay_s=10e-3)
+    if args.small:
+        timing = Timing(rounds=1, replay_s=1e-6)
+    prepare_torch(device)
+    scene = build_scene(robot, device, num_envs=num_envs, num_terrains=num_terrains, walk_s=8.0, seed=0)
+    ceiling = measure_ceiling(device, timing)
+    rows = [
+        measure_kernel(case, ceiling, device, timing, compiled=not args.small) for case in make_cases(scene).values()
+    ]
+    report = {**provenance(device, 0), "robot": robot.name, "num_envs": num_envs, "num_terrains": num_terrains}
+    report["rows"] = rows
+    print_table(report)
+    out = args.out or Path("results/bench") / file_name(report["device"])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(report, indent=1) + "\n")
+    print(f"Written to {out}.")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

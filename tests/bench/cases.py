@@ -1,0 +1,319 @@
+"""The kernels as the simulation launches them, each with its counterpart in torch and the work it must do.
+
+Work is what a kernel cannot do without. Bytes: each input that the result depends on once, each output once. Flops:
+the formulas with everything hoisted that is the same for a terrain, row or environment, so that computing something
+twice counts against a kernel. Special functions: exponentials and logarithms, a power being one of each.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from kernels.episode import command_goal
+from kernels.observation import ANG_VEL_SCALE, LIN_VEL_SCALE, Noise, write_observation, write_scan
+from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, add_penalties
+from kernels.super_gaussian import LOWER, NEGLIGIBLE, UPPER, rasterise
+from sim.crossing import CrossingCfg, make_task
+from sim.robots.robot import RobotCfg
+from sim.rollout import Rollout
+from sim.space import SUPER_GAUSSIAN
+from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from tests.bench import counterparts
+from tests.bench.ceiling import Work
+
+FLOAT = 4
+FLOPS_PER_TRIANGLE = 60  # six dot products, their differences, comparisons up to an edge (Ericson's nearest point)
+FLOPS_PER_PROBE = 30  # turning a probe into the world, sign and size of its distance
+RECORD = (2 + 5 * 3 + 2) * FLOAT  # two shapes, five vectors, two margins
+SOLVER_CONTACT = (1 + 2 + 9 + 1 + 3 + 1) * FLOAT  # world, geoms, frame, first row, three forces, column
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Robots in the middle of gene terrains, with a command and random actions; all on the device."""
+
+    rollout: Rollout
+    genes: np.ndarray
+    """Shape (num_terrains, 64)."""
+    seeds: np.ndarray
+    command: Any
+    """Shape (num_envs, 3)."""
+    last_action: Any
+    """Shape (num_envs, num_joints)."""
+
+    @property
+    def robot(self) -> RobotCfg:
+        return self.rollout.robot
+
+    @property
+    def num_envs(self) -> int:
+        return self.rollout.sim.num_envs
+
+
+def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: int, walk_s: float, seed: int) -> Scene:
+    """Lets robots walk for ``walk_s`` seconds by their shipped controller: at 0.75 m/s, the bumps begin after 2 m."""
+    rollout = Rollout(
+        robot, robot.policy_file, num_terrains=num_terrains, num_replicas=math.ceil(num_envs / num_terrains),
+        num_envs=num_envs, device=device, cfg=CrossingCfg(),
+    )  # fmt: skip
+    genes = SUPER_GAUSSIAN.hard_random(num_terrains, seed)
+    seeds = np.random.SeedSequence(seed).generate_state(num_terrains, np.uint32)
+    rollout.put(genes, seeds)
+    for _ in range(round(walk_s / robot.control_dt)):
+        rollout.control_step()
+    sim = rollout.sim
+    actions = np.random.default_rng(seed).normal(size=(num_envs, robot.num_joints)).astype(np.float32)
+    with wp.ScopedDevice(device):
+        sim.refresh()
+        sim.collide()  # of the poses in which the last step ended
+        command = wp.zeros((num_envs, 3), dtype=float)
+        command_goal(sim.joint_q, wp.zeros(num_envs, dtype=int), make_task(rollout.cfg, robot), command)
+        return Scene(rollout=rollout, genes=genes, seeds=seeds, command=command, last_action=wp.array(actions))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One kernel, the same work in torch, and how near their results must be."""
+
+    name: str
+    launch: Callable[[], None]
+    output: Any
+    """Warp array that it writes; cleared before a comparison."""
+    counterpart: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    """What the counterpart is called with."""
+    work: Work
+    atol: float
+    rtol: float = 0.0
+    read: Callable[[], np.ndarray] | None = None
+    """What the kernel wrote; if left out, ``output`` as it is."""
+    read_torch: Callable[[Any], np.ndarray] = lambda tensor: tensor.cpu().numpy()
+
+    def run_kernel(self) -> np.ndarray:
+        """What one launch writes."""
+        self.output.zero_()
+        self.launch()
+        return (self.read() if self.read else self.output.numpy()).copy()
+
+    def compare(self, outputs: Any) -> None:
+        """Refuses outputs of the counterpart that are not the kernel's: nothing may be timed then.
+
+        A value that is missing on one side (a probe that just touches, one of two that are equally deep) may go
+        either way in single precision, in 2 % of the rows.
+        """
+        ours, theirs = self.run_kernel(), self.read_torch(outputs)
+        if ours.shape != theirs.shape:
+            raise ValueError(f"{self.name}: torch gives shape {theirs.shape}, the kernel {ours.shape}")
+        far = ~(np.abs(ours - theirs) <= self.atol + self.rtol * np.abs(theirs))
+        absent = np.isnan(ours) & np.isnan(theirs)
+        undecided = np.isnan(ours) != np.isnan(theirs)
+        present = (~np.isnan(theirs)).sum()
+        if (far & ~absent & ~undecided).any() or undecided.sum() > 0.02 * present or present == 0:
+            wrong = int((far & ~absent).sum())
+            raise ValueError(f"{self.name}: {wrong} of {ours.size} values of kernel and torch differ")
+
+
+def _share_within_reach(genes: np.ndarray) -> float:
+    """Share of pairs of a node and a bump in which the bump adds anything in single precision, of a sample."""
+    y, x = np.mgrid[0:NUM_ROWS, 0:NUM_COLS] * SPACING
+    within = []
+    for bump in genes[:: max(1, len(genes) // 8)].reshape(-1, len(LOWER)):
+        values = LOWER + (np.clip(bump, -1.0, 1.0) + 1.0) / 2.0 * (UPPER - LOWER)
+        mu_x, mu_y, sigma_x, sigma_y, p_x, p_y, theta, _ = values
+        u = np.abs(np.cos(theta) * (x - mu_x) - np.sin(theta) * (y - mu_y)) / sigma_x
+        v = np.abs(np.sin(theta) * (x - mu_x) + np.cos(theta) * (y - mu_y)) / sigma_y
+        within.append(((u < NEGLIGIBLE ** (0.5 / p_x)) & (v < NEGLIGIBLE ** (0.5 / p_y))).mean())
+    return float(np.mean(within))
+
+
+def _rasterise_case(scene: Scene) -> Case:
+    genes = wp.array(scene.genes, dtype=float)
+    heights = wp.zeros((len(scene.genes), NUM_ROWS, NUM_COLS), dtype=float)  # the ground under the robots stays
+    where = wp.to_torch(genes).device
+    lower, upper = (torch.tensor(bounds, dtype=torch.float32, device=where) for bounds in (LOWER, UPPER))
+    x, y = (torch.arange(count, device=where) * SPACING for count in (NUM_COLS, NUM_ROWS))
+    # A node and bump: two rotated, scaled coordinates (7), two comparisons; within reach of the bump two powers, one
+    # exponential, and six more flops for signs, product and sum.
+    pairs = heights.size * genes.shape[1] // len(LOWER)
+    near = _share_within_reach(scene.genes) * pairs
+    return Case(
+        name="rasterise",
+        launch=lambda: rasterise(genes, SPACING, heights),
+        output=heights,
+        counterpart=counterparts.rasterise,
+        arguments=(wp.to_torch(genes), lower, upper, x, y),
+        work=Work(
+            bytes=FLOAT * (genes.size + heights.size), flops=9 * pairs + round(6 * near), specials=round(5 * near)
+        ),
+        atol=2e-5,  # steep flanks cost single precision two digits
+    )
+
+
+RECORDED = ("point0", "point1", "normal", "offset1")
+
+
+def _kernel_contacts(scene: Scene) -> np.ndarray:
+    """Records of the contact kernel by environment and probe, (num_envs, num_probes, 12), NaN where there is none."""
+    sim: Any = scene.rollout.sim
+    count = int(sim.contact_count.numpy()[0])
+    if count > sim.contact_capacity:
+        raise ValueError(f"{count} contacts do not fit in {sim.contact_capacity}: raise the robot's nconmax")
+    records = np.concatenate([getattr(sim.contact_records, name).numpy()[:count] for name in RECORDED], axis=1)
+    shape1 = sim.contact_records.shape1.numpy()[:count]
+    env, shape = np.divmod(shape1 - sim.layout.first_shape, sim.layout.shapes_per_env)
+    position = sim.probes.position.numpy()
+    shape_of_probe = np.repeat(sim.probes.strip_shape.numpy(), np.diff(sim.probes.strip_start.numpy()))
+    # A record names its shape and the probe's centre.
+    distance = np.abs(records[:, None, 3:6] - position).sum(2)
+    probe = np.argmin(np.where(shape_of_probe == shape[:, None], distance, np.inf), axis=1)
+    return _by_probe(env, probe, records, (scene.num_envs, len(position)))
+
+
+def _torch_contacts(outputs: tuple[torch.Tensor, ...], num_probes: int) -> np.ndarray:
+    """The same of the counterpart, which has a slot for each record that there may be."""
+    probe, *vectors = (output.cpu().numpy() for output in outputs)
+    exists = probe >= 0
+    records = np.concatenate([vector[exists] for vector in vectors], axis=1)
+    return _by_probe(np.nonzero(exists)[0], probe[exists], records, (len(probe), num_probes))
+
+
+def _by_probe(env: np.ndarray, probe: np.ndarray, records: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    values = np.full((*shape, records.shape[1]), np.nan, np.float32)
+    values[env, probe] = records
+    return values
+
+
+def _contact_case(scene: Scene) -> Case:
+    sim: Any = scene.rollout.sim
+    body_q = wp.to_torch(sim.body_q).view(sim.num_envs, -1, 7)
+    probes = [getattr(sim.probes, name).numpy() for name in ("position", "strip_start", "strip_radius", "strip_body")]
+    tables = counterparts.make_tables(*probes, spacing=SPACING, device=body_q.device)
+    arguments = (body_q, wp.to_torch(sim.terrain_of_env), wp.to_torch(sim.bank.heights), SPACING, tables)
+    num_probes, poses = len(probes[0]), 7 * len(np.unique(probes[3]))
+    # Poses, probes, the nodes under probes that could touch, and records; two triangles a cell under such a probe.
+    cells, nodes = counterparts.cells_in_reach(*arguments)
+    read = FLOAT * (sim.num_envs * (poses + 1) + nodes + 3 * num_probes)
+    return Case(
+        name="contact",
+        launch=sim.collide,
+        output=sim.contact_count,
+        read=lambda: _kernel_contacts(scene),
+        counterpart=counterparts.collide,
+        arguments=arguments,
+        read_torch=lambda outputs: _torch_contacts(outputs, num_probes),
+        work=Work(
+            bytes=read + int(sim.contact_count.numpy()[0]) * RECORD,
+            flops=2 * FLOPS_PER_TRIANGLE * cells + FLOPS_PER_PROBE * num_probes * sim.num_envs,
+        ),
+        atol=5e-4,  # normals of probes whose centre is near the surface
+    )
+
+
+def _scan_work(scene: Scene) -> Work:
+    """A point: three nodes read, one value written; rotation (8), cell and interpolation (10), clip (4)."""
+    points = scene.robot.num_scan_points
+    return Work(bytes=FLOAT * scene.num_envs * (points * (3 + 1) + 7 + 1), flops=22 * scene.num_envs * points)
+
+
+def _scan_case(scene: Scene) -> Case:
+    sim = scene.rollout.sim
+    out = wp.zeros((scene.num_envs, scene.robot.num_scan_points), dtype=float)
+    arrays = (sim.joint_q, sim.terrain_of_env, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y)
+    return Case(
+        name="scan",
+        launch=lambda: write_scan(sim.joint_q, sim.terrain_of_env, sim.bank.terrain, sim.sensors, out),
+        output=out,
+        counterpart=counterparts.scan,
+        arguments=(*map(wp.to_torch, arrays), SPACING),
+        work=_scan_work(scene),
+        atol=5e-4,  # where cells are steep, a micrometre along is many up, times 5
+    )
+
+
+def _observation_case(scene: Scene) -> Case:
+    sim = scene.rollout.sim
+    out = wp.zeros((scene.num_envs, scene.robot.observation_size), dtype=float)
+    seed = wp.zeros(1, dtype=int)
+    state = (sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env)
+    arrays = (*state, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y, sim.sensors.default_joint_pos)
+    tensors = [wp.to_torch(array) for array in arrays]
+
+    def constant(*values: float) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=tensors[0].device)
+
+    scale = constant(LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE)
+    # The scan; joint coordinates and velocities, command and action read; three vectors turned into the base (100).
+    scan, joints = _scan_work(scene), scene.robot.num_joints
+    values = (2 * joints + 6) + 3 + joints + (12 + 3 * joints)
+    flops = scan.flops + scene.num_envs * (100 + 3 * joints)
+    return Case(
+        name="observation",
+        launch=lambda: write_observation(*state, sim.bank.terrain, sim.sensors, Noise(), seed, out),
+        output=out,
+        counterpart=counterparts.observation,
+        arguments=(*tensors, constant(*sim.sensors.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
+        work=Work(bytes=scan.bytes + FLOAT * scene.num_envs * values, flops=flops),
+        atol=5e-4,
+        rtol=1e-5,
+    )
+
+
+def _penalties_case(scene: Scene) -> Case:
+    sim, robot = scene.rollout.sim, scene.robot
+    sums = wp.zeros((scene.num_envs, len(PENALTIES)), dtype=float)
+    counted = wp.ones(scene.num_envs, dtype=int)
+    roles = sim.geom_role.numpy()
+    joint_q, joint_qd, command, force = map(wp.to_torch, (sim.joint_q, sim.joint_qd, scene.command, sim.geom_force))
+    feet, others = (torch.tensor(np.flatnonzero(roles & role), device=force.device) for role in (FOOT, BASE | LIMB))
+    base_com = torch.tensor(list(sim.sensors.base_com), dtype=torch.float32, device=force.device)
+    limits = (robot.contact_force_limit, robot.physics_dt)
+    # Base state, command, forces and flag read, six sums read and written; two vectors turned, ten flops a geom.
+    geoms = len(robot.geom_names)
+    values = 4 + 6 + 3 + 3 * geoms + 1 + 2 * len(PENALTIES)
+    return Case(
+        name="penalties",
+        launch=lambda: add_penalties(
+            sim.joint_q, sim.joint_qd, sim.sensors.base_com, scene.command, sim.geom_force, sim.geom_role, *limits,
+            counted, sums,
+        ),
+        output=sums,
+        counterpart=counterparts.penalties,
+        arguments=(
+            joint_q, joint_qd, base_com, command, force, feet, others, wp.to_torch(counted),
+            torch.zeros_like(wp.to_torch(sums)), *limits,
+        ),
+        work=Work(bytes=FLOAT * scene.num_envs * values, flops=scene.num_envs * (80 + 10 * geoms)),
+        atol=1e-6,
+        rtol=5e-5,
+    )  # fmt: skip
+
+
+def _geom_forces_case(scene: Scene) -> Case:
+    sim: Any = scene.rollout.sim
+    names = ("count", "world", "geom", "frame", "efc_address", "efc_force")
+    tensors = [wp.to_torch(getattr(sim.solver_contacts, name)) for name in names]
+    # The solver's contacts read, the forces written; 18 flops a contact: a vector turned, added.
+    count = min(int(sim.solver_contacts.count.numpy()[0]), sim.solver_contacts.capacity)
+    forces = 3 * FLOAT * sim.geom_force.size
+    return Case(
+        name="contact_forces",
+        launch=sim.read_geom_forces,
+        output=sim.geom_force,
+        counterpart=counterparts.geom_forces,
+        arguments=(*tensors, wp.to_torch(sim.column_of_geom), len(sim.geom_names)),
+        work=Work(bytes=count * SOLVER_CONTACT + forces, flops=18 * count),
+        atol=5e-3,
+        rtol=2e-5,
+    )
+
+
+def make_cases(scene: Scene) -> dict[str, Case]:
+    """All kernels on one scene, by name."""
+    makers = (_rasterise_case, _contact_case, _scan_case, _observation_case, _penalties_case, _geom_forces_case)
+    with wp.ScopedDevice(scene.rollout.sim.device):
+        return {case.name: case for case in [make(scene) for make in makers]}

@@ -1,0 +1,164 @@
+"""Every counterpart in torch computes what its kernel does; ceilings, timing and the file of `make bench`."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from tests.bench.__main__ import file_name, main
+from tests.bench.cases import build_scene, make_cases
+from tests.bench.ceiling import (
+    FLOPS_PER_STEP,
+    SPECIALS_PER_STEP,
+    Ceiling,
+    Work,
+    exponentials,
+    launch,
+    multiply_add,
+)
+from tests.bench.timing import MAX_LAUNCHES, Timing, Variant, fit_launches, time_in_turns
+
+KERNELS = ("rasterise", "contact", "scan", "observation", "penalties", "contact_forces")
+
+
+@pytest.fixture(scope="module")
+def scene(anymal, device):
+    """Fourteen robots on five terrains, in the middle of the bumps; half of them thrown on the ground."""
+    scene = build_scene(anymal, device, num_envs=14, num_terrains=5, walk_s=6.0, seed=0)
+    sim, rng = scene.rollout.sim, np.random.default_rng(3)
+    joint_q = sim.joint_q.numpy().copy()
+    turned = rng.normal(size=(7, 4))
+    joint_q[:7, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    joint_q[:7, 0] = rng.uniform(6, 10, 7)
+    joint_q[:7, 2] -= rng.uniform(0.3, 0.5, 7)
+    sim.joint_q.assign(joint_q)
+    sim.refresh()
+    sim.collide()
+    return scene
+
+
+@pytest.fixture(scope="module")
+def cases(scene):
+    return make_cases(scene)
+
+
+def outputs_of(case):
+    with torch.no_grad():
+        return case.counterpart(*case.arguments)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernel_and_counterpart_agree(cases, name):
+    assert tuple(cases) == KERNELS
+    cases[name].compare(outputs_of(cases[name]))
+
+
+def test_contacts_of_every_kind_are_compared(cases):
+    probe = outputs_of(cases["contact"])[0]
+    deepest, first, last = (probe >= 0).sum(dim=(0, 1)).tolist()
+    assert deepest > 30 and first > 3 and last > 3
+    assert (~np.isnan(cases["contact"].run_kernel()[..., 0])).sum() == deepest + first + last
+
+
+def spoil(name, outputs):
+    """The outputs with one fault each that a wrong kernel could have."""
+    if name != "contact":
+        one_value = outputs.clone()
+        one_value.view(-1)[one_value.view(-1).abs().argmax()] *= 1.01
+        return [one_value, outputs.roll(1, 0), outputs[:-1]]
+    probe, point, centre, normal, offset = outputs
+    return [
+        (torch.full_like(probe, -1), point, centre, normal, offset),
+        (probe[..., :1].expand_as(probe), point, centre, normal, offset),
+        (probe, point + 0.001, centre, normal, offset),
+        (probe, point, centre.flip(-1), normal, offset),
+        (probe, point, centre, normal * 1.001, offset),
+        (probe, point, centre, normal, -offset),
+    ]
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_another_output_is_refused(cases, name):
+    for outputs in spoil(name, outputs_of(cases[name])):
+        with pytest.raises(ValueError, match=name):
+            cases[name].compare(outputs)
+
+
+def test_multiply_adds_are_all_done(device):
+    # Eight chains a thread start at i, i + 1 ... i + 7 and take 16 times x -> 0.999 x + 0.001 a step.
+    out = wp.zeros(3, dtype=float, device=device)
+    launch(multiply_add, out, 2, 0.999, 0.001)
+    chains = np.arange(3)[:, None] + np.arange(8.0)
+    for _ in range(2 * 16):
+        chains = chains * 0.999 + 0.001
+    np.testing.assert_allclose(out.numpy(), chains.sum(1), rtol=1e-5)
+    assert FLOPS_PER_STEP == 16 * 8 * 2
+
+
+def test_exponentials_are_all_computed(device):
+    # Four chains a thread start at i * 1e-6 + (0, 0.1, 0.2, 0.3) and take 4 times x -> exp(-x) a step.
+    out = wp.zeros(3, dtype=float, device=device)
+    launch(exponentials, out, 2)
+    chains = np.arange(3)[:, None] * 1e-6 + np.array([0, 0.1, 0.2, 0.3])
+    for _ in range(2 * 4):
+        chains = np.exp(-chains)
+    np.testing.assert_allclose(out.numpy(), chains.sum(1), rtol=1e-5)
+    assert SPECIALS_PER_STEP == 4 * 4
+
+
+# 1 TB/s from memory, 4 in a cache of 1 MB, 10 TFLOP/s, 1 T exponentials/s, 2 us a launch.
+CEILING = Ceiling(
+    copies={1 << 10: 1e9, 1 << 20: 4e12, 1 << 30: 1e12}, flops_per_s=1e13, specials_per_s=1e12, launch_s=2e-6
+)
+
+
+@pytest.mark.parametrize(
+    ("work", "seconds", "share", "bound_by"),
+    [
+        (Work(bytes=10**9, flops=10**9), 2e-3, 0.5, "memory"),  # 1 GB at 1 TB/s is 1 ms: half of 2 ms
+        (Work(bytes=10**5, flops=0), 1e-7, 0.25, "memory"),  # 0.1 MB: as the best copy of 1 MB or more, 25 ns
+        (Work(bytes=10**6, flops=10**10), 4e-3, 0.25, "arithmetic"),  # 1e10 flops at 1e13/s: 1 ms of 4
+        (Work(bytes=10**6, flops=10**9, specials=10**9), 2e-3, 0.5, "special functions"),
+        (Work(bytes=4000, flops=1000), 4e-6, 2.5e-4, "launch"),  # of 4 us an empty launch takes half
+        (Work(bytes=4000, flops=1000), 1e-5, 1e-4, "latency"),  # of 10 us a fifth
+    ],
+)
+def test_what_bounds_a_kernel(work, seconds, share, bound_by):
+    assert CEILING.judge(work, seconds) == (pytest.approx(share), bound_by)
+
+
+def test_launches_fill_the_replay():
+    def make(launches):
+        return Variant(replay=lambda: sum(range(launches)), launches=launches, work=list)
+
+    assert fit_launches(make, "cpu", Timing(replay_s=1e-12)).launches == 1
+    assert fit_launches(make, "cpu", Timing(replay_s=1e3)).launches == MAX_LAUNCHES
+
+
+def test_variants_take_turns_after_a_warm_up():
+    played = []
+    variants = {name: Variant(replay=lambda name=name: played.append(name), launches=2, work=list) for name in "ab"}
+    seconds = time_in_turns(variants, "cpu", Timing(rounds=3))
+    assert played == ["a", "b"] * 4
+    assert seconds.keys() == {"a", "b"} and min(seconds.values()) > 0
+
+
+def test_a_file_is_named_after_its_device():
+    assert file_name("NVIDIA H200") == "nvidia-h200.json"
+    assert file_name("CPU (x86_64, 2 cores)") == "cpu.json"
+
+
+@pytest.mark.slow
+def test_command(tmp_path, device, capsys):
+    out = tmp_path / "new" / "bench.json"
+    main(["--small", "--num-envs", "3", "--device", device, "--out", str(out)])
+    report = json.loads(out.read_text())
+    assert [row["kernel"] for row in report["rows"]] == [*KERNELS]
+    for row in report["rows"]:
+        assert row["speedup"] == pytest.approx(row["torch_ms"] / row["ours_ms"])
+        assert row["torch_compile_ms"] is None and row["ceiling_share"] > 0
+    assert {"command", "commit", "device", "versions", "seed", "date"} <= report.keys()
+    printed = capsys.readouterr().out
+    assert all(kernel in printed for kernel in KERNELS)
