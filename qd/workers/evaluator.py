@@ -10,10 +10,10 @@ import re
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,6 +133,30 @@ class WorkerStatus:
         rates = " + ".join(f"{rate:.1f}" for rate in self.episodes_per_s)
         again = f", {self.retries} crossed again" if self.retries else ""
         return f"{self.workers} worker{'s' * (self.workers != 1)} ({rates} episodes/s{again})"
+
+
+@dataclass(frozen=True)
+class Compute:
+    """Where terrains are crossed."""
+
+    device: str = "cpu"
+    """Warp device name."""
+    workers: str | None = None
+    """Who crosses them, as :func:`parse_workers` takes it."""
+    num_envs: int | None = None
+    """Robots at once over all workers; as many as the device is good for if None. It changes no result."""
+
+    @classmethod
+    def resolve(cls, device: str | None = None, workers: str | None = None, num_envs: int | None = None) -> Self:
+        """What a command line asks for, on the device that is there: CUDA if there is one, else the CPU.
+
+        Raises:
+            ValueError: If a value cannot be used, or the device is not there.
+            OSError: If there is no Ray cluster at RAY_ADDRESS.
+        """
+        if num_envs is not None and num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        return cls(resolve_device(device, workers), workers, num_envs)
 
 
 class Evaluate(Protocol):
@@ -262,6 +286,8 @@ def _ray_module(name: str) -> Any:
 
 
 Build = Callable[[EvaluatorCfg, int], Crosser]
+OpenEvaluator = Callable[[EvaluatorCfg], AbstractContextManager[Evaluate]]
+"""Opens what crosses terrains, as :func:`open_evaluator` does."""
 
 
 @contextmanager

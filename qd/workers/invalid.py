@@ -101,17 +101,19 @@ def refuse_all_invalid(result: "RolloutResult | Any") -> None:
     )
 
 
-def tell_invalid(result: "RolloutResult | Any", what: str) -> None:
+def tell_invalid(result: "RolloutResult | Any", what: str, *, all_ok: bool = False) -> None:
     """Prints why episodes are invalid where over 5 % are, in a line that leaves progress bars whole.
 
     Args:
         result: The episodes.
         what: What was crossed, for the line.
+        all_ok: Whether all of them may be.
 
     Raises:
         AllInvalidError: If no episode is valid.
     """
-    refuse_all_invalid(result)
+    if not all_ok:
+        refuse_all_invalid(result)
     words = invalid_words(invalid_reasons(result), result.invalid.size)
     if words is not None:
         tqdm.write(f"{what}: {words}", file=sys.stderr)

@@ -2,59 +2,33 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 
 from kernels.episode import Outcome
 from qd.workers.evaluator import EvaluatorCfg
+from sim.rollout import RolloutResult
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 SCALES = (1.0, 2.0, 1.0, 4.0, 1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class Result:
-    """The fields of a rollout's result that the search reads; leading axes (terrain, replica)."""
-
-    penalties: np.ndarray
-    penalty_names: tuple[str, ...]
-    base_collision: np.ndarray
-    reached_goal: np.ndarray
-    fallen: np.ndarray
-    invalid: np.ndarray
-    invalidity: np.ndarray
-    duration_s: np.ndarray
-    physics_steps: int
-    robot_steps: int
-    busy_steps: int
-    wall_s: float
-    idle_share: float = 0.25
-    reward: np.ndarray | None = None
-
-    @property
-    def outcome(self) -> np.ndarray:
-        """Outcome of each episode, out of time where nothing else is said."""
-        cases = [self.invalid, self.base_collision, self.reached_goal]
-        kinds = [Outcome.INVALID, Outcome.BASE_COLLISION, Outcome.GOAL]
-        return np.select(cases, kinds, Outcome.TIME_OUT).astype(np.uint8)
-
-
-def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES) -> Result:
-    """A result with given penalties, shape (T, R, P); nothing else happened unless said."""
+def make_result(penalties, *, base_collision=None, invalid=None, late=None, names=PENALTIES) -> RolloutResult:
+    """A result with given penalties, shape (T, R, P); all others reach the goal unless they are late."""
     penalties = np.asarray(penalties, dtype=np.float64)
     never = np.zeros(penalties.shape[:2], dtype=bool)
     collided = never if base_collision is None else np.asarray(base_collision, dtype=bool)
     excluded = never if invalid is None else np.asarray(invalid, dtype=bool)
-    return Result(
+    cases = [excluded, collided, never if late is None else np.asarray(late, dtype=bool)]
+    kinds = [Outcome.INVALID, Outcome.BASE_COLLISION, Outcome.TIME_OUT]
+    return RolloutResult(
         penalties=penalties,
         penalty_names=tuple(names[: penalties.shape[2]]),
-        base_collision=collided,
-        reached_goal=~collided & ~excluded,
-        fallen=never,
-        invalid=excluded,
+        outcome=np.select(cases, kinds, Outcome.GOAL).astype(np.uint8),
         invalidity=np.where(excluded, np.uint8(2), np.uint8(0)),  # Invalidity.STATE
+        fallen=never,
         duration_s=np.full(never.shape, 15.0, dtype=np.float32),
+        final_position=np.zeros((*never.shape, 3), dtype=np.float32),
         # In proportion, so that a search among others or in groups comes to the same.
         physics_steps=400 * len(penalties),
         robot_steps=400 * len(penalties),
@@ -63,7 +37,7 @@ def make_result(penalties, *, base_collision=None, invalid=None, names=PENALTIES
     )
 
 
-def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> Result:
+def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> RolloutResult:
     """Penalties that differ between terrains by their genes and between replicas by their seed."""
     genes = np.asarray(genes, dtype=np.float64)
     hardness = np.stack([np.abs(genes[:, k::6]).mean(axis=1) for k in range(6)], axis=1)

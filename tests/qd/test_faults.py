@@ -65,10 +65,10 @@ def work(crosses, saved=None, opened=None, seeds=None):
 def test_outcomes_are_counted_by_hand():
     collided = np.array([[True, False, False, False], [False] * 4])
     invalid = np.array([[False, True, False, False], [False] * 4])
-    result = make_result(np.ones((2, 4, 6)), base_collision=collided, invalid=invalid)
-    late = dataclasses.replace(result, reached_goal=result.reached_goal & ([[True] * 3 + [False], [True] * 4]))
+    late = [[False] * 3 + [True], [False] * 4]
+    result = make_result(np.ones((2, 4, 6)), base_collision=collided, invalid=invalid, late=late)
     # one arrives, one collides, one is out of time, one is invalid
-    assert outcome_counts(late).tolist() == [[1, 1, 1, 1], [4, 0, 0, 0]]
+    assert outcome_counts(result).tolist() == [[1, 1, 1, 1], [4, 0, 0, 0]]
 
 
 def test_confirming_crosses_with_contact_resolved_what_was_not_crossed_before(failing):

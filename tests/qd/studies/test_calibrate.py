@@ -130,7 +130,7 @@ def fail(share):
 
     def change(result, call):
         missed = np.arange(result.invalid.shape[1]) < share * result.invalid.shape[1]
-        return replace(result, reached_goal=np.broadcast_to(~missed, result.invalid.shape))
+        return make_result(result.penalties, late=np.broadcast_to(missed, result.invalid.shape))
 
     return change
 

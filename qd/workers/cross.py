@@ -1,0 +1,429 @@
+"""The crossing service: controllers cross terrains, in lots that fill the device, and what is done is kept on disk.
+
+A terrain's episodes depend on the terrain, its seed and the settings of the crossing alone. So each lot is stored as
+soon as it is done, with a key for every terrain, and a terrain is found again in whatever lots: a command that was
+stopped goes on when it is run again.
+"""
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from kernels.episode import Invalidity, Outcome
+from kernels.penalties import PENALTIES
+from qd.run.progress import share_bar
+from qd.workers.evaluator import (
+    Compute,
+    EvaluatorCfg,
+    OpenEvaluator,
+    Pipeline,
+    open_evaluator,
+    parse_workers,
+    pipeline_of,
+)
+from qd.workers.invalid import tell_invalid
+from qd.workers.shards import merged
+from sim.files.atomic import write_atomically
+from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.files.provenance import code_fingerprint
+from sim.mujoco_c.crossing import cross_terrains
+from sim.policy.spec import controller_hash
+from sim.robots.identity import robot_identity
+from sim.robots.robot import RobotCfg, get_robot
+from sim.rollout import RolloutResult
+from sim.space import load_space, space_identity
+
+How = Literal["searched", "resolved", "mujoco_c"]
+"""Physics of the search; the same with contact resolved; MuJoCo C, with contact resolved there too."""
+
+MOST_BYTES = 1_000_000_000
+"""Size of a cache folder above which the files that were not used for longest go."""
+
+_LOT_EPISODES = {"cuda": 16_384, "cpu": 20}  # of a worker; two lots are under way
+_LOT_TERRAINS = 3_200  # of a worker at most: their height maps take 600 MB
+_MUJOCO_C_LOT = 4  # terrains of a process
+_KEY, _ROWS = "key", "rows"
+_ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_position")
+
+
+class Cache:
+    """Arrays in the files of a folder, by key. A damaged file counts as absent, in a printed line.
+
+    Args:
+        folder: Where they are; made when the first is written.
+        most_bytes: Size above which the files that were not used for longest are removed.
+    """
+
+    def __init__(self, folder: Path, *, most_bytes: int = MOST_BYTES) -> None:
+        self.folder, self._most_bytes = folder, most_bytes
+
+    def file(self, key: str) -> Path:
+        """The file of a key."""
+        return self.folder / f"{key}.npz"
+
+    def keys(self, prefix: str = "") -> list[str]:
+        """Keys that have a file, sorted."""
+        return sorted(file.stem for file in self.folder.glob(f"{prefix}*.npz"))
+
+    def read(self, key: str, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]] | None:
+        """The arrays of a key, all of them or those named; None if there are none."""
+        file = self.file(key)
+        if not file.is_file():
+            return None
+        try:
+            wanted = [name for name in array_names(file) if names is None or name in (*names, _KEY)]
+            arrays = read_arrays(file, wanted)
+            if str(arrays.pop(_KEY, "")) != key:
+                raise ValueError("it is another key's")
+            os.utime(file)
+        except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
+            self.discard(key, error)
+            return None
+        return arrays
+
+    def discard(self, key: str, why: object) -> None:
+        """Removes a damaged file and says so."""
+        print(f"{self.file(key)} is damaged ({' '.join(str(why).split())}): it is made again", flush=True)
+        self.file(key).unlink(missing_ok=True)
+
+    def write(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Stores the arrays of a key in one step.
+
+        Raises:
+            OSError: If they cannot be written.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.file(key), npz_bytes({_KEY: np.array(key), **arrays}))
+        self._remove_least_used(key)
+
+    def _remove_least_used(self, but: str) -> None:
+        about = [(file, file.stat()) for file in self.folder.glob("*.npz")]
+        size = sum(stat.st_size for _, stat in about)
+        for file, stat in sorted(about, key=lambda pair: pair[1].st_mtime_ns):
+            if size <= self._most_bytes:
+                return
+            if file.stem != but:
+                file.unlink(missing_ok=True)
+                size -= stat.st_size
+
+
+class _Stored:
+    """Crossings in a cache that were made in one way, each terrain under the hash of itself and its seed.
+
+    Args:
+        cache: Where they are.
+        way: Hash of what they depend on beside terrain and seed.
+        penalty_names: Columns of their penalties.
+    """
+
+    def __init__(self, cache: Cache, way: str, penalty_names: tuple[str, ...]) -> None:
+        self._cache, self._way, self._penalty_names = cache, way, penalty_names
+        self._places: dict[bytes, tuple[str, int]] = {}  # of a terrain, the file's key and the row there
+        for key in cache.keys(way):
+            rows = (cache.read(key, [_ROWS]) or {}).get(_ROWS, np.zeros((0, 32), np.uint8))
+            self._places.update({row.tobytes(): (key, place) for place, row in enumerate(rows)})
+
+    def read(self, terrains: NDArray[Any], seeds: NDArray[Any]) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
+        """Which of the terrains have been crossed, and their results, file by file."""
+        by_file: dict[str, list[tuple[int, int]]] = {}
+        for number, row in enumerate(_row_keys(terrains, seeds)):
+            if place := self._places.get(row):
+                by_file.setdefault(place[0], []).append((number, place[1]))
+        for key, pairs in by_file.items():
+            numbers, places = np.array(pairs).T
+            arrays = self._cache.read(key)
+            if arrays is None:  # removed or damaged meanwhile
+                continue
+            rows = arrays.pop(_ROWS)
+            if set(_ARRAYS) - arrays.keys() or any(len(values) != len(rows) for values in arrays.values()):
+                self._cache.discard(key, f"it must hold {', '.join(_ARRAYS)} of {len(rows)} terrains")
+                continue
+            yield numbers, self._result({name: values[places] for name, values in arrays.items()})
+
+    def _result(self, arrays: dict[str, Any]) -> RolloutResult:
+        """A result that took no time."""
+        return RolloutResult(
+            **arrays, penalty_names=self._penalty_names, physics_steps=0, robot_steps=0, busy_steps=0, wall_s=0.0
+        )
+
+    def write(self, terrains: NDArray[Any], seeds: NDArray[Any], result: RolloutResult) -> None:
+        """Stores a lot."""
+        rows = _row_keys(terrains, seeds)
+        key = f"{self._way}-{hashlib.sha256(b''.join(rows)).hexdigest()[:32]}"
+        arrays = {name: getattr(result, name) for name in (*_ARRAYS, "reward") if getattr(result, name) is not None}
+        self._cache.write(key, {_ROWS: np.array([[*row] for row in rows], np.uint8), **arrays})
+        self._places.update({row: (key, place) for place, row in enumerate(rows)})
+
+
+def _row_keys(terrains: NDArray[Any], seeds: NDArray[Any]) -> list[bytes]:
+    rows = np.ascontiguousarray(terrains, np.float32)
+    shape = str(rows.shape[1:]).encode()
+    return [
+        hashlib.sha256(shape + row.tobytes() + int(seed).to_bytes(4, "little")).digest()
+        for row, seed in zip(rows, seeds, strict=True)
+    ]
+
+
+class Crossings:
+    """Lets controllers of a robot cross terrains; a simulation stays open for calls that agree in all but the terrains.
+
+    Args:
+        robot: The robot.
+        compute: Where terrains are crossed.
+        cache: Folder of the crossings that are done; None to store nothing.
+        open_evaluator: Opens simulations.
+    """
+
+    def __init__(
+        self,
+        robot: RobotCfg | str,
+        compute: Compute,
+        *,
+        cache: Path | None = None,
+        open_evaluator: OpenEvaluator = open_evaluator,
+    ) -> None:
+        self.robot, self.compute = get_robot(robot), compute
+        self._cache = None if cache is None else Cache(cache)
+        self._stored: dict[str, _Stored] = {}
+        self._open_evaluator = open_evaluator
+        self._stack = ExitStack()
+        self._opened: tuple[EvaluatorCfg, Pipeline] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the simulation that is open."""
+        self._opened = None
+        self._stack.close()
+
+    def cross(
+        self,
+        policy: str,
+        terrains: NDArray[Any],
+        seeds: NDArray[Any],
+        *,
+        replicas: int,
+        space: str = "super_gaussian",
+        how: How = "searched",
+        reward: bool = False,
+        penalties_from_s: float = 0.0,
+        label: str = "",
+        at_most: int | None = None,
+        invalid_ok: bool = False,
+    ) -> RolloutResult:
+        """Lets a controller cross each terrain several times.
+
+        Episodes that are invalid are reported on stderr where they are many.
+
+        Args:
+            policy: The controller, as :func:`sim.policy.loaders.load_policy` takes it.
+            terrains: Genes, shape (B, num_genes), or heights [m], shape (B, nrow, ncol).
+            seeds: One a terrain, shape (B,), uint32.
+            replicas: Episodes a terrain.
+            space: Terrain space of the genes, as :func:`sim.space.load_space` takes it.
+            how: What crosses them.
+            reward: Whether the training task's reward is summed too.
+            penalties_from_s: Penalties are summed from this time of an episode on [s].
+            label: What is crossed, for the progress bar.
+            at_most: Terrains of the largest call to come that agrees with this one; the simulation has room for them.
+            invalid_ok: Whether a result without a valid episode is returned.
+
+        Returns:
+            One row a terrain. Steps and time are those of the terrains that were not in the cache. MuJoCo C tells
+            neither where a robot ended nor whether it had fallen, and not why an episode is invalid.
+
+        Raises:
+            AllInvalidError: If no episode is valid.
+            EvaluatorError: If a worker is lost.
+        """
+        if seeds.shape != (len(terrains),):
+            raise ValueError(f"seeds must have shape ({len(terrains)},), one a terrain, got {seeds.shape}")
+        cfg = EvaluatorCfg(
+            robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)), num_replicas=replicas, space=space,
+            device=self.compute.device, workers=self.compute.workers, num_envs=self.compute.num_envs, reward=reward,
+            penalties_from_s=penalties_from_s, resolved=how == "resolved",
+        )  # fmt: skip
+        if how == "mujoco_c" and (reward or penalties_from_s):
+            raise ValueError("MuJoCo C sums no reward, and penalties from the start only")
+        if not len(terrains):
+            return _no_terrains(cfg, self.robot.penalties)
+        stored = self._stored_crossings(cfg, how)
+        parts = list(stored.read(terrains, seeds)) if stored else []
+        done = np.concatenate([np.zeros(0, np.intp), *(numbers for numbers, _ in parts)])
+        missing = np.setdiff1d(np.arange(len(terrains)), done)
+        for numbers, result in self._cross_missing(cfg, how, terrains, seeds, missing, label, at_most):
+            if stored:
+                stored.write(terrains[numbers], seeds[numbers], result)
+            parts.append((numbers, result))
+        result = _in_order(parts)
+        tell_invalid(result, label or policy, all_ok=invalid_ok)
+        return result
+
+    def _stored_crossings(self, cfg: EvaluatorCfg, how: How) -> _Stored | None:
+        """The cache of what is crossed in one way; None without a cache, or if the controller's code has no file."""
+        controller = controller_hash(cfg.policy)
+        if self._cache is None or controller is None:
+            return None
+        way = [robot_identity(self.robot), self.robot.penalties, controller, space_identity(cfg.space)]
+        way += [cfg.num_replicas, cfg.device.startswith("cuda"), how, cfg.reward, cfg.penalties_from_s]
+        key = hashlib.sha256(json.dumps([*way, code_fingerprint(("kernels", "sim"))]).encode()).hexdigest()[:32]
+        if key not in self._stored:
+            self._stored[key] = _Stored(self._cache, key, self.robot.penalties)
+        return self._stored[key]
+
+    def _cross_missing(
+        self,
+        cfg: EvaluatorCfg,
+        how: How,
+        terrains: NDArray[Any],
+        seeds: NDArray[Any],
+        missing: NDArray[np.intp],
+        label: str,
+        at_most: int | None,
+    ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
+        """Numbers and results of the terrains that are not in the cache, lot by lot."""
+        if not len(missing):
+            return
+        if how == "mujoco_c":
+            yield from self._cross_in_mujoco_c(cfg, terrains, seeds, missing, label)
+            return
+        count = max(len(missing), at_most or 0)
+        lot = _lot_size(replace(cfg, num_terrains=count))
+        try:
+            pipeline = self._open(replace(cfg, num_terrains=min(count, 2 * lot)))
+            with share_bar(label) as progress:
+                for part, result in pipeline.in_lots(terrains[missing], seeds[missing], lot, progress):
+                    yield missing[part], result
+        except BaseException:
+            self.close()  # what failed is not used again
+            raise
+
+    def _open(self, cfg: EvaluatorCfg) -> Pipeline:
+        """A simulation with room for so many terrains; the one that is open if it serves."""
+        if self._opened is not None:
+            opened, pipeline = self._opened
+            room = opened.num_terrains
+            if replace(opened, num_terrains=cfg.num_terrains) == cfg and room >= cfg.num_terrains:
+                return pipeline
+        self.close()
+        pipeline = pipeline_of(self._stack.enter_context(self._open_evaluator(cfg)))
+        self._opened = (cfg, pipeline)
+        return pipeline
+
+    def _cross_in_mujoco_c(
+        self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
+    ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
+        processes, space = parse_workers(cfg.workers).num_processes, load_space(cfg.space)
+        size = _MUJOCO_C_LOT * processes
+        for first in range(0, len(missing), size):
+            lot = missing[first : first + size]
+            tqdm.write(f"{label}: terrain {first + 1} to {first + len(lot)} of {len(missing)}", file=sys.stderr)
+            episodes = cross_terrains(
+                self.robot, cfg.policy, terrains[lot], seeds[lot], space=space, num_episodes=cfg.num_replicas,
+                device=cfg.device, processes=processes, resolved=True,
+            )  # fmt: skip
+            yield lot, _as_result(episodes, self.robot.penalties)
+
+
+def cross(
+    controllers: Mapping[str, str],
+    terrains: NDArray[Any],
+    seeds: NDArray[Any],
+    *,
+    robot: RobotCfg | str = "anymal",
+    compute: Compute | None = None,
+    replicas: int,
+    space: str = "super_gaussian",
+    how: How = "searched",
+    reward: bool = False,
+    penalties_from_s: float = 0.0,
+    cache: Path | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> dict[str, RolloutResult]:
+    """Lets each controller cross each terrain several times.
+
+    Args:
+        controllers: By name, as :func:`sim.policy.loaders.load_policy` takes them.
+        terrains: Genes, shape (B, num_genes), or heights [m], shape (B, nrow, ncol).
+        seeds: One a terrain, shape (B,), uint32.
+        robot: The robot, or its name or settings file.
+        compute: Where terrains are crossed; by default on the CPU, by a process a core.
+        replicas: Episodes a terrain.
+        space: Terrain space of the genes, as :func:`sim.space.load_space` takes it.
+        how: What crosses them.
+        reward: Whether the training task's reward is summed too.
+        penalties_from_s: Penalties are summed from this time of an episode on [s].
+        cache: Folder where crossings are stored and found again.
+        open_evaluator: Opens simulations.
+
+    Returns:
+        One result a controller.
+
+    Raises:
+        AllInvalidError: If no episode of a controller is valid.
+        EvaluatorError: If a worker is lost.
+    """
+    with Crossings(robot, compute or Compute(), cache=cache, open_evaluator=open_evaluator) as crossings:
+        return {
+            name: crossings.cross(
+                policy, terrains, seeds, replicas=replicas, space=space, how=how, reward=reward,
+                penalties_from_s=penalties_from_s, label=name,
+            )
+            for name, policy in controllers.items()
+        }  # fmt: skip
+
+
+def _lot_size(cfg: EvaluatorCfg) -> int:
+    """Terrains that are crossed between two writes; two lots are under way."""
+    episodes = _LOT_EPISODES[cfg.device.partition(":")[0]]
+    return max(1, min(episodes // cfg.num_replicas, _LOT_TERRAINS)) * cfg.num_workers
+
+
+def _in_order(parts: Sequence[tuple[NDArray[np.intp], RolloutResult]]) -> RolloutResult:
+    """One result of parts that hold some of the terrains each."""
+    order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
+    return take_terrains(merged([result for _, result in parts], join=1), order)
+
+
+def take_terrains(result: RolloutResult, numbers: NDArray[np.intp]) -> RolloutResult:
+    """The rows of some terrains, in the order given; steps and time stay those of all."""
+    arrays = {field.name: getattr(result, field.name) for field in fields(result)}
+    return replace(result, **{name: value[numbers] for name, value in arrays.items() if isinstance(value, np.ndarray)})
+
+
+def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutResult:
+    shape = (0, cfg.num_replicas)
+    return RolloutResult(
+        penalties=np.zeros((*shape, len(penalty_names))), penalty_names=penalty_names,
+        outcome=np.zeros(shape, np.uint8), invalidity=np.zeros(shape, np.uint8), fallen=np.zeros(shape, bool),
+        duration_s=np.zeros(shape, np.float32), final_position=np.zeros((*shape, 3), np.float32),
+        physics_steps=0, robot_steps=0, busy_steps=0, wall_s=0.0, reward=np.zeros(shape) if cfg.reward else None,
+    )  # fmt: skip
+
+
+def _as_result(terrains: Sequence[Any], penalty_names: tuple[str, ...]) -> RolloutResult:
+    """Episodes in MuJoCo C, a record a terrain, as a rollout's result."""
+    outcome = np.array([terrain.outcome for terrain in terrains])
+    columns = [PENALTIES.index(name) for name in penalty_names]
+    return RolloutResult(
+        penalties=np.array([terrain.penalties for terrain in terrains])[..., columns], penalty_names=penalty_names,
+        outcome=outcome, invalidity=np.where(outcome == Outcome.INVALID, Invalidity.STATE, 0).astype(np.uint8),
+        fallen=np.zeros(outcome.shape, bool),
+        duration_s=np.array([terrain.duration_s for terrain in terrains]).astype(np.float32),
+        final_position=np.full((*outcome.shape, 3), np.nan, np.float32),
+        physics_steps=0, robot_steps=0, busy_steps=0, wall_s=0.0,
+    )  # fmt: skip

@@ -1,0 +1,257 @@
+"""The crossing service: results of every terrain in order, and what its cache finds, keeps apart and gives up."""
+
+from contextlib import contextmanager
+from dataclasses import fields
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from kernels.episode import Invalidity, Outcome
+from qd.workers import cross as service
+from qd.workers.cross import Cache, Crossings, cross
+from qd.workers.evaluator import Compute
+from qd.workers.invalid import AllInvalidError
+from sim.robots.robot import get_robot
+from sim.space import SUPER_GAUSSIAN
+from tests.qd import stand_in
+
+ROBOT = get_robot("anymal")
+POLICY = str(ROBOT.policy_file)
+TWO_WORKERS = Compute(workers="2")
+GENES = SUPER_GAUSSIAN.hard_random(9, 3)
+SEEDS = np.arange(9, dtype=np.uint32)
+
+
+class StandIn:
+    """Opens evaluators that note the seeds of what they cross, and stop with an error before the ``stop``-th."""
+
+    def __init__(self, *, stop: int | None = None, invalid: bool = False) -> None:
+        self.cfgs, self.crossed, self.stop, self.invalid = [], [], stop, invalid
+
+    @contextmanager
+    def __call__(self, cfg):
+        self.cfgs.append(cfg)
+
+        def evaluate(genes, seeds, progress=None):
+            if self.stop is not None and len(self.crossed) + len(seeds) > self.stop:
+                raise KeyboardInterrupt
+            self.crossed += seeds.tolist()
+            result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
+            invalid = np.ones(result.invalid.shape, bool)
+            return stand_in.make_result(result.penalties, invalid=invalid) if self.invalid else result
+
+        yield evaluate
+
+
+def cross_all(opened, cache=None, genes=GENES, seeds=SEEDS, *, replicas=20, policy=POLICY, **kwargs):
+    with Crossings(ROBOT, TWO_WORKERS, cache=cache, open_evaluator=opened) as crossings:
+        return crossings.cross(policy, genes, seeds, replicas=replicas, **kwargs)
+
+
+def arrays_of(result):
+    values = {field.name: getattr(result, field.name) for field in fields(result)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def assert_same(result, expected):
+    assert arrays_of(result).keys() == arrays_of(expected).keys()
+    for name, values in arrays_of(expected).items():
+        np.testing.assert_array_equal(getattr(result, name), values, err_msg=name)
+        assert getattr(result, name).dtype == values.dtype
+    assert result.penalty_names == expected.penalty_names
+
+
+EXPECTED = stand_in.evaluate(GENES, SEEDS, 20)
+
+
+def test_a_result_has_a_row_a_terrain_in_order():
+    assert_same(cross_all(StandIn()), EXPECTED)
+
+
+def test_cached_crossings_are_the_same_bit_for_bit_and_take_no_time(tmp_path):
+    first = cross_all(StandIn(), tmp_path)
+    again = StandIn()
+    cached = cross_all(again, tmp_path)
+    assert again.cfgs == []
+    assert_same(cached, EXPECTED)
+    assert (first.wall_s, cached.wall_s, cached.robot_steps) == (4.5, 0.0, 0)  # 0.5 s a terrain of the stand-in
+
+
+def test_work_that_was_stopped_goes_on_from_its_last_lot_in_other_lots_and_another_order(tmp_path):
+    stopped = StandIn(stop=5)
+    with pytest.raises(KeyboardInterrupt):
+        cross_all(stopped, tmp_path)
+    assert stopped.crossed == [0, 1, 2, 3]  # two lots of a terrain a worker
+    order = np.array([8, 3, 5, 0, 7])
+    after = StandIn()
+    result = cross_all(after, tmp_path, GENES[order], SEEDS[order])
+    assert after.crossed == [8, 5, 7]
+    assert_same(result, stand_in.evaluate(GENES[order], SEEDS[order], 20))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"replicas": 10},
+        {"how": "resolved"},
+        {"reward": True},
+        {"penalties_from_s": 1.0},
+        {"space": "course"},
+        {"policy": str(get_robot("cassie").policy_file)},
+        {"genes": -GENES},
+        {"seeds": SEEDS + np.uint32(100)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_crossings_of_another_kind_are_not_found(tmp_path, change):
+    cross_all(StandIn(), tmp_path)
+    other = StandIn()
+    cross_all(other, tmp_path, **change)
+    assert len(other.crossed) == len(GENES)
+
+
+def test_crossings_by_other_code_robot_or_kind_of_device_are_not_found(tmp_path, monkeypatch):
+    cross_all(StandIn(), tmp_path)
+    for robot, compute in ((get_robot("cassie"), TWO_WORKERS), (ROBOT, Compute("cuda"))):
+        opened = StandIn()
+        cross({"a": POLICY}, GENES, SEEDS, robot=robot, compute=compute, replicas=20, cache=tmp_path,
+              open_evaluator=opened)  # fmt: skip
+        assert len(opened.crossed) == len(GENES)
+    monkeypatch.setattr(service, "code_fingerprint", lambda rooms: "of other code")
+    changed = StandIn()
+    cross_all(changed, tmp_path)
+    assert len(changed.crossed) == len(GENES)
+
+
+def test_nothing_is_stored_of_a_controller_whose_code_has_no_file(tmp_path):
+    cross_all(StandIn(), tmp_path, policy="builtins:abs")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "rename", "empty"])
+def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, damage):
+    cross_all(StandIn(), tmp_path)
+    lots = sorted(tmp_path.iterdir())
+    content = bytearray(lots[0].read_bytes())
+    if damage == "rename":
+        lots[1].replace(lots[0])
+    else:
+        content[len(content) // 2] ^= 255
+        lots[0].write_bytes({"cut": content[:-100], "flip": content, "empty": b""}[damage])
+    capsys.readouterr()
+    again = StandIn()
+    assert_same(cross_all(again, tmp_path), EXPECTED)
+    assert len(again.crossed) in ((1, 2) if damage != "rename" else (2, 3, 4))
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1 and str(lots[0]) in out
+    after = StandIn()
+    cross_all(after, tmp_path)
+    assert after.crossed == []
+
+
+def test_a_file_of_the_cache_that_lacks_an_array_is_crossed_again(tmp_path):
+    cross_all(StandIn(), tmp_path)
+    cache = Cache(tmp_path)
+    key = cache.keys()[0]
+    arrays = cache.read(key)
+    del arrays["outcome"]
+    cache.write(key, arrays)
+    again = StandIn()
+    assert_same(cross_all(again, tmp_path), EXPECTED)
+    assert len(again.crossed) in (1, 2)
+
+
+def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
+    block = {"values": np.random.default_rng(0).random(1000)}  # 8 kB that cannot be packed
+    cache = Cache(tmp_path, most_bytes=25_000)
+    for key in ("a", "b", "c"):
+        cache.write(key, block)
+    for place, key in enumerate(("a", "b", "c")):
+        service.os.utime(cache.file(key), (place, place))
+    assert cache.read("a") is not None  # now b is the one that was not used for longest
+    cache.write("d", block)
+    assert cache.keys() == ["a", "c", "d"]
+    Cache(tmp_path, most_bytes=10).write("e", block)
+    assert cache.keys() == ["e"]
+
+
+def test_the_cache_reads_what_was_written_and_nothing_else(tmp_path):
+    cache = Cache(tmp_path / "new")
+    assert cache.read("a") is None
+    cache.write("a", {"x": np.arange(3), "y": np.zeros((2, 0), np.uint8)})
+    np.testing.assert_array_equal(cache.read("a")["x"], [0, 1, 2])
+    assert cache.read("a")["y"].shape == (2, 0)
+    assert cache.read("a", ["y"]).keys() == {"y"}
+
+
+def test_a_simulation_stays_open_for_calls_that_agree():
+    opened = StandIn()
+    with Crossings(ROBOT, TWO_WORKERS, open_evaluator=opened) as crossings:
+        crossings.cross(POLICY, GENES[:2], SEEDS[:2], replicas=20, at_most=9)
+        crossings.cross(POLICY, GENES, SEEDS, replicas=20)
+        assert [cfg.num_terrains for cfg in opened.cfgs] == [4]  # two lots of a terrain a worker
+        crossings.cross(POLICY, GENES, SEEDS, replicas=20, how="resolved")
+        assert [cfg.resolved for cfg in opened.cfgs] == [False, True]
+
+
+def test_lots_fill_the_device():
+    opened = StandIn()
+    genes, seeds = np.zeros((5000, 64), np.float32), np.zeros(5000, np.uint32)
+    for compute in (Compute("cuda"), Compute(workers="3")):
+        with Crossings(ROBOT, compute, open_evaluator=opened) as crossings:
+            crossings.cross(POLICY, genes, seeds, replicas=20)
+    gpu, cpu = opened.cfgs
+    assert (gpu.num_terrains, gpu.envs_of_worker) == (2 * (16_384 // 20), 2 * (16_384 // 20) * 20)
+    assert (cpu.num_terrains, cpu.num_workers) == (6, 3)
+
+
+def test_no_terrains_open_nothing():
+    opened = StandIn()
+    result = cross_all(opened, genes=GENES[:0], seeds=SEEDS[:0], reward=True)
+    assert result.penalties.shape == (0, 20, 6) and result.reward.shape == result.outcome.shape == (0, 20)
+    assert opened.cfgs == []
+
+
+def test_seeds_must_be_one_a_terrain():
+    with pytest.raises(ValueError, match="seeds"):
+        cross_all(StandIn(), seeds=SEEDS[:3])
+
+
+def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tmp_path):
+    with pytest.raises(AllInvalidError):
+        cross_all(StandIn(invalid=True), tmp_path)
+    assert cross_all(StandIn(), tmp_path, invalid_ok=True).invalid.all()  # it was stored all the same
+
+
+def test_several_controllers_cross_by_name(tmp_path):
+    controllers = {"shipped": POLICY, "other": str(get_robot("cassie").policy_file)}
+    results = cross(controllers, GENES, SEEDS, robot="anymal", compute=TWO_WORKERS, replicas=20, cache=tmp_path,
+                    open_evaluator=StandIn())  # fmt: skip
+    assert results.keys() == controllers.keys()
+    for result in results.values():
+        assert_same(result, EXPECTED)
+
+
+def test_mujoco_c_gives_the_robots_penalties_and_is_stored_apart(tmp_path, monkeypatch):
+    """Columns follow the robot's penalties, of which the records of MuJoCo C hold all six in their fixed order."""
+    calls = []
+
+    def cross_terrains(robot, policy, terrains, seeds, *, num_episodes, resolved, **_):
+        calls.extend(seeds.tolist())
+        outcome = np.full(num_episodes, Outcome.TIME_OUT, np.uint8)
+        outcome[0] = Outcome.INVALID
+        penalties = np.where(outcome[:, None] == Outcome.INVALID, np.nan, np.arange(6.0))
+        record = SimpleNamespace(outcome=outcome, penalties=penalties, duration_s=np.full(num_episodes, 20.0))
+        return [record] * len(terrains)
+
+    monkeypatch.setattr(service, "cross_terrains", cross_terrains)
+    cross_all(StandIn(), tmp_path)
+    for _ in range(2):
+        result = cross_all(StandIn(), tmp_path, how="mujoco_c")
+        assert calls == SEEDS.tolist()
+        assert (result.invalidity[:, 0] == Invalidity.STATE).all() and not result.invalidity[:, 1:].any()
+        columns = [service.PENALTIES.index(name) for name in ROBOT.penalties]
+        np.testing.assert_array_equal(result.penalties[3, 1], columns)
+    with pytest.raises(ValueError, match="reward"):
+        cross_all(StandIn(), how="mujoco_c", reward=True)
