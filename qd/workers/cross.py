@@ -35,10 +35,9 @@ from qd.workers.invalid import tell_invalid
 from qd.workers.shards import merged
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
-from sim.files.provenance import code_fingerprint
+from sim.files.records import code_fingerprint, robot_identity
 from sim.mujoco_c.crossing import cross_terrains
 from sim.policy.spec import controller_hash
-from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import RolloutResult
 from sim.space import load_space, space_identity
