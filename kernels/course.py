@@ -20,9 +20,6 @@ CENTRE_ROW = 80
 SLOPE_ROWS = 40
 """Rows to each side of the way in which a cross slope is inclined: 2 m; beyond, it stays level."""
 MAX_ELEMENTS = 6
-GROUND_CELLS = 2
-"""How far the ground of an element reaches beyond it on both sides: 0.1 m, half of the least flat ground between two. A
-kerb alone is a face of 0.05 m, on which nobody stands."""
 GENES = ("kind", "lead", "size", "length", "detail", "turn")
 """Genes of one element in order: kind, flat ground before it, and four parameters (:data:`PARAMETERS`)."""
 GENES_PER_ELEMENT = len(GENES)
@@ -123,7 +120,6 @@ _SLOPE_ROWS = wp.constant(SLOPE_ROWS)
 _MOST = wp.constant(MAX_ELEMENTS)
 _GENES = wp.constant(GENES_PER_ELEMENT)
 _KINDS = wp.constant(_NUM_KINDS)
-_GROUND_CELLS = wp.constant(GROUND_CELLS)
 _LEAD_LOW = wp.constant(float(LEAD.low))
 _LEAD_HIGH = wp.constant(float(LEAD.high))
 _CELL = wp.constant(SPACING)
@@ -412,31 +408,3 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
             "one grid per row of genes"
         )
     rasterise_elements(lay_out(genes), heights_out)
-
-
-@wp.kernel
-def _spread_kernel(
-    elements: wp.array2d[Element], values: wp.array2d[float], elsewhere: float, columns_out: wp.array2d[float]
-):
-    """Grid (num_terrains, num_columns)."""
-    t, col = wp.tid()
-    value = elsewhere
-    for e in range(elements.shape[1]):
-        element = elements[t, e]
-        s = col - element.first
-        if element.cells > 0 and s >= -_GROUND_CELLS and s < element.cells + _GROUND_CELLS:
-            value = values[t, e]
-    columns_out[t, col] = value
-
-
-def spread(elements: Any, values: Any, elsewhere: float, columns_out: Any) -> None:
-    """Give each column of cells the value of the element that lies there, or that ends within 0.1 m of it.
-
-    Args:
-        elements: As :func:`lay_out` leaves them, shape (num_terrains, num_elements); one without cells lies nowhere.
-        values: One an element, likewise.
-        elsewhere: Of columns without an element.
-        columns_out: Warp array, shape (num_terrains, num_columns); column k is x = 0.05 k to 0.05 (k + 1) m.
-    """
-    inputs = [elements, values, elsewhere]
-    wp.launch(_spread_kernel, columns_out.shape, inputs, outputs=[columns_out], device=elements.device)

@@ -1,9 +1,9 @@
 """What the ground is like: friction and softness of patches, from genes to the contacts on them.
 
-A map divides the terrain evenly into patches, row along y, column along x: 4 x 8 of 2 m x 2 m, or 320 strips across the
-way, each as long as a cell of the height grid. Patches at the edge go on beyond it. Friction is a factor: that of the
-contacts of a robot on any other ground is multiplied by it. Softness is the time constant of a contact [s], critically
-damped, at MuJoCo's constant impedance: at rest a body sinks in by a depth that grows with the time constant's square.
+A map divides the terrain into 4 x 8 patches of 2 m x 2 m, row along y, column along x. Patches at the edge go on beyond
+it. Friction is a factor: that of the contacts of a robot on any other ground is multiplied by it. Softness is the time
+constant of a contact [s], critically damped, at MuJoCo's constant impedance: at rest a body sinks in by a depth that
+grows with the time constant's square.
 """
 
 from typing import Any
@@ -19,10 +19,8 @@ PATCH = wp.constant(2.0)
 """Side of a patch [m]."""
 NUM_PATCHES = ROWS * COLS
 """Genes of a map: the first row of patches, at y = 0 m to 2 m, comes first."""
-WIDTH, LENGTH = wp.constant(ROWS * PATCH), wp.constant(COLS * PATCH)
-"""Of a terrain, along y and along x [m]."""
-PATCHES, STRIPS = (ROWS, COLS), (1, 320)
-"""Shapes that a map may have: patches of 2 m, or strips of 0.05 m over the whole width."""
+PATCHES = (ROWS, COLS)
+"""Shape of a map."""
 LEAST_FRICTION = wp.constant(0.15)
 """Factor of a gene of -1; a gene of 1 changes nothing."""
 LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S = wp.constant(0.01), wp.constant(0.06)
@@ -36,9 +34,9 @@ class Ground:
     """Maps of all terrains."""
 
     friction: wp.array3d[float]
-    """Factor of the friction, shape (num_terrains, rows, cols)."""
+    """Factor of the friction, shape (num_terrains, 4, 8)."""
     time_constant: wp.array3d[float]
-    """Contact time constant [s], ``FIRM`` for the robot's own; shape (num_terrains, rows, cols)."""
+    """Contact time constant [s], ``FIRM`` for the robot's own; shape (num_terrains, 4, 8)."""
 
 
 @wp.struct
@@ -64,10 +62,10 @@ class GroundRecords:
 
 
 @wp.func
-def patch_at(x: float, y: float, rows: int, cols: int) -> wp.vec2i:
-    """Row and column of the patch under world-local (x, y) [m], of so many rows and columns."""
-    row = wp.clamp(int(wp.floor(y * float(rows) / WIDTH)), 0, rows - 1)
-    col = wp.clamp(int(wp.floor(x * float(cols) / LENGTH)), 0, cols - 1)
+def patch_at(x: float, y: float) -> wp.vec2i:
+    """Row and column of the patch under world-local (x, y) [m]."""
+    row = wp.clamp(int(wp.floor(y / PATCH)), 0, ROWS - 1)
+    col = wp.clamp(int(wp.floor(x / PATCH)), 0, COLS - 1)
     return wp.vec2i(row, col)
 
 
@@ -87,7 +85,7 @@ def _tell_contacts_kernel(
     own = contacts.shape1[slot] - layout.first_shape
     t = terrain_of_env[own // layout.shapes_per_env]
     point = contacts.point0[slot]
-    patch = patch_at(point[0], point[1], ground.friction.shape[1], ground.friction.shape[2])
+    patch = patch_at(point[0], point[1])
     records_out.friction[slot] = ground.friction[t, patch[0], patch[1]]
     tau = ground.time_constant[t, patch[0], patch[1]]
     stiffness = float(0.0)
@@ -130,17 +128,17 @@ def _share(gene: float) -> float:
 
 @wp.kernel
 def _decode_friction_kernel(genes: wp.array2d[float], friction_out: wp.array3d[float]):
-    """Grid (num_terrains, rows, cols)."""
+    """Grid (num_terrains, 4, 8)."""
     t, row, col = wp.tid()
-    missing = 1.0 - _share(genes[t, row * friction_out.shape[2] + col])
+    missing = 1.0 - _share(genes[t, row * COLS + col])
     friction_out[t, row, col] = 1.0 - missing * (1.0 - LEAST_FRICTION)
 
 
 @wp.kernel
 def _decode_softness_kernel(genes: wp.array2d[float], time_constant_out: wp.array3d[float]):
-    """Grid (num_terrains, rows, cols)."""
+    """Grid (num_terrains, 4, 8)."""
     t, row, col = wp.tid()
-    share = _share(genes[t, row * time_constant_out.shape[2] + col])
+    share = _share(genes[t, row * COLS + col])
     tau = FIRM
     if share > 0.0:
         tau = LEAST_TIME_CONSTANT_S * wp.pow(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S, share)
@@ -148,31 +146,30 @@ def _decode_softness_kernel(genes: wp.array2d[float], time_constant_out: wp.arra
 
 
 def decode_friction(genes: Any, friction_out: Any) -> None:
-    """Turn genes, shape (num_terrains, rows * cols), into a map of friction: linear from the least to 1."""
+    """Turn genes, shape (num_terrains, 32), into a map of friction: linear from the least to 1."""
     _decode(_decode_friction_kernel, genes, friction_out)
 
 
 def decode_softness(genes: Any, time_constant_out: Any) -> None:
-    """Turn genes, shape (num_terrains, rows * cols), into time constants [s]: equal steps are equal ratios."""
+    """Turn genes, shape (num_terrains, 32), into time constants [s]: equal steps are equal ratios."""
     _decode(_decode_softness_kernel, genes, time_constant_out)
 
 
 def _decode(kernel: Any, genes: Any, values_out: Any) -> None:
-    expected = (genes.shape[0], *values_out.shape[1:])
-    num_patches = expected[1] * expected[2]
-    if genes.shape[1] != num_patches or tuple(values_out.shape) != expected:
+    expected = (genes.shape[0], ROWS, COLS)
+    if genes.shape[1] != NUM_PATCHES or tuple(values_out.shape) != expected:
         raise ValueError(
-            f"a map must have shape {expected} and {num_patches} genes a terrain, got {tuple(values_out.shape)} and "
+            f"a map must have shape {expected} and {NUM_PATCHES} genes a terrain, got {tuple(values_out.shape)} and "
             f"genes of shape {tuple(genes.shape)}"
         )
     wp.launch(kernel, expected, [genes], outputs=[values_out], device=genes.device)
 
 
-def make_ground(num_terrains: int, device: str, shape: tuple[int, int] = PATCHES) -> Ground:
-    """Maps of ground that changes nothing, each of some rows and columns."""
+def make_ground(num_terrains: int, device: str) -> Ground:
+    """Maps of ground that changes nothing."""
     ground = Ground()
-    ground.friction = wp.ones((num_terrains, *shape), dtype=float, device=device)
-    ground.time_constant = wp.zeros((num_terrains, *shape), dtype=float, device=device)
+    ground.friction = wp.ones((num_terrains, ROWS, COLS), dtype=float, device=device)
+    ground.time_constant = wp.zeros((num_terrains, ROWS, COLS), dtype=float, device=device)
     return ground
 
 

@@ -27,7 +27,7 @@ class TerrainBank:
         device: str,
         nrow: int = NUM_ROWS,
         ncol: int = NUM_COLS,
-        ground_shape: tuple[int, int] | None = None,
+        with_ground: bool = False,
     ) -> None:
         """Make flat terrains.
 
@@ -36,8 +36,7 @@ class TerrainBank:
             device: Warp device name.
             nrow: Nodes along y.
             ncol: Nodes along x.
-            ground_shape: Rows and columns of their maps of friction and softness, which contacts then pay for; no maps
-                if None.
+            with_ground: Whether they have maps of friction and softness, which contacts then pay for.
 
         Raises:
             ValueError: If there is no terrain or a grid has no cell.
@@ -48,7 +47,7 @@ class TerrainBank:
         self.terrain.heights = wp.zeros((num_terrains, nrow, ncol), dtype=float, device=device)
         self.terrain.ceilings = wp.zeros(ceiling_shape(num_terrains, nrow, ncol), dtype=float, device=device)
         self.terrain.spacing = SPACING
-        self.ground: Ground | None = ground_shape and make_ground(num_terrains, device, ground_shape)
+        self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
         self.device = device
 
     @property
@@ -80,25 +79,19 @@ class TerrainBank:
             raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
         if ground is not None and len(ground) != len(heights):
             raise ValueError(f"ground must be of {len(heights)} terrains, got {len(ground)}")
-        maps = self._maps_of(slots, wanted=None if ground is None else ground.shape)
+        maps = self._maps_of(slots, wanted=ground is not None)
         replaced.assign(heights.astype(np.float32))
         max_blocks(replaced, self.terrain.ceilings[slots])
         if maps is not None:
-            ground = ground or GroundMaps.plain(len(heights), maps.friction.shape[1:])
+            ground = ground or GroundMaps.plain(len(heights))
             maps.friction.assign(np.float32(ground.friction))
             maps.time_constant.assign(np.float32(ground.time_constant_s))
 
-    def _maps_of(self, slots: slice, *, wanted: tuple[int, int] | None) -> "Ground | None":
-        """The maps of some slots, None of a bank without any.
-
-        Raises:
-            ValueError: If maps of another shape are wanted.
-        """
-        there = None if self.ground is None else self.ground.friction.shape[1:]
-        if wanted is not None and wanted != there:
-            got = "a bank without maps" if there is None else f"a bank with maps of shape {there}"
-            raise ValueError(f"terrains have friction or softness, got {got}: give ground_shape={wanted}")
+    def _maps_of(self, slots: slice, *, wanted: bool) -> "Ground | None":
+        """The maps of some slots, None of a bank without any."""
         if self.ground is None:
+            if wanted:
+                raise ValueError("terrains have friction or softness, got a bank without maps: give with_ground=True")
             return None
         maps = Ground()
         maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
@@ -118,7 +111,7 @@ class TerrainBank:
         valid, replaced = space.validate(genes), self.heights[slots]
         if len(valid) != len(replaced):
             raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
-        maps = self._maps_of(slots, wanted=space.ground_shape)
+        maps = self._maps_of(slots, wanted=bool(space.ground))
         on_device = wp.array(valid, dtype=float, device=self.device)
         space.rasterise(on_device, SPACING, replaced)
         max_blocks(replaced, self.terrain.ceilings[slots])
@@ -176,7 +169,7 @@ def terrains_of(
         Float32, shape (num_terrains, NUM_ROWS, NUM_COLS), and maps.
     """
     device = device or host_device()
-    bank = TerrainBank(len(genes), device=device, ground_shape=space.ground_shape)
+    bank = TerrainBank(len(genes), device=device, with_ground=bool(space.ground))
     with wp.ScopedDevice(device):
         bank.set_genes(genes, space)
         return np.array(bank.heights.numpy()), bank.ground_maps()

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from kernels.ground import MOST_TIME_CONSTANT_S, make_ground
+from kernels.ground import COLS, MOST_TIME_CONSTANT_S, ROWS, make_ground
 from sim.bank import TerrainBank
 from sim.ground import patches_at
 from sim.space import TerrainSpace
@@ -52,17 +52,17 @@ def corridor_ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
         Float32 tensor on their device, shape (num_terrains, num_maps, 41, 121), 0 where ground is as always: the
         friction that is missing, and the time constant over that of the softest ground.
     """
-    if space.ground_shape is None:
+    if not space.ground:
         return genes.new_empty(len(genes), 0, *SHAPE)
-    (rows, cols), device = space.ground_shape, str(wp.device_from_torch(genes.device))
-    ground = make_ground(len(genes), device, space.ground_shape)
+    device = str(wp.device_from_torch(genes.device))
+    ground = make_ground(len(genes), device)
     with wp.ScopedDevice(device):
         space.lay_ground(wp.from_torch(genes.contiguous()), ground)
     maps = {
         "friction": 1.0 - wp.to_torch(ground.friction),
         "softness": wp.to_torch(ground.time_constant) / float(MOST_TIME_CONSTANT_S),
     }
-    row, col = patches_at(_nodes(Y), NUM_ROWS - 1, rows), patches_at(_nodes(X), NUM_COLS - 1, cols)
+    row, col = patches_at(_nodes(Y), NUM_ROWS - 1, ROWS), patches_at(_nodes(X), NUM_COLS - 1, COLS)
     return torch.stack([maps[kind][:, row][:, :, col] for kind in space.ground], dim=1)
 
 

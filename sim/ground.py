@@ -7,18 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kernels.ground import FIRM, PATCHES, STRIPS
+from kernels.ground import FIRM, PATCHES
 from kernels.ground import LEAST_FRICTION as LEAST_FRICTION
 from kernels.ground import LEAST_TIME_CONSTANT_S as LEAST_TIME_CONSTANT_S
 from kernels.ground import MOST_TIME_CONSTANT_S as MOST_TIME_CONSTANT_S
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""
-ELEMENT_KINDS = ("element-friction", "element-softness")
-"""The same, as names ask for it that want a value for each element of a course in place of one for each patch."""
-MAP_SHAPES = (PATCHES, STRIPS)
-"""Rows and columns that a map may have."""
-_SUFFIX = re.compile(rf"((?:\+(?:{'|'.join((*ELEMENT_KINDS, *GROUND_KINDS))}))+)$")
+_SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(GROUND_KINDS)}))+)$")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,8 +26,7 @@ class GroundMaps:
     """
 
     friction: NDArray[np.float32]
-    """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, rows, cols), row along y; these
-    are one of :data:`MAP_SHAPES`."""
+    """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""
     time_constant_s: NDArray[np.float32]
     """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, likewise."""
 
@@ -43,30 +38,19 @@ class GroundMaps:
                 f"maps must be of as many terrains, got {len(self.friction)} of friction and "
                 f"{len(self.time_constant_s)} of softness"
             )
-        if self.friction.shape != self.time_constant_s.shape:
-            raise ValueError(
-                f"maps must have the same rows and columns, got {self.friction.shape[1:]} of friction and "
-                f"{self.time_constant_s.shape[1:]} of softness"
-            )
 
     def __len__(self) -> int:
         """T."""
         return len(self.friction)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        _, rows, cols = self.friction.shape
-        return rows, cols
 
     def __getitem__(self, rows: slice) -> "GroundMaps":
         """Those of some terrains."""
         return GroundMaps(friction=self.friction[rows], time_constant_s=self.time_constant_s[rows])
 
     @classmethod
-    def plain(cls, num_terrains: int, shape: tuple[int, ...] = PATCHES) -> "GroundMaps":
-        """Maps of ground that changes nothing, of some rows and columns."""
-        whole = num_terrains, *shape
+    def plain(cls, num_terrains: int) -> "GroundMaps":
+        """Maps of ground that changes nothing."""
+        whole = num_terrains, *PATCHES
         return cls(friction=np.ones(whole, np.float32), time_constant_s=np.full(whole, FIRM, np.float32))
 
     def joined(self, other: "GroundMaps") -> "GroundMaps":
@@ -110,35 +94,22 @@ def check_time_constant(time_constant_s: NDArray[np.floating]) -> None:
 
 
 def _check_map(name: str, values: NDArray[np.floating], allowed: NDArray[np.bool_], words: str) -> None:
-    if values.ndim != 3 or values.shape[1:] not in MAP_SHAPES:
-        (rows, cols), (_, strips) = MAP_SHAPES
-        raise ValueError(
-            f"a map of {name} must have shape (terrains, {rows}, {cols}), a value a patch of 2 m, or (terrains, 1, "
-            f"{strips}), a value every 0.05 m of the way, got {values.shape}"
-        )
+    if values.ndim != 3 or values.shape[1:] != PATCHES:
+        rows, cols = PATCHES
+        raise ValueError(f"a map of {name} must have shape (terrains, {rows}, {cols}), got {values.shape}")
     if not allowed.all():
         raise ValueError(f"{name} must be {words}, got {values[~allowed][0]:g} in one of the patches")
 
 
 def check_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
-    """What the ground is to have maps of, each once and in the order of :data:`GROUND_KINDS` or :data:`ELEMENT_KINDS`.
-
-    Raises:
-        ValueError: If one is unknown, or some are of patches and some of elements.
-    """
-    unknown = [kind for kind in kinds if kind not in (*GROUND_KINDS, *ELEMENT_KINDS)]
+    """What the ground is to have maps of, each once and in the order of :data:`GROUND_KINDS`."""
+    unknown = [kind for kind in kinds if kind not in GROUND_KINDS]
     if unknown or not kinds:
         raise ValueError(
             f"unknown ground {', '.join(map(repr, unknown)) or 'of nothing'}: expected friction, softness or both "
-            f"(--ground friction softness), or {' and '.join(ELEMENT_KINDS)} with the space course"
+            "(--ground friction softness)"
         )
-    for known in (GROUND_KINDS, ELEMENT_KINDS):
-        if set(kinds) <= set(known):
-            return tuple(kind for kind in known if kind in kinds)
-    raise ValueError(
-        f"ground must be of patches ({' '.join(GROUND_KINDS)}) or of elements ({' '.join(ELEMENT_KINDS)}), got "
-        f"{' and '.join(kinds)}: leave one of them out"
-    )
+    return tuple(kind for kind in GROUND_KINDS if kind in kinds)
 
 
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:

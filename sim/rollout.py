@@ -148,7 +148,7 @@ class Rollout:
         cfg: CrossingCfg | None = None,
         solver: SolverCfg | None = None,
         space: TerrainSpace = SUPER_GAUSSIAN,
-        ground_shape: tuple[int, int] | None = None,
+        with_ground: bool = False,
     ) -> None:
         """Load the policy, build the simulation and capture the control step.
 
@@ -162,7 +162,7 @@ class Rollout:
             cfg: The crossing.
             solver: Solver options.
             space: What the genes of terrains mean.
-            ground_shape: Rows and columns of maps that heights may come with; with genes the space decides.
+            with_ground: Whether heights may come with maps of the ground; with genes the space decides.
 
         Raises:
             ValueError: If the policy does not fit the robot, a number is not positive, or memory is too small.
@@ -175,14 +175,14 @@ class Rollout:
         self.robot, self.cfg = robot, cfg or CrossingCfg()
         self.num_terrains, self.num_replicas = num_terrains, num_replicas
         self.num_envs = min(num_envs or num_terrains * num_replicas, num_terrains * num_replicas)
-        self.space, self._ground_shape = space, ground_shape or space.ground_shape
+        self.space, self._with_ground = space, with_ground or bool(space.ground)
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         with _saying_what_does_not_fit(self.num_envs, num_terrains, device):
             self._build(loaded, solver, device)
 
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
-        bank = TerrainBank(self.num_terrains, device=device, ground_shape=self._ground_shape)
+        bank = TerrainBank(self.num_terrains, device=device, with_ground=self._with_ground)
         self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
         self._lots: deque[_Lot] = deque()
         self._first_free = self._waiting = 0  # the ring's next slot, and episodes that no robot may take yet

@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels import super_gaussian
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
-from sim.ground import ELEMENT_KINDS, check_kinds, joined_name, split_name
+from sim.ground import check_kinds, joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.spaces.base import Seed as Seed
 from sim.spaces.base import TerrainSpace as TerrainSpace
 from sim.spaces.base import clipped as clipped
-from sim.spaces.course import COURSE, Course
-from sim.spaces.elements import OnElements
+from sim.spaces.course import COURSE
 from sim.spaces.ground import OnGround
 
 _HEIGHT = PARAMETERS.index("w")
@@ -172,16 +171,7 @@ def _with_ground(space: TerrainSpace, kinds: tuple[str, ...]) -> TerrainSpace:
             f"the space {space.name} has {' and '.join(space.ground)} of its own, got --ground {' '.join(kinds)}: "
             "leave --ground out"
         )
-    of_elements = tuple(kind for kind in kinds if kind in ELEMENT_KINDS)
-    if not of_elements:
-        return OnGround(inner=space, kinds=kinds) if kinds else space
-    if not isinstance(space, Course):
-        of_patches = " ".join(kind.removeprefix("element-") for kind in of_elements)
-        raise ValueError(
-            f"the space {space.name} has no elements, got --ground {' '.join(of_elements)}: give --space course, or "
-            f"patches (--ground {of_patches})"
-        )
-    return OnElements(inner=space, names=of_elements)
+    return OnGround(inner=space, kinds=kinds) if kinds else space
 
 
 def get_space(name: str, sha256: str | None = None, *, file: Path | None = None) -> TerrainSpace:

@@ -273,7 +273,6 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
     paths = flags.archive or (_usual_archive(flags, robot),)
     archives = [_read_archive(flags, robot, path) for path in paths]
     spaces = tuple(map(space_of, archives))
-    _check_grounds(paths, spaces)
     splits = [
         split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path, keep_validation=keep_validation)
         for one, path in zip(archives, paths, strict=True)
@@ -300,21 +299,6 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
         goal_rate=np.concatenate(rates),
         about=(about[0] if len(about) == 1 else {key: [one[key] for one in about] for key in about[0]}) | chosen,
     )
-
-
-def _check_grounds(paths: Sequence[Path], spaces: Sequence[TerrainSpace]) -> None:
-    """Refuses archives whose maps of the ground have different rows and columns: a training has one shape of maps.
-
-    Raises:
-        ValueError: If there are such.
-    """
-    shapes = {space.ground_shape: f"{path} of {space.name}" for path, space in zip(paths, spaces, strict=True)}
-    told = [of for shape, of in shapes.items() if shape is not None]
-    if len(told) > 1:
-        raise ValueError(
-            f"the ground of all archives must differ by patch or by element, got both: {', '.join(told)}: leave out "
-            "those of one kind"
-        )
 
 
 def _rows_to_train_on(

@@ -129,7 +129,7 @@ class Simulation:
 
     def __init__(self, robot: "RobotCfg", device: str) -> None:
         self._robot, self._device = robot, device
-        self._rollouts: dict[tuple[str, int, int, str, tuple[int, int] | None], Any] = {}
+        self._rollouts: dict[tuple[str, int, int, str, bool], Any] = {}
 
     def prepare(self, first: Wanted, count: int = 1) -> Any:
         """The rollout that crosses such terrains, so many at once; built if there is none yet.
@@ -140,12 +140,12 @@ class Simulation:
         from sim.rollout import Rollout
         from sim.space import load_space
 
-        shape = None if first.ground is None else first.ground.shape
-        kind = (first.policy, count, first.replicas, first.space, shape)
+        with_ground = first.ground is not None
+        kind = (first.policy, count, first.replicas, first.space, with_ground)
         if kind not in self._rollouts:
             self._rollouts[kind] = Rollout(
                 self._robot, first.policy, num_terrains=count, num_replicas=first.replicas, device=self._device,
-                space=load_space(first.space), ground_shape=shape,
+                space=load_space(first.space), with_ground=with_ground,
             )  # fmt: skip
         return self._rollouts[kind]
 
@@ -260,8 +260,8 @@ class Recordings:
         alike: dict[Any, list[int]] = {}
         for k in missing:
             one = wanted[k]
-            shape = None if one.ground is None else one.ground.shape
-            kind = (one.policy, one.replicas, one.seed, one.space, one.terrain.shape, shape)
+            with_ground = one.ground is not None
+            kind = (one.policy, one.replicas, one.seed, one.space, one.terrain.shape, with_ground)
             alike.setdefault(kind, []).append(k)
         for numbers in alike.values():
             yield from (numbers[k : k + self._at_once] for k in range(0, len(numbers), self._at_once))

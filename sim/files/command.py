@@ -79,8 +79,7 @@ class OnGround:
 
     ground: tuple[str, ...] | None = None
     """What the ground differs in from patch to patch of 2 m: friction, softness, or both; 32 genes each beside those of
-    the terrain space. With --space course also from element to element: element-friction, element-softness, or both; 6
-    genes each. As always if left out."""
+    the terrain space. As always if left out."""
 
 
 @dataclass(frozen=True, kw_only=True)

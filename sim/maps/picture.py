@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
-from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, GroundMaps, patches_at
+from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES, GroundMaps, patches_at
 from sim.terrain import NUM_COLS, NUM_ROWS
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> 
     """
     row, col = (
         patches_at(np.arange(count) - margin, nodes - 1, patches)
-        for count, patches, nodes in zip(colors.shape[:2], ground.shape, (NUM_ROWS, NUM_COLS), strict=True)
+        for count, patches, nodes in zip(colors.shape[:2], PATCHES, (NUM_ROWS, NUM_COLS), strict=True)
     )
     tint = ground_tint(ground)[row[:, None], col]
     return colors + tint[..., 3:] * (tint[..., :3] - colors)

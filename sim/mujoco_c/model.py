@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
-from sim.ground import GroundMaps
+from sim.ground import PATCHES, GroundMaps
 from sim.maps.terrain_files import Margins, as_hfield
 from sim.robots.robot import RobotCfg
 from sim.simulation import GROUND_FRICTION
@@ -176,7 +176,7 @@ class _Patch:
 
 def _patches_of(ground: GroundMaps) -> list[_Patch]:
     """The patches of one terrain; columns of the map in which nothing changes are one."""
-    (num_rows, num_cols), maps = ground.shape, np.stack([ground.friction[0], ground.time_constant_s[0]])
+    (num_rows, num_cols), maps = PATCHES, np.stack([ground.friction[0], ground.time_constant_s[0]])
     changes = 1 + np.flatnonzero((maps[..., 1:] != maps[..., :-1]).any(axis=(0, 1)))
     return [
         _Patch(

@@ -18,7 +18,7 @@ from kernels.episode import Invalidity, Outcome
 from sim.bank import heights_of
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
-from sim.ground import MAP_SHAPES
+from sim.ground import PATCHES
 from sim.recording.recorder import FRAME_ARRAYS, Recording, space_in
 from sim.space import get_space, is_own
 
@@ -129,7 +129,7 @@ def _check_shapes(content: dict[str, NDArray[Any]]) -> None:
         if content[name].shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {content[name].shape}")
     for name in ("friction", "time_constant_s"):
-        if name in content and (len(content[name]) != terrains or content[name].shape[1:] not in MAP_SHAPES):
+        if name in content and (len(content[name]) != terrains or content[name].shape[1:] != PATCHES):
             raise ValueError(f"{name} must be maps of {terrains} terrains, got shape {content[name].shape}")
     for name, num_axes in (("genes", 2), ("heights", 3)):
         if name in content and (content[name].ndim != num_axes or len(content[name]) != terrains):

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kernels.ground import PATCHES, Ground
+from kernels.ground import Ground
 
 Seed = int | np.random.Generator
 """What random terrains are drawn from. A Generator gives other terrains on each call, an int the same ones."""
@@ -51,11 +51,6 @@ class TerrainSpace(Protocol):
     def ground(self) -> tuple[str, ...]:
         """What its terrains have maps of beside heights, some of :data:`sim.ground.GROUND_KINDS`."""
         return ()
-
-    @property
-    def ground_shape(self) -> tuple[int, int] | None:
-        """Rows and columns of these maps; None if there are none."""
-        return PATCHES if self.ground else None
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device.

@@ -66,15 +66,6 @@ def heights(genes):
     return grid
 
 
-def columns(genes, values):
-    """Values of the elements of one course by column of cells, 0 elsewhere, shape (320,): to 2 cells beyond them."""
-    found = np.zeros(320)
-    for number, col, patch in patches(genes):
-        if patch.shape[1] > 1:
-            found[col - 2 : col + patch.shape[1] + 1] = values[number]
-    return found
-
-
 def patches(genes):
     """Each element that fits: its number, the node before it, and its heights over the ground there."""
     col = 80

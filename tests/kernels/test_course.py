@@ -13,7 +13,6 @@ from kernels.course import (
     place,
     rasterise,
     rasterise_elements,
-    spread,
 )
 from tests.kernels import course_oracle as oracle
 from tests.kernels.course_oracle import course, element
@@ -194,30 +193,3 @@ def test_wrong_shapes_are_named(device):
     with pytest.raises(ValueError, match=r"spacing must be 0.05 m, got 0.1"):
         rasterise(genes, 0.1, out)
     assert lay_out(genes).shape == (2, MAX_ELEMENTS)
-
-
-def spread_over(genes, values, device):
-    """Values of the elements of courses by column, 0 where no element lies."""
-    columns = wp.full((len(genes), 320), -1.0, dtype=float, device=device)
-    elements = lay_out(wp.array(np.float32(genes), device=device))
-    spread(elements, wp.array(np.float32(values), device=device), 0.0, columns)
-    return columns.numpy()
-
-
-def test_the_ground_of_an_element_reaches_a_tenth_of_a_metre_beyond_it(device):
-    # A kerb behind 5 cells is the cell from x = 4.25 m to 4.30 m: its ground lies from x = 4.15 m to 4.40 m. A ditch of
-    # 8 cells behind 4 more lies from x = 4.50 m to 4.90 m.
-    genes = course(element("kerb", lead=5, size=0.15, turn=1), element("ditch", size=0.4, length=8))
-    found = spread_over(genes, [[1, 2, 3, 4, 5, 6]], device)[0]
-    expected = np.zeros(320)
-    expected[83:88], expected[88:100] = 1, 2
-    np.testing.assert_array_equal(found, expected)
-
-
-def test_values_of_elements_lie_where_the_builder_has_elements(device):
-    genes = np.random.default_rng(5).uniform(-1.2, 1.2, (60, 36)).astype(np.float32)
-    values = np.tile(np.arange(1.0, 7.0), (60, 1))
-    found = spread_over(genes, values, device)
-    for row, columns in zip(genes, found, strict=True):
-        np.testing.assert_array_equal(columns, oracle.columns(row, values[0]))
-    assert (np.unique(found) == np.arange(7)).all()

@@ -165,9 +165,7 @@ def test_recordings_keep_the_ground(searched, anymal):
     def cross(wanted, progress):
         (one,) = wanted
         asked.append(one)
-        rollout = Rollout(
-            anymal, stand, space=get_space(one.space), ground_shape=one.ground and one.ground.shape, **own
-        )
+        rollout = Rollout(anymal, stand, space=get_space(one.space), with_ground=one.ground is not None, **own)
         seeds = np.array([one.terrain_seed], np.uint32)
         return [record(rollout, one.terrain[None], seeds, policy=one.policy, ground=one.ground)[1]]
 

@@ -189,7 +189,7 @@ def test_training_is_the_same_on_every_device(device, monkeypatch):
     np.testing.assert_allclose(predicted(there, genes)["ratios"], predicted(here, genes)["ratios"], atol=0.005)
 
 
-@pytest.mark.parametrize("name", ["super_gaussian", "course+element-friction", "{own}+softness"])
+@pytest.mark.parametrize("name", ["super_gaussian", "course+friction", "{own}+softness"])
 def test_it_learns_and_proposes_on_every_device(device, name, tmp_path, monkeypatch):
     monkeypatch.setattr("sim.space._named", [])
     space = load_space(name.format(own=write_ridges(tmp_path)))
@@ -312,9 +312,7 @@ def test_the_newest_are_kept(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "space", [SUPER_GAUSSIAN, COURSE, get_space("course+element-friction")], ids=lambda space: space.name
-)
+@pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE, get_space("course+friction")], ids=lambda space: space.name)
 def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
     cfg = SchedulerCfg(
         emitters=5, batch_size=8, groups=2, method="surrogate+cma_mae", training_steps=3, candidates=2, generations=2,

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from kernels.ground import PATCHES
 from sim.bank import heights_of, terrains_of
 from sim.corridor import SHAPE, corridor_ground, corridor_heights
 from sim.space import SUPER_GAUSSIAN, get_space
@@ -25,7 +26,7 @@ def test_a_space_of_one_spacing_gives_means_of_its_nodes():
         np.testing.assert_allclose(found[:, row, col], around, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["super_gaussian+friction+softness", "course+element-softness"])
+@pytest.mark.parametrize("name", ["super_gaussian+friction+softness", "course+softness"])
 def test_ground_around_the_way(name):
     space = get_space(name)
     genes = space.uniform_random(3, 2)
@@ -33,7 +34,7 @@ def test_ground_around_the_way(name):
     assert found.shape == (3, len(space.ground), *SHAPE)
     _, ground = terrains_of(genes, space)
     maps = {"friction": 1.0 - ground.friction, "softness": ground.time_constant_s / 0.06}
-    rows, cols = ground.shape
+    rows, cols = PATCHES
     for row, col in ((0, 0), (20, 57), (40, 120), (7, 70), (19, 71)):
         patch = int((2.0 + 0.1 * row) * rows / 8.0 + 1e-6), int((2.0 + 0.1 * col) * cols / 16.0 + 1e-6)
         for place, kind in enumerate(space.ground):

@@ -342,15 +342,6 @@ def test_archives_of_two_terrain_spaces_are_trained_on_together(places):
     assert alone.settings["space"] == "course" and "space" not in alone.settings["archive"]
 
 
-def test_archives_whose_ground_has_maps_of_two_shapes_are_refused(places):
-    names = [f"course{ground}" for ground in ("+friction", "+element-friction")]
-    for name in names:
-        write_courses(places / f"{name}.npz", name.removeprefix("course"))
-    both = tuple(places / f"{name}.npz" for name in names)
-    with pytest.raises(ValueError, match=r"ground of all archives must differ by patch or by element, got both: .*"):
-        job_of(config(places, archive=both, run_dir=places / "none"))
-
-
 def test_a_training_on_several_archives_goes_on(places):
     write_archive(places / "second.npz", make_archive(12, seed=2))
     both = (places / "archive" / "archive.npz", places / "second.npz")

@@ -125,7 +125,7 @@ class Mix:
             heights = np.concatenate([heights, others])
             types += (self.cfg.mix,) * count
             if ground is not None:
-                ground = GroundMaps.plain(self.cfg.hand_crafted, ground.shape).joined(ground)
+                ground = GroundMaps.plain(self.cfg.hand_crafted).joined(ground)
             return Tiles(heights=heights, type_of_column=types, ground=ground)
         return Tiles(heights=heights, type_of_column=types)
 
@@ -176,8 +176,7 @@ class Mix:
     def _elites(self) -> tuple[NDArray[np.float32], GroundMaps | None]:
         """Heights of the present elites, shape (rows, NUM_ROWS, NUM_COLS), and their ground if any space has maps."""
         heights = np.empty((len(self.rows), NUM_ROWS, NUM_COLS), np.float32)
-        shape = next((space.ground_shape for space in self.spaces if space.ground_shape is not None), None)
-        ground = None if shape is None else GroundMaps.plain(len(self.rows), shape)
+        ground = GroundMaps.plain(len(self.rows)) if any(space.ground for space in self.spaces) else None
         first = 0
         for genes, space in zip(self.genes, self.spaces, strict=True):
             (there,) = np.nonzero((first <= self.rows) & (self.rows < first + len(genes)))

@@ -107,8 +107,7 @@ class CommandTask:
 
     def _build_simulation(self, terrain_of_env: np.ndarray, rng: np.random.Generator) -> Simulation:
         tiles = self.tiles
-        shape = None if tiles.ground is None else tiles.ground.shape
-        bank = TerrainBank(len(tiles.heights), device=self.device, ground_shape=shape)
+        bank = TerrainBank(len(tiles.heights), device=self.device, with_ground=tiles.ground is not None)
         bank.set_heights(tiles.heights, ground=tiles.ground)
         return Simulation(
             self.robot,

@@ -211,18 +211,6 @@ def test_elites_bring_their_ground():
     assert make_mix().next().ground is None
 
 
-def test_elites_bring_the_ground_of_their_elements():
-    space = get_space("course+element-friction")
-    genes = space.hard_random(4, 1)
-    cfg = MixCfg(terrains=4, swap_every=2)
-    mix = Mix(cfg=cfg, genes=(genes,), spaces=(space,), crosses=True, seed=0, device="cpu")
-    tiles = mix.next()
-    assert tiles.ground is not None and tiles.ground.shape == (1, 320) and (tiles.ground.friction[:2] == 1.0).all()
-    own = terrains_of(genes[mix.rows], space)[1]
-    assert own is not None and (own.friction < 1.0).any()
-    np.testing.assert_array_equal(tiles.ground.friction[2:], own.friction)
-
-
 def test_elites_of_several_spaces_are_drawn_together_each_with_its_own_ground():
     parts = {"super_gaussian+friction": 3, "course": 4, "course+softness": 2}
     spaces = tuple(map(get_space, parts))
