@@ -179,7 +179,8 @@ def write_run(folder: Path, archive: Archive, seed: int | None = None) -> Path:
     folder.mkdir()
     write_archive(folder / "archive.npz", archive)
     if seed is not None:
-        own = {"settings": {"seed": seed, "robot_sha256": None}, "iterations": 3, "device": "CPU", "sessions": []}
+        settings = {"seed": seed, "robot_sha256": archive.robot_sha256}
+        own = {"settings": settings, "iterations": 3, "device": "CPU", "sessions": []}
         (folder / "config.json").write_text(json.dumps(own))
     return folder
 
