@@ -21,9 +21,9 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "confirm": Command("qd.run.judge:Confirm", "cross the failing elites again with contact resolved"),
         "certify": Command("qd.run.judge:Certify", "which failing elites other controllers cross: faults"),
         "minimise": Command("qd.run.minimise:Minimise", "which parts of a failing terrain it takes to fail"),
-        "pack": Command("qd.evaluate.pack:MakePack", "faults of a run as a pack to test any controller on"),
-        "evaluate": Command("qd.evaluate.evaluate:Evaluate", "rates of controllers, or the paper's tables"),
-        "dose": Command("qd.evaluate.dose:MeasureDose", "which real obstacle at which size stops a controller"),
+        "pack": Command("qd.commands:MakePack", "faults of a run as a pack to test any controller on"),
+        "evaluate": Command("qd.commands:Evaluate", "rates of controllers, or the paper's tables"),
+        "dose": Command("qd.commands:Dose", "which real obstacle at which size stops a controller"),
         "cross": Command("qd.show.cross:Cross", "cross a height map of your own"),
     },
     "Look at it": {
@@ -42,10 +42,6 @@ COMMANDS: dict[str, dict[str, Command]] = {
     "Bring a robot": {
         "stand": Command("sim.commands:Stand", "look at a robot: its joints and geoms, whether it stands"),
         "calibrate": Command("qd.studies.calibrate:Calibrate", "measure the penalty scales of a robot"),
-    },
-    "Study the search": {
-        "distances": Command("qd.evaluate.distances:Distances", "how far test terrains lie from those trained on"),
-        "tables": Command("qd.evaluate.publish:Tables", "the published numbers beside the paper's"),
     },
     "Measure speed": {
         "train-speed": Command("train.ppo.speed:TrainSpeed", "environment steps a second of training"),

@@ -5,12 +5,9 @@ Modules with Warp, torch or Newton are imported inside ``execute``, so that ``--
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-from msgspec import Meta
 
 from sim.files.command import OfRobot, OnDevice, Who, command_line
-from sim.files.settings import NonNegativeInt, PositiveInt
+from sim.files.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,11 +18,11 @@ class Stand(OfRobot, OnDevice):
     constraint rows it needs when it lies on rough ground. The exit status is 1 if something must be mended.
     """
 
-    seconds: Annotated[float, Meta(gt=0, le=60)] = 3.0
+    seconds: float = setting(3.0, above=0, most=60)
     """How long it stands, and lies [s]."""
-    drops: PositiveInt = 32
+    drops: int = setting(32, least=1)
     """Robots dropped in random poses on hard-random terrain."""
-    seed: NonNegativeInt = 0
+    seed: int = setting(0, least=0)
     """Draws poses and terrains."""
 
     def execute(self) -> int:

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("kernels", "sim", "qd", "train")  # a room may import itself and the rooms before it
 QD_DOORS_FOR_TRAIN = (
-    "search", "archive", "space", "descriptors", "fitness", "fresh", "faults", "families", "pack", "run", "workers",
+    "search", "archive", "space", "descriptors", "fitness", "fresh", "faults", "families", "run", "workers",
     "evaluate",
 )  # fmt: skip
 LIBRARY_DOORS = {  # a room, or a folder of one

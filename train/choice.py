@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qd.evaluate.crossings import cross_all
+from qd.evaluate.evaluate import cross_sets
 from qd.evaluate.measures import terrain_rates
 from qd.evaluate.sets import make_sets
 from qd.run.directory import ROUNDS_FILE
@@ -75,12 +75,15 @@ def _goal_rates(job: "Hardening", tune: "Tune") -> dict[str, dict[str, float]]:
 
     The elites of all archives are one set, since a small archive has few for validation.
     """
-    sets = make_sets(FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space, part="validation")
+    sets = make_sets(FIXED_SETS, job.terrains, 0, space=job.space, part="validation")
     archives = divisible(tune.archives)
     sets |= {run.name: held_out(job, run, "validation") for run in archives}
     controllers = {"base": job.base, "before": tune.before, "after": tune.policy}
     print(f"\nOn validation terrains, before {tune.run.name} and after:", flush=True)
-    results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
+    results = cross_sets(
+        controllers, sets, robot=job.robot, compute=job.compute, episodes=job.episodes, reward=True,
+        cache=job.path / "crossings", open_evaluator=job.open_evaluator,
+    )  # fmt: skip
     found: dict[str, dict[str, float]] = {}
     for when in controllers:
         rates = {name: terrain_rates(row[when])["goal"] for name, row in results.items()}

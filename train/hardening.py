@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from qd.archive import read_archive
-from qd.evaluate.evaluate import Evaluate, evaluator_of
+from qd.evaluate.evaluate import EPISODES, sizes_for
+from qd.evaluate.sets import paper_terrains
 from qd.faults import is_judged
 from qd.fresh import Open
 from qd.run.arguments import Archive, job_of
@@ -21,7 +22,7 @@ from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, RunDirectory, claimed
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
 from qd.run.settings import SearchCfg, changed, differences, preset
 from qd.search import run_search
-from qd.workers.evaluator import EvaluatorCfg, check_policy, open_evaluator, resolve_device
+from qd.workers.evaluator import Compute, check_policy, open_evaluator, resolve_device
 from sim.files.atomic import is_leftover, read_json
 from sim.files.command import Interrupted, command_line, naming_what_is_next
 from sim.files.records import identity
@@ -34,7 +35,7 @@ from train.finetune import Finetune
 from train.harden import Harden
 from train.ppo.learner import read_start
 from train.ppo.run import CHECKPOINT, POLICY
-from train.rounds import FIXED_SETS, begin, divisible, read_rounds, record, tell
+from train.rounds import begin, divisible, read_rounds, record, tell
 from train.tuning import check_sizes, hardening_sizes
 
 BASE = "base"
@@ -103,8 +104,11 @@ class Hardening:
     path: Path
     device: str
     space: TerrainSpace
-    evaluator: EvaluatorCfg
-    """What crosses the sets of the evaluation."""
+    compute: Compute
+    terrains: int
+    """Of each set of the evaluation."""
+    episodes: int
+    """On each of them."""
     search_iterations: int
     tune_sizes: dict[str, int]
     """Of each training: robots, terrains at a time, iterations, and how often terrains are exchanged."""
@@ -238,15 +242,17 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     wanted = flags.search_episodes or (_GPU_EPISODES if on_cuda else search.iterations * an_iteration)
     tuned = {name: getattr(flags, f"tune_{name}") for name in ("iterations", "num_envs", "terrains")}
     tuning = replace(Finetune.defaults(["--robot", robot.spec]), **tuned)
-    names = ("terrains", "episodes", "device", "workers", "num_envs", "space")
-    evaluation = Evaluate(robot=robot.spec, sets=FIXED_SETS, **{name: getattr(flags, name) for name in names})
+    compute, full = Compute(device, flags.workers, flags.num_envs), (paper_terrains(robot.name), EPISODES)
+    terrains, episodes = sizes_for(compute, flags.terrains, flags.episodes, full=full, small=(24, 4))
     found = Hardening(
         flags=flags,
         robot=robot,
         path=flags.run_dir or Path("runs") / f"{robot.name}-harden-{flags.seed}",
         device=device,
         space=space,
-        evaluator=replace(evaluator_of(evaluation, robot), reward=True),
+        compute=compute,
+        terrains=terrains,
+        episodes=episodes,
         search_iterations=-(-wanted // an_iteration),
         tune_sizes=hardening_sizes(tuning, robot, device),
         settings={},
@@ -286,7 +292,7 @@ def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> di
         "search": searched,
         "tune": {**job.tune_sizes, "shares": flags.shares, "noise_of": BASE, **recipe},
         "keep": flags.keep,
-        "evaluation": {"terrains": job.evaluator.num_terrains, "episodes": job.evaluator.num_replicas},
+        "evaluation": {"terrains": job.terrains, "episodes": job.episodes},
     }
 
 

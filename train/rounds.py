@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from qd.archive import read_archive
-from qd.evaluate.crossings import cross_all
-from qd.evaluate.measures import measure
-from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, split_elites
-from qd.evaluate.tables import make_tables
+from qd.evaluate.evaluate import evaluate
+from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets
 from qd.faults import fault_numbers
 from qd.run.directory import ROUNDS_FILE, RunDirectory, read_archive_of
 from qd.workers.evaluator import origin_of
 from sim.files.atomic import has_shape, read_json, to_json, write_atomically
 from sim.files.intervals import value_words
 from sim.files.records import identity
-from sim.policy.spec import about_controllers
 from train.harden import Comparison
 
 if TYPE_CHECKING:
@@ -124,25 +121,21 @@ def _tables(job: "Hardening", known: Mapping[str, Any]) -> dict[str, Any]:
     others = [one for one, row in known.items() if row["rounds"] != job.compared.get(one)]
     there = [stage for stage in there if stage.compared not in others]
     controllers = {stage.controller: stage.policy for stage in there}
-    sets = dict(make_sets(FIXED_SETS, job.evaluator.num_terrains, 0, space=job.space))
+    sets = dict(make_sets(FIXED_SETS, job.terrains, 0, space=job.space))
     searched = [stage.search for stage in there if not stage.compared and job.is_searched(stage)]
     sets |= {run.name: held_out(job, run) for run in divisible(searched)}
-    results = cross_all(controllers, sets, job.evaluator, job.path / "crossings", open_evaluator=job.open_evaluator)
-    scales = job.robot.read_penalty_scales(None if job.flags.policy is None else str(job.flags.policy))
-    crossed = {name: {who: measure(one, scales) for who, one in row.items()} for name, row in results.items()}
-    about = about_controllers(controllers, job.robot)
     return {
-        "episodes": job.evaluator.num_replicas,
-        "controllers": about,
-        **make_tables(crossed, sets, job.robot, 0, hashes={who: one["sha256"] for who, one in about.items()}),
-    }
+        **evaluate(
+            controllers, sets, robot=job.robot, compute=job.compute, episodes=job.episodes,
+            cache=job.path / "crossings", open_evaluator=job.open_evaluator,
+        )
+    }  # fmt: skip
 
 
 def held_out(job: "Hardening", run: Path, part: Part = "test") -> TerrainSet:
     """Elites of an archive that no training draws."""
     archive = read_archive_of(job.robot, run, job.flags.space)
-    split = split_elites(archive, job.robot.name, spec=job.robot.spec, run=run)
-    return replace(generated_set(archive, split, job.evaluator.num_terrains, 0, part), name=run.name)
+    return replace(generated_set(archive, job.terrains, 0, part), name=run.name)
 
 
 def tell(content: Mapping[str, Any]) -> None:

@@ -9,16 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qd.archive import Archive
-from qd.evaluate.sets import (
-    TRAINED_ON,
-    EliteSplit,
-    elites_sha256,
-    marks_of,
-    recorded_marks,
-    space_of,
-    split_elites,
-)
-from qd.run.directory import directory_of, published_or_newest, read_archive_of
+from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
+from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, split_elites
+from qd.run.directory import directory_of, published_or_newest
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.policy.spec import SHIPPED, name_of
@@ -273,10 +266,7 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
     paths = flags.archive or (_usual_archive(flags, robot),)
     archives = [_read_archive(flags, robot, path) for path in paths]
     spaces = tuple(map(space_of, archives))
-    splits = [
-        split_elites(one, robot.name, flags.split_seed, spec=robot.spec, run=path, keep_validation=keep_validation)
-        for one, path in zip(archives, paths, strict=True)
-    ]
+    splits = list(map(split_elites, archives))
     rows = _rows_to_train_on(flags, paths, archives, splits)
     parts = [one.genes[chosen] for one, chosen in zip(archives, rows, strict=True)]
     rates = [(one.fresh or one).goal_rate[chosen] for one, chosen in zip(archives, rows, strict=True)]
@@ -335,7 +325,7 @@ def _usual_archive(flags: Finetune, robot: RobotCfg) -> Path:
 
 def _read_archive(flags: Finetune, robot: RobotCfg, path: Path) -> Archive:
     try:
-        return read_archive_of(robot, path, flags.space)
+        return read_elites(path, robot, flags.space)
     except FileNotFoundError as error:
         make = command_line("archive", robot=robot.spec, policy=None if flags.policy is None else str(flags.policy))
         raise ValueError(f"{error}; make one with `{make}` and name it with --archive") from error

@@ -8,18 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.evaluate.sets import plain_set
-from qd.run.progress import share_bar
-from qd.workers.evaluator import Evaluate
-from qd.workers.invalid import tell_invalid
 from sim.files.intervals import bootstrap_interval
 from sim.rates import counted_episodes, terrain_means
 from sim.rollout import RolloutResult
-from sim.space import SUPER_GAUSSIAN, TerrainSpace
 from sim.terrain import CROSSING_TYPES
 
-MEASURES = ("success", "goal", "fallen", "reward")
-"""Names of the measures beside the penalties: three rates as fractions, and the reward in 20 s."""
 VELOCITY_FROM_S = 2.0
 """The velocity error counts from this time of an episode on [s]: before it the robot gets going."""
 
@@ -32,7 +25,7 @@ class Measured:
     """
 
     values: dict[str, NDArray[np.float64]]
-    """Mean of each of :data:`MEASURES` on each terrain, shape (T,)."""
+    """Mean of each of :data:`qd.evaluate.labels.MEASURES` on each terrain, shape (T,)."""
     penalties: dict[str, NDArray[np.float64]]
     """Mean of each scaled penalty on each terrain, shape (T,)."""
     goals: NDArray[np.int64]
@@ -69,25 +62,22 @@ def of_terrains(families: Families, chosen: NDArray[np.bool_]) -> Families:
     return None if families is None else families[chosen]
 
 
-def invalid_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """What to say of invalid episodes, one line for each crossing of a set that has some.
+def invalid_line(outcomes: Mapping[str, int]) -> str:
+    """What to say of the invalid episodes of a set; empty where it has none.
 
     A falling robot may leave the valid states before it touches the ground: what is left out may be failures.
 
     Args:
-        outcomes: Episodes by how they ended (:class:`kernels.episode.Outcome`, lower case), by what crossed.
+        outcomes: Episodes by how they ended (:class:`kernels.episode.Outcome`, lower case).
     """
-    lines = []
-    for what, counts in outcomes.items():
-        count, total = counts["invalid"], sum(counts.values())
-        if count:
-            goal = counts["goal"] / total
-            success = 1.0 - (counts["base_collision"] + count) / total
-            lines.append(
-                f"{what}: {count} of {total} episodes are invalid ({count / total:.1%}) and left out; counted as "
-                f"failures, goal would be {goal:.3f}, no base collision {success:.3f}"
-            )
-    return lines
+    count, total = outcomes["invalid"], sum(outcomes.values())
+    if not count:
+        return ""
+    goal, success = outcomes["goal"] / total, 1.0 - (outcomes["base_collision"] + count) / total
+    return (
+        f"{count} of {total} episodes are invalid ({count / total:.1%}) and left out; counted as failures, goal would "
+        f"be {goal:.3f}, no base collision {success:.3f}"
+    )
 
 
 def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
@@ -183,27 +173,4 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
         "vx_error_interval": bootstrap_interval(per_terrain, seed),
         "episodes": int(usable.sum()),
         "goal_rate": float(result.reached_goal.mean()),
-    }
-
-
-def base_rates(evaluate: Evaluate, count: int, seed: int, space: TerrainSpace = SUPER_GAUSSIAN) -> dict[str, Any]:
-    """What ``base.json`` says of one controller on ``count`` terrains each, hand-crafted, hard-random and flat.
-
-    Penalties of ``evaluate`` must count from :data:`VELOCITY_FROM_S` on; the seed draws the test sets, the hard-random
-    terrains from a space, the one of ``evaluate``.
-
-    Raises:
-        AllInvalidError: If no episode of a set is valid.
-    """
-    sets = {name: plain_set(name, count, seed, space) for name in ("hand_crafted", "hard_random", "flat")}
-    results = {}
-    for name, chosen in sets.items():
-        with share_bar(name) as show:
-            results[name] = evaluate(chosen.terrains, chosen.seeds, show)
-        tell_invalid(results[name], name)
-    hand_crafted = sets["hand_crafted"]
-    return {
-        "hand_crafted": summarise(results["hand_crafted"], seed, types=hand_crafted.types, levels=hand_crafted.levels),
-        "hard_random": summarise(results["hard_random"], seed),
-        "flat": velocity_error(results["flat"], seed),
     }

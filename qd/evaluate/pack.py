@@ -1,278 +1,543 @@
-"""A pack of terrains: the command that makes one, and any controller tested on it."""
+"""Packs: terrains on which any controller can be tested, spread over the ways in which a searched one fails.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+Every terrain is a fault or a *near-fault*: under :data:`NEAR_GOAL_RATE` of the robots reach the goal in 40 fresh
+episodes, and it is known to be passable, since another controller is certified on it or the searched one crosses it in
+at least half of its episodes. What nobody is known to cross is in no pack.
+"""
+
+import hashlib
+import zipfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults import EPISODES
-from qd.fresh import Open
-from qd.pack import (
-    PACK_FILE,
-    TERRAINS_FILE,
-    Candidates,
-    Pack,
-    candidates_of,
-    check_judged,
-    choose,
-    pack_folder,
-    read_pack,
-    rounded,
-    write_terrains,
-)
-from qd.run.arguments import evaluator_of as evaluator_of_run
-from qd.run.directory import RESULTS, RUNS
-from qd.run.judge import PANEL_FOLDER, config_of, judged_run, searched_policy
-from qd.workers.evaluator import check_policy, open_evaluator, origin_of, resolve_device
-from sim.files.atomic import prepare_output
-from sim.files.command import InSpace, Where, Who, naming_what_is_next, publish
+from qd.archive import Archive, FaultCounts, read_archive
+from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
+from qd.evaluate.figures import draw_gallery
+from qd.evaluate.measures import terrain_rates
+from qd.evaluate.sets import TerrainSet, set_rng
+from qd.evaluate.show import show_pack, show_pack_test
+from qd.faults import EPISODES, judgement, rate_of
+from qd.fitness import FAILING_GOAL_RATE
+from qd.groups import Modes, elites_of, families_of, find_modes, verdict_of
+from qd.minimal import fresh_counts
+from qd.run.directory import RESULTS, RUNS, RunDirectory
+from qd.run.minimise import minimal_of_run
+from qd.run.settings import as_settings, own_policy
+from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from sim.bank import heights_of
+from sim.files.atomic import prepare_output, read_json, write_atomically
+from sim.files.command import publish
+from sim.files.figures import as_png
+from sim.files.intervals import bootstrap_interval, wilson_interval
+from sim.files.npz import npz_bytes, read_arrays
 from sim.files.records import identity
-from sim.files.settings import setting
-from sim.policy.spec import controller_hash, controllers_of, is_same, who_crossed
+from sim.policy.spec import about_controllers, is_same, who_crossed
+from sim.rates import counted_episodes
+from sim.robots.robot import RobotCfg, robot_of
+from sim.rollout import RolloutResult
+from sim.space import get_space, recorded_space
+from sim.terrain import NUM_COLS, NUM_ROWS
 
-if TYPE_CHECKING:
-    from qd.evaluate.evaluate import Evaluate
-    from qd.evaluate.sets import TerrainSet
-    from sim.robots.robot import RobotCfg
+PACK_FILE, TERRAINS_FILE = "pack.json", "pack.npz"
+PACK_FOLDER = "pack"
+"""Of a robot's published results."""
+NEAR_GOAL_RATE = 0.75
+"""Goal rate of the searched controller from which on a terrain is no near-fault."""
+HEIGHT_UNIT_M = 1e-3
+"""Heights of a pack are whole numbers of it, in its file and where they are crossed [m]."""
+GROUPS = ("verdict", "mode", "cause", "kind", "family")
+"""What terrains are grouped by."""
+
+_MAX_BYTES = 1e9  # of an array that is read
+_OF_A_TERRAIN = ("name", "kind", "elite", "verdict", "mode", "family", "cause")  # also in the npz
+_KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
+_TESTED = "this"  # the controller that is tested, beside the pack's
+_DRAWN = 12  # terrains of a pack in its figure
+
+Row = dict[str, Any]
+"""What a controller made of one terrain, as JSON values; rates are None on an invalid one."""
+
+
+class Candidate(NamedTuple):
+    """A terrain that may be taken."""
+
+    genes: NDArray[np.float32]
+    """Shape (num_genes,)."""
+    about: dict[str, Any]
+    """What is known of it, as JSON values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MakePack(Who, InSpace, Where):
-    """Make a pack of terrains from a run: faults and near-faults, to test any controller on.
+class Pack:
+    """A pack as its files have it."""
 
-    The terrains are spread over the ways in which the searched controller fails and over families of kin. Faults come
-    first, and minimal terrains of the run are among them. Every controller crosses each terrain. pack.npz has the
-    terrains. pack.json has the rates and what is known of each terrain. pack.png shows some of them. The run needs
-    fresh episodes, confirmations and certificates. Crossings are kept, so the same command goes on after Ctrl-C.
-    """
+    folder: Path
+    heights: NDArray[np.float32]
+    """[m], shape (N, nrow, ncol)."""
+    genes: NDArray[np.float32]
+    """Shape (N, num_genes)."""
+    content: dict[str, Any]
+    """Of ``pack.json``."""
 
-    run: Path | None = None
-    """Run directory; the newest of the robot under runs/."""
-    size: int = setting(100, least=1)
-    """How many terrains. There are fewer if the run has fewer faults and near-faults."""
-    controllers: tuple[str, ...] = ()
-    """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base, all of
-    results/<robot>/*.pt, and the robot's panel. The searched controller is always among them."""
-    episodes: int = setting(EPISODES, least=1)
-    """Episodes on each terrain."""
-    seed: int = setting(0, least=0)
-    """Draws other episodes."""
-    out: Path | None = None
-    """Folder to write to; runs/<robot>-pack."""
+    @property
+    def terrains(self) -> list[dict[str, Any]]:
+        """What is known of each."""
+        return self.content["terrains"]
 
-    def execute(self) -> None:
-        """Runs the command."""
-        make_pack(self)
+    def __len__(self) -> int:
+        """N."""
+        return len(self.heights)
 
 
-def make_pack(args: MakePack, *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
-    """Chooses terrains of a run, lets all controllers cross them, and writes the pack.
+def make_pack(
+    run: Path,
+    controllers: Mapping[str, str],
+    *,
+    compute: Compute,
+    robot: str | None = None,
+    policy: str | None = None,
+    space: str | None = None,
+    size: int = 100,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    out: Path | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> dict[str, Any]:
+    """Chooses terrains of a judged run, lets controllers cross them, and writes the pack.
 
     Args:
-        args: Which run and controllers, and where to work.
-        open_evaluator: Opens what crosses terrains.
+        run: Run directory.
+        controllers: Policy of each by its name; if empty, the files of the robot's results and its panel. The searched
+            one is always among them.
+        compute: Where terrains are crossed.
+        robot: Robot that the command line names.
+        policy: The searched controller, where it is code or its file has moved.
+        space: Terrain space that the command line names.
+        size: How many terrains; fewer if the run has fewer.
+        episodes: On each terrain.
+        seed: Draws the episodes.
+        out: Folder to write to; under runs/ if None.
+        open_evaluator: Opens simulations.
 
     Returns:
         The content of ``pack.json``.
-
-    Raises:
-        FileNotFoundError: If there is no run.
-        ValueError: If the run is damaged, or was not reevaluated, confirmed and certified, has nothing to take, its
-            robot or controller is another now, or a controller does not fit.
-        Interrupted: On Ctrl-C; what was crossed is kept.
-        EvaluatorError: If a worker is lost; likewise.
     """
-    from qd.evaluate.crossings import cross_all
-    from qd.evaluate.pack_rates import grouped, over_all, rows_of
-    from qd.evaluate.show import picture_of_pack, print_pack
-    from sim.bank import heights_of
-    from sim.space import get_space
-
-    path, cfg, robot = config_of(args, args.run, args.space)
-    policy = searched_policy(path, cfg, robot, args.policy, "packed")
-    device = resolve_device(args.device, args.workers)
-    controllers = _controllers(args.controllers, policy, robot)
-    for name, one in controllers.items():
-        _check_fits(name, one, robot, device)
-    with judged_run(path, cfg, robot, "all") as judged:
-        check_judged(judged.archive, path, robot)
-        candidates = candidates_of(judged.archive, path, robot)
-    chosen = choose(candidates.terrains, args.size)
-    _tell_choice(candidates, len(chosen), args.size, path)
-    space = get_space(cfg.space, cfg.space_sha256)
-    if space.ground:
-        raise ValueError(
-            f"a pack holds heights alone, got terrains of {space.name} with {' and '.join(space.ground)} of their own: "
-            "give a run without --ground"
-        )
-    heights = rounded(heights_of(np.array([one.genes for one in chosen]), space))
-    own = evaluator_of_run(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
-    evaluator = replace(own, num_replicas=args.episodes, num_terrains=len(chosen), lots=1)
-    out = args.out or RUNS / f"{robot.name}-pack"
+    cfg = RunDirectory(run).read_cfg()
+    recorded_space(cfg.space, cfg.space_sha256, named=space, file=run)
+    body = robot_of(as_settings(cfg), robot, run)
+    searched = policy or own_policy(run, cfg, body)
+    controllers = {**(controllers or _published_controllers(body))}
+    if not any(is_same(searched, crosser) for crosser in controllers.values()):
+        controllers = {"searched": searched, **controllers}
+    for crosser in controllers.values():
+        check_policy(crosser, body, compute.device)
+    archive = read_archive(run)
+    _check_judged(archive, run)
+    candidates, modes, not_passable = candidates_of(archive, run, body)
+    chosen = choose(candidates, size)
+    if not chosen:
+        raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
+    print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
+    drawn_in = get_space(cfg.space, cfg.space_sha256)
+    if drawn_in.ground:
+        raise ValueError(f"a pack holds heights alone, got terrains of {drawn_in.name}, which have ground of their own")
+    heights = rounded(heights_of(np.array([candidate.genes for candidate in chosen]), drawn_in))
+    out = out or RUNS / f"{body.name}-pack"
     prepare_output(out / TERRAINS_FILE)
 
     def measure() -> dict[str, Any]:
-        terrains = _set_of(heights, len(heights), args.seed)
-        crossed = cross_all(
-            controllers, {"pack": terrains}, evaluator, _kept(robot), open_evaluator=open_evaluator
+        terrains = pack_set(heights, len(heights), seed)
+        crossed = cross_sets(
+            controllers, {"pack": terrains}, robot=body, compute=compute, episodes=episodes,
+            cache=crossings_folder(body), open_evaluator=open_evaluator,
         )["pack"]  # fmt: skip
         rows = {who: rows_of(result) for who, result in crossed.items()}
-        rates = [[np.nan if row["goal_rate"] is None else row["goal_rate"] for row in own] for own in rows.values()]
-        more = {"controllers": np.array([*rows]), "goal_rates": np.array(rates).T, "robot": np.array(robot.name)}
-        abouts = [one.about for one in chosen]
+        rates = np.array([[row["goal_rate"] for row in of_crosser] for of_crosser in rows.values()], np.float64).T
+        abouts = [candidate.about for candidate in chosen]
+        more = {"controllers": np.array([*rows]), "goal_rates": rates, "robot": np.array(body.name)}
         return {
-            **origin_of(device, args.seed, args.workers),
-            **identity(robot, policy),
+            **origin_of(compute.device, seed, compute.workers),
+            **identity(body, searched),
             "space": cfg.space,
             "space_sha256": cfg.space_sha256,
-            "episodes": args.episodes,
-            "searched": next(who for who, one in controllers.items() if is_same(one, policy)),
-            "iterations": judged.archive.iterations,
-            "panel": list(judged.archive.faults.certifiers) if judged.archive.faults else [],
-            "candidates": len(candidates.terrains),
-            "not_known_to_be_passable": candidates.not_passable,
-            "controllers": {
-                who: {"policy": Path(one).name, "sha256": controller_hash(one)} for who, one in controllers.items()
-            },
-            "rates": {who: over_all(own, abouts, args.seed) for who, own in rows.items()},
+            "episodes": episodes,
+            "searched": next(who for who, crosser in controllers.items() if is_same(crosser, searched)),
+            "iterations": archive.iterations,
+            "panel": list(archive.faults.certifiers) if archive.faults else [],
+            "candidates": len(candidates),
+            "not_known_to_be_passable": not_passable,
+            "controllers": about_controllers(controllers, body),
+            "rates": {who: over_all(of_crosser, abouts, seed) for who, of_crosser in rows.items()},
             "by": grouped(abouts, rows),
             "modes": [
-                {"mode": mode.number, "ending": mode.ending, "marked_by": mode.marked_by}
-                for mode in candidates.modes.modes
+                {"mode": mode.number, "ending": mode.ending, "marked_by": mode.marked_by} for mode in modes.modes
             ],
             "terrains_sha256": write_terrains(out, heights, chosen, more),
             "terrains": [
-                about | {"rates": {who: own[place] for who, own in rows.items()}} for place, about in enumerate(abouts)
+                about | {"rates": {who: of_crosser[place] for who, of_crosser in rows.items()}}
+                for place, about in enumerate(abouts)
             ],
         }
 
-    with naming_what_is_next("what is crossed is kept", lambda: "The same command goes on."):
-        return publish(
-            out / PACK_FILE, measure, print_pack,
-            draw=lambda report: picture_of_pack(report["terrains"], heights, report["searched"], robot.name),
-        )  # fmt: skip
+    def draw(report: dict[str, Any]) -> bytes:
+        return _draw_worst(report["terrains"], heights, report["searched"], body.name)
+
+    return publish(out / PACK_FILE, measure, show_pack, draw=draw)
 
 
-def evaluate_pack(flags: "Evaluate", *, open_evaluator: Open = open_evaluator) -> dict[str, Any]:
-    """Tests one controller on a pack: prints what fails beside the rates of the pack's controllers, writes it.
+def evaluate_pack(
+    pack: Pack,
+    robot: RobotCfg,
+    policy: str,
+    *,
+    compute: Compute,
+    terrains: int | None = None,
+    episodes: int | None = None,
+    seed: int = 0,
+    out: Path | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> dict[str, Any]:
+    """Tests one controller on a pack: prints what fails beside the rates of the pack's controllers, and writes it.
 
     Args:
-        flags: Which pack and controller, and where to work.
-        open_evaluator: Opens what crosses terrains.
-
-    Returns:
-        The content of the result file.
-
-    Raises:
-        FileNotFoundError: If there is no pack.
-        ValueError: If it is damaged or of another robot, the controller does not fit, or a flag does not go with it.
-        Interrupted: On Ctrl-C.
-        EvaluatorError: If a worker is lost.
+        pack: The pack.
+        robot: Its robot.
+        policy: The controller.
+        compute: Where terrains are crossed.
+        terrains: The first of the pack; all on a GPU.
+        episodes: On each terrain; by default as many as suit the device.
+        seed: Draws the episodes.
+        out: File for the numbers; under runs/ if None. The figure is written beside it.
+        open_evaluator: Opens simulations.
     """
-    from qd.evaluate.crossings import cross_all
-    from qd.evaluate.evaluate import evaluator_of
-    from qd.evaluate.pack_rates import grouped, over_all, rows_of
-    from qd.evaluate.show import picture_of_pack, print_pack_test
-    from sim.robots.robot import robot_of
-
-    assert flags.pack is not None
-    of_terrains = (flags.space, flags.ground, flags.run_dir, flags.split_seed or None)
-    if flags.makes_tables or any(one is not None for one in of_terrains):
-        raise ValueError(
-            "a pack is crossed by one controller and has its own terrains, got another flag of tables or terrains "
-            "beside --pack: leave out --policies, --archive, --sets, --split-seed, --run-dir, --space and --ground, "
-            "and give --policy"
-        )
-    folder = pack_folder(flags.pack)
-    pack = read_pack(folder)
-    robot = robot_of(pack.content, flags.robot, folder / PACK_FILE, flag="pack")
-    policy = str(flags.policy or robot.policy_file)
-    evaluator = replace(evaluator_of(flags, robot, (len(pack), EPISODES)), policy=policy)
-    check_policy(policy, robot, evaluator.device)
-    terrains = _set_of(pack.heights, min(evaluator.num_terrains, len(pack)), flags.seed)
+    full = (len(pack), EPISODES)
+    count, episodes = sizes_for(compute, terrains, episodes, full=full, small=(min(24, len(pack)), 4))
+    check_policy(policy, robot, compute.device)
+    chosen = pack_set(pack.heights, min(count, len(pack)), seed)
+    abouts = pack.terrains[: len(chosen)]
     who = who_crossed(robot, policy)
-    out = flags.out or RUNS / f"{who}-pack.json"
-    abouts = pack.terrains[: len(terrains)]
 
     def measure() -> dict[str, Any]:
-        result = cross_all(
-            {who: policy}, {"pack": terrains}, evaluator, _kept(robot), open_evaluator=open_evaluator
+        result = cross_sets(
+            {who: policy}, {"pack": chosen}, robot=robot, compute=compute, episodes=episodes,
+            cache=crossings_folder(robot), open_evaluator=open_evaluator,
         )["pack"][who]  # fmt: skip
-        own = rows_of(result)
+        rows = rows_of(result)
         beside = {name: [about["rates"][name] for about in abouts] for name in pack.content["rates"]}
+        about_pack = {name: pack.content[name] for name in ("robot", "robot_sha256", "terrains_sha256", "episodes")}
+        about_pack |= {name: pack.content[name] for name in ("seed", "searched", "modes")}
         return {
-            **origin_of(evaluator.device, flags.seed, flags.workers),
+            **origin_of(compute.device, seed, compute.workers),
             **identity(robot, policy),
-            "episodes": evaluator.num_replicas,
-            "pack": _about_pack(pack),
-            "rates": over_all(own, abouts, flags.seed),
-            "beside": {name: over_all(rows, abouts, flags.seed) for name, rows in beside.items()},
-            "by": grouped(abouts, {_OWN: own, **beside}),
-            "terrains": [about | {"rates": {_OWN: row}} for about, row in zip(abouts, own, strict=True)],
+            "episodes": episodes,
+            "pack": {**about_pack, "folder": pack.folder.name, "terrains": len(pack)},
+            "rates": over_all(rows, abouts, seed),
+            "beside": {name: over_all(of_crosser, abouts, seed) for name, of_crosser in beside.items()},
+            "by": grouped(abouts, {_TESTED: rows, **beside}),
+            "terrains": [about | {"rates": {_TESTED: row}} for about, row in zip(abouts, rows, strict=True)],
         }
 
-    with naming_what_is_next("what is crossed is kept", lambda: "The same command goes on."):
-        return publish(
-            out, measure, lambda report: print_pack_test(report, folder),
-            draw=lambda report: picture_of_pack(report["terrains"], pack.heights, _OWN, who),
-        )  # fmt: skip
+    def draw(report: dict[str, Any]) -> bytes:
+        return _draw_worst(report["terrains"], pack.heights, _TESTED, who)
+
+    return publish(out or RUNS / f"{who}-pack.json", measure, show_pack_test, draw=draw)
 
 
-_OWN = "this"  # the controller that is tested, beside those of the pack
-
-
-def _about_pack(pack: Pack) -> dict[str, Any]:
-    names = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched", "modes")
-    return {**{name: pack.content[name] for name in names}, "folder": pack.folder.name, "terrains": len(pack)}
-
-
-def _controllers(named: Sequence[str], searched: str, robot: "RobotCfg") -> dict[str, str]:
-    """Who crosses a pack, by name; the searched controller first where nobody names it."""
-    found = controllers_of(named, robot)
-    if not named:
-        folder = RESULTS / robot.name
-        for file in (*sorted(folder.glob("*.pt")), *sorted((folder / PANEL_FOLDER).glob("*.pt"))):
-            if not any(is_same(str(file), one) for one in found.values()):
-                name = file.stem if file.stem not in found else f"{file.parent.name}-{file.stem}"
-                found[name] = str(file)
-    return found if any(is_same(searched, one) for one in found.values()) else {"searched": searched, **found}
-
-
-def _check_fits(name: str, policy: str, robot: "RobotCfg", device: str) -> None:
-    try:
-        check_policy(policy, robot, device)
-    except ValueError as error:
-        raise ValueError(f"controller {name} does not fit {robot.name}: {error}") from error
-
-
-def _tell_choice(candidates: Candidates, count: int, size: int, path: Path) -> None:
-    """Says how many terrains there are, and what was left out.
-
-    Raises:
-        ValueError: If there is none.
-    """
-    rest = f"failing terrains that nobody is known to cross: {candidates.not_passable:,}"
-    if not count:
-        raise ValueError(
-            f"{path} must have faults or near-faults to make a pack of, got none, and {rest}: let its search go on, or "
-            "certify with more controllers (`faultline certify --by NAME=FILE`)"
-        )
-    told = f"Faults and near-faults in {path}: {len(candidates.terrains):,}, of which the pack has {count:,}"
-    print(f"{told}, {size:,} were asked for." if count < size else f"{told}.")
-    print(f"Left out, {rest}.", flush=True)
-
-
-def _kept(robot: "RobotCfg") -> Path:
-    """Where crossings of packs are kept until they are reported."""
-    return RUNS / f"{robot.name}-packs" / "crossings"
-
-
-def _set_of(heights: NDArray[np.float32], count: int, seed: int) -> "TerrainSet":
+def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
     """The first terrains of a pack, with episodes that nothing else has."""
-    from qd.evaluate.sets import TerrainSet, set_rng
-
     seeds = set_rng("pack", seed).integers(2**32, size=len(heights), dtype=np.uint32)
     return TerrainSet(name="pack", terrains=heights[:count], seeds=seeds[:count], numbers=np.arange(count))
+
+
+def _published_controllers(robot: RobotCfg) -> dict[str, str]:
+    """The shipped controller as ``base``, and the files of the robot's results and its panel by their names."""
+    controllers = {"base": str(robot.policy_file)}
+    folder = RESULTS / robot.name
+    for file in (*sorted(folder.glob("*.pt")), *sorted((folder / "panel").glob("*.pt"))):
+        if not any(is_same(str(file), policy) for policy in controllers.values()):
+            name = file.stem if file.stem not in controllers else f"{file.parent.name}-{file.stem}"
+            controllers[name] = str(file)
+    return controllers
+
+
+def _check_judged(archive: Archive, run: Path) -> None:
+    if archive.fresh is None:
+        raise ValueError(f"{run} must be judged, got no fresh episodes: run `faultline judge` on it first")
+    faults, failing = archive.faults or FaultCounts.none_of(len(archive)), archive.failing
+    crossed = faults.resolved_outcomes.any(axis=1) & faults.certifier_outcomes.any(axis=(1, 2))
+    if (failing & ~crossed).any():
+        raise ValueError(
+            f"{run} must have its {failing.sum()} failing elites crossed with contact resolved and by other "
+            f"controllers, got {(failing & crossed).sum()}: run `faultline judge` on it first"
+        )
+
+
+def candidates_of(archive: Archive, run: Path, robot: RobotCfg) -> tuple[list[Candidate], Modes, int]:
+    """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
+
+    Args:
+        archive: With fresh values and fault counts.
+        run: Its directory, where minimal terrains are read.
+        robot: Its robot.
+
+    Returns:
+        The terrains, the failure modes of the elites among them, and how many failing elites and minimal terrains are
+        left out, since nobody is known to cross them.
+    """
+    assert archive.fresh is not None
+    rate = archive.fresh.goal_rate
+    near = np.flatnonzero(archive.fresh.valid & (rate < NEAR_GOAL_RATE))
+    passable = archive.certified | (rate >= FAILING_GOAL_RATE)
+    families = families_of(archive.genes[near], get_space(archive.space, archive.space_sha256))
+    modes = find_modes(elites_of(archive.rows(near))) if len(near) else Modes(modes=[], labels=near, silhouettes={})
+    kin = {
+        number: {"mode": mode, "family": family}
+        for number, mode, family in zip(near.tolist(), modes.labels.tolist(), families.tolist(), strict=True)
+    }
+    numbers, judged = minimal_of_run(run, archive, robot)
+    entries = {entry["elite"]: entry for entry in numbers["elites"]}
+    candidates, not_passable = [], 0
+    for number in near.tolist():
+        if passable[number]:
+            about = _about_elite(archive, number, entries.get(number))
+            candidates.append(Candidate(archive.genes[number], about | kin[number]))
+        not_passable += not passable[number]
+    for place, entry in enumerate(numbers["elites"]):
+        if len(entry["bumps"]) == entry["of"]:
+            continue  # the elite itself
+        if judged.certified[place]:
+            candidates.append(Candidate(judged.genes[place], _about_minimal(entry) | kin[entry["elite"]]))
+        not_passable += not judged.certified[place]
+    return candidates, modes, int(not_passable)
+
+
+def _about_elite(archive: Archive, number: int, minimal: dict[str, Any] | None) -> dict[str, Any]:
+    return {
+        "name": f"elite-{number}",
+        "kind": "elite",
+        "elite": number,
+        "cell": int(archive.cell[number]),
+        "iteration": int(archive.iteration[number]),
+        "parts": None,
+        "verdict": _verdict(verdict_of(archive, number)),
+        "cause": None if minimal is None or minimal["cause"] is None else minimal["cause"]["kind"],
+        "searched": rate_of(fresh_counts(archive, number)),
+        **judgement(archive, number),
+    }
+
+
+def _about_minimal(entry: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "name": f"elite-{entry['elite']}-minimal",
+        "kind": "minimal",
+        "elite": entry["elite"],
+        "cell": entry["cell"],
+        "iteration": entry["iteration"],
+        "parts": entry["bumps"],
+        "verdict": _verdict(entry["verdict"]),
+        "cause": None if entry["cause"] is None else entry["cause"]["kind"],
+        "searched": {name: entry[name] for name in ("goal_rate", "goal_interval", "valid_episodes")},
+        "resolved": entry["resolved"],
+        "certificates": entry["certificates"],
+    }
+
+
+def _verdict(verdict: str) -> str:
+    return "fault" if verdict == "fault" else "near-fault"
+
+
+def choose(candidates: Sequence[Candidate], size: int) -> list[Candidate]:
+    """Some of the candidates, so that each beginning of the list is spread as well as can be.
+
+    Next comes a fault before a near-fault, then one of the family that was taken least often, of the failure mode that
+    was, of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
+
+    Args:
+        candidates: To choose from.
+        size: How many; fewer where there are fewer.
+    """
+    left, taken = list(candidates), list[Candidate]()
+    counts = {name: Counter[Any]() for name in ("family", "mode", "kind")}
+
+    def turn(candidate: Candidate) -> tuple[Any, ...]:
+        about = candidate.about
+        often = (count[about[name]] for name, count in counts.items())
+        return about["verdict"] != "fault", *often, about["searched"]["goal_rate"], about["elite"], about["kind"]
+
+    while left and len(taken) < size:
+        taken.append(left.pop(min(range(len(left)), key=lambda place: turn(left[place]))))
+        for name, count in counts.items():
+            count[taken[-1].about[name]] += 1
+    return taken
+
+
+def rows_of(result: RolloutResult) -> list[Row]:
+    """What crossings say of each terrain: rates, the goal rate with its interval (Wilson), and valid episodes."""
+    counted, rates = counted_episodes(result.invalid), terrain_rates(result)
+    hits, valid = (result.reached_goal & counted).sum(axis=1).tolist(), counted.sum(axis=1).tolist()
+    return [
+        {f"{name}_rate": None if np.isnan(values[place]) else float(values[place]) for name, values in rates.items()}
+        | {"goal_interval": list(wilson_interval(hits[place], valid[place])), "valid_episodes": valid[place]}
+        for place in range(len(valid))
+    ]
+
+
+def fails(row: Row) -> bool:
+    """Whether a controller fails a terrain: under half of its valid episodes reach the goal."""
+    return row["goal_rate"] is not None and row["goal_rate"] < FAILING_GOAL_RATE
+
+
+def over_all(rows: Sequence[Row], abouts: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
+    """Means over terrains with 95 % intervals, bootstrap over families, as JSON values.
+
+    Args:
+        rows: What a controller made of each terrain.
+        abouts: What is known of each.
+        seed: Of the bootstrap.
+
+    Returns:
+        ``goal_rate``, ``success_rate`` and ``fallen_rate`` with ``goal_interval`` and so on; of the valid ``terrains``
+        how many are ``failing``, and of their ``families`` in how many one is (``failing_families``).
+    """
+    valid = [place for place, row in enumerate(rows) if row["goal_rate"] is not None]
+    families = np.array([abouts[place]["family"] for place in valid], np.int64)
+    means: dict[str, Any] = {}
+    for name in ("goal", "success", "fallen"):
+        values = np.array([rows[place][f"{name}_rate"] for place in valid], np.float64)
+        means[f"{name}_rate"] = float(values.mean()) if valid else None
+        means[f"{name}_interval"] = bootstrap_interval(values, seed, families=families)
+    failing = np.array([fails(rows[place]) for place in valid], bool)
+    return means | {
+        "failing": int(failing.sum()),
+        "terrains": len(valid),
+        "failing_families": len(np.unique(families[failing])),
+        "families": len(np.unique(families)),
+    }
+
+
+def grouped(abouts: Sequence[dict[str, Any]], rows: Mapping[str, Sequence[Row]]) -> dict[str, list[dict[str, Any]]]:
+    """How controllers fare by :data:`GROUPS`: mean goal rates and how many terrains fail.
+
+    Args:
+        abouts: What is known of each terrain.
+        rows: Controller -> what it made of each.
+
+    Returns:
+        Group -> its values, the most frequent first, each with ``terrains`` and, by controller, ``goal_rate`` (None
+        without a valid terrain) and ``failing``.
+    """
+    return {group: _by(group, abouts, rows) for group in GROUPS}
+
+
+def _by(group: str, abouts: Sequence[dict[str, Any]], rows: Mapping[str, Sequence[Row]]) -> list[dict[str, Any]]:
+    members: dict[Any, list[int]] = {}
+    for place, about in enumerate(abouts):
+        members.setdefault(about[group], []).append(place)
+    lines = []
+    for value, places in sorted(members.items(), key=lambda pair: (-len(pair[1]), str(pair[0]))):
+        some = {who: [of_crosser[place] for place in places] for who, of_crosser in rows.items()}
+        rates = {
+            who: [row["goal_rate"] for row in chosen if row["goal_rate"] is not None] for who, chosen in some.items()
+        }
+        lines.append(
+            {
+                group: value,
+                "terrains": len(places),
+                "goal_rate": {who: float(np.mean(known)) if known else None for who, known in rates.items()},
+                "failing": {who: sum(map(fails, chosen)) for who, chosen in some.items()},
+            }
+        )
+    return lines
+
+
+def _draw_worst(terrains: Sequence[dict[str, Any]], heights: NDArray[np.float32], who: str, title: str) -> bytes:
+    """The terrains with the lowest goal rates of a controller."""
+    rates = {place: about["rates"][who]["goal_rate"] for place, about in enumerate(terrains)}
+    places = sorted((place for place, rate in rates.items() if rate is not None), key=rates.__getitem__)[:_DRAWN]
+    captions = []
+    for place in places:
+        about = terrains[place]
+        words = filter(None, [about["verdict"], about["cause"], f"{rates[place]:.0%} arrive"])
+        captions.append(f"{place}: {about['name']}: {', '.join(words)}")
+    failing = sum(fails(about["rates"][who]) for about in terrains)
+    return as_png(draw_gallery(heights[places], captions, f"{title}: fails {failing} of {len(terrains)} terrains"))
+
+
+def rounded(heights: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Heights [m] as a pack has them, in whole numbers of :data:`HEIGHT_UNIT_M`."""
+    return (np.rint(np.asarray(heights, np.float64) / HEIGHT_UNIT_M) * HEIGHT_UNIT_M).astype(np.float32)
+
+
+def write_terrains(
+    folder: Path, heights: NDArray[np.float32], chosen: Sequence[Candidate], more: dict[str, Any]
+) -> str:
+    """Writes ``pack.npz``, atomically; equal content gives equal bytes.
+
+    Args:
+        folder: Of the pack.
+        heights: [m], rounded, shape (N, nrow, ncol).
+        chosen: The N terrains.
+        more: Further arrays.
+
+    Returns:
+        SHA-256 of the file.
+    """
+    whole = np.rint(heights.astype(np.float64) / HEIGHT_UNIT_M).astype(np.int32)
+    abouts = [candidate.about for candidate in chosen]
+    content = {
+        # Of smooth ground the rise along x hardly changes along y, so that this packs into a third of the bytes.
+        "twists": np.diff(np.diff(whole, axis=2, prepend=np.int32(0)), axis=1, prepend=np.int32(0)),
+        "height_unit_m": np.array(HEIGHT_UNIT_M),
+        "genes": np.array([candidate.genes for candidate in chosen], np.float32),
+        **{name: np.array(["" if about[name] is None else about[name] for about in abouts]) for name in _OF_A_TERRAIN},
+        "searched_goal_rate": np.array([about["searched"]["goal_rate"] for about in abouts], np.float64),
+        **more,
+    }
+    data = npz_bytes(content, compression=zipfile.ZIP_BZIP2)
+    write_atomically(folder / TERRAINS_FILE, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def pack_folder(named: str) -> Path:
+    """The folder of a pack: the one named, or the published one of a robot that is.
+
+    Raises:
+        FileNotFoundError: If there is none.
+    """
+    published = RESULTS / named / PACK_FOLDER
+    for folder in (Path(named), published):
+        if (folder / PACK_FILE).is_file():
+            return folder
+    raise FileNotFoundError(f"no pack at {named} or {published}: `faultline export --pack` makes one")
+
+
+def read_pack(folder: Path) -> Pack:
+    """Reads a pack; data only, nothing in it can run.
+
+    Raises:
+        ValueError: If it is damaged, or its two files are not of one making.
+    """
+    file = folder / TERRAINS_FILE
+    try:
+        content = read_json(folder / PACK_FILE)
+        if missing := [name for name in _KEYS if name not in content]:
+            raise ValueError(f"{PACK_FILE} lacks {', '.join(missing)}")
+        if hashlib.sha256(file.read_bytes()).hexdigest() != content["terrains_sha256"]:
+            raise ValueError(f"{TERRAINS_FILE} is not the one that {PACK_FILE} names")
+        if not isinstance(content["rates"], dict) or not all("rates" in about for about in content["terrains"]):
+            raise ValueError(f"{PACK_FILE} must have the rates of each controller, over all terrains and on each")
+        arrays = read_arrays(file, ("twists", "height_unit_m", "genes"), max_bytes=_MAX_BYTES)
+        whole = np.cumsum(np.cumsum(arrays["twists"], axis=1), axis=2)
+        heights = (whole * float(arrays["height_unit_m"])).astype(np.float32)
+        expected = (len(content["terrains"]), NUM_ROWS, NUM_COLS)
+        if heights.shape != expected or not np.isfinite(heights).all() or not len(heights):
+            raise ValueError(f"heights must be finite, of shape {expected}, got {heights.shape}")
+    except Exception as error:  # a damaged zip archive can fail with anything
+        raise ValueError(f"{folder} must be a pack, but is damaged: {error}: put a copy of it back") from None
+    return Pack(folder=folder, heights=heights, genes=arrays["genes"], content=content)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.archive import Archive
-from qd.pack import PACK_FILE, pack_folder, read_pack
+from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
 from qd.run.directory import RUNS, folder_for
 from qd.show.elites import find_archive
 from sim.files.atomic import prepare_output, to_json, write_atomically

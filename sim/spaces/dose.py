@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kernels import course
 from kernels.course import SPACING, Element, Kind
 from kernels.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S
+from sim.bank import host_device
 from sim.ground import GROUND_KINDS, joined_name
 from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.ground import gene_of
@@ -121,27 +122,19 @@ class Dose:
         )
 
     def changed(self, values: Iterable[float] | None, others: Mapping[str, float]) -> "Dose":
-        """The same with other values, the easiest first, and other parameters where it has them.
-
-        Raises:
-            ValueError: If a value is out of range or comes twice, or there is none.
-        """
-        own = {name: value for name, value in others.items() if name in self.others}
-        found = replace(self, others={**self.others, **own})
-        if values is not None:
-            found = replace(found, values=tuple(sorted(values, reverse=not self.harder_up)))
-        if not found.values or len(set(found.values)) < len(found.values):
-            raise ValueError(f"{self.title}: values of {self.parameter} must be some, each once, got {found.values}")
-        for name, value in [*((self.parameter, value) for value in found.values), *own.items()]:
-            own_range = self.quantities[name]
-            off = own_range.step and abs(value / own_range.step - round(value / own_range.step)) > 1e-6
-            if not own_range.low <= value <= own_range.high or off:
-                steps = f" in steps of {own_range.step:g}" if own_range.step else ""
-                raise ValueError(
-                    f"{self.title}: {name} must be {own_range.low:g} to {own_range.high:g} {own_range.unit}".rstrip()
-                    + f"{steps}, got {value:g}"
-                )
-        return found
+        """The same with other values, the easiest first, and other parameters where it has them."""
+        changed = {name: value for name, value in others.items() if name in self.others}
+        values = self.values if values is None else sorted(values, reverse=not self.harder_up)
+        if not values or len(set(values)) < len(values):
+            raise ValueError(f"{self.title}: values of {self.parameter} must be some, each once, got {values}")
+        for name, value in [*((self.parameter, value) for value in values), *changed.items()]:
+            quantity = self.quantities[name]
+            off_step = quantity.step and abs(value / quantity.step - round(value / quantity.step)) > 1e-6
+            if off_step or not quantity.low <= value <= quantity.high:
+                steps = f" in steps of {quantity.step:g}" if quantity.step else ""
+                limits = f"{quantity.low:g} to {quantity.high:g} {quantity.unit}".rstrip()
+                raise ValueError(f"{self.title}: {name} must be {limits}{steps}, got {value:g}")
+        return replace(self, values=tuple(values), others={**self.others, **changed})
 
     def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Terrains of all values, ``count`` each: those of the first place, value by value, then those of the next.
@@ -159,19 +152,19 @@ class Dose:
         if self.kind is None:
             return np.tile(self._level(), (count, 1))
         record: Any = Element  # Warp makes its dtype
-        found: Any = np.zeros((count, len(self.values)), record.numpy_dtype())
-        found["kind"] = self.kind
-        found["detail"] = 1.0  # pallets
-        found["first"] = (FIRST_COL + np.arange(count) * NUM_PLACES // count)[:, None]
-        found["turn"] = self._turns(count, rng)[:, None]
+        elements: Any = np.zeros((count, len(self.values)), record.numpy_dtype())
+        elements["kind"] = self.kind
+        elements["detail"] = 1.0  # pallets
+        elements["first"] = (FIRST_COL + np.arange(count) * NUM_PLACES // count)[:, None]
+        elements["turn"] = self._turns(count, rng)[:, None]
         for name, value in self.others.items():
-            self._set(found, name, value)
-        self._set(found, self.parameter, np.array(self.values))
-        return _heights_of(found.reshape(-1))
+            self._set(elements, name, value)
+        self._set(elements, self.parameter, np.array(self.values))
+        return _heights_of(elements.reshape(-1))
 
     def _set(self, elements: Any, name: str, value: Any) -> None:
-        own = self.quantities[name]
-        elements[own.field] = np.rint(value / SPACING) if own.cells else value
+        quantity = self.quantities[name]
+        elements[quantity.field] = np.rint(value / SPACING) if quantity.cells else value
 
     def _turns(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         if self.kind is Kind.CROSS_SLOPE:
@@ -197,8 +190,6 @@ def _heights_of(elements: Any) -> NDArray[np.float32]:
         elements: Records of :class:`kernels.course.Element`, as :func:`kernels.course.place` takes them, shape
             (num_terrains,). All that :data:`QUANTITIES` allow fit before x = 12 m.
     """
-    from sim.bank import host_device  # it needs the spaces
-
     with wp.ScopedDevice(host_device()):
         laid: Any = wp.array(elements[:, None], dtype=Element)
         course.place(laid)
@@ -256,30 +247,38 @@ DOSES: dict[str, Dose] = {
 """Every dose by its name."""
 
 
-def chosen_doses(
-    names: Sequence[str], values: Mapping[str, Sequence[float]], others: Mapping[str, float]
-) -> dict[str, Dose]:
-    """Doses that a command line asks for, in the order of :data:`DOSES`.
+def chosen_doses(elements: Mapping[str, Sequence[float] | None], others: Mapping[str, float]) -> dict[str, Dose]:
+    """Some of the doses, in the order of :data:`DOSES`.
 
     Args:
-        names: Some of :data:`DOSES`; all if empty.
-        values: Other values of some of them.
+        elements: Some of :data:`DOSES`, each with other values or None; all if empty.
         others: Other parameters of those that have them.
-
-    Raises:
-        ValueError: If a name is unknown, nobody has a parameter, or a value cannot be used.
     """
-    unknown = [name for name in (*names, *values) if name not in DOSES]
-    if unknown:
-        raise ValueError(f"elements must be some of {', '.join(DOSES)}, got {', '.join(unknown)}")
-    idle = [name for name in values if names and name not in names]
-    if idle:
-        raise ValueError(f"--values are of {', '.join(idle)}, which --elements leaves out: add it there")
-    chosen = {name: dose for name, dose in DOSES.items() if not names or name in names}
-    known = {name for dose in chosen.values() for name in dose.others}
+    elements = elements or dict.fromkeys(DOSES)
+    if unknown := elements.keys() - DOSES.keys():
+        raise ValueError(f"elements must be some of {', '.join(DOSES)}, got {', '.join(sorted(unknown))}")
+    doses = {name: dose for name, dose in DOSES.items() if name in elements}
+    known = {name for dose in doses.values() for name in dose.others}
     if wrong := others.keys() - known:
         raise ValueError(
-            f"--at must name parameters that the elements have beside the one that grows, {', '.join(sorted(known))}, "
+            f"at must name parameters that the elements have beside the one that grows, {', '.join(sorted(known))}, "
             f"got {', '.join(sorted(wrong))}"
         )
-    return {name: dose.changed(values.get(name), others) for name, dose in chosen.items()}
+    return {name: dose.changed(elements[name], others) for name, dose in doses.items()}
+
+
+def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
+    """Doses that a command line names: ``stairs_up``, ``ditch=0.2,0.4``, with other parameters, ``tread=0.25``."""
+    elements: dict[str, Sequence[float] | None] = {}
+    for word in " ".join(words).split():
+        name, equals, values = word.partition("=")
+        elements[name] = [_number(value, word) for value in values.split(",")] if equals else None
+    pairs = (word.partition("=") for word in " ".join(at).split())
+    return chosen_doses(elements, {name: _number(value, f"{name}={value}") for name, _, value in pairs})
+
+
+def _number(text: str, word: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}") from None

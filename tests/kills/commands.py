@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from kernels.episode import Outcome
-from qd.evaluate import evaluate, measures
+from qd.commands import Evaluate
+from qd.evaluate import evaluate
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.show import recordings, replay
 from qd.studies import calibrate
@@ -66,10 +67,9 @@ def calibrate_with(policy: Path) -> None:
 
 def evaluate_with(policy: Path) -> int:
     """Crossings with a controller, up to where the simulation would be built."""
-    evaluate.open_evaluator = stand_in.open_stand_in
-    measures.base_rates = lambda *crossed: (_ for _ in ()).throw(SystemExit(0))
+    evaluate.cross_sets = lambda *crossed, **how: (_ for _ in ()).throw(SystemExit(0))
     flags = ["--policy", str(policy), "--device", "cpu", "--terrains", "2", "--episodes", "1"]
-    return command.run_command(evaluate.Evaluate, [*flags, "--out", str(policy.parent / "rates.json")], name="evaluate")
+    return command.run_command(Evaluate, [*flags, "--out", str(policy.parent / "rates.json")], name="evaluate")
 
 
 def as_nobody(command: Callable[[Path], Any], path: Path) -> Any:

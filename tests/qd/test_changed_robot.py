@@ -11,10 +11,7 @@ import pytest
 import torch
 
 from qd.archive import read_archive, write_archive
-from qd.evaluate.crossings import KeptCrossings
-from qd.evaluate.distances import Distances
-from qd.evaluate.evaluate import Evaluate
-from qd.evaluate.sets import plain_set
+from qd.commands import Evaluate
 from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.arguments import Archive, job_of
 from qd.search import run_search
@@ -26,7 +23,6 @@ from qd.show.recordings import Recordings, on_elite
 from qd.show.replay import ReplayElite
 from qd.show.report.command import Report
 from qd.show.view.command import View
-from qd.workers.evaluator import EvaluatorCfg
 from sim.files.command import run_command
 from sim.files.records import identity, robot_digest
 from sim.recording.file import write_recording
@@ -106,7 +102,6 @@ READERS = {
     "an archive alone": (Export, ("--run", "alone.npz")),
     "finetune": (Finetune, ("--archive", "runs/dog", "--device", "cpu", "--policy")),
     "evaluate": (Evaluate, ("--archive", "runs/dog", "--device", "cpu")),
-    "distances": (Distances, ("--archive", "runs/dog")),
 }
 
 
@@ -237,22 +232,6 @@ def test_recordings_of_the_robot_before_are_made_anew_or_refused(dog, capsys):
     argv = ["--robot", str(dog), "--recording", "named.recording.npz"]
     line = refused(capsys, Film, *argv)
     assert line.startswith("named.recording.npz is of robot 'dog' as it was")
-
-
-def test_kept_crossings_are_those_of_the_robot_and_the_controller_as_they_are(dog):
-    terrains = plain_set("hard_random", 2, 0)
-
-    def file():
-        return KeptCrossings(
-            Path("kept"), EvaluatorCfg(robot=str(dog), policy="", num_terrains=2, num_replicas=1)
-        ).file(trot(dog), terrains)
-
-    found, code = {file()}, dog.parent / "dog_trot.py"
-    change_robot(dog)
-    found.add(file())
-    code.write_text(code.read_text().replace("0.35", "0.3"))
-    found.add(file())
-    assert len(found) == 3
 
 
 @pytest.mark.parametrize("kind", ["train", "finetune"])

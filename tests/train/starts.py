@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from qd.archive import write_archive
-from qd.evaluate.sets import TRAINED_ON, marks_of
+from qd.evaluate.marks import TRAINED_ON, marks_of
 from tests.train.archives import make_archive
 from train.ppo.cfg import PpoCfg
 

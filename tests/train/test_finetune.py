@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from qd.archive import FaultCounts, write_archive
-from qd.evaluate.sets import marks_of, recorded_marks, split_elites
+from qd.evaluate.marks import marks_of, recorded_marks
+from qd.evaluate.sets import split_elites
 from sim import space as spaces
 from sim.files.atomic import locked
 from sim.files.command import run_command
-from sim.files.settings import from_builtins
+from sim.files.settings import built
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from sim.robots.training import TuningCfg
@@ -315,7 +316,7 @@ def test_several_archives_are_trained_on_together(places):
 def test_what_one_archive_holds_out_is_not_trained_on_from_another(places):
     write_archive(places / "same.npz", make_archive(30, seed=1))
     write_archive(places / "part.npz", (whole := make_archive(30, seed=1)).rows(np.arange(20)))
-    split = split_elites(whole, "anymal")
+    split = split_elites(whole)
     held_out = whole.genes[np.concatenate([split.test, split.validation])]
     job = job_of(config(places, archive=(places / "same.npz", places / "part.npz"), run_dir=places / "none"))
     assert not set(marks_of(held_out)) & set(job.trained_on)
@@ -506,7 +507,7 @@ def test_which_elites_are_trained_on(places, judged):
         assert sorted(rows) == list(expected), only
         held = job_of(config(places, archive=(path,), only=only, run_dir=places / "none"))
         kept = {genes.tobytes() for genes in held.mix.genes[0]}
-        train = {archive.genes[row].tobytes() for row in split_elites(archive, "anymal").train}
+        train = {archive.genes[row].tobytes() for row in split_elites(archive).train}
         assert kept == train & {genes.tobytes() for genes in job.mix.genes[0]}
     assert job.settings["archive"]["only"] == "uncertified" and job.settings["archive"]["held_out"] is False
     learnable = job_of(config(places, archive=(path,), only="failing", draw="learnable", run_dir=places / "none"))
@@ -515,8 +516,8 @@ def test_which_elites_are_trained_on(places, judged):
 
 def test_all_elites_are_more_than_both_parts_of_a_split(places, monkeypatch):
     """A split takes 750 and 300 of a large archive; here 4 and 2 of ten."""
-    monkeypatch.setattr("qd.evaluate.sets.PAPER_TRAINING_ELITES", 4)
-    monkeypatch.setattr("qd.evaluate.sets.PAPER_TERRAINS", {"anymal": 2})
+    monkeypatch.setattr("qd.evaluate.paper.TRAINING_ELITES", 4)
+    monkeypatch.setattr("qd.evaluate.paper.TERRAINS", {"anymal": 2})
     archive = make_archive(10)
     write_archive(places / "ten.npz", archive)
     own = {"archive": (places / "ten.npz",), "run_dir": places / "none"}
@@ -565,7 +566,7 @@ def test_a_run_of_before_actors_were_averaged_goes_on_without(places, finished):
     older = {**settings, "ppo": {key: value for key, value in settings["ppo"].items() if key != "average"}}
     old = {**saved, "extra": {**saved["extra"], "settings": older}}
     assert check_resumed(config(places), old, settings) == []
-    assert from_builtins(Finetune, Finetune.begun(ROBOT, older), "a training").ppo.average == 0.0
+    assert built(Finetune, Finetune.begun(ROBOT, older), "a training").ppo.average == 0.0
 
 
 def test_a_run_of_before_starts_were_spread_goes_on(places, finished):
@@ -582,7 +583,7 @@ def test_a_run_of_before_there_was_a_validation_part_goes_on_with_its_elites(pla
     with monkeypatch.context() as before:
         before.setattr("train.tuning._keeps_validation", lambda saved: False)
         assert finetune(config(places, run_dir=run, iterations=1)) == 0
-    split = split_elites(archive, "anymal")
+    split = split_elites(archive)
     old = sorted(marks_of(archive.genes[np.concatenate([split.train, split.validation])]))
     assert len(old) == 8 and recorded_marks(str(run / "policy.pt")) == set(old)
     job = job_of(resumed(run, iterations=2))

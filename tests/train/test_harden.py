@@ -13,7 +13,8 @@ import torch
 
 from kernels.episode import Outcome
 from qd.archive import read_archive, write_archive
-from qd.evaluate.sets import make_sets, marks_of, recorded_marks, split_elites
+from qd.evaluate.marks import marks_of, recorded_marks
+from qd.evaluate.sets import make_sets, split_elites
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
 from sim.policy.spec import controller_hash
@@ -153,7 +154,7 @@ def test_every_controller_is_evaluated_on_the_fixed_sets_and_every_archive(place
     fates = tables["differences"]["search-0"]["base -> round-1"]
     assert fates["mended"]["count"] == fates["compared"] == tables["terrains"]["search-0"] >= 1
     archive = read_archive(places / "run" / "search-0")
-    held_out = split_elites(archive, "anymal").test
+    held_out = split_elites(archive).test
     assert set(fates["mended"]["terrains"]) <= set(held_out.tolist())
 
 
@@ -236,7 +237,7 @@ def test_the_choice_is_by_terrains_that_are_not_reported(places, stubbed, monkey
     assert list(seen) == ["hand_crafted", "hard_random", "search-0"]
     assert list(rounds_of(places)["choices"]["tune-1"]["goal"]["after"]) == ["hand_crafted", "hard_random", "elites"]
     archive = read_archive(places / "run" / "search-0")
-    split = split_elites(archive, "anymal")
+    split = split_elites(archive)
     assert set(marks_of(seen["search-0"].terrains)) == set(marks_of(archive.genes[split.validation]))
     reported = make_sets(("hand_crafted", "hard_random"), 3, 0)
     assert not any(np.array_equal(seen[name].terrains, one.terrains) for name, one in reported.items())
@@ -462,7 +463,7 @@ def test_a_real_training_draws_from_all_archives_and_brings_its_critic_along(pla
     marks = recorded_marks(str(run / "tune-2" / "policy.pt"))
     for name in ("search-0", "search-1"):
         archive = read_archive(run / name)
-        split = split_elites(archive, "anymal")
+        split = split_elites(archive)
         assert set(marks_of(archive.genes[split.train])) <= marks
         assert not set(marks_of(archive.genes[split.test])) & marks
 

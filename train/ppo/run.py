@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from qd.evaluate.sets import TRAINED_ON
+from qd.evaluate.marks import TRAINED_ON
 from qd.run.settings import differences
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import command_line

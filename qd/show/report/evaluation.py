@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+from qd.evaluate.labels import FATES, SETS
 from qd.show.crossed import ARRIVED, FAILED, Crossed
 from qd.show.crossing_figures import draw_maps
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, Folded, Picture, absent, counted, heading, paragraph, percent, picture, table
-from qd.show.report.tables import CERTIFIED, CHANGES, GENERATED, LABELS, MEASURES, RESOLVED, Change, Changes, by_kind
+from qd.show.report.tables import CERTIFIED, GENERATED, MEASURES, Change, Changes, by_kind
 from sim.files.command import plain_command
-from sim.files.intervals import value_words
 from sim.files.records import without_machine
 
 _TRAINED_ON = {
@@ -35,7 +35,6 @@ def tables_section(shown: Shown) -> list[Block]:
         *([paragraph(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
         *(measure_table(kinds, measure) for measure in MEASURES),
         *certified_table(kinds),
-        *resolved_table(tables),
         Folded("Show the figure", drawn) if (drawn := _drawn(shown.material.tables_file.with_suffix(".png"))) else "",
         Folded("Show what became of terrains", changes) if (changes := changes_tables(tables)) else "",
         *before_after(shown),
@@ -74,7 +73,7 @@ def most_mended(tables: dict[str, Any]) -> tuple[str, str] | None:
     if not pairs:
         return None
     best = max(pairs, key=lambda who: pairs[who]["mended"]["count"])
-    mended, failing = (pairs[best][kind]["count"] for kind in CHANGES[:2])
+    mended, failing = (pairs[best][kind]["count"] for kind in ("mended", "still_failing"))
     return f"elites held out of training that {first} fails and {best} mends", f"{mended} of {mended + failing}"
 
 
@@ -88,7 +87,8 @@ def fates(tables: dict[str, Any]) -> str:
     if not pairs:
         return ""
     compared = max(found["compared"] for found in pairs.values())
-    counts = {who: [found[kind]["count"] for kind in CHANGES[:3]] for who, found in pairs.items()}
+    kinds = ("mended", "still_failing", "newly_broken")
+    counts = {who: [found[kind]["count"] for kind in kinds] for who, found in pairs.items()}
     told = [f"{who} mends {mended} of {mended + failing}" for who, (mended, failing, _) in counts.items()]
     told[0] += f" that {first} fails"
     broken = [f"{number} by {who}" for who, (_, _, number) in counts.items() if number]
@@ -141,7 +141,7 @@ def _worst(kinds: dict[str, Any]) -> str:
 
 
 def _label(name: str) -> str:
-    return LABELS.get(name, name)
+    return SETS.get(name, name)
 
 
 def _value(tables: dict[str, Any], measure: str, name: str, who: str) -> str:
@@ -200,45 +200,18 @@ def _role(about: dict[str, Any], members: list[str]) -> str:
     )
 
 
-def resolved_table(tables: dict[str, Any]) -> list[Block]:
-    """Goal rates with contact resolved, and the bias of the others against them; nothing where nobody looked.
-
-    Args:
-        tables: The evaluation's.
-    """
-    rows = [
-        [f"{_label(name)} ({one['terrains']}): {who}, {how}", _with_limits(one["goal"], one["intervals"]["goal"]),
-         _points(one["goal_bias"], one["goal_bias_interval"])]
-        for key, how in RESOLVED.items() for name, row in (tables.get(key) or {}).items() for who, one in row.items()
-    ]  # fmt: skip
-    if not rows:
-        return []
-    text = (
-        "The same terrains with contact resolved (steps of 1 ms, a time constant of 3 ms), here and in MuJoCo C. The "
-        "bias is how far the rate at the search's settings lies above that."
-    )
-    return [paragraph(text), table(["contact resolved", "goal reached", "bias"], rows)]
-
-
-def _points(value: float | None, limits: list[float] | None) -> str:
-    """A difference of rates in points, as people read it."""
-    if value is None:
-        return "-"
-    return value_words(100.0 * value, limits and [100.0 * limit for limit in limits], "+.1f") + " points"
-
-
 def changes_tables(tables: dict[str, Any]) -> list[Block]:
     """What became of the terrains from the first controller to every other, and folded between the others."""
     first = next(iter(tables["controllers"]))
     from_first, others = [], []
     for name, pairs in tables["differences"].items():
         for pair, found in pairs.items():
-            counts = [f"{found[kind]['count']}" for kind in CHANGES]
+            counts = [f"{found[kind]['count']}" for kind in FATES]
             row = [f"{_label(name)}: {pair}", *counts, f"{found['compared']}"]
             (from_first if pair.startswith(f"{first} -> ") else others).append(row)
     if not from_first and not others:
         return []
-    head = ["terrains", *(kind.replace("_", " ") for kind in CHANGES), "compared"]
+    head = ["terrains", *FATES.values(), "compared"]
     text = (
         "Terrains that a controller fails, under half of its episodes reaching the goal, from the first controller to "
         "the second; of several trainings the first one:"

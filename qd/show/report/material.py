@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qd.archive import ARCHIVE_FILE, Archive
+from qd.evaluate.tables import read_tables
 from qd.groups import Elites, Modes, Ranking
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
@@ -15,7 +16,7 @@ from qd.show.elites import find_archive
 from qd.show.figures import summary
 from qd.show.minima import MinimalFound, read_minimal_numbers
 from qd.show.report.pdf import find_browser
-from qd.show.report.tables import Change, Changes, read_tables
+from qd.show.report.tables import Change, Changes
 from sim.files.atomic import prepare_output
 from sim.files.command import command_line
 from sim.policy.spec import ControllerSpec, spec_of
@@ -155,7 +156,7 @@ def gather(cfg: "Report") -> Material:
         reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
         minimal=read_minimal_numbers(found.folder, archive),
-        tables=read_tables(tables_file, robot) if has_tables else None,
+        tables={**read_tables(tables_file, robot)} if has_tables else None,
         tables_file=tables_file,
     )
     _check_out(material.out, cfg.format)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qd.evaluate.labels import SETS
+from qd.evaluate.tables import as_tables
 from qd.run.directory import ROUNDS_FILE
 from qd.show.report.evaluation import changes_tables, measure_table
 from qd.show.report.page import (
@@ -19,8 +21,8 @@ from qd.show.report.page import (
     publish_page,
     table,
 )
-from qd.show.report.tables import LABELS, MEASURES, by_kind, unreadable
-from sim.files.atomic import prepare_output, read_json
+from qd.show.report.tables import MEASURES, by_kind
+from sim.files.atomic import has_shape, prepare_output, read_json
 from sim.files.command import plain_command
 from sim.files.figures import bar_lengths, new_figure
 from sim.files.records import without_machine
@@ -76,9 +78,13 @@ def _read(run: Path, robot: str | None) -> dict[str, Any]:
         go_on = "let it go on with the command that began it"
         raise ValueError(f"{file} must have a search that is over, got none: {go_on}")
     shapes = _SHAPES | ({"choices": {...: _CHOICE}} if "choices" in content else {})
-    damaged = unreadable({**content, **content.get("tables", {})}, shapes)
-    if damaged:
-        raise ValueError(f"{file} must be of `faultline harden`, but its {damaged} cannot be read: put a copy back")
+    try:
+        damaged = [key for key, shape in shapes.items() if not has_shape(content.get(key), shape)]
+        if damaged:
+            raise ValueError(f"its {damaged[0]} cannot be read")
+        content["tables"] = as_tables({"robot": content["robot"], **content["tables"]})
+    except ValueError as error:
+        raise ValueError(f"{file} must be of `faultline harden`, but {error}: put a copy back") from None
     if robot is not None and get_robot(robot).name != content["robot"]:
         raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
     return content
@@ -207,7 +213,7 @@ def _draw_lines(axes: "Axes", tables: dict[str, Any], measure: str, joined: list
         limits = [tables["intervals"][measure][name][controllers[place]] for place in there]
         values, lengths = 100.0 * rates, 100.0 * bar_lengths(rates, limits)
         places = np.array(there) + 0.06 * (k - (count - 1) / 2)
-        label = LABELS.get(name, f"{name}, held out")
+        label = SETS.get(name, f"{name}, held out")
         axes.errorbar(places, values, lengths, color=colour, marker=marker, capsize=3, label=label, linestyle="")
         rounds = [joined[place] for place in there]
         axes.plot(places[rounds], values[rounds], color=colour, linewidth=1.2)

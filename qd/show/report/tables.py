@@ -1,119 +1,31 @@
-"""The evaluation's ``tables.json``, read as data, and the terrains in it that are worth showing before and after."""
+"""The evaluation's tables by kind of controller, and the terrains in them that are worth showing before and after."""
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from qd.archive import Archive, read_archive
+from qd.evaluate import labels as evaluation
 from qd.run.directory import check_space
-from sim.files.atomic import has_shape, read_json
-from sim.files.command import command_line
-from sim.files.records import check_robot
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, kind_of
 from sim.robots.robot import RobotCfg
 
-MEASURES = {
-    "goal": "goal reached",
-    "success": "no base collision",
-    "reward": "training reward",
-}
+MEASURES = {name: evaluation.MEASURES[name] for name in ("goal", "success", "reward")}
 """Measures shown, in words; the first two are fractions."""
-CHANGES = ("mended", "still_failing", "newly_broken", "fine")
-"""What may have become of a terrain between two controllers."""
-GENERATED, FAR = "generated", "generated_far"
+GENERATED, FAR = evaluation.HELD_OUT
 """Sets of elites that were held out of training; the second is the part farthest from what was trained on."""
-LABELS = {
-    "hand_crafted": "hand-crafted",
-    "hard_random": "hard-random",
-    GENERATED: "generated, held out",
-    FAR: "generated, farthest third",
-    "generated_independent": "generated, another search",
-}
-"""Sets in words."""
-CERTIFIED = {"certified_goal": "goal reached", "certified_success": "no base collision"}
+CERTIFIED = {name: evaluation.MEASURES[measure] for name, measure in evaluation.CERTIFIED.items()}
 """Measures on certified terrains alone, in words."""
-RESOLVED = {"resolved": "contact resolved", "mujoco_c": "MuJoCo C"}
-"""Other crossings of the same terrains, both with contact resolved."""
 _KINDS = ("mended", "newly_broken", "still_failing")
 _MENDED = 2  # terrains shown of that kind; of each other one
 _CONTROLLERS = ("*.pt", "*.onnx")  # files beside the tables that may be one
-_NUMBER = int | float | None
-
-
-def read_tables(file: Path, robot: RobotCfg) -> dict[str, Any]:
-    """The evaluation's tables.
-
-    Args:
-        file: What ``faultline evaluate`` wrote.
-        robot: Robot it must be of.
-        spec: What the command line calls it, for errors; ``robot`` if left out.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is damaged, another file, of another robot, or of one that has changed since.
-    """
-    writer = f"`{command_line('evaluate', robot=robot.spec, policies='base=shipped', out=file)}`"
-    if not file.exists():
-        raise FileNotFoundError(f"no tables at {file}: {writer} writes them")
-    tables = read_json(file)
-    if damaged := unreadable(tables, {"robot": str}):
-        raise ValueError(f"{file} must hold the tables of {writer}, but its {damaged} cannot be read: give that file")
-    if tables["robot"] != robot.name:
-        raise ValueError(
-            f"{file} is of robot {tables['robot']}, got --robot {robot.name}: give that robot or other tables"
-        )
-    if tables.get("part") == "validation":
-        raise ValueError(
-            f"{file} is of validation terrains, by which settings are chosen: make tables to report with {writer}"
-        )
-    check_robot(tables, robot, file, f"make them anew with {writer}")
-    return tables
-
-
-def unreadable(tables: dict[str, Any], more: dict[str, Any]) -> str | None:
-    """The first key of tables whose value cannot be read; None if all can.
-
-    Args:
-        tables: What a file has.
-        more: Shapes of other keys that must be there.
-    """
-    shapes = itertools.chain(more.items(), _shapes(tables))
-    return next((key for key, shape in shapes if not has_shape(tables.get(key), shape)), None)
-
-
-def _shapes(tables: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Every key of the tables read, with its shape for :func:`has_shape`; later shapes need earlier keys to fit."""
-    terrains = {"count": int, "terrains": [int]}
-    changes = {**dict.fromkeys(CHANGES, terrains), "fine": {"count": int}}
-    yield "episodes", int
-    yield "controllers", {...: {"policy": str, "sha256": str | None}}
-    yield "terrains", {...: int}
-    yield "differences", {...: {...: {"compared": int, **changes}}}
-    values, intervals = (
-        dict.fromkeys(tables["terrains"], dict.fromkeys(tables["controllers"], kind)) for kind in (_NUMBER, list | None)
-    )
-    yield from ((measure, values) for measure in MEASURES)
-    yield "intervals", dict.fromkeys(MEASURES, intervals)
-    yield "over_seeds", {...: {...: {...: {"mean": _NUMBER, "interval": list | None}}}}
-    # What older tables do not have.
-    if tables.get("certified"):
-        yield "certified", {...: {"terrains": int, "chosen_by": {...: str}}}
-        of_sets = dict.fromkeys(tables["certified"], dict.fromkeys(tables["controllers"], _NUMBER))
-        yield from ((measure, of_sets) for measure in CERTIFIED)
-        limits = dict.fromkeys(tables["certified"], dict.fromkeys(tables["controllers"], list | None))
-        yield "intervals", dict.fromkeys(CERTIFIED, limits)
-    rates = {f"goal{what}": kind for what, kind in (("", _NUMBER), ("_bias", _NUMBER), ("_bias_interval", list | None))}
-    known = (key for key in RESOLVED if tables.get(key))
-    yield from ((key, {...: {...: {"terrains": int, **rates, "intervals": {"goal": list | None}}}}) for key in known)
 
 
 def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
     """The tables with one column a kind of controller, where a kind was trained from several seeds.
 
     Args:
-        tables: As :func:`read_tables` gives them.
+        tables: As :func:`qd.evaluate.tables.read_tables` gives them.
 
     Returns:
         The same, but for ``controllers``, measures and ``intervals``: of a kind of several those are the mean over them
@@ -181,7 +93,7 @@ def changes_of(tables: dict[str, Any], file: Path, robot: RobotCfg) -> Changes:
     The other controller is the one that mends the most among those whose files are found.
 
     Args:
-        tables: As :func:`read_tables` gives them.
+        tables: As :func:`qd.evaluate.tables.read_tables` gives them.
         file: Where they lie: controllers and archive may have been put beside them since.
         robot: The robot, whose own controller is one of them as a rule.
 

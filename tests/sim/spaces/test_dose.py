@@ -5,7 +5,7 @@ import pytest
 
 from sim.bank import terrains_of
 from sim.space import get_space
-from sim.spaces.dose import DOSES, FIRST_COL, LEVEL_SPACE, NUM_PLACES, chosen_doses
+from sim.spaces.dose import DOSES, FIRST_COL, LEVEL_SPACE, NUM_PLACES, chosen_doses, parse_doses
 from tests.kernels import course_oracle as oracle
 from tests.kernels.course_oracle import course, element
 
@@ -26,7 +26,7 @@ IN_RANGE = {
 
 
 def dose_of(name, *values, **others):
-    return chosen_doses([name], {name: values}, others)[name]
+    return chosen_doses({name: values}, others)[name]
 
 
 @pytest.mark.parametrize("name", IN_RANGE)
@@ -88,7 +88,7 @@ def test_ground_is_level_and_the_same_everywhere(name, values, map_of):
 
 def test_every_dose_can_be_made_and_gets_harder():
     for name, dose in DOSES.items():
-        assert chosen_doses([name], {name: dose.values}, dose.others)[name] == dose
+        assert chosen_doses({name: dose.values}, dose.others)[name] == dose
         assert len(dose.terrains(1, np.random.default_rng(0))) == len(dose.values)
         assert dose.parameter in dose.quantities and dose.others.keys() < dose.quantities.keys()
 
@@ -99,21 +99,31 @@ def test_words():
     assert DOSES["softness"].in_words(0.0125) == "0.013 s" and DOSES["friction"].in_words(0.15) == "0.15"
 
 
+def test_a_command_line_names_doses():
+    assert list(parse_doses([], [])) == list(DOSES)
+    doses = parse_doses(["friction=0.2,0.9 stairs_up", "ditch"], ["tread=0.25"])
+    assert list(doses) == ["stairs_up", "ditch", "friction"]  # in the order of DOSES
+    assert doses["friction"].values == (0.9, 0.2)  # the easier first
+    assert doses["stairs_up"].others == {"tread": 0.25, "flight": 5.0}
+    assert doses["ditch"] == DOSES["ditch"]
+
+
 @pytest.mark.parametrize(
-    ("names", "values", "others", "message"),
+    ("elements", "at", "field"),
     [
-        (["stair"], {}, {}, "elements must be some of stairs_up, .*, got stair"),
-        ([], {"stair": [1.0]}, {}, "got stair"),
-        (["ditch"], {"beam": [0.3]}, {}, "--values are of beam, which --elements leaves out"),
-        (["ditch"], {"ditch": [0.12]}, {}, "ditch: width must be 0.1 to 4 m in steps of 0.05, got 0.12"),
-        (["ditch"], {"ditch": [0.1, 0.1]}, {}, "each once"),
-        (["stairs_up"], {"stairs_up": [0.9]}, {}, "stairs up: rise must be 0.01 to 0.5 m, got 0.9"),
-        (["stairs_up"], {}, {"flight": 2.5}, "flight must be 2 to 8 steps in steps of 1, got 2.5"),
-        (["friction"], {"friction": [0.1]}, {}, "level ground: friction must be 0.15 to 1, got 0.1"),
-        (["ditch"], {}, {"tread": 0.3}, "that the elements have beside the one that grows, depth, got tread"),
-        (["sill"], {"sill": [float("nan")]}, {}, "sill: height must be"),
+        ("stair", "", "stair"),
+        ("ditch=0.12", "", "width"),  # no multiple of 5 cm
+        ("ditch=0.1,0.1", "", "width"),
+        ("ditch=", "", "ditch="),
+        ("stairs_up=0.9", "", "rise"),
+        ("stairs_up=high", "", "stairs_up=high"),
+        ("stairs_up", "flight=2.5", "flight"),
+        ("friction=0.1", "", "friction"),
+        ("ditch", "tread=0.3", "tread"),
+        ("ditch", "depth", "depth"),
+        ("sill=nan", "", "height"),
     ],
 )
-def test_what_cannot_be_made_is_refused(names, values, others, message):
-    with pytest.raises(ValueError, match=message):
-        chosen_doses(names, values, others)
+def test_what_cannot_be_made_is_refused(elements, at, field):
+    with pytest.raises(ValueError, match=field):
+        parse_doses([elements], [at])

@@ -1,0 +1,175 @@
+"""The commands of searching and evaluating: their flags, and nothing else."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sim.files.command import OfRobot, Where, Who
+from sim.files.settings import setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Who, Where):
+    """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
+
+    Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
+    --policies, --archive, --independent, --sets or --part the command makes tables: any controllers on the same
+    hand-crafted, hard-random and generated terrains, with rewards, penalties and intervals. With --pack it says which
+    terrains of a pack of faults a controller fails. Crossings are stored, so after Ctrl-C the same command goes on.
+    """
+
+    pack: str | None = None
+    """Pack of faults that the controller is tested on: a folder that `faultline export` made, or anymal or cassie for
+    the published one. --terrains takes the first of it; all on CUDA."""
+    policies: tuple[str, ...] = ()
+    """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped. The
+    others are compared with the first. base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind;
+    their mean is shown too."""
+    archive: Path | None = None
+    """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
+    independent: Path | None = None
+    """Run of another search, with another seed, or its archive.npz: elites that share no ancestor with those trained
+    on, drawn from all of its elites. They are the terrains of generated_independent."""
+    part: Literal["test", "validation"] = "test"
+    """Which terrains the tables are of. test: those to report. validation: others of the same kinds, to choose settings
+    by: elites that are neither trained on nor in the test, and other hand-crafted and hard-random terrains."""
+    space: str | None = None
+    """Terrain space of the hard-random terrains: super_gaussian, course, or file.py:CLASS, with ground as in
+    course+friction; super_gaussian if left out. If the archive is of a space of your own, name it here."""
+    sets: tuple[str, ...] = ()
+    """Sets of the tables: hand_crafted, hard_random, with --archive generated and generated_far, and with --independent
+    generated_independent. All of them if left out."""
+    terrains: int | None = setting(None, least=1)
+    """Terrains a set; 300 on CUDA (tables of Cassie: 180), 24 on the CPU."""
+    episodes: int | None = setting(None, least=1)
+    """Episodes a terrain; 20 on CUDA, 4 on the CPU."""
+    seed: int = setting(0, least=0)
+    """Draws other test sets."""
+    out: Path | None = None
+    """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
+    runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
+    validation validation.json. A figure of a pack or of tables is written beside it as .png."""
+
+    def execute(self) -> None:
+        """Evaluates."""
+        from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables
+        from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, read_pack
+        from qd.workers.evaluator import Compute
+        from sim.files.command import split_words
+        from sim.policy.spec import controllers_of
+        from sim.robots.robot import get_robot, robot_of
+
+        compute = Compute.resolve(self.device, self.workers, self.num_envs)
+        size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
+        makes_tables = self.policies or self.sets or self.archive or self.independent or self.part != "test"
+        if self.pack is not None:
+            if makes_tables or self.space is not None:
+                raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
+            folder = pack_folder(self.pack)
+            pack = read_pack(folder)
+            robot = robot_of(pack.content, self.robot, folder / PACK_FILE, flag="pack")
+            evaluate_pack(pack, robot, self.policy or str(robot.policy_file), compute=compute, out=self.out, **size)
+            return
+        robot = get_robot(self.robot)
+        if not makes_tables:
+            policy = self.policy or str(robot.policy_file)
+            evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
+            return
+        if self.policy is not None:
+            raise ValueError(
+                f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
+            )
+        cfg = SetsCfg(
+            names=tuple(split_words(self.sets)), archive=self.archive, independent=self.independent, space=self.space,
+            part=self.part, **size,
+        )  # fmt: skip
+        evaluate_tables(robot, controllers_of(self.policies, robot), cfg, compute=compute, out=self.out)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dose(OfRobot, Where):
+    """Measure which real obstacle at which size stops a controller.
+
+    One obstacle stands alone on flat ground, and one of its sizes grows: the rise of stairs, the width of a ditch; or
+    the ground is level and its friction falls. For each value the command measures how many robots reach the goal.
+    Terrains of a value differ in where the obstacle begins, evenly over 1 m, and in the seeds of their episodes. All
+    values and controllers have the same places and seeds. Crossings are stored: the same command goes on.
+    """
+
+    policies: tuple[str, ...] = ()
+    """Controllers, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped; base=shipped if left
+    out."""
+    elements: tuple[str, ...] = ()
+    """Obstacles: stairs_up, stairs_down, step_up, step_down, sill, rail, pallet, ramp_up, ramp_down, cross_slope,
+    ditch, beam, stones, rubble; grounds: friction, softness. All of them if left out. With other values as
+    stairs_up=0.15,0.2,0.25; they may lie beyond what the space course has."""
+    at: tuple[str, ...] = ()
+    """Other sizes of obstacles beside the one that grows, each NAME=VALUE: tread=0.25 depth=0.3."""
+    resolved: bool = False
+    """Cross with contact resolved: steps of 1 ms and a contact time constant of 3 ms; about five times the work."""
+    terrains: int | None = setting(None, least=1)
+    """Terrains a value; 20 on CUDA, 8 on the CPU."""
+    episodes: int | None = setting(None, least=1)
+    """Episodes a terrain; 4 on CUDA, 2 on the CPU."""
+    seed: int = setting(0, least=0)
+    """Draws other episodes."""
+    out: Path | None = None
+    """File for the numbers; runs/<robot>-dose/dose.json, with contact resolved dose-resolved.json. The figure is
+    written beside it as .png."""
+
+    def execute(self) -> None:
+        """Measures."""
+        from qd.evaluate.dose import measure_dose
+        from qd.workers.evaluator import Compute
+        from sim.policy.spec import controllers_of
+        from sim.robots.robot import get_robot
+        from sim.spaces.dose import parse_doses
+
+        robot = get_robot(self.robot)
+        measure_dose(
+            robot, controllers_of(self.policies, robot), parse_doses(self.elements, self.at),
+            compute=Compute.resolve(self.device, self.workers, self.num_envs), resolved=self.resolved,
+            terrains=self.terrains, episodes=self.episodes, seed=self.seed, out=self.out,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class MakePack(Who, Where):
+    """Make a pack of terrains from a judged run: faults and near-faults, to test any controller on.
+
+    The terrains are spread over the ways in which the searched controller fails and over families of kin. Faults come
+    first, and minimal terrains of the run are among them. Every controller crosses each terrain. pack.npz has the
+    terrains. pack.json has the rates and what is known of each terrain. pack.png shows some of them.
+    """
+
+    run: Path | None = None
+    """Run directory; the newest of the robot under runs/."""
+    space: str | None = None
+    """Terrain space of the run, where it is one of your own: file.py:CLASS."""
+    size: int = setting(100, least=1)
+    """How many terrains. There are fewer if the run has fewer faults and near-faults."""
+    controllers: tuple[str, ...] = ()
+    """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base, all of
+    results/<robot>/*.pt, and the robot's panel. The searched controller is always among them."""
+    episodes: int = setting(20, least=1)
+    """Episodes on each terrain."""
+    seed: int = setting(0, least=0)
+    """Draws other episodes."""
+    out: Path | None = None
+    """Folder to write to; runs/<robot>-pack."""
+
+    def execute(self) -> None:
+        """Makes it."""
+        from qd.evaluate.pack import make_pack
+        from qd.run.directory import newest_run
+        from qd.workers.evaluator import Compute
+        from sim.policy.spec import controllers_of
+        from sim.robots.robot import get_robot
+
+        robot = get_robot(self.robot)
+        make_pack(
+            self.run or newest_run(robot, self.policy),
+            controllers_of(self.controllers, robot) if self.controllers else {},
+            compute=Compute.resolve(self.device, self.workers, self.num_envs), robot=self.robot, policy=self.policy,
+            space=self.space, size=self.size, episodes=self.episodes, seed=self.seed, out=self.out,
+        )  # fmt: skip

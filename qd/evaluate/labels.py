@@ -1,0 +1,39 @@
+"""Words for what an evaluation reports: sets of terrains, measures, and what became of a terrain."""
+
+HELD_OUT = ("generated", "generated_far")
+"""Sets of elites held out of training: all, and the third that lies farthest from those trained on."""
+INDEPENDENT = "generated_independent"
+"""Set of elites of another search."""
+FROM_ARCHIVE = (*HELD_OUT, INDEPENDENT)
+"""Sets made of elites."""
+SETS = {
+    "hand_crafted": "hand-crafted",
+    "hard_random": "hard-random",
+    "generated": "generated, held out",
+    "generated_far": "generated, farthest third",
+    INDEPENDENT: "generated, another search",
+}
+"""Sets of the tables, in words."""
+MEASURES = {
+    "goal": "goal reached",
+    "success": "no base collision",
+    "fallen": "fallen",
+    "reward": "training reward",
+}
+"""Measures beside the penalties, in words: three rates as fractions, and the sum of the reward over 20 s. No base
+collision is what the paper calls success."""
+CERTIFIED = {"certified_goal": "goal", "certified_success": "success"}
+"""Measures on the certified terrains of a set alone, by what they measure."""
+RATES = ("goal", "success", "fallen", *CERTIFIED)
+"""Measures that lie between 0 and 1, and so do their intervals."""
+FATES = {
+    "mended": "mended",
+    "still_failing": "still failing",
+    "newly_broken": "newly broken",
+    "fine": "fine",
+}
+"""What may have become of a terrain from one controller to another: failed by the first, both, the second, neither."""
+COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+"""Of controllers, in order: Okabe and Ito's, which are apart for every kind of colour blindness."""
+MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
+"""Of controllers, in order."""

@@ -1,0 +1,66 @@
+"""Marks of the elites that a controller was trained on, so that it is not tested on them."""
+
+import hashlib
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.files.atomic import read_json
+from sim.policy.loaders import read_weights
+from sim.policy.spec import ControllerSpec
+
+TRAINED_ON = "trained_on"
+"""Key of the training record, and of checkpoint and controller, with the marks of all elites trained on."""
+_LENGTH = 12  # of 2,000 elites, two have the same with a chance of one in 100 million
+
+
+def marks_of(genes: NDArray[np.float32]) -> list[str]:
+    """A short mark of each elite that depends on its genes, shape (E, num_genes), alone."""
+    rows = np.ascontiguousarray(genes, np.float32)
+    return [hashlib.sha256(row.tobytes()).hexdigest()[:_LENGTH] for row in rows]
+
+
+def recorded_marks(policy: str) -> set[str]:
+    """Marks of the elites that a controller was trained on, by its file and the record beside it; none if none are."""
+    marks: set[str] = set()
+    for file in ControllerSpec.parse(policy).files:
+        record = file.with_suffix(".train.json")
+        contents = [read_json(record)] if record.is_file() else []
+        for content in (*contents, *_parts_of_weights(file)):
+            recorded = content.get(TRAINED_ON, [])
+            if not isinstance(recorded, list) or not all(isinstance(mark, str) for mark in recorded):
+                raise ValueError(f"{file} or the record beside it is damaged at {TRAINED_ON}: put a copy of it back")
+            marks.update(recorded)
+    return marks
+
+
+def _parts_of_weights(file: Path) -> list[dict[str, Any]]:
+    """Where marks may stand in a file of weights: itself, and what a checkpoint has beside the networks."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of TorchScript files, which have none
+            content = read_weights(file)
+    except Exception:  # another kind of file, which has no marks
+        return []
+    parts = [content, content.get("extra")] if isinstance(content, dict) else []
+    return [part for part in parts if isinstance(part, dict)]
+
+
+def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], elites: str) -> None:
+    """Refuses to test controllers on elites, shape (T, num_genes), that they were trained on.
+
+    Raises:
+        ValueError: If one of the controllers was trained on some of them, as far as its record says; naming it.
+    """
+    marks = marks_of(genes)
+    for name, policy in controllers.items():
+        count = len(recorded_marks(policy).intersection(marks))
+        if count:
+            raise ValueError(
+                f"{name} must not be tested on what it was trained on, got {count} of the {len(marks)} elites of "
+                f"{elites}: give the archive as it was when it was trained, or another search"
+            )
