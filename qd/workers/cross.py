@@ -36,7 +36,7 @@ from qd.workers.shards import merged
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
-from sim.mujoco_c.crossing import cross_terrains
+from sim.mujoco_c.crossing import PlainCrossings, cross_terrains
 from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import RolloutResult
@@ -326,16 +326,19 @@ class Crossings:
     def _cross_in_mujoco_c(
         self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
     ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
-        processes, space = parse_workers(cfg.workers).num_processes, load_space(cfg.space)
-        size = _MUJOCO_C_LOT * processes
-        for first in range(0, len(missing), size):
-            lot = missing[first : first + size]
-            tqdm.write(f"{label}: terrain {first + 1} to {first + len(lot)} of {len(missing)}", file=sys.stderr)
-            episodes = cross_terrains(
-                self.robot, cfg.policy, terrains[lot], seeds[lot], space=space, num_episodes=cfg.num_replicas,
-                device=cfg.device, processes=processes, resolved=True,
+        processes, done = parse_workers(cfg.workers).num_processes, list[tuple[int, PlainCrossings]]()
+        with tqdm(desc=label, total=len(missing) * cfg.num_replicas, unit="episode", file=sys.stderr) as bar:
+            crossings = cross_terrains(
+                self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),
+                num_episodes=cfg.num_replicas, device=cfg.device, processes=processes, resolved=True,
+                progress=bar.update,
             )  # fmt: skip
-            yield lot, _as_result(episodes, self.robot.penalties)
+            for count, crossed in enumerate(crossings, 1):
+                done.append(crossed)
+                if len(done) == _MUJOCO_C_LOT * processes or count == len(missing):
+                    numbers, episodes = zip(*done, strict=True)
+                    yield missing[list(numbers)], _as_result(episodes, self.robot.penalties)
+                    done.clear()
 
 
 def cross(
@@ -414,7 +417,7 @@ def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutRe
     )  # fmt: skip
 
 
-def _as_result(terrains: Sequence[Any], penalty_names: tuple[str, ...]) -> RolloutResult:
+def _as_result(terrains: Sequence[PlainCrossings], penalty_names: tuple[str, ...]) -> RolloutResult:
     """Episodes in MuJoCo C, a record a terrain, as a rollout's result."""
     outcome = np.array([terrain.outcome for terrain in terrains])
     columns = [PENALTIES.index(name) for name in penalty_names]

@@ -42,6 +42,10 @@ class Starts:
     """Velocity of the base's origin, world frame [m/s]; its angular velocity, base frame [rad/s]; joint velocities
     [rad/s]; shape (num_episodes, 6 + num_joints)."""
 
+    def __getitem__(self, rows: slice) -> "Starts":
+        """Some of the episodes."""
+        return Starts(qpos=self.qpos[rows], qvel=self.qvel[rows])
+
 
 def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:
     """Newton's joint state as MuJoCo's: quaternion wxyz, velocity of the origin, angular velocity in the base frame.
