@@ -14,7 +14,7 @@ from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from sim.files.command import split_words
 from sim.files.records import PENALTY_DEFINITION, robot_identity
-from sim.files.settings import built, check, setting
+from sim.files.settings import check, from_builtins, setting
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, label_suffix, spec_of
 
 if TYPE_CHECKING:
@@ -247,7 +247,7 @@ def from_settings(settings: Settings, iterations: int) -> SearchCfg:
     """
     try:
         own = {"scheduler": still_there(settings.get("scheduler")), "iterations": iterations}
-        return built(SearchCfg, {**settings, **own}, "a search")
+        return from_builtins(SearchCfg, {**settings, **own}, "a search")
     except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
 

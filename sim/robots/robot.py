@@ -4,14 +4,15 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.records import check_identity
-from sim.files.settings import setting
+from sim.files.settings import NonNegativeFloat, PositiveFloat, PositiveInt
 from sim.policy.spec import controller_hash
 from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg, TuningCfg
 
@@ -40,44 +41,44 @@ class RobotCfg:
     """Actuated joints in policy order, which is the file's order."""
     default_joint_pos: tuple[float, ...]
     """Default pose [rad]; an action of 0 holds it."""
-    default_base_height: float = setting(0.0, least=0)
+    default_base_height: NonNegativeFloat = 0.0
     """Height of the base over flat ground at the start [m]; of a settings file without it, the lowest one at which no
     foot starts in the ground."""
-    footprint: tuple[float, float] = setting(above=0)
+    footprint: tuple[PositiveFloat, PositiveFloat]
     """Half length and half width of the stance [m]."""
     scan_x: tuple[float, ...]
     """Height-scan points ahead of the base, yaw frame [m]."""
     scan_y: tuple[float, ...]
     """Height-scan points left of the base, yaw frame [m]."""
-    contact_force_limit: float = setting(above=0)
+    contact_force_limit: PositiveFloat
     """Contact force of a foot beyond which it is penalised [N]."""
     penalties: tuple[str, ...]
     """Raw penalties that count, a subset of :data:`kernels.penalties.PENALTIES`."""
     collision_bit: bool
     """Whether base collision is a descriptor of its own (the paper: Cassie)."""
-    action_scale: float = setting(0.5, above=0)
+    action_scale: PositiveFloat = 0.5
     """Radians per unit of action."""
-    physics_dt: float = setting(0.005, above=0, most=0.05)
-    decimation: int = setting(4, least=1)
+    physics_dt: Annotated[float, Meta(gt=0, le=0.05)] = 0.005
+    decimation: PositiveInt = 4
     """Physics steps per control step."""
-    max_speed: float = setting(100.0, above=0)
+    max_speed: PositiveFloat = 100.0
     """A state with a velocity beyond is invalid [m/s or rad/s]: what the robot cannot reach, not even when it falls."""
-    nconmax: int = setting(40, least=1)
+    nconmax: PositiveInt = 40
     """Contacts an environment on average; the buffer is shared by all."""
-    njmax: int = setting(100, least=1)
+    njmax: PositiveInt = 100
     """Constraint rows an environment."""
-    stiffness: tuple[float, ...] | None = setting(None, above=0)
+    stiffness: tuple[PositiveFloat, ...] | None = None
     """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
-    damping: tuple[float, ...] | None = setting(None, least=0)
+    damping: tuple[NonNegativeFloat, ...] | None = None
     """Velocity gain of each joint [N m s/rad], together with ``stiffness``."""
-    effort_limit: tuple[float, ...] | None = setting(None, above=0)
+    effort_limit: tuple[PositiveFloat, ...] | None = None
     """Largest torque of each joint [N m]; the file's if None, and never more than that of its actuators."""
-    armature: tuple[float, ...] | None = setting(None, least=0)
+    armature: tuple[NonNegativeFloat, ...] | None = None
     """Inertia of each joint's rotor, behind its gears [kg m^2]; the file's if None."""
-    friction: float | None = setting(None, above=0)
+    friction: PositiveFloat | None = None
     """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF. Less than the ground's .3 counts as
     .3."""
-    contact_time_constant_s: float | None = setting(None, above=0)
+    contact_time_constant_s: PositiveFloat | None = None
     """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
     training: TrainingCfg = field(default_factory=TrainingCfg)
     """What the training of its controller takes of the robot."""

@@ -15,7 +15,7 @@ from qd.evaluate.sets import split_elites
 from sim import space as spaces
 from sim.files.atomic import locked
 from sim.files.command import run_command
-from sim.files.settings import built
+from sim.files.settings import from_builtins
 from sim.policy.loaders import load_policy
 from sim.robots.robot import get_robot
 from sim.robots.training import TuningCfg
@@ -566,7 +566,7 @@ def test_a_run_of_before_actors_were_averaged_goes_on_without(places, finished):
     older = {**settings, "ppo": {key: value for key, value in settings["ppo"].items() if key != "average"}}
     old = {**saved, "extra": {**saved["extra"], "settings": older}}
     assert check_resumed(config(places), old, settings) == []
-    assert built(Finetune, Finetune.begun(ROBOT, older), "a training").ppo.average == 0.0
+    assert from_builtins(Finetune, Finetune.begun(ROBOT, older), "a training").ppo.average == 0.0
 
 
 def test_a_run_of_before_starts_were_spread_goes_on(places, finished):
