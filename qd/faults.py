@@ -261,7 +261,7 @@ def _counts_in_mujoco_c(archive: Archive, numbers: NDArray[np.int64], work: Work
     from kernels.episode import Outcome
     from sim.mujoco_c.crossing import cross_terrains
     from sim.robots.robot import get_robot
-    from sim.space import get_space
+    from sim.spaces.registry import get_space
 
     crossings = dict(cross_terrains(
         get_robot(work.evaluator.robot), work.evaluator.policy, archive.genes[numbers],

@@ -30,9 +30,9 @@ class Stand(OfRobot, OnDevice):
 
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
+        from sim.device import resolve_device
         from sim.robots.robot import get_robot
         from sim.robots.stand import describe_model, describe_standing, stand
-        from sim.simulation import resolve_device
 
         robot = get_robot(self.robot)
         print(describe_model(robot), flush=True)

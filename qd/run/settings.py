@@ -128,7 +128,7 @@ class SearchCfg:
     fitness: FitnessCfg
     scheduler: SchedulerCfg
     space: str = "super_gaussian"
-    """Terrain space, as :func:`sim.space.load_space` takes it."""
+    """Terrain space, as :func:`sim.spaces.registry.load_space` takes it."""
     space_sha256: str | None = None
     """Hash of its code if it is a user's own."""
     robot_sha256: str | None = None

@@ -40,7 +40,7 @@ from sim.mujoco_c.crossing import PlainCrossings, cross_terrains
 from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg, get_robot
 from sim.rollout import RolloutResult
-from sim.space import load_space, space_identity
+from sim.spaces.registry import identity, load_space
 
 How = Literal["searched", "resolved", "mujoco_c"]
 """Physics of the search; the same with contact resolved; MuJoCo C, with contact resolved there too."""
@@ -233,7 +233,7 @@ class Crossings:
             terrains: Genes, shape (B, num_genes), or heights [m], shape (B, nrow, ncol).
             seeds: One a terrain, shape (B,), uint32.
             replicas: Episodes a terrain.
-            space: Terrain space of the genes, as :func:`sim.space.load_space` takes it.
+            space: Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it.
             how: What crosses them.
             reward: Whether the training task's reward is summed too.
             penalties_from_s: Penalties are summed from this time of an episode on [s].
@@ -277,7 +277,8 @@ class Crossings:
         controller = controller_hash(cfg.policy)
         if self._cache is None or controller is None:
             return None
-        way = [robot_identity(self.robot), self.robot.penalties, controller, space_identity(cfg.space)]
+        space = identity(cfg.space, load_space(cfg.space).sha256)
+        way = [robot_identity(self.robot), self.robot.penalties, controller, space]
         way += [cfg.num_replicas, cfg.device.startswith("cuda"), how, cfg.reward, cfg.penalties_from_s]
         key = hashlib.sha256(json.dumps([*way, code_fingerprint(("kernels", "sim"))]).encode()).hexdigest()[:32]
         if key not in self._stored:
@@ -365,7 +366,7 @@ def cross(
         robot: The robot, or its name or settings file.
         compute: Where terrains are crossed; by default on the CPU, by a process a core.
         replicas: Episodes a terrain.
-        space: Terrain space of the genes, as :func:`sim.space.load_space` takes it.
+        space: Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it.
         how: What crosses them.
         reward: Whether the training task's reward is summed too.
         penalties_from_s: Penalties are summed from this time of an episode on [s].

@@ -43,7 +43,7 @@ from sim.robots.model import build_robot
 from sim.robots.robot import RobotCfg
 from sim.simulation import SolverCfg
 from sim.simulation import resolved as with_contact_resolved
-from sim.space import TerrainSpace
+from sim.spaces.base import TerrainSpace
 
 _mj: Any = mujoco  # its types are not written down
 _WARNINGS = [

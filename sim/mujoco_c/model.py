@@ -21,7 +21,7 @@ from sim.ground import PATCHES, GroundMaps
 from sim.maps.terrain_files import Margins, as_hfield
 from sim.robots.robot import RobotCfg
 from sim.simulation import GROUND_FRICTION
-from sim.space import TerrainSpace
+from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m

@@ -24,7 +24,7 @@ def load_robot(path: Path) -> RobotCfg:
     """
     import warp as wp
 
-    from sim.bank import host_device
+    from sim.device import host_device
     from sim.robots.model import read_robot
     from sim.robots.probes import make_probes
     from sim.robots.stand import start_height

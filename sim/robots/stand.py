@@ -10,13 +10,14 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.bank import TerrainBank, host_device
+from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg
+from sim.device import host_device
 from sim.robots.model import build_robot, effort_limits, geom_names, leaf_name
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.simulation import CAPACITY_OVERFLOWS, Simulation
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import SPACING
 
 _GRAVITY = 9.81

@@ -14,7 +14,7 @@ from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, op
 from sim.crossing import CrossingCfg
 from sim.robots.robot import get_robot
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.searches import make_job, rows_of
 

@@ -7,7 +7,7 @@ import numpy as np
 from qd.archive import Archive, FaultCounts
 from sim.files.records import PENALTY_DEFINITION, robot_digest
 from sim.robots.robot import ROBOTS
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")

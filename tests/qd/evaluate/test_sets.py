@@ -25,8 +25,8 @@ from qd.evaluate.sets import (
 )
 from sim.bank import heights_of
 from sim.files.records import robot_digest
-from sim.space import SUPER_GAUSSIAN
 from sim.spaces.course import COURSE
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.train.archives import certified_archive, make_archive
 
 

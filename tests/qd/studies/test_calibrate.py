@@ -10,7 +10,7 @@ from qd.studies.calibrate import Calibrate, Crossed, penalty_scales
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from sim.files.records import identity
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.stand_in import make_result
 

@@ -22,7 +22,7 @@ from sim.mujoco_c.model import (
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.simulation import GROUND_FRICTION, SolverCfg
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
 from tests.sim.policies import stand
