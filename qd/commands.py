@@ -57,7 +57,7 @@ class Evaluate(Who, Where):
         from qd.workers.evaluator import Compute
         from sim.files.command import split_words
         from sim.policy.spec import controllers_of
-        from sim.robots.robot import get_robot, robot_of
+        from sim.robots.find import get_robot, robot_of
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
@@ -122,7 +122,7 @@ class Dose(OfRobot, Where):
         from qd.evaluate.dose import measure_dose
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
         from sim.spaces.dose import parse_doses
 
         robot = get_robot(self.robot)
@@ -164,7 +164,7 @@ class MakePack(Who, Where):
         from qd.run.directory import newest_run
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
 
         robot = get_robot(self.robot)
         make_pack(

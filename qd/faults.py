@@ -260,7 +260,7 @@ def _counts_in_mujoco_c(archive: Archive, numbers: NDArray[np.int64], work: Work
     """Outcomes of elites in plain MuJoCo C, shape (len(numbers), 4)."""
     from kernels.episode import Outcome
     from sim.mujoco_c.crossing import cross_terrains
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
     from sim.spaces.registry import get_space
 
     crossings = dict(cross_terrains(

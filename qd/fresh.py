@@ -235,7 +235,7 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         Interrupted: On Ctrl-C; the run is as it was.
         EvaluatorError: If a worker is lost; likewise.
     """
-    from sim.robots.robot import get_robot, robot_of
+    from sim.robots.find import get_robot, robot_of
     from sim.spaces.registry import get_space, load_space
 
     path = args.run or newest_run(get_robot(args.robot or "anymal"), args.policy)

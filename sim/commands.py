@@ -31,7 +31,7 @@ class Stand(OfRobot, OnDevice):
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
         from sim.device import resolve_device
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
         from sim.robots.stand import describe_model, describe_standing, stand
 
         robot = get_robot(self.robot)
@@ -58,7 +58,7 @@ class ExportPolicy(Who):
     def execute(self) -> None:
         """Writes the file and says what it holds."""
         from sim.policy.export import INPUT, OUTPUT, export_onnx, read_checkpoint
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
 
         policy = read_checkpoint(self.policy, get_robot(self.robot))
         apart = export_onnx(policy, self.out)

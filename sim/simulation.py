@@ -22,8 +22,6 @@ from sim.solver import dynamics_of, use_own_solver
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
-CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
-"""mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 _RESOLVED_DT = 0.001
 _RESOLVED_TIME_CONSTANT_S = 0.003
 

@@ -28,7 +28,8 @@ from sim.files.command import Interrupted, command_line, naming_what_is_next
 from sim.files.records import identity
 from sim.files.settings import check
 from sim.policy.spec import certifier_hash, controller_hash, controllers_of, is_same
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.spaces.registry import is_own, load_space
 from train.choice import choose, known_choice

@@ -15,7 +15,8 @@ from qd.run.directory import directory_of, published_or_newest
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.policy.spec import SHIPPED, name_of
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from sim.robots.training import RewardCfg
 from sim.spaces.base import TerrainSpace
 from sim.spaces.registry import get_space, identity, is_own, load_space

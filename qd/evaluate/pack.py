@@ -39,7 +39,8 @@ from sim.files.npz import npz_bytes, read_arrays
 from sim.files.records import identity
 from sim.policy.spec import about_controllers, is_same, who_crossed
 from sim.rates import counted_episodes
-from sim.robots.robot import RobotCfg, robot_of
+from sim.robots.find import robot_of
+from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space, load_space
 from sim.terrain import NUM_COLS, NUM_ROWS

@@ -147,7 +147,7 @@ def job_of(args: Archive) -> Job:
         FileNotFoundError: If there is no run to resume.
         ValueError: If robot, preset, device, controller, space, a setting or the run directory is not as it must be.
     """
-    from sim.robots.robot import get_robot, robot_of
+    from sim.robots.find import get_robot, robot_of
     from sim.spaces.registry import is_own
 
     if args.confirm == "yes" and args.reproduce == "no":

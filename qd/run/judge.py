@@ -89,7 +89,7 @@ class Judged:
 
 def config_of(args: OfRobot, run: Path | None, space: str | None) -> tuple[Path, SearchCfg, "RobotCfg"]:
     """Directory, search and robot of the run that a command line names, and its terrain space at hand."""
-    from sim.robots.robot import get_robot, robot_of
+    from sim.robots.find import get_robot, robot_of
     from sim.spaces.registry import get_space, load_space
 
     policy = args.policy if isinstance(args, Who) else None

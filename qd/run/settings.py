@@ -394,7 +394,7 @@ def resumed(path: Path, there: SearchCfg, robot: "RobotCfg", changes: Settings, 
     Args:
         path: Its directory.
         there: Its settings.
-        robot: Its robot as it is now, by :func:`sim.robots.robot.robot_of`.
+        robot: Its robot as it is now, by :func:`sim.robots.find.robot_of`.
         changes: What the command line gives, as :func:`changed` takes it.
         moved: Where the run's controller is now, if elsewhere.
 

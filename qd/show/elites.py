@@ -143,7 +143,7 @@ def robot_named(name: str | None) -> "RobotCfg":
     Raises:
         ValueError: If there is no such robot.
     """
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
 
     return get_robot(name or _USUAL_ROBOT)
 
@@ -162,7 +162,7 @@ def find_archive(named: str | None, run: Path | None, policy: str | None = None,
         ValueError: If it is damaged, of another robot, of penalties that the robot does not have, or of a terrain space
             that is not at hand.
     """
-    from sim.robots.robot import robot_of
+    from sim.robots.find import robot_of
 
     if run is None or named is not None:
         robot_named(named)  # an unknown name is said first

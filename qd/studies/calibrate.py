@@ -69,7 +69,7 @@ class Calibrate(Who, OnGround, Where):
         """
         from qd.workers import evaluator as workers
         from sim.crossing import CrossingCfg
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
         from sim.spaces.registry import load_space
 
         check(self)

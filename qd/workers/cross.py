@@ -38,7 +38,8 @@ from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
 from sim.mujoco_c.crossing import PlainCrossings, cross_terrains
 from sim.policy.spec import controller_hash
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import identity, load_space
 

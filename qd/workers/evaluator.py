@@ -242,7 +242,7 @@ def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
         ValueError: If it cannot be loaded or does not fit the robot.
     """
     from sim.policy.loaders import load_policy
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
 
     # A cluster's GPUs need not be this machine's; for the CPU no simulation need be loaded.
     here = device if device == "cpu" else resolve_device(None)
@@ -251,7 +251,7 @@ def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
 
 def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
     from sim.rollout import CrossingCfg, Rollout
     from sim.simulation import SolverCfg, resolved
     from sim.spaces.registry import load_space

@@ -32,7 +32,7 @@ def key_of(evaluator: "EvaluatorCfg", drawn: list[Any]) -> str | None:
     Returns:
         None if nobody can tell whether the controller has changed, since its code has no file.
     """
-    from sim.robots.robot import get_robot  # both import Warp or MuJoCo: not for `--help`
+    from sim.robots.find import get_robot
     from sim.spaces.registry import get_space, identity
 
     controller = controller_hash(evaluator.policy)

@@ -17,7 +17,7 @@ from qd.show import figures
 from qd.workers.evaluator import EvaluatorCfg
 from sim.files.records import provenance, robot_identity
 from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from qd.archive import Archive, FaultCounts
 from sim.files.records import PENALTY_DEFINITION, robot_digest
-from sim.robots.robot import ROBOTS
+from sim.robots.shipped import ROBOTS
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values
 

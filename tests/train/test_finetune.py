@@ -16,7 +16,7 @@ from sim.files.atomic import locked
 from sim.files.command import run_command
 from sim.files.settings import from_builtins
 from sim.policy.loaders import load_policy
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.robots.training import TuningCfg
 from sim.spaces import registry as spaces
 from tests.builders import fresh_values

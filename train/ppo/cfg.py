@@ -107,7 +107,7 @@ class TrainingFlags(OnDevice):
         Raises:
             ValueError: If there is no such robot, no such run, or one whose settings cannot be read.
         """
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
 
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--robot", default=_ROBOT)

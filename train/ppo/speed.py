@@ -38,7 +38,7 @@ class TrainSpeed(OfRobot, OnDevice):
         """
         from sim.device import resolve_device
         from sim.files.records import provenance
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
         from train.ppo.learner import Ranks
 
         check(self)

@@ -8,7 +8,7 @@ import numpy as np
 from qd.evaluate.measures import Measured, measure
 from qd.evaluate.sets import TerrainSet, plain_set
 from qd.evaluate.tables import Controller, Tables, make_tables
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
 

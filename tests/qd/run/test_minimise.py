@@ -13,7 +13,7 @@ from qd.archive import read_archive, write_archive
 from qd.run.minimise import Minimise, minimise_run
 from sim.files.command import Interrupted
 from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.qd.stand_in import make_result
 
 RESULTS = Path(__file__).parents[3] / "results"

@@ -15,7 +15,8 @@ from qd.run.settings import (
     policy_spec,
     preset,
 )
-from sim.robots.robot import ROBOTS, RobotCfg
+from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
 from tests.qd import stand_in
 
 

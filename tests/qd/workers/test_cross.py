@@ -12,7 +12,7 @@ from qd.workers import cross as service
 from qd.workers.cross import Cache, Crossings, cross
 from qd.workers.evaluator import Compute
 from qd.workers.invalid import AllInvalidError
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from sim.files.records import robot_digest
+from sim.robots.find import get_robot
 from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.robot import RobotCfg
 from tests.sim.dogs import GAINS, KINDS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
 
 
