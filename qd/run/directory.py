@@ -158,11 +158,9 @@ def check_space(archive: Archive, run: Path, named: str | None) -> None:
     Raises:
         ValueError: If it is none, or one of a user's own that the command line does not name or that has changed.
     """
-    from sim.spaces.registry import get_space, load_space  # which imports Warp: not for `--help`
+    from sim.space import recorded_space  # which imports Warp: not for `--help`
 
-    if named is not None:
-        load_space(named)
-    get_space(archive.space, archive.space_sha256)
+    recorded_space(archive.space, archive.space_sha256, named=named, file=run)
 
 
 def folder_for(run: Path, robot: str) -> Path:

@@ -15,8 +15,7 @@ from qd.run.settings import (
     policy_spec,
     preset,
 )
-from sim.robots.robot import RobotCfg
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, RobotCfg
 from tests.qd import stand_in
 
 
@@ -108,8 +107,8 @@ def test_long_values_are_shortened():
 @pytest.mark.parametrize(
     ("bad", "what"),
     [
-        ({}, "scheduler"),
-        ({"scheduler": "wide"}, "scheduler"),
+        ({}, "scheduler must be an object, got None"),
+        ({"scheduler": "wide"}, "scheduler must be an object, got 'wide'"),
         ({"fitness": {}, "scheduler": {}}, "penalties"),
         ({"fitness": {"penalties": [], "scales": []}, "scheduler": {}}, ""),
     ],

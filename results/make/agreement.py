@@ -1,0 +1,90 @@
+"""How far rates at the search's settings lie from contact resolved and from MuJoCo C: agreement.json.
+
+A terrain that was chosen by its rate at some settings owes a part of that rate to chance, which does not come again.
+So the terrains, hard-random ones and elites, are drawn at random, and those that fail are chosen by one set of episodes
+and judged by another.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.fitness import FAILING_GOAL_RATE
+from qd.workers.cross import Crossings, How
+from results.make.common import Script, parse
+from sim.rates import agreement, crossing_rates
+from sim.space import SUPER_GAUSSIAN
+
+KEY = 20261123  # with the seed, the entropy of everything drawn here, and nowhere else
+HARD_RANDOM, ELITES, FIRST, SECOND = range(4)  # streams of it
+
+
+def cross_in_all_ways(
+    script: Script, crossings: Crossings, name: str, genes: NDArray[np.float32], space: str
+) -> dict[str, NDArray[np.uint8]]:
+    """Outcomes of a set's episodes by how they were crossed, (num_terrains, num_episodes); fewer terrains in MuJoCo C.
+
+    ``search`` has the first starts; ``again`` (the same settings), ``resolved`` and ``mujoco_c`` have the second.
+    """
+    episodes, in_mujoco_c = (1, 1) if script.small else (40, 40)
+    first, second = (
+        np.random.SeedSequence([KEY, script.seed], spawn_key=(stream,)).generate_state(len(genes), np.uint32)
+        for stream in (FIRST, SECOND)
+    )
+
+    def cross(seeds: NDArray[np.uint32], how: How, count: int) -> NDArray[np.uint8]:
+        result = crossings.cross(
+            script.policy, genes[:count], seeds[:count], replicas=episodes, space=space, how=how,
+            label=f"{name}, {how}",
+        )  # fmt: skip
+        return result.outcome
+
+    return {
+        "search": cross(first, "searched", len(genes)),
+        "again": cross(second, "searched", len(genes)),
+        "resolved": cross(second, "resolved", len(genes)),
+        "mujoco_c": cross(second, "mujoco_c", in_mujoco_c),
+    }
+
+
+def compare(outcome: dict[str, NDArray[np.uint8]], seed: int) -> dict[str, Any]:
+    """Rates at the search's settings minus those of the other ways; ``both_resolved``: ours resolved minus MuJoCo C."""
+    pairs = {name: ("search", name) for name in ("again", "resolved", "mujoco_c")}
+    pairs["both_resolved"] = ("resolved", "mujoco_c")
+    return {
+        name: agreement(outcome[ours][: len(outcome[theirs])], outcome[theirs], seed)
+        for name, (ours, theirs) in pairs.items()
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Crosses both sets in all ways and writes how far they agree."""
+    script = parse(__doc__, argv, "agreement.json")
+    terrains, elites = (1, 1) if script.small else (300, 150)
+    draws = [np.random.default_rng(np.random.SeedSequence([KEY, script.seed], spawn_key=(k,))) for k in range(2)]
+    archive = script.read_archive()
+    chosen = draws[ELITES].permutation(len(archive))[:elites]
+    sets = {
+        "hard_random": (SUPER_GAUSSIAN.hard_random(terrains, draws[HARD_RANDOM]), SUPER_GAUSSIAN.name),
+        "elites": (archive.genes[chosen], archive.space),
+    }
+    with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
+        outcome = {name: cross_in_all_ways(script, crossings, name, *terrains) for name, terrains in sets.items()}
+    fails = {
+        way: crossing_rates(outcome["elites"][way], "goal") < FAILING_GOAL_RATE
+        for way in ("search", "again", "resolved")
+    }
+    return script.write(
+        {
+            **{name: compare(of_set, script.seed) for name, of_set in outcome.items()},
+            "failing": int(fails["search"].sum()),
+            "failing_again": int((fails["search"] & fails["again"]).sum()),
+            "failing_resolved": int((fails["search"] & fails["resolved"]).sum()),
+        }
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+#!/bin/bash
+# Makes all published numbers, in order: results/make/all.sh [ROBOT ...], anymal and cassie if none is named.
+# A step is skipped if its file was made by today's sources of kernels, sim, qd and train.
+# Behind a step stands its device time on one H100 (by kind of robot, ANYmal / Cassie, where they differ).
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+python=.venv/bin/python
+
+make_file() { # FILE SCRIPT ROBOT
+  if "$python" -m results.make.common "$1"; then
+    echo "$1 is of today's sources."
+  else
+    "$python" -m "results.make.$2" --robot "$3"
+  fi
+}
+
+robots=("$@")
+[ $# -gt 0 ] || robots=(anymal cassie)
+for robot in "${robots[@]}"; do
+  folder=results/$robot
+  make_file "$folder/base.json" base "$robot"                         # 2 min
+  make_file "$folder/penalty_ratios.json" penalty_ratios "$robot"     # 1 min
+  make_file "$folder/archive/archive.json" archive "$robot"           # 100 min: three searches, judged
+  make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
+  make_file "$folder/agreement.json" agreement "$robot"               # 10 min, most of it MuJoCo C on 16 cores
+  make_file "$folder/search.json" search "$robot"                     # 105 min: 21 searches
+  make_file "$folder/ablation.json" ablation "$robot"                 # 7 min
+  make_file "$folder/tables.json" tables "$robot"                     # 60 min: nine trainings
+  make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU
+  make_file "$folder/rounds.json" rounds "$robot"                     # 120 min
+  make_file "$folder/dose.json" dose "$robot"                         # 5 min
+  make_file "$folder/spaces.json" spaces "$robot"                     # 16 min
+  make_file "$folder/pack/pack.json" pack "$robot"                    # 2 min
+  make_file "$folder/train_speed.json" train_speed "$robot"           # 1 min
+  if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
+    .venv/bin/torchrun --nproc-per-node 2 -m results.make.train_speed --robot "$robot" # 1 min on two GPUs
+    make_file "$folder/scale.json" scale "$robot"                     # 4 min on all GPUs
+  fi
+  make_file "$folder/speed.json" speed "$robot"                       # 12 min, 4 of them on the CPU
+  make_file "$folder/solver_options.json" solver_options "$robot"     # 3 min
+done
+"$python" -m tests.bench                                              # 3 min
+"$python" -m results.make.docs

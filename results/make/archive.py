@@ -1,0 +1,54 @@
+"""The published archives: results/<robot>/archive, archive_cma_mae and independent.
+
+The default method, the paper's method, and the default one again with another seed. Each is a search of preset wide.
+Then it is judged: fresh episodes, contact resolved, a specialist trained on what fails, and others' crossings.
+"""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from qd.judge import judge
+from qd.run.settings import preset
+from qd.search import search
+from results.make.common import Script, parse
+from train.cfg import FinetuneCfg
+from train.finetune import train_specialist
+
+SEARCHES = {"archive": (None, 0), "archive_cma_mae": ("cma_mae", 0), "independent": (None, 1)}
+"""Method, or None for the default one, and seed of each."""
+PUBLISHED = ("archive.npz", "archive.json", "config.json", "metrics.jsonl", "*.png", "certifiers/specialist.pt")
+"""Files of a run that are published."""
+
+
+def make_archive(script: Script, name: str) -> Path:
+    """Searches and judges; returns the run."""
+    method, seed = SEARCHES[name]
+    cfg = preset("small" if script.small else "wide", script.robot)
+    scheduler = cfg.scheduler if method is None else replace(cfg.scheduler, method=method)
+    cfg = replace(cfg, scheduler=scheduler, seed=seed + script.seed, iterations=1 if script.small else cfg.iterations)
+    run = script.runs / name
+    search(cfg, run, script.compute)
+    if script.small:  # a second judging and a training take minutes on a CPU
+        return run
+    judge(run, stages=("fresh", "resolved"), compute=script.compute)
+    train_specialist(script.robot, run, FinetuneCfg.specialist(script.robot))
+    judge(run, stages=("others",), compute=script.compute)
+    return run
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Makes the three archives and publishes them beside each other."""
+    script = parse(__doc__, argv, "archive/archive.json")
+    for name in SEARCHES:
+        run = make_archive(script, name)
+        for pattern in PUBLISHED:
+            for file in run.glob(pattern):
+                target = script.out.parent.parent / name / file.relative_to(run)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, target)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Bare physics: terrain contacts and solver alone, on the motion of recorded crossings or of standing robots."""
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from torch.profiler import ProfilerActivity, profile
+
+from kernels.ground import PATCHES
+from sim.bank import TerrainBank
+from sim.rollout import Rollout
+from sim.simulation import Simulation
+
+SEGMENT_STEPS = 10  # control steps: over 0.2 s a replayed robot still moves as the recorded one did
+SEGMENT_EVERY = 20
+PROFILED_STEPS = 50
+NAMED_KERNELS = 40
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """A stretch of recorded motion: the state at its start and the joint targets from there on, on the device."""
+
+    joint_q: Any
+    """Shape (num_envs, 7 + num_joints)."""
+    joint_qd: Any
+    """Shape (num_envs, 6 + num_joints)."""
+    targets: list[Any]
+    """Of each control step, shape (num_envs, 7 + num_joints)."""
+
+
+def record_segments(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> list[Segment]:
+    """State and targets of the first 10 of every 20 control steps of crossings, as :meth:`Rollout.put` takes them."""
+    sim, segments = rollout.sim, []
+    rollout.clear()
+    rollout.put(terrains, seeds)
+    for step in range(round(rollout.cfg.max_duration_s / rollout.robot.control_dt)):
+        if step % SEGMENT_EVERY == 0:
+            segments.append(Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
+        rollout.control_step()
+        if step % SEGMENT_EVERY < SEGMENT_STEPS:
+            segments[-1].targets.append(wp.clone(sim.targets))
+    return segments
+
+
+class Motion:
+    """Recorded segments that are replayed in one simulation, by a captured graph of the physics of a control step."""
+
+    def __init__(self, sim: Simulation, segments: list[Segment]) -> None:
+        """Captures the graph and replays two segments, so that the kernels are loaded."""
+        self.sim, self.segments = sim, segments
+        self.robot_steps = sim.num_envs * sim.robot.decimation * sum(len(segment.targets) for segment in segments)
+        """Physics steps of all robots in one replay of all segments."""
+
+        def control_step() -> None:
+            for _ in range(sim.robot.decimation):
+                sim.physics_step()
+
+        with wp.ScopedDevice(sim.device):
+            self._graph: Any = sim.capture(control_step)
+        self._replay(segments[:2])
+
+    def replay(self) -> float:
+        """Plays all segments back, each from its recorded state; returns the seconds it took."""
+        return seconds_of(lambda: self._replay(self.segments), self.sim.device)
+
+    def stand(self, control_steps: int) -> float:
+        """Goes on from the present state for some control steps; returns the seconds it took."""
+        return seconds_of(lambda: [wp.capture_launch(self._graph) for _ in range(control_steps)], self.sim.device)
+
+    def _replay(self, segments: list[Segment]) -> None:
+        sim = self.sim
+        with wp.ScopedDevice(sim.device):
+            all_robots = wp.ones(sim.num_envs, dtype=int)
+            for segment in segments:
+                wp.copy(sim.joint_q, segment.joint_q)
+                wp.copy(sim.joint_qd, segment.joint_qd)
+                sim.clear_solver(all_robots)
+                for targets in segment.targets:
+                    wp.copy(sim.targets, targets)
+                    wp.capture_launch(self._graph)
+
+
+def seconds_of(work: Callable[[], object], device: str) -> float:
+    """Seconds from when the device is idle to when it has done the work."""
+    with wp.ScopedDevice(device):
+        wp.synchronize_device(device)
+        began = time.perf_counter()
+        work()
+        wp.synchronize_device(device)
+        return time.perf_counter() - began
+
+
+def replay_rates(motions: list[Motion], rounds: int) -> list[float]:
+    """Physics steps a second over all robots of each motion, replayed in turns; the median of ``rounds``."""
+    seconds = np.median([[motion.replay() for motion in motions] for _ in range(rounds)], axis=0)
+    return [motion.robot_steps / float(s) for motion, s in zip(motions, seconds, strict=True)]
+
+
+def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32], rounds: int) -> dict[str, float]:
+    """Physics steps a second over all robots of contacts and solver alone.
+
+    Returns:
+        ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and
+        ``ground``, in the motion of the crossings on ground with maps of friction and softness that change nothing.
+    """
+    sim, robot = rollout.sim, rollout.robot
+    segments = record_segments(rollout, terrains, seeds)
+    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, ground_shape=PATCHES)
+    bank.set_heights(sim.bank.heights.numpy())
+    motion = Motion(sim, segments)
+    with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
+    walking, ground = replay_rates([motion, with_maps], rounds)
+    rollout.clear()
+    rollout.put(terrains, seeds)
+    sim.joint_qd.zero_()
+    targets = np.zeros(sim.targets.shape, dtype=np.float32)
+    targets[:, 7:] = robot.default_joint_pos
+    sim.targets.assign(targets)
+    motion.stand(100)  # 2 s, in which they settle
+    standing = 250 * robot.decimation * sim.num_envs / motion.stand(250)
+    return {"walking": walking, "standing": standing, "ground": ground}
+
+
+def kernel_shares(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> list[dict[str, Any]]:
+    """Name and share of the GPU's time of each kernel, the most first, over the second second of crossings."""
+    rollout.put(terrains, seeds)
+    for _ in range(PROFILED_STEPS):
+        rollout.control_step()
+    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+        for _ in range(PROFILED_STEPS):
+            rollout.control_step()
+        wp.synchronize_device(rollout.sim.device)
+    times: dict[str, float] = {}
+    for event in profiled.key_averages():
+        name = re.sub(r"_[0-9a-f]{8}(_cuda_kernel_forward)?$|_cuda_kernel_forward$", "", event.key)
+        times[name] = times.get(name, 0.0) + event.self_device_time_total
+    total = sum(times.values())
+    ranked = sorted(times.items(), key=lambda item: -item[1])[:NAMED_KERNELS]
+    return [{"name": name, "share": time / total} for name, time in ranked]

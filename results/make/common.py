@@ -1,0 +1,133 @@
+"""What the scripts share: their five flags, the file that each writes, and means over seeds with their intervals."""
+
+import argparse
+import json
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qd.archive import Archive
+from qd.run.directory import read_archive_of
+from qd.workers.evaluator import Compute
+from sim.files.atomic import write_atomically
+from sim.files.intervals import t_interval
+from sim.files.records import identity, provenance, sources_sha256
+from sim.robots.robot import RobotCfg, get_robot
+from sim.simulation import resolve_device
+
+SEEDS = (0, 1, 2)
+"""Seeds of everything that is done several times."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Script:
+    """One script at work: for which robot, where, and which file it writes."""
+
+    robot: RobotCfg
+    device: str
+    seed: int
+    small: bool
+    """Whether this is a trial on a CPU, of a minute or so, whose numbers mean nothing."""
+    out: Path
+
+    @property
+    def policy(self) -> str:
+        """The robot's shipped controller."""
+        return str(self.robot.policy_file)
+
+    @property
+    def compute(self) -> Compute:
+        """Where terrains are crossed."""
+        return Compute(self.device)
+
+    @property
+    def results(self) -> Path:
+        """Folder of the robot's published files."""
+        return Path("results") / self.robot.name
+
+    @property
+    def runs(self) -> Path:
+        """Folder for runs that are not published."""
+        return self.out.parent / "runs" if self.small else Path("runs/make") / self.robot.name
+
+    def read_archive(self, name: str = "archive") -> Archive:
+        """A published archive of archive.py; in a trial too."""
+        return read_archive_of(self.robot, self.results / name)
+
+    def run_of_archive(self) -> Path:
+        """The run of the published archive to work in; a copy of what is published where the run itself is gone."""
+        run = self.runs / "archive"
+        if not (run / "archive.npz").exists():
+            shutil.copytree(self.results / "archive", run, dirs_exist_ok=True)
+        return run
+
+    def origin(self) -> dict[str, Any]:
+        """Where the numbers come from, as every file says it, with robot and controller."""
+        return {**provenance(self.device, self.seed), **identity(self.robot, self.policy)}
+
+    def write(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Writes the file, with its origin first, and prints it without that; returns its content."""
+        print(json.dumps(numbers, indent=1)[:4000])
+        return self.add(self.origin(), numbers)
+
+    def add(self, report: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Writes a report with numbers behind it; returns its content."""
+        content = {**report, **numbers}
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.out, (json.dumps(content, indent=1) + "\n").encode())
+        print(f"Written to {self.out}.")
+        return content
+
+
+def parse(doc: str | None, argv: Sequence[str] | None, file: str) -> Script:
+    """Reads the flags that every script has.
+
+    Args:
+        doc: Says what the script does.
+        argv: Words of the command line; those of the process if None.
+        file: Name of the file written, in ``results/<robot>``.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robot", default="anymal")
+    parser.add_argument("--device", help="a CUDA device if there is one")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--small", action="store_true", help="a trial of a minute or so; it publishes nothing")
+    parser.add_argument("--out", type=Path, help=f"file to write; results/<robot>/{file} if left out")
+    args = parser.parse_args(argv)
+    robot = get_robot(args.robot)
+    folder = Path("runs/make/small" if args.small else "results") / robot.name
+    return Script(
+        robot=robot,
+        device=resolve_device(args.device),
+        seed=args.seed,
+        small=args.small,
+        out=args.out or folder / file,
+    )
+
+
+def published_controllers(script: Script) -> dict[str, str]:
+    """The shipped controller as ``base``, and those of ``results/<robot>`` by name."""
+    files = {name: script.results / f"{name}.pt" for name in ("C-HC", "C-HR", "C-G", "hardened")}
+    return {"base": script.policy, **{name: str(file) for name, file in files.items() if file.exists()}}
+
+
+def mean_over_seeds(name: str, values: Sequence[float | None]) -> dict[str, Any]:
+    """``name`` and ``name_interval``: mean and 95 % t interval over seeds; None where a seed has no value."""
+    if not values or any(value is None for value in values):
+        return {name: None, f"{name}_interval": None}
+    numbers = np.asarray(values, np.float64)
+    return {name: float(numbers.mean()), f"{name}_interval": t_interval(numbers)}
+
+
+def is_current(file: Path) -> bool:
+    """Whether a file was made by today's sources."""
+    return file.exists() and json.loads(file.read_text()).get("sources_sha256") == sources_sha256()
+
+
+if __name__ == "__main__":
+    sys.exit(not is_current(Path(sys.argv[1])))

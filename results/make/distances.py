@@ -1,0 +1,45 @@
+"""How far test terrains lie from the elites trained on: distances.json, RMS of the heights' differences [m].
+
+Elites of one archive descend from each other, and a held-out one may be a near copy of one that was trained on. Then a
+rate on held-out elites says little of other terrains.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from qd.evaluate.sets import make_sets, nearest_distance, paper_terrains, space_of, split_elites
+from results.make.common import parse
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Measures every set's terrains on the CPU."""
+    script = parse(__doc__, argv, "distances.json")
+    archive, independent = script.read_archive(), script.read_archive("independent")
+    trained_on = archive.genes[split_elites(archive).train][: 20 if script.small else None]
+    count = 5 if script.small else paper_terrains(script.robot.name)
+    names = ("hard_random", "generated", "generated_far", "generated_independent")
+    sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=space_of(archive))
+    nearest = {
+        name: nearest_distance(terrains.terrains, trained_on, space_of(archive)) for name, terrains in sets.items()
+    }
+    return script.write(
+        {
+            "iterations": archive.iterations,
+            "trained_on": len(trained_on),
+            "nearest_m": {
+                name: {
+                    "terrains": len(distances),
+                    "median": float(np.median(distances)),
+                    "least": float(distances.min()),
+                    "largest": float(distances.max()),
+                }
+                for name, distances in nearest.items()
+            },
+        }
+    )
+
+
+if __name__ == "__main__":
+    main()

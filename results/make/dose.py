@@ -1,0 +1,25 @@
+"""Which real obstacle at which size stops a controller: dose.json, and dose-resolved.json with contact resolved."""
+
+from collections.abc import Sequence
+
+from qd.evaluate.dose import measure_dose
+from results.make.common import parse, published_controllers
+from sim.spaces.dose import parse_doses
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Lets the base and the published controllers cross every value of every obstacle."""
+    script = parse(__doc__, argv, "dose.json")
+    controllers = published_controllers(script)
+    doses = parse_doses(("step_up=0.1,0.4",) if script.small else (), ())
+    size = {"terrains": 1, "episodes": 1} if script.small else {}
+    for resolved in (False,) if script.small else (False, True):
+        out = script.out.with_stem(f"{script.out.stem}-resolved") if resolved else script.out
+        measure_dose(
+            script.robot, controllers, doses, compute=script.compute, resolved=resolved, seed=script.seed, out=out,
+            **size,
+        )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

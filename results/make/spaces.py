@@ -1,0 +1,59 @@
+"""What breaks the controller in each terrain space, and the dose beside them: spaces.json."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from qd.archive import Archive
+from qd.groups import elites_of, failure_modes
+from qd.judge import judge
+from qd.run.directory import RunDirectory
+from qd.run.settings import preset
+from qd.search import search
+from results.make.common import parse
+from sim.space import get_space
+
+SPACES = ("super_gaussian", "super_gaussian+friction", "course")
+COUNTS = (
+    "iterations", "episodes", "elites", "reachable_coverage", "corrected_elites", "families", "failing", "confirmed",
+    "certified", "faults", "faults_panel",
+)  # fmt: skip
+
+
+def modes_of(archive: Archive) -> list[dict[str, Any]]:
+    """How many elites fail in which way, with the most typical terrain in words."""
+    space = get_space(archive.space, archive.space_sha256)
+    return [
+        {
+            "ending": mode.ending,
+            "marked_by": mode.marked_by,
+            "elites": len(mode.members),
+            "goal_rate": mode.goal_rate,
+            "typical": mode.typical,
+            "terrain": space.describe(archive.genes[mode.typical]),
+        }
+        for mode in failure_modes(elites_of(archive)).modes
+    ]
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Searches each space as long, and judges what was found."""
+    script = parse(__doc__, argv, "spaces.json")
+    numbers = {}
+    for name in SPACES:
+        cfg = preset("small" if script.small else "wide", script.robot, space=name)
+        cfg = replace(cfg, seed=script.seed, iterations=1 if script.small else 13)
+        run = script.runs / "spaces" / name
+        search(cfg, run, script.compute)
+        archive = judge(run, stages=("fresh",) if script.small else ("fresh", "resolved", "others"),
+                        compute=script.compute)  # fmt: skip
+        summary = RunDirectory(run).read_summary()
+        numbers[name] = {**{count: summary.get(count) for count in COUNTS}, "modes": modes_of(archive)}
+    dose = script.out.with_name("dose.json")
+    rows = json.loads(dose.read_text())["dose"] if dose.exists() else None
+    return script.write({"spaces": numbers, "dose": rows})
+
+
+if __name__ == "__main__":
+    main()

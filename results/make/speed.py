@@ -1,0 +1,165 @@
+"""How fast the search runs beside the bare physics it is made of, and what else is quoted of speed: speed.json.
+
+The iterations timed are those of a real search, ask to saved checkpoint. Bare rates are measured right after, on the
+terrains that it asks for next, with as many robots and the same solver.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.run.directory import Metrics, RunDirectory
+from qd.run.settings import SearchCfg, preset
+from qd.scheduler import Scheduler
+from qd.search import search
+from qd.workers.evaluator import EvaluatorCfg, build_rollout, open_evaluator
+from results.make.bare import bare_rates, kernel_shares
+from results.make.common import Script, parse
+from sim.rollout import Rollout
+from sim.space import SUPER_GAUSSIAN
+
+WARM_UP = 2
+WIDE = ("cma_mae", "cma_mae+map_elites", "surrogate")
+CURVE = (1024, 4096, 32768)
+EPISODES_A_ROBOT = REPLICAS = 20
+PAPER_EPISODES = 4_000_000
+
+
+def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> tuple[Metrics, NDArray[np.float32]]:
+    """Metrics rows of some iterations of a new search after the first two, and the terrains that it asks for next."""
+    path = script.runs / "speed" / name
+    shutil.rmtree(path, ignore_errors=True)
+    cfg = replace(cfg, iterations=iterations + WARM_UP)
+    search(cfg, path, script.compute)
+    saved = RunDirectory(path).load(cfg)
+    assert saved is not None
+    state, metrics = saved
+    scheduler = Scheduler.from_state(state)
+    return metrics[WARM_UP:], np.concatenate([scheduler.ask(group) for group in range(cfg.scheduler.num_groups)])
+
+
+def rollout_of(script: Script, num_terrains: int, num_envs: int, replicas: int) -> Rollout:
+    """A simulation of the shipped controller in this process."""
+    cfg = EvaluatorCfg(
+        robot=script.robot, policy=script.policy, num_terrains=num_terrains, num_replicas=replicas,
+        device=script.device, workers="1", num_envs=num_envs,
+    )  # fmt: skip
+    rollout = build_rollout(cfg, num_terrains)
+    assert isinstance(rollout, Rollout)
+    return rollout
+
+
+def time_iteration(script: Script) -> dict[str, Any]:
+    """The paper's iteration beside bare physics on the same crossings."""
+    cfg = preset("small" if script.small else "paper", script.robot)
+    if script.small:
+        cfg = replace(cfg, replicas=1, scheduler=replace(cfg.scheduler, emitters=2, batch_size=2, groups=1))
+    metrics, terrains = time_search(script, "iteration", cfg, 1 if script.small else 10)
+    rate = float(np.median([row["robot_steps"] / row["wall_s"] for row in metrics]))
+    rollout = rollout_of(script, len(terrains), cfg.episodes_per_iteration, cfg.replicas)
+    bare = bare_rates(rollout, terrains, np.arange(len(terrains), dtype=np.uint32), rounds=1 if script.small else 3)
+    return {
+        "num_envs": cfg.episodes_per_iteration,
+        "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
+        "idle_share": float(np.median([row["idle_share"] for row in metrics])),
+        "search_share": float(np.median([row["search_s"] / row["wall_s"] for row in metrics])),
+        "world_steps_per_s": rate,
+        "bare_world_steps_per_s": bare["walking"],
+        "bare_world_steps_per_s_standing": bare["standing"],
+        "bare_physics_ratio": rate / bare["walking"],
+        "bare_physics_ratio_standing": rate / bare["standing"],
+        "ground_step_ratio": bare["walking"] / bare["ground"],
+        "conditions_step_ratio": None,
+    }
+
+
+def time_wide(script: Script) -> dict[str, Any]:
+    """Iterations of preset wide by method, and what the paper's four million episodes take by them."""
+    numbers = {}
+    for method in WIDE:
+        cfg = preset("wide", script.robot)
+        cfg = replace(cfg, scheduler=replace(cfg.scheduler, method=method))
+        metrics, _ = time_search(script, f"wide-{method}", cfg, 6)
+        seconds = float(np.median([row["wall_s"] for row in metrics]))
+        numbers[method] = {
+            "iteration_s_median": seconds,
+            "minutes_per_4m_episodes": PAPER_EPISODES / cfg.episodes_per_iteration * seconds / 60,
+            "idle_share": float(np.median([row["idle_share"] for row in metrics])),
+            "search_share": float(np.median([row["search_s"] / row["wall_s"] for row in metrics])),
+        }
+    return numbers
+
+
+def time_curve(script: Script) -> list[dict[str, float]]:
+    """Episodes a second on hard-random terrains over numbers of robots, each of which runs 20 episodes."""
+    rows = []
+    for count in (4,) if script.small else CURVE:
+        num_terrains = max(1, count * EPISODES_A_ROBOT // REPLICAS)
+        genes = SUPER_GAUSSIAN.hard_random(num_terrains, script.seed)
+        cfg = EvaluatorCfg(
+            robot=script.robot, policy=script.policy, num_terrains=max(1, num_terrains // 5), num_replicas=REPLICAS,
+            num_envs=count, device=script.device, workers="1",
+        )  # fmt: skip
+        with open_evaluator(cfg) as evaluate:
+            result = evaluate(genes, np.arange(num_terrains, dtype=np.uint32))
+        rate = result.outcome.size / result.wall_s
+        rows.append({"num_envs": count, "episodes_per_s": rate, "idle_share": result.idle_share})
+    return rows
+
+
+def time_kernels(script: Script, num_envs: int) -> list[dict[str, Any]]:
+    """Shares of a control step's kernels in hard-random crossings; on a GPU alone."""
+    num_terrains = num_envs // REPLICAS
+    rollout = rollout_of(script, num_terrains, num_envs, REPLICAS)
+    genes = SUPER_GAUSSIAN.hard_random(num_terrains, script.seed)
+    return kernel_shares(rollout, genes, np.arange(num_terrains, dtype=np.uint32))
+
+
+def time_cpu(script: Script) -> dict[str, Any]:
+    """What a user without a GPU waits for: the whole archive command of preset small."""
+    run, began = script.runs / "speed" / "cpu", time.perf_counter()
+    shutil.rmtree(run, ignore_errors=True)
+    words = ("archive", "--robot", script.robot.name, "--preset", "small", "--device", "cpu", "--run-dir", str(run))
+    subprocess.run([sys.executable, "-m", "faultline", *words], check=True)
+    return {"archive_wall_s": time.perf_counter() - began, "view_to_failure_s": None}
+
+
+def training_rates(file: Path) -> dict[str, float | None]:
+    """PPO's environment steps a second with learning, as train_speed.py wrote them."""
+    rows = json.loads(file.read_text())["rows"] if file.exists() else []
+    rates = {(row["gpus"], row["num_envs"]): row["train_env_steps_per_s"] for row in rows}
+    return {
+        "train_env_steps_per_s": rates.get((1, 4096)),
+        "train_env_steps_per_s_8192": rates.get((1, 8192)),
+        "train_env_steps_per_s_2gpu": rates.get((2, 8192)),
+        "train_env_steps_per_s_mjlab": None,
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Times everything."""
+    script = parse(__doc__, argv, "speed.json")
+    on_gpu = script.device.startswith("cuda")
+    return script.write(
+        {
+            **time_iteration(script),
+            **training_rates(script.out.with_name("train_speed.json")),
+            "envs_curve": time_curve(script),
+            "wide": time_wide(script) if on_gpu else None,
+            "kernels": time_kernels(script, 4000) if on_gpu else None,
+            "cpu": None if script.small else time_cpu(script),
+        }
+    )
+
+
+if __name__ == "__main__":
+    main()

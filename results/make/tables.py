@@ -1,0 +1,127 @@
+"""The paper's tables: controllers trained on three kinds of terrains, on terrains they have not seen: tables.json.
+
+C-HC trains on hand-crafted terrains, C-HR on hard-random ones too, C-G on elites of the published archive too; three
+seeds each, of which the first is published as a file. tables.npz has the goal rate of every terrain.
+"""
+
+import itertools
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.evaluate.evaluate import SetsCfg, cross_sets, crossings_folder, evaluate_tables
+from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
+from results.make.common import SEEDS, Script, parse, published_controllers
+from sim.rates import crossing_rates
+from train.cfg import FinetuneCfg, RunCfg
+from train.finetune import finetune
+
+MIXES = {"C-HC": "hand-crafted", "C-HR": "hard-random", "C-G": "generated"}
+EPISODES = 20
+RESAMPLES = 10_000
+
+
+def train_controllers(script: Script) -> dict[str, str]:
+    """Trains each kind with each seed; returns the files by name, those of further seeds as C-G@1."""
+    controllers, options = {}, RunCfg(device=script.device)
+    for name, mix in MIXES.items():
+        for seed in SEEDS:
+            cfg = replace(FinetuneCfg.of(script.robot), mix=mix, seed=seed)
+            if mix == "generated":
+                cfg = replace(cfg, archive=(str(script.results / "archive"),))
+            policy = finetune(script.robot, cfg, script.runs / "tables" / f"{name}-{seed}", options)
+            controllers[name if seed == SEEDS[0] else f"{name}@{seed}"] = str(policy)
+            if seed == SEEDS[0]:
+                shutil.copyfile(policy, script.results / f"{name}.pt")
+    return controllers
+
+
+def difference(
+    first: NDArray[np.float64], second: NDArray[np.float64], families: NDArray[np.int64], seed: int
+) -> dict[str, Any]:
+    """How much more often the first kind of controller reaches the goal than the second.
+
+    Args:
+        first: Goal rates of its seeds on the terrains, shape (num_seeds, num_terrains).
+        second: Likewise.
+        families: Of terrains that are not independent, shape (num_terrains,).
+        seed: Of the bootstrap.
+
+    Returns:
+        ``goal``, and its 95 % ``interval`` over families and seeds, both resampled.
+    """
+    known = np.isfinite(first).all(axis=0) & np.isfinite(second).all(axis=0)
+    family = np.unique(families[known], return_inverse=True)[1]
+    sizes = np.bincount(family).astype(np.float64)
+    sums = [np.array([np.bincount(family, row[known]) for row in kind]) for kind in (first, second)]
+    rng, draws = np.random.default_rng(seed), []
+    for _ in range(RESAMPLES):
+        weights = np.bincount(rng.integers(len(sizes), size=len(sizes)), minlength=len(sizes))
+        rates = [kind[rng.integers(len(kind), size=len(kind))].mean(axis=0) @ weights for kind in sums]
+        draws.append((rates[0] - rates[1]) / (sizes @ weights))
+    mean = float((sums[0].mean(axis=0) - sums[1].mean(axis=0)).sum() / sizes.sum())
+    return {"goal": mean, "interval": np.quantile(draws, [0.025, 0.975]).tolist()}
+
+
+def differences(
+    rates: Mapping[str, NDArray[np.float64]], families: NDArray[np.int64], seed: int
+) -> dict[str, dict[str, Any]]:
+    """:func:`difference` of every two kinds on one set, the later one first: ``C-G - C-HR``."""
+    kinds: dict[str, list[NDArray[np.float64]]] = {}
+    for name, of_controller in rates.items():
+        kinds.setdefault(name.partition("@")[0], []).append(of_controller)
+    return {
+        f"{second} - {first}": difference(np.array(kinds[second]), np.array(kinds[first]), families, seed)
+        for first, second in itertools.combinations(kinds, 2)
+    }
+
+
+def families_of(terrains: TerrainSet) -> NDArray[np.int64]:
+    """Family of each terrain; each its own where they are independent."""
+    return np.arange(len(terrains)) if terrains.families is None else terrains.families
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Trains and evaluates; a trial evaluates what is published on few terrains."""
+    script = parse(__doc__, argv, "tables.json")
+    controllers = published_controllers(script)
+    if script.small:
+        controllers = {name: controllers[name] for name in ("base", "C-G")}
+    else:
+        hardened = {name: file for name, file in controllers.items() if name == "hardened"}
+        controllers = {"base": controllers["base"], **train_controllers(script), **hardened}
+    cfg = SetsCfg(
+        names=("hard_random", "generated") if script.small else (),
+        archive=script.results / "archive",
+        independent=None if script.small else script.results / "independent",
+        terrains=2 if script.small else paper_terrains(script.robot.name),
+        episodes=1 if script.small else EPISODES,
+        seed=script.seed,
+    )
+    tables = evaluate_tables(script.robot, controllers, cfg, compute=script.compute, out=script.out)
+    archive = script.read_archive()
+    independent = None if cfg.independent is None else script.read_archive("independent")
+    sets = make_sets(cfg.names, cfg.terrains, cfg.seed, archive=archive, independent=independent)
+    crossed = cross_sets(
+        controllers, sets, robot=script.robot, compute=script.compute, episodes=cfg.episodes, reward=True,
+        cache=crossings_folder(script.robot),
+    )  # fmt: skip
+    rates = {
+        name: {who: crossing_rates(result.outcome, "goal") for who, result in row.items()}
+        for name, row in crossed.items()
+    }
+    script.add(
+        tables,
+        {"kind_differences": {name: differences(rates[name], families_of(sets[name]), cfg.seed) for name in sets}},
+    )
+    arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
+    arrays |= {f"{name}_family": families_of(terrains) for name, terrains in sets.items()}
+    np.savez_compressed(script.out.with_suffix(".npz"), controllers=np.array(list(controllers)), **arrays)
+
+
+if __name__ == "__main__":
+    main()

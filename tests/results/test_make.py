@@ -1,0 +1,85 @@
+"""The scripts that make published numbers: each runs as a trial, and the pages say what the files say."""
+
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from results.make import common, docs
+from sim.files.records import sources_sha256
+
+MAKE = Path(common.__file__).parent
+SCRIPTS = ("base", "penalty_ratios", "agreement", "distances", "dose", "train_speed", "solver_options")
+
+
+def run_small(name, out, device):
+    """The JSON that a script writes as a trial."""
+    importlib.import_module(f"results.make.{name}").main(["--small", "--device", device, "--out", str(out)])
+    return json.loads(out.read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_trial_writes_its_file(name, tmp_path, device):
+    report = run_small(name, tmp_path / f"{name}.json", device)
+    assert {"command", "commit", "sources_sha256", "dirty", "device", "versions", "seed", "date"} <= report.keys()
+    assert report["robot"] == "anymal" and report["sources_sha256"] == sources_sha256()
+
+
+def test_the_list_names_every_script_once():
+    scripts = {file.stem for file in MAKE.glob("*.py")} - {"bare"}
+    lines = (MAKE / "all.sh").read_text().splitlines()
+    assert [name for name in scripts if not any(f" {name} " in line or f"make.{name}" in line for line in lines)] == []
+
+
+def test_a_file_of_other_sources_is_not_current(tmp_path):
+    file = tmp_path / "base.json"
+    assert not common.is_current(file)
+    file.write_text(json.dumps({"sources_sha256": sources_sha256()}))
+    assert common.is_current(file)
+    file.write_text(json.dumps({"sources_sha256": "0" * 64}))
+    assert not common.is_current(file)
+
+
+def test_means_over_seeds():
+    # Of 1, 2 and 6 the mean is 3 and the standard deviation sqrt(7); t at 97.5 % and 2 degrees of freedom is 4.303.
+    half = 4.303 * np.sqrt(7) / np.sqrt(3)
+    numbers = common.mean_over_seeds("elites", [1, 2, 6])
+    assert numbers["elites"] == 3
+    assert numbers["elites_interval"] == pytest.approx([3 - half, 3 + half], rel=1e-3)
+    assert common.mean_over_seeds("faults", [1, None]) == {"faults": None, "faults_interval": None}
+    assert common.mean_over_seeds("faults", [5]) == {"faults": 5, "faults_interval": None}
+
+
+def test_pages_say_what_the_files_say():
+    assert docs.main(["--check"]) == 0
+
+
+def test_a_table_is_written_between_its_marks(tmp_path):
+    folder = tmp_path / "results" / "dog"
+    folder.mkdir(parents=True)
+    nearest = {"hard_random": {"terrains": 4, "median": 0.114, "least": 0.07, "largest": 0.2}}
+    (folder / "distances.json").write_text(json.dumps({"nearest_m": nearest}))
+    page = tmp_path / "page.md"
+    page.write_text("Before.\n<!-- table: distances dog -->\nold\n<!-- table: end -->\nBehind.\n")
+    words = ["--results", str(tmp_path / "results"), "--docs", str(tmp_path)]
+    assert docs.main([*words, "--check"]) == 1
+    assert docs.main(words) == 0 and docs.main([*words, "--check"]) == 0
+    assert page.read_text().splitlines() == [
+        "Before.",
+        "<!-- table: distances dog -->",
+        "| terrains | number | median | least | largest |",
+        "| --- | --- | --- | --- | --- |",
+        "| hard-random | 4 | 11.4 cm | 7.0 cm | 20.0 cm |",
+        "<!-- table: end -->",
+        "Behind.",
+    ]
+    page.write_text("<!-- table: distance dog -->\n<!-- table: end -->\n")
+    with pytest.raises(ValueError, match="distance"):
+        docs.main(words)
+    (folder / "distances.json").write_text("{}")
+    page.write_text("<!-- table: distances dog -->\n<!-- table: end -->\n")
+    with pytest.raises(ValueError, match="nearest_m"):
+        docs.main(words)
