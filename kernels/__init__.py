@@ -16,7 +16,7 @@ _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 def _start_warp() -> None:
     """Starts Warp without the warning that its C++ writes where there is no CUDA driver.
 
-    Every process would write it, workers too. Who chooses a device says it (:func:`sim.simulation.resolve_device`).
+    Every process would write it, workers too. Who chooses a device says it (:func:`sim.device.resolve_device`).
     """
     try:
         stderr = os.dup(2)

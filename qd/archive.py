@@ -144,7 +144,7 @@ class Archive(Evaluation):
 
     robot: str
     space: str
-    """Name of the terrain space of the genes (:func:`sim.space.get_space`)."""
+    """Name of the terrain space of the genes (:func:`sim.spaces.registry.get_space`)."""
     penalties: tuple[str, ...]
     """Names of the P penalties, in the order of the ratios."""
     scales: tuple[float, ...]
@@ -372,7 +372,7 @@ def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
 
 
 def _check_shapes(archive: Archive) -> None:
-    from sim.space import get_space, is_own  # which imports Warp: not for `--help`
+    from sim.spaces.registry import get_space, is_own  # which imports Warp: not for `--help`
 
     num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
     # How many genes a space of one's own has only its code says, and reading an archive runs none.

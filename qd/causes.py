@@ -12,7 +12,7 @@ from sim.ground import PATCHES, patches_at
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 if TYPE_CHECKING:
-    from sim.space import TerrainSpace
+    from sim.spaces.base import TerrainSpace
 
 LEAST_HEIGHT = 0.03
 """A part that is nowhere so high or deep under the robot lies beside its way [m]."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from sim.files.command import OfRobot, Where, Who
-from sim.files.settings import setting
+from sim.files.settings import NonNegativeInt, PositiveInt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +39,11 @@ class Evaluate(Who, Where):
     sets: tuple[str, ...] = ()
     """Sets of the tables: hand_crafted, hard_random, with --archive generated and generated_far, and with --independent
     generated_independent. All of them if left out."""
-    terrains: int | None = setting(None, least=1)
+    terrains: PositiveInt | None = None
     """Terrains a set; 300 on CUDA (tables of Cassie: 180), 24 on the CPU."""
-    episodes: int | None = setting(None, least=1)
+    episodes: PositiveInt | None = None
     """Episodes a terrain; 20 on CUDA, 4 on the CPU."""
-    seed: int = setting(0, least=0)
+    seed: NonNegativeInt = 0
     """Draws other test sets."""
     out: Path | None = None
     """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
@@ -57,7 +57,7 @@ class Evaluate(Who, Where):
         from qd.workers.evaluator import Compute
         from sim.files.command import split_words
         from sim.policy.spec import controllers_of
-        from sim.robots.robot import get_robot, robot_of
+        from sim.robots.find import get_robot, robot_of
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
@@ -107,11 +107,11 @@ class Dose(OfRobot, Where):
     """Other sizes of obstacles beside the one that grows, each NAME=VALUE: tread=0.25 depth=0.3."""
     resolved: bool = False
     """Cross with contact resolved: steps of 1 ms and a contact time constant of 3 ms; about five times the work."""
-    terrains: int | None = setting(None, least=1)
+    terrains: PositiveInt | None = None
     """Terrains a value; 20 on CUDA, 8 on the CPU."""
-    episodes: int | None = setting(None, least=1)
+    episodes: PositiveInt | None = None
     """Episodes a terrain; 4 on CUDA, 2 on the CPU."""
-    seed: int = setting(0, least=0)
+    seed: NonNegativeInt = 0
     """Draws other episodes."""
     out: Path | None = None
     """File for the numbers; runs/<robot>-dose/dose.json, with contact resolved dose-resolved.json. The figure is
@@ -122,7 +122,7 @@ class Dose(OfRobot, Where):
         from qd.evaluate.dose import measure_dose
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
         from sim.spaces.dose import parse_doses
 
         robot = get_robot(self.robot)
@@ -146,14 +146,14 @@ class MakePack(Who, Where):
     """Run directory; the newest of the robot under runs/."""
     space: str | None = None
     """Terrain space of the run, where it is one of your own: file.py:CLASS."""
-    size: int = setting(100, least=1)
+    size: PositiveInt = 100
     """How many terrains. There are fewer if the run has fewer faults and near-faults."""
     controllers: tuple[str, ...] = ()
     """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base, all of
     results/<robot>/*.pt, and the robot's panel. The searched controller is always among them."""
-    episodes: int = setting(20, least=1)
+    episodes: PositiveInt = 20
     """Episodes on each terrain."""
-    seed: int = setting(0, least=0)
+    seed: NonNegativeInt = 0
     """Draws other episodes."""
     out: Path | None = None
     """Folder to write to; runs/<robot>-pack."""
@@ -164,7 +164,7 @@ class MakePack(Who, Where):
         from qd.run.directory import newest_run
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
 
         robot = get_robot(self.robot)
         make_pack(

@@ -260,16 +260,16 @@ def _counts_in_mujoco_c(archive: Archive, numbers: NDArray[np.int64], work: Work
     """Outcomes of elites in plain MuJoCo C, shape (len(numbers), 4)."""
     from kernels.episode import Outcome
     from sim.mujoco_c.crossing import cross_terrains
-    from sim.robots.robot import get_robot
-    from sim.space import get_space
+    from sim.robots.find import get_robot
+    from sim.spaces.registry import get_space
 
-    crossings = cross_terrains(
+    crossings = dict(cross_terrains(
         get_robot(work.evaluator.robot), work.evaluator.policy, archive.genes[numbers],
         elite_seeds(archive, work.seed, stream=_CONFIRM_STREAM)[numbers],
         space=get_space(archive.space, archive.space_sha256), num_episodes=EPISODES, device=work.evaluator.device,
         processes=processes, resolved=True,
-    )  # fmt: skip
-    outcome = np.array([one.outcome for one in crossings])
+    ))  # fmt: skip
+    outcome = np.array([crossings[number].outcome for number in range(len(numbers))])
     return _counts(
         goal=outcome == Outcome.GOAL,
         base_collision=outcome == Outcome.BASE_COLLISION,

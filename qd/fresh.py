@@ -235,13 +235,15 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         Interrupted: On Ctrl-C; the run is as it was.
         EvaluatorError: If a worker is lost; likewise.
     """
-    from sim.robots.robot import get_robot, robot_of
-    from sim.space import recorded_space
+    from sim.robots.find import get_robot, robot_of
+    from sim.spaces.registry import get_space, load_space
 
     path = args.run or newest_run(get_robot(args.robot or "anymal"), args.policy)
     run = RunDirectory(path)
     config, cfg = run.read_config(), run.read_cfg()
-    recorded_space(cfg.space, cfg.space_sha256, named=args.space, file=path)
+    if args.space is not None:
+        load_space(args.space)
+    get_space(cfg.space, cfg.space_sha256)
     robot = robot_of(as_settings(cfg), args.robot, path)
     seed = cfg.seed if args.seed is None else args.seed
     if seed < 0:

@@ -19,7 +19,7 @@ from sklearn.metrics import silhouette_score
 from qd.archive import Archive
 from qd.fitness import FAILING_GOAL_RATE
 from sim.bank import heights_of
-from sim.space import TerrainSpace
+from sim.spaces.base import TerrainSpace
 
 VERDICTS = ("", "failing", "confirmed", "certified", "fault")
 """What an elite is, in a word."""

@@ -25,7 +25,7 @@ from qd.workers.evaluator import EvaluatorCfg, pipeline_of
 from qd.workers.invalid import invalid_reasons, invalid_words
 
 if TYPE_CHECKING:
-    from sim.space import TerrainSpace
+    from sim.spaces.base import TerrainSpace
 
 How = Literal["exhaustive", "greedy"]
 Parts = tuple[int, ...]

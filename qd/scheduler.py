@@ -17,7 +17,9 @@ from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.run.settings import SchedulerCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, clipped, get_space
+from sim.spaces.base import TerrainSpace, clipped
+from sim.spaces.registry import get_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 if TYPE_CHECKING:
     from qd.surrogate import Surrogate

@@ -146,7 +146,7 @@ def begin(
 
 def _new(cfg: SearchCfg) -> "Scheduler":
     from qd.scheduler import Scheduler  # pyribs takes two seconds to import
-    from sim.space import get_space
+    from sim.spaces.registry import get_space
 
     return Scheduler(
         cfg.scheduler,
@@ -214,9 +214,9 @@ def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
     if invalid is not None:
         print(f"Warning: {invalid}")
     if len(archive):
-        from sim.space import to_be_named
+        from sim.spaces.registry import is_own
 
-        space = to_be_named(job.evaluator.space)
+        space = job.evaluator.space if is_own(job.evaluator.space) else None
         worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg), space=space)
         print(f"Next, see the worst terrain:  {worst}")
     return archive

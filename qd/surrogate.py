@@ -20,7 +20,8 @@ from qd.run.settings import SchedulerCfg, still_there
 from qd.variation import varied
 from sim.corridor import corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch
-from sim.space import TerrainSpace, clipped, get_space
+from sim.spaces.base import TerrainSpace, clipped
+from sim.spaces.registry import get_space
 
 BATCH = 64
 """Terrains of a step of training, for each network."""

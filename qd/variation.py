@@ -15,7 +15,7 @@ def varied(pool: Tensor, count: int, cfg: SchedulerCfg, genes_per_part: int | No
         pool: Genes of the elites, shape (E, num_genes).
         count: Number of children.
         cfg: Step sizes and that share.
-        genes_per_part: As of :attr:`sim.space.TerrainSpace.genes_per_part`.
+        genes_per_part: As of :attr:`sim.spaces.base.TerrainSpace.genes_per_part`.
         draw: What they are drawn from, on the pool's device.
 
     Returns:

@@ -7,8 +7,10 @@ import warp as wp
 
 from kernels.ground import FIRM, Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+from sim.device import host_device
 from sim.ground import GroundMaps
-from sim.space import SUPER_GAUSSIAN, TerrainSpace
+from sim.spaces.base import TerrainSpace
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _ALL = slice(None)
@@ -127,11 +129,6 @@ class TerrainBank:
         return GroundMaps(
             friction=np.array(self.ground.friction.numpy()), time_constant_s=np.array(self.ground.time_constant.numpy())
         )
-
-
-def host_device() -> str:
-    """Warp device of small work for the host: the CPU, or the default device where Warp has no compiler for the CPU."""
-    return "cpu" if wp.is_cpu_available() else str(wp.get_device())
 
 
 def heights_of(

@@ -5,9 +5,12 @@ Modules with Warp, torch or Newton are imported inside ``execute``, so that ``--
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
 
 from sim.files.command import OfRobot, OnDevice, Who, command_line
-from sim.files.settings import setting
+from sim.files.settings import NonNegativeInt, PositiveInt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,18 +21,18 @@ class Stand(OfRobot, OnDevice):
     constraint rows it needs when it lies on rough ground. The exit status is 1 if something must be mended.
     """
 
-    seconds: float = setting(3.0, above=0, most=60)
+    seconds: Annotated[float, Meta(gt=0, le=60)] = 3.0
     """How long it stands, and lies [s]."""
-    drops: int = setting(32, least=1)
+    drops: PositiveInt = 32
     """Robots dropped in random poses on hard-random terrain."""
-    seed: int = setting(0, least=0)
+    seed: NonNegativeInt = 0
     """Draws poses and terrains."""
 
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
-        from sim.robots.robot import get_robot
+        from sim.device import resolve_device
+        from sim.robots.find import get_robot
         from sim.robots.stand import describe_model, describe_standing, stand
-        from sim.simulation import resolve_device
 
         robot = get_robot(self.robot)
         print(describe_model(robot), flush=True)
@@ -55,7 +58,7 @@ class ExportPolicy(Who):
     def execute(self) -> None:
         """Writes the file and says what it holds."""
         from sim.policy.export import INPUT, OUTPUT, export_onnx, read_checkpoint
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
 
         policy = read_checkpoint(self.policy, get_robot(self.robot))
         apart = export_onnx(policy, self.out)

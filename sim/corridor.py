@@ -7,7 +7,7 @@ import warp as wp
 from kernels.ground import COLS, MOST_TIME_CONSTANT_S, ROWS, make_ground
 from sim.bank import TerrainBank
 from sim.ground import patches_at
-from sim.space import TerrainSpace
+from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 X = (2.0, 14.0)

@@ -8,6 +8,8 @@ from kernels.episode import Task
 from kernels.restart import StartRanges
 from sim.robots.robot import RobotCfg
 
+CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
+"""mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 FALLEN_TILT_DEG = 60.0
 """A robot that leans further than this has fallen [degrees]."""
 
@@ -43,8 +45,6 @@ class CrossingCfg:
 
 def make_task(cfg: CrossingCfg, robot: RobotCfg, *, to_goal: bool = True) -> Task:
     """The goal, command and ends of a crossing as a kernel argument; without ``to_goal`` the goal ends none."""
-    from sim.simulation import CAPACITY_OVERFLOWS  # imports Newton, which the settings alone do not need
-
     task = Task()
     for name in ("goal", "speed", "yaw_gain", "max_yaw_rate", "lower", "upper", "base_force"):
         setattr(task, name, getattr(cfg, name))

@@ -26,7 +26,8 @@ from sim.policy.runner import Memory, PolicyRunner
 from sim.reward import Reward
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation, SolverCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace
+from sim.spaces.base import TerrainSpace
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 
 @dataclass(frozen=True, kw_only=True)

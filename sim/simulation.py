@@ -1,9 +1,7 @@
 """Parallel robots on height grids: one world each, terrain contact of our own, Newton's MuJoCo solver."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import newton
@@ -24,8 +22,6 @@ from sim.solver import dynamics_of, use_own_solver
 
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
-CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
-"""mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 _RESOLVED_DT = 0.001
 _RESOLVED_TIME_CONSTANT_S = 0.003
 
@@ -60,30 +56,6 @@ def resolved(robot: RobotCfg) -> tuple[RobotCfg, SolverCfg]:
     return replace(robot, physics_dt=_RESOLVED_DT, decimation=steps), SolverCfg(
         time_constant_s=_RESOLVED_TIME_CONSTANT_S
     )
-
-
-def resolve_device(name: str | None) -> str:
-    """Warp device name for what a user asked for: ``None`` is CUDA where there is one, else the CPU.
-
-    Raises:
-        ValueError: If the device is unknown or absent.
-    """
-    if name is None:
-        return "cuda:0" if wp.is_cuda_available() else _cpu_instead()
-    if name.startswith("cuda") and not wp.is_cuda_available():
-        raise ValueError(f"device '{name}' asked for, but no CUDA device was found here: use --device cpu")
-    try:
-        return str(wp.get_device("cuda:0" if name == "cuda" else name))
-    except (RuntimeError, ValueError) as error:
-        present = ", ".join(("cpu", *map(str, wp.get_cuda_devices())))
-        raise ValueError(f"unknown device '{name}': expected one of {present}") from error
-
-
-@cache
-def _cpu_instead() -> str:
-    """The CPU, where no device was asked for; says so, once."""
-    print("No CUDA device was found here: this machine works on its CPU.", file=sys.stderr, flush=True)
-    return "cpu"
 
 
 class Simulation:

@@ -15,10 +15,12 @@ import warp as wp
 
 from qd.run.directory import RESULTS
 from sim.bank import TerrainBank
+from sim.device import resolve_device
 from sim.files.command import publish
 from sim.files.records import provenance
-from sim.robots.robot import ROBOTS, get_robot
-from sim.simulation import Simulation, resolve_device
+from sim.robots.find import get_robot
+from sim.robots.shipped import ROBOTS
+from sim.simulation import Simulation
 from tests.builders import as_of_now
 from tests.sim.scenes import Stepper
 

@@ -17,9 +17,9 @@ import tyro
 import faultline
 from sim.bank import heights_of
 from sim.policy.loaders import load_policy
+from sim.robots.find import get_robot
 from sim.robots.model import build_robot, effort_limits
-from sim.robots.robot import get_robot
-from sim.space import load_space
+from sim.spaces.registry import load_space
 from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.docs import PAGES, ROOT, code_of, commands_of, mentions_of, numbers_of, run_by_make, text_of
 from tests.sim.dogs import MASS, mjcf

@@ -60,7 +60,7 @@ class Train(TrainingFlags):
 
 def _job_of(flags: Train, began: float) -> "Job":
     """What the flags ask for, checked."""
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
     from train.ppo.learner import Ranks
     from train.ppo.run import Job, check_resumed, device_of, prepare_run_dir, read_saved, settings_of, sizes_of
 

@@ -28,8 +28,10 @@ from sim.files.command import Interrupted, command_line, naming_what_is_next
 from sim.files.records import identity
 from sim.files.settings import check
 from sim.policy.spec import certifier_hash, controller_hash, controllers_of, is_same
-from sim.robots.robot import RobotCfg, get_robot
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, load_space, on_ground, to_be_named
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import is_own, load_space
 from train.choice import choose, known_choice
 from train.finetune import Finetune
 from train.harden import Harden
@@ -233,8 +235,8 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     policy = flags.policy or robot.policy_file
     read_start(policy, robot)
     check_policy(str(policy), robot, device)
-    flags = replace(flags, space=on_ground(flags.space, flags.ground), ground=None)
-    space = SUPER_GAUSSIAN if flags.space is None else load_space(flags.space)
+    space = load_space(flags.space, flags.ground)
+    flags = replace(flags, space=flags.space and space.name, ground=None)
     on_cuda = device.startswith("cuda")
     sizes = {name: getattr(flags, name) for name in ("emitters", "batch_size", "replicas")}
     search = changed(preset(flags.preset or ("wide" if on_cuda else "small"), robot, str(policy)), sizes)
@@ -441,7 +443,7 @@ def _tune(job: Hardening, tune: Tune) -> None:
         own |= {"run_dir": tune.run, "policy": tune.start, "seed": tune.seed, "shares": flags.shares, **job.tune_sizes}
         own |= {"noise_of": Path(job.base)} if tune.start != flags.policy else {}
         own |= {"draw": flags.draw} if tune.archives else {"mix": "hard-random"}
-    own["space"] = to_be_named(job.space.name) if tune.archives else job.space.name
+    own["space"] = job.space.name if is_own(job.space.name) or not tune.archives else None
     if replace(training, **own).execute():
         raise KeyboardInterrupt
 

@@ -15,17 +15,12 @@ from qd.run.directory import directory_of, published_or_newest
 from sim.files.command import command_line
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.policy.spec import SHIPPED, name_of
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from sim.robots.training import RewardCfg
-from sim.space import (
-    SUPER_GAUSSIAN,
-    TerrainSpace,
-    load_space,
-    on_ground,
-    recorded_identity,
-    recorded_space,
-    to_be_named,
-)
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import get_space, identity, is_own, load_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from train.finetune import Finetune, archive_paths
 from train.ppo.learner import Start, read_start
 from train.ppo.run import (
@@ -122,7 +117,8 @@ class FineTuning(Training):
         Of one that was trained on all elites, none held out: the command that lets it certify.
         """
         settings = self.job.settings
-        newest, space = (archive_paths(settings) or [None])[-1], to_be_named(self.mix.spaces[-1].name)
+        newest, space = (archive_paths(settings) or [None])[-1], self.mix.spaces[-1].name
+        space = space if is_own(space) else None
         if newest is not None and not settings["archive"].get("held_out", True):
             by, run = f"S={self.job.run_dir / POLICY}", directory_of(Path(newest))
             return command_line("certify", robot=self.job.robot.spec, run=run, space=space, by=[by])
@@ -259,7 +255,7 @@ def _elites(flags: Finetune, robot: RobotCfg, *, keep_validation: bool) -> _Elit
             raise ValueError(f"mix {flags.mix} takes no terrains from an archive: leave --archive out")
         if flags.only != "all" or not flags.held_out:
             raise ValueError(f"mix {flags.mix} has no elites: leave --only and --no-held-out out, or use mix generated")
-        space = load_space(on_ground(flags.space, flags.ground) or SUPER_GAUSSIAN.name)
+        space = load_space(flags.space, flags.ground)
         return _Elites((np.zeros((0, space.num_genes), np.float32),), (space,))
     if flags.ground is not None:
         raise ValueError("mix generated takes the ground of its archives, got --ground: leave it out")
@@ -368,7 +364,7 @@ def chosen_elites(archive: Archive, only: str, path: Path) -> np.ndarray:
 
 def _identities(spaces: Sequence[TerrainSpace]) -> list[str]:
     """What the terrains of each space depend on, wherever its code lies."""
-    return [recorded_identity(space.name, space.sha256) for space in spaces]
+    return [identity(space.name, space.sha256) for space in spaces]
 
 
 def _named(spaces: Sequence[TerrainSpace], saved: dict[str, Any] | None) -> dict[str, Any]:
@@ -391,7 +387,9 @@ def _check_space(flags: Finetune, there: dict[str, Any]) -> None:
         ValueError: If it is a user's own that the command line does not name, or another now.
     """
     if there.get("space") is not None:
-        recorded_space(there["space"], there.get("space_sha256"), named=flags.space, file=flags.resume)
+        if flags.space is not None:
+            load_space(flags.space)
+        get_space(there["space"], there.get("space_sha256"))
 
 
 def _refuse_changes(flags: Finetune, saved: dict[str, Any], settings: dict[str, Any]) -> None:

@@ -22,8 +22,8 @@ from sim.policy.spec import about_controllers
 from sim.rates import hits_of
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.space import SUPER_GAUSSIAN
 from sim.spaces.dose import LEVEL_SPACE, Dose
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU

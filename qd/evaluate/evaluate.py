@@ -34,7 +34,8 @@ from sim.files.records import identity, robot_identity
 from sim.policy.spec import controller_hash, name_of, who_crossed
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.space import SUPER_GAUSSIAN, load_space
+from sim.spaces.registry import load_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 EPISODES = 20
 """Episodes a terrain on a GPU."""
@@ -54,7 +55,7 @@ class SetsCfg:
     independent: Path | None = None
     """Run of another search, or its archive file, for ``generated_independent``."""
     space: str | None = None
-    """Terrain space of the hard-random terrains, as :func:`sim.space.load_space` takes it; super_gaussian if None."""
+    """Terrain space of the hard-random terrains, by name; super_gaussian if None."""
     part: Part = "test"
     terrains: int | None = None
     """A set; by default as many as suit the device."""

@@ -39,9 +39,10 @@ from sim.files.npz import npz_bytes, read_arrays
 from sim.files.records import identity
 from sim.policy.spec import about_controllers, is_same, who_crossed
 from sim.rates import counted_episodes
-from sim.robots.robot import RobotCfg, robot_of
+from sim.robots.find import robot_of
+from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.space import get_space, recorded_space
+from sim.spaces.registry import get_space, load_space
 from sim.terrain import NUM_COLS, NUM_ROWS
 
 PACK_FILE, TERRAINS_FILE = "pack.json", "pack.npz"
@@ -129,7 +130,9 @@ def make_pack(
         The content of ``pack.json``.
     """
     cfg = RunDirectory(run).read_cfg()
-    recorded_space(cfg.space, cfg.space_sha256, named=space, file=run)
+    if space is not None:
+        load_space(space)
+    get_space(cfg.space, cfg.space_sha256)
     body = robot_of(as_settings(cfg), robot, run)
     searched = policy or own_policy(run, cfg, body)
     controllers = {**(controllers or _published_controllers(body))}

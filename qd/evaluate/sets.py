@@ -25,7 +25,9 @@ from qd.groups import families_of, rms_distances
 from qd.run.directory import read_archive_of, search_seed
 from sim.bank import heights_of
 from sim.robots.robot import RobotCfg
-from sim.space import SUPER_GAUSSIAN, TerrainSpace, get_space
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import get_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 
 Part = Literal["test", "validation"]
@@ -101,7 +103,7 @@ class TerrainSet:
     levels: NDArray[np.int64] | None = None
     """Level of each hand-crafted terrain, shape (T,)."""
     space: str = SUPER_GAUSSIAN.name
-    """Terrain space of genes, as :func:`sim.space.load_space` takes it."""
+    """Terrain space of genes, as :func:`sim.spaces.registry.load_space` takes it."""
     families: NDArray[np.int64] | None = None
     """Number of each elite's family (:func:`qd.groups.families_of`), shape (T,); None of independent terrains."""
     certificates: Certificates | None = None

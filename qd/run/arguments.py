@@ -30,7 +30,7 @@ from sim.policy.spec import controller_hash
 
 if TYPE_CHECKING:
     from sim.robots.robot import RobotCfg
-    from sim.space import TerrainSpace
+    from sim.spaces.base import TerrainSpace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +147,8 @@ def job_of(args: Archive) -> Job:
         FileNotFoundError: If there is no run to resume.
         ValueError: If robot, preset, device, controller, space, a setting or the run directory is not as it must be.
     """
-    from sim.robots.robot import get_robot, robot_of
-    from sim.space import to_be_named
+    from sim.robots.find import get_robot, robot_of
+    from sim.spaces.registry import is_own
 
     if args.confirm == "yes" and args.reproduce == "no":
         raise ValueError("--confirm yes needs the fresh episodes that --reproduce no leaves out: give one of the two")
@@ -182,8 +182,8 @@ def job_of(args: Archive) -> Job:
     named = moved or code_of(cfg)
     at_end = {name: _at_end(getattr(args, name), cfg) for name in ("reproduce", "confirm")}
     later = {
-        "robot": robot.spec, "run": path, "policy": named, "space": to_be_named(space.name), "device": args.device,
-        "workers": args.workers,
+        "robot": robot.spec, "run": path, "policy": named, "space": space.name if is_own(space.name) else None,
+        "device": args.device, "workers": args.workers,
     }  # fmt: skip
     return Job(
         cfg=cfg,
@@ -209,19 +209,19 @@ def _space_of(args: Archive, there: SearchCfg | None) -> "tuple[TerrainSpace, di
         ValueError: If there is none of that name, it does not work, or the run's own is not named or has changed.
     """
     from sim.ground import split_name
-    from sim.space import SUPER_GAUSSIAN, get_space, load_space, on_ground
+    from sim.spaces.registry import get_space, load_space
 
     base = args.space if there is None or args.space else split_name(there.space)[0]
-    named = args.space if args.ground is None else on_ground(base, args.ground)
-    given = None if named is None else load_space(named)
+    given = load_space(base, args.ground) if there is None or args.space or args.ground else None
     if there is None:
-        space = given or SUPER_GAUSSIAN
+        assert given is not None
+        space = given
         sigma0 = space.sigma0 if args.sigma0 is None else args.sigma0
         return space, {"space": space.name, "space_sha256": space.sha256, "sigma0": sigma0}
     moved = given is not None and given.sha256 is not None and given.sha256 == there.space_sha256
     if given is not None and given.name != there.space and not moved:
         return given, {"space": given.name, "space_sha256": given.sha256}  # which the run refuses
-    return get_space(there.space, there.space_sha256, file=args.resume), {"space": None}
+    return get_space(there.space, there.space_sha256), {"space": None}
 
 
 def check_certifiers(certifiers: Mapping[str, str], cfg: SearchCfg, robot: "RobotCfg", device: str) -> None:
@@ -263,11 +263,11 @@ def own_file(robot: "RobotCfg") -> dict[str, Any]:
 
 
 def _resume_command(robot: "RobotCfg", path: Path, args: Archive, policy: str | None) -> str:
-    from sim.space import to_be_named
+    from sim.spaces.registry import is_own
 
     at_end = {name: None if getattr(args, name) == "auto" else getattr(args, name) for name in ("reproduce", "confirm")}
     return command_line(
-        "archive", robot=robot.spec, resume=path, policy=policy, space=args.space and to_be_named(args.space),
+        "archive", robot=robot.spec, resume=path, policy=policy, space=args.space if is_own(args.space or "") else None,
         device=args.device, workers=args.workers, num_envs=args.num_envs, **at_end,
     )  # fmt: skip
 
@@ -294,7 +294,7 @@ def evaluator_of(
     Raises:
         ValueError: If the controller cannot be loaded or does not fit the robot.
     """
-    from sim.space import get_space
+    from sim.spaces.registry import get_space
 
     check_policy(policy, robot, device)
     return EvaluatorCfg(

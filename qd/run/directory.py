@@ -158,9 +158,11 @@ def check_space(archive: Archive, run: Path, named: str | None) -> None:
     Raises:
         ValueError: If it is none, or one of a user's own that the command line does not name or that has changed.
     """
-    from sim.space import recorded_space  # which imports Warp: not for `--help`
+    from sim.spaces.registry import get_space, load_space  # which imports Warp: not for `--help`
 
-    recorded_space(archive.space, archive.space_sha256, named=named, file=run)
+    if named is not None:
+        load_space(named)
+    get_space(archive.space, archive.space_sha256)
 
 
 def folder_for(run: Path, robot: str) -> Path:

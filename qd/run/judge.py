@@ -89,13 +89,15 @@ class Judged:
 
 def config_of(args: OfRobot, run: Path | None, space: str | None) -> tuple[Path, SearchCfg, "RobotCfg"]:
     """Directory, search and robot of the run that a command line names, and its terrain space at hand."""
-    from sim.robots.robot import get_robot, robot_of
-    from sim.space import recorded_space
+    from sim.robots.find import get_robot, robot_of
+    from sim.spaces.registry import get_space, load_space
 
     policy = args.policy if isinstance(args, Who) else None
     path = run or newest_run(get_robot(args.robot or "anymal"), policy)
     cfg = RunDirectory(path).read_cfg()
-    recorded_space(cfg.space, cfg.space_sha256, named=space, file=path)
+    if space is not None:
+        load_space(space)
+    get_space(cfg.space, cfg.space_sha256)
     return path, cfg, robot_of(as_settings(cfg), args.robot, path)
 
 
@@ -193,7 +195,7 @@ def confirm_run(args: Confirm, *, open_evaluator: Open = open_evaluator) -> Arch
     policy = searched_policy(path, cfg, robot, args.policy, "confirmed")
     if args.mujoco_c:
         from sim.mujoco_c.model import refuse_softness  # with MuJoCo: not for `--help`
-        from sim.space import get_space
+        from sim.spaces.registry import get_space
 
         refuse_softness(get_space(cfg.space, cfg.space_sha256))
     device = resolve_device(args.device, args.workers)

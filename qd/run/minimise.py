@@ -28,7 +28,7 @@ from sim.files.records import identity
 if TYPE_CHECKING:
     from qd.causes import Shape
     from sim.robots.robot import RobotCfg
-    from sim.space import TerrainSpace
+    from sim.spaces.base import TerrainSpace
 
 FIGURE_FILE = "minimal.png"
 
@@ -224,7 +224,7 @@ def minimise_run(args: Minimise, *, open_evaluator: Open = open_evaluator) -> di
         Interrupted: On Ctrl-C; lots that ended are kept.
         EvaluatorError: If a worker is lost; likewise.
     """
-    from sim.space import get_space  # with Warp: not for `--help`
+    from sim.spaces.registry import get_space  # with Warp: not for `--help`
 
     path, cfg, robot = config_of(args, args.run, args.space)
     policy = searched_policy(path, cfg, robot, args.policy, "minimised")
@@ -292,7 +292,7 @@ def minimal_of_run(path: Path, archive: Archive, robot: "RobotCfg") -> tuple[dic
     Raises:
         ValueError: If their file is damaged.
     """
-    from sim.space import get_space  # with Warp: not for `--help`
+    from sim.spaces.registry import get_space  # with Warp: not for `--help`
 
     known = read_minimal(path, archive)
     space = get_space(archive.space, archive.space_sha256)

@@ -14,7 +14,7 @@ from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from sim.files.command import split_words
 from sim.files.records import PENALTY_DEFINITION, robot_identity
-from sim.files.settings import built, check, setting
+from sim.files.settings import check, from_builtins, setting
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, label_suffix, spec_of
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class SearchCfg:
     fitness: FitnessCfg
     scheduler: SchedulerCfg
     space: str = "super_gaussian"
-    """Terrain space, as :func:`sim.space.load_space` takes it."""
+    """Terrain space, as :func:`sim.spaces.registry.load_space` takes it."""
     space_sha256: str | None = None
     """Hash of its code if it is a user's own."""
     robot_sha256: str | None = None
@@ -247,7 +247,7 @@ def from_settings(settings: Settings, iterations: int) -> SearchCfg:
     """
     try:
         own = {"scheduler": still_there(settings.get("scheduler")), "iterations": iterations}
-        return built(SearchCfg, {**settings, **own}, "a search")
+        return from_builtins(SearchCfg, {**settings, **own}, "a search")
     except (TypeError, ValueError) as error:
         raise ValueError(f"settings must be those of a search of this version, but: {error}") from None
 
@@ -394,7 +394,7 @@ def resumed(path: Path, there: SearchCfg, robot: "RobotCfg", changes: Settings, 
     Args:
         path: Its directory.
         there: Its settings.
-        robot: Its robot as it is now, by :func:`sim.robots.robot.robot_of`.
+        robot: Its robot as it is now, by :func:`sim.robots.find.robot_of`.
         changes: What the command line gives, as :func:`changed` takes it.
         moved: Where the run's controller is now, if elsewhere.
 

@@ -14,7 +14,7 @@ from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, l
 if TYPE_CHECKING:
     from qd.show.minima import MinimalFound
     from sim.robots.robot import RobotCfg
-    from sim.space import TerrainSpace
+    from sim.spaces.base import TerrainSpace
 
 _USUAL_ROBOT = "anymal"
 
@@ -36,18 +36,18 @@ class Found:
     @property
     def space(self) -> "TerrainSpace":
         """What the genes mean."""
-        from sim.space import get_space
+        from sim.spaces.registry import get_space
 
         return get_space(self.archive.space, self.archive.space_sha256)
 
     @property
     def go_on(self) -> str:
         """How to let the search go on, for errors."""
-        from sim.space import to_be_named
+        from sim.spaces.registry import is_own
 
         searched, _ = self.as_searched()
         code = searched if ControllerSpec.parse(searched).runs_code else None
-        more = {"resume": self.folder, "policy": code, "space": to_be_named(self.space.name)}
+        more = {"resume": self.folder, "policy": code, "space": self.space.name if is_own(self.space.name) else None}
         more["iterations"] = 2 * max(self.archive.iterations, 1)
         return f"let its search go on with `{command_line('archive', robot=self.robot.spec, **more)}`"
 
@@ -143,7 +143,7 @@ def robot_named(name: str | None) -> "RobotCfg":
     Raises:
         ValueError: If there is no such robot.
     """
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
 
     return get_robot(name or _USUAL_ROBOT)
 
@@ -162,7 +162,7 @@ def find_archive(named: str | None, run: Path | None, policy: str | None = None,
         ValueError: If it is damaged, of another robot, of penalties that the robot does not have, or of a terrain space
             that is not at hand.
     """
-    from sim.robots.robot import robot_of
+    from sim.robots.find import robot_of
 
     if run is None or named is not None:
         robot_named(named)  # an unknown name is said first

@@ -178,7 +178,7 @@ def _of_archive(cfg: Export) -> _Source:
 
 def _of_pack(cfg: Export, named: str) -> _Source:
     """The terrains of a pack."""
-    from sim.robots.robot import robot_of
+    from sim.robots.find import robot_of
 
     if (cfg.run, cfg.space, cfg.minimal) != (None, None, None):
         raise ValueError(

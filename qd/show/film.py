@@ -165,7 +165,7 @@ def _own_order(cfg: Film, path: Path) -> Order:
 
 def _kept_orders(cfg: Film, path: Path) -> Iterator[Order]:
     from sim.recording.file import read_recording
-    from sim.robots.robot import robot_of
+    from sim.robots.find import robot_of
 
     recording = read_recording(path)
     robot = robot_of({**recording.origin, "robot": recording.robot}, cfg.robot, path)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from sim.space import TerrainSpace
+    from sim.spaces.base import TerrainSpace
 
 _SHOWN = 12  # terrains of the gallery
 _COLUMNS = 3

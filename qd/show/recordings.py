@@ -53,7 +53,7 @@ class Wanted:
     terrain_seed: int
     """Seed of the terrain's episodes."""
     space: str = "super_gaussian"
-    """Terrain space of genes, as :func:`sim.space.load_space` takes it."""
+    """Terrain space of genes, as :func:`sim.spaces.registry.load_space` takes it."""
     ground: "GroundMaps | None" = field(default=None, compare=False)
     """Friction and softness beside heights."""
 
@@ -86,7 +86,7 @@ def on_elite(
     Raises:
         ValueError: If a number is out of range, or the terrain space is not at hand.
     """
-    from sim.space import get_space
+    from sim.spaces.registry import get_space
 
     return Wanted(
         label=label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}",
@@ -138,7 +138,7 @@ class Simulation:
             ValueError: If the controller cannot be loaded or does not fit the robot.
         """
         from sim.rollout import Rollout
-        from sim.space import load_space
+        from sim.spaces.registry import load_space
 
         with_ground = first.ground is not None
         kind = (first.policy, count, first.replicas, first.space, with_ground)
@@ -268,21 +268,22 @@ class Recordings:
 
     def file_of(self, wanted: Wanted) -> Path:
         """Where the recording of some crossings is kept; another file with other code or packages."""
-        from sim.space import SUPER_GAUSSIAN, space_identity
+        from sim.spaces.registry import get_space, identity
+        from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
-        identity: list[Any] = [self._about, controller_hash(wanted.policy), [wanted.terrain_seed]]
-        identity += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), self._code]
+        depends_on: list[Any] = [self._about, controller_hash(wanted.policy), [wanted.terrain_seed]]
+        depends_on += [wanted.replicas, wanted.terrain.astype(np.float32).tobytes().hex(), self._code]
         if wanted.ground is not None:
-            identity += [wanted.ground.friction.tobytes().hex(), wanted.ground.time_constant_s.tobytes().hex()]
+            depends_on += [wanted.ground.friction.tobytes().hex(), wanted.ground.time_constant_s.tobytes().hex()]
         if wanted.space != SUPER_GAUSSIAN.name:  # the only one at first, which no name says
-            identity.append(space_identity(wanted.space))
-        key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:_KEY_LENGTH]
+            depends_on.append(identity(wanted.space, get_space(wanted.space).sha256))
+        key = hashlib.sha256(json.dumps(depends_on).encode()).hexdigest()[:_KEY_LENGTH]
         return self._folder / f"{key}.npz"
 
     def _is(self, recording: "Recording", wanted: Wanted) -> bool:
         """Whether a recording is of just these crossings; a file may have been renamed."""
         from sim.recording.recorder import space_in
-        from sim.space import recorded_identity, space_identity
+        from sim.spaces.registry import get_space, identity
 
         origin = recording.origin
         terrain = recording.heights if recording.genes is None else recording.genes
@@ -291,7 +292,8 @@ class Recordings:
             and self._about.items() <= recording.origin.items()
             and recording.joint_names == self._robot.joint_names
             and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
-            and recorded_identity(space_in(origin), origin.get("space_sha256")) == space_identity(wanted.space)
+            and identity(space_in(origin), origin.get("space_sha256"))
+            == identity(wanted.space, get_space(wanted.space).sha256)
             and np.array_equal(terrain, wanted.terrain[None])
             and (wanted.ground is None or _same_ground(recording.ground, wanted.ground))
             and recording.seeds.tolist() == [wanted.terrain_seed]

@@ -69,8 +69,8 @@ class Calibrate(Who, OnGround, Where):
         """
         from qd.workers import evaluator as workers
         from sim.crossing import CrossingCfg
-        from sim.robots.robot import get_robot
-        from sim.space import load_space, on_ground
+        from sim.robots.find import get_robot
+        from sim.spaces.registry import load_space
 
         check(self)
         robot = get_robot(self.robot or "anymal")
@@ -79,7 +79,7 @@ class Calibrate(Who, OnGround, Where):
                 "the scales kept with a robot are those of its shipped controller, got another one (--policy): "
                 "name a file for its scales with --out"
             )
-        space = load_space(on_ground(self.space, self.ground) or self.space)
+        space = load_space(self.space, self.ground)
         device, policy = workers.resolve_device(self.device, self.workers), self.policy or str(robot.policy_file)
         workers.check_policy(policy, robot, device)
         evaluator = workers.EvaluatorCfg(

@@ -36,11 +36,12 @@ from qd.workers.shards import merged
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
-from sim.mujoco_c.crossing import cross_terrains
+from sim.mujoco_c.crossing import PlainCrossings, cross_terrains
 from sim.policy.spec import controller_hash
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.space import load_space, space_identity
+from sim.spaces.registry import identity, load_space
 
 How = Literal["searched", "resolved", "mujoco_c"]
 """Physics of the search; the same with contact resolved; MuJoCo C, with contact resolved there too."""
@@ -233,7 +234,7 @@ class Crossings:
             terrains: Genes, shape (B, num_genes), or heights [m], shape (B, nrow, ncol).
             seeds: One a terrain, shape (B,), uint32.
             replicas: Episodes a terrain.
-            space: Terrain space of the genes, as :func:`sim.space.load_space` takes it.
+            space: Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it.
             how: What crosses them.
             reward: Whether the training task's reward is summed too.
             penalties_from_s: Penalties are summed from this time of an episode on [s].
@@ -277,7 +278,8 @@ class Crossings:
         controller = controller_hash(cfg.policy)
         if self._cache is None or controller is None:
             return None
-        way = [robot_identity(self.robot), self.robot.penalties, controller, space_identity(cfg.space)]
+        space = identity(cfg.space, load_space(cfg.space).sha256)
+        way = [robot_identity(self.robot), self.robot.penalties, controller, space]
         way += [cfg.num_replicas, cfg.device.startswith("cuda"), how, cfg.reward, cfg.penalties_from_s]
         key = hashlib.sha256(json.dumps([*way, code_fingerprint(("kernels", "sim"))]).encode()).hexdigest()[:32]
         if key not in self._stored:
@@ -326,16 +328,19 @@ class Crossings:
     def _cross_in_mujoco_c(
         self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
     ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
-        processes, space = parse_workers(cfg.workers).num_processes, load_space(cfg.space)
-        size = _MUJOCO_C_LOT * processes
-        for first in range(0, len(missing), size):
-            lot = missing[first : first + size]
-            tqdm.write(f"{label}: terrain {first + 1} to {first + len(lot)} of {len(missing)}", file=sys.stderr)
-            episodes = cross_terrains(
-                self.robot, cfg.policy, terrains[lot], seeds[lot], space=space, num_episodes=cfg.num_replicas,
-                device=cfg.device, processes=processes, resolved=True,
+        processes, done = parse_workers(cfg.workers).num_processes, list[tuple[int, PlainCrossings]]()
+        with tqdm(desc=label, total=len(missing) * cfg.num_replicas, unit="episode", file=sys.stderr) as bar:
+            crossings = cross_terrains(
+                self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),
+                num_episodes=cfg.num_replicas, device=cfg.device, processes=processes, resolved=True,
+                progress=bar.update,
             )  # fmt: skip
-            yield lot, _as_result(episodes, self.robot.penalties)
+            for count, crossed in enumerate(crossings, 1):
+                done.append(crossed)
+                if len(done) == _MUJOCO_C_LOT * processes or count == len(missing):
+                    numbers, episodes = zip(*done, strict=True)
+                    yield missing[list(numbers)], _as_result(episodes, self.robot.penalties)
+                    done.clear()
 
 
 def cross(
@@ -362,7 +367,7 @@ def cross(
         robot: The robot, or its name or settings file.
         compute: Where terrains are crossed; by default on the CPU, by a process a core.
         replicas: Episodes a terrain.
-        space: Terrain space of the genes, as :func:`sim.space.load_space` takes it.
+        space: Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it.
         how: What crosses them.
         reward: Whether the training task's reward is summed too.
         penalties_from_s: Penalties are summed from this time of an episode on [s].
@@ -414,7 +419,7 @@ def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutRe
     )  # fmt: skip
 
 
-def _as_result(terrains: Sequence[Any], penalty_names: tuple[str, ...]) -> RolloutResult:
+def _as_result(terrains: Sequence[PlainCrossings], penalty_names: tuple[str, ...]) -> RolloutResult:
     """Episodes in MuJoCo C, a record a terrain, as a rollout's result."""
     outcome = np.array([terrain.outcome for terrain in terrains])
     columns = [PENALTIES.index(name) for name in penalty_names]

@@ -87,7 +87,7 @@ class EvaluatorCfg:
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
-    """Terrain space of the genes, as :func:`sim.space.load_space` takes it."""
+    """Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it."""
     resolved: bool = False
     """Whether contact is resolved (:func:`sim.simulation.resolved`), which takes five times as long."""
 
@@ -220,7 +220,7 @@ def resolve_device(name: str | None, workers: str | None = None) -> str:
     on_ray, count = parse_workers(workers)
     if on_ray:
         return _ray_module("ray_cluster").cluster_device(name, count)
-    from sim.simulation import resolve_device as resolve
+    from sim.device import resolve_device as resolve
 
     device = resolve(name)
     if device.startswith("cuda") and (count or 1) > 1:
@@ -242,7 +242,7 @@ def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
         ValueError: If it cannot be loaded or does not fit the robot.
     """
     from sim.policy.loaders import load_policy
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
 
     # A cluster's GPUs need not be this machine's; for the CPU no simulation need be loaded.
     here = device if device == "cpu" else resolve_device(None)
@@ -251,10 +251,10 @@ def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
 
 def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
-    from sim.robots.robot import get_robot
+    from sim.robots.find import get_robot
     from sim.rollout import CrossingCfg, Rollout
     from sim.simulation import SolverCfg, resolved
-    from sim.space import load_space
+    from sim.spaces.registry import load_space
 
     robot = get_robot(cfg.robot)
     robot, solver = resolved(robot) if cfg.resolved else (robot, SolverCfg())

@@ -32,14 +32,15 @@ def key_of(evaluator: "EvaluatorCfg", drawn: list[Any]) -> str | None:
     Returns:
         None if nobody can tell whether the controller has changed, since its code has no file.
     """
-    from sim.robots.robot import get_robot  # both import Warp or MuJoCo: not for `--help`
-    from sim.space import space_identity
+    from sim.robots.find import get_robot
+    from sim.spaces.registry import get_space, identity
 
     controller = controller_hash(evaluator.policy)
     if controller is None:
         return None
     robot = get_robot(evaluator.robot)
-    way = [robot_identity(robot), robot.penalties, controller, space_identity(evaluator.space)]
+    space = identity(evaluator.space, get_space(evaluator.space).sha256)
+    way = [robot_identity(robot), robot.penalties, controller, space]
     way += [evaluator.num_replicas, evaluator.device.startswith("cuda"), evaluator.resolved]
     way += [evaluator.reward, evaluator.penalties_from_s, code_fingerprint(("kernels", "sim"))]
     return hashlib.sha256(json.dumps([*way, *drawn]).encode()).hexdigest()

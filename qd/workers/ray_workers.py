@@ -77,7 +77,7 @@ def _packed_robot(robot: Any) -> Any:
 
 def _packed_space(space: str) -> Controller | str:
     from sim.ground import split_name
-    from sim.space import is_own
+    from sim.spaces.registry import is_own
 
     return Controller.of(split_name(space)[0]) if is_own(space) else space
 

@@ -15,7 +15,7 @@ from qd.fitness import FAILING_GOAL_RATE
 from qd.workers.cross import Crossings, How
 from results.make.common import Script, parse
 from sim.rates import agreement, crossing_rates
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.registry import SUPER_GAUSSIAN
 
 KEY = 20261123  # with the seed, the entropy of everything drawn here, and nowhere else
 HARD_RANDOM, ELITES, FIRST, SECOND = range(4)  # streams of it

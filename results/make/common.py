@@ -17,7 +17,8 @@ from qd.workers.evaluator import Compute
 from sim.files.atomic import write_atomically
 from sim.files.intervals import t_interval
 from sim.files.records import identity, provenance, sources_sha256
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from sim.simulation import resolve_device
 
 SEEDS = (0, 1, 2)

@@ -15,7 +15,7 @@ import warp as wp
 from qd.run.settings import preset
 from qd.workers.evaluator import EvaluatorCfg, available_cores, open_evaluator, worker_status
 from results.make.common import parse
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.registry import SUPER_GAUSSIAN
 
 ROUNDS = 3
 """Evaluations timed of each, after one that is not; the median counts."""

@@ -14,7 +14,7 @@ from results.make.common import parse
 from sim.rates import agreement
 from sim.rollout import Rollout, RolloutResult
 from sim.simulation import SolverCfg, resolved
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.registry import SUPER_GAUSSIAN
 
 ITERATIONS = (3, 4, 5, 6, 8, 50)
 CAPACITIES = (0.5, 0.75, 1.5)

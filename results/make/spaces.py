@@ -12,7 +12,7 @@ from qd.run.directory import RunDirectory
 from qd.run.settings import preset
 from qd.search import search
 from results.make.common import parse
-from sim.space import get_space
+from sim.spaces.registry import get_space
 
 SPACES = ("super_gaussian", "super_gaussian+friction", "course")
 COUNTS = (

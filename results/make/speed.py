@@ -25,7 +25,7 @@ from qd.workers.evaluator import EvaluatorCfg, build_rollout, open_evaluator
 from results.make.bare import bare_rates, kernel_shares
 from results.make.common import Script, parse
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.registry import SUPER_GAUSSIAN
 
 WARM_UP = 2
 WIDE = ("cma_mae", "cma_mae+map_elites", "surrogate")

@@ -21,7 +21,7 @@ from typing import Any, Protocol, get_args, get_origin, get_type_hints, runtime_
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.records import without_machine
-from sim.files.settings import check, setting
+from sim.files.settings import PositiveInt, check
 
 _ALL = "all"
 _DEBUG = "FAULTLINE_DEBUG"
@@ -59,7 +59,7 @@ class Where(OnDevice):
     workers: str | None = None
     """Worker processes: a number of them on the CPU (one a core if left out), ray for one on every device of a Ray
     cluster, or ray:N for N of them. RAY_ADDRESS names a running cluster."""
-    num_envs: int | None = setting(None, least=1)
+    num_envs: PositiveInt | None = None
     """How many robots walk at once, over all workers. Each takes one episode after another. If left out, as many as
     suit the device. It changes how long the work takes, and no result."""
 
@@ -184,6 +184,17 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
+
+
+def peek(argv: Sequence[str], flag: str) -> str | None:
+    """The last value that a command line gives a flag, as ``--flag value`` or ``--flag=value``; None if it has none."""
+    value = None
+    for word, following in pairwise([*argv, ""]):
+        if word == flag:
+            value = following
+        elif word.startswith(f"{flag}="):
+            value = word.partition("=")[2]
+    return value
 
 
 def _refuse_bare_flags(cls: type, argv: Sequence[str]) -> None:

@@ -1,168 +1,149 @@
-"""Settings: what a field may hold stands on the field, and is checked, and read back from JSON, in one place."""
+"""Settings: types and ranges stand on the fields of dataclasses, and msgspec checks values against them.
+
+A range is written ``Annotated[int, Meta(ge=1)]`` with :class:`msgspec.Meta`. Floats must be finite.
+"""
 
 import math
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from types import UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+import re
+from collections.abc import Iterator
+from dataclasses import MISSING, field, fields, is_dataclass
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-_KEY = "allowed"
-_MAX_WHOLE = 1 << 53  # up to which whole numbers are floats too
-_NAMES = {int: "a whole number", float: "a finite number", str: "a text", bool: "True or False", type(None): "None"}
+import msgspec
+from msgspec import Meta
 
-Built = TypeVar("Built")
+PositiveInt = Annotated[int, Meta(ge=1)]
+NonNegativeInt = Annotated[int, Meta(ge=0)]
+PositiveFloat = Annotated[float, Meta(gt=0)]
+NonNegativeFloat = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Interval = Annotated[tuple[float, float], Meta(description="the lower limit first")]
 
-
-@dataclass(frozen=True, kw_only=True)
-class Allowed:
-    """What a field may hold; of a tuple each number. None always passes."""
-
-    least: float | None = None
-    above: float | None = None
-    most: float | None = None
-    one_of: tuple[Any, ...] | None = None
-    rising: bool = False
-    """Whether no number of a tuple may be below the one before."""
-
-    def complaint(self, value: Any) -> str | None:
-        """What a value should have been; None if it may stand."""
-        if self.one_of is not None:
-            return None if value in self.one_of else f"be one of {', '.join(map(str, self.one_of))}"
-        numbers = value if isinstance(value, tuple | list) else (value,)
-        if not all(map(self._holds, numbers)):
-            return self._words()
-        return "rise" if self.rising and list(numbers) != sorted(numbers) else None
-
-    def _holds(self, number: Any) -> bool:
-        return (
-            isinstance(number, int | float)
-            and math.isfinite(number)
-            and (self.least is None or number >= self.least)
-            and (self.above is None or number > self.above)
-            and (self.most is None or number <= self.most)
-        )
-
-    def _words(self) -> str:
-        low = f"at least {self.least:g}" if self.least is not None else ""
-        low = f"above {self.above:g}" if self.above is not None else low
-        high = f"at most {self.most:g}" if self.most is not None else ""
-        return "be " + (" and ".join(filter(None, [low, high])) or "a finite number")
-
-
-def setting(default: Any = MISSING, **allowed: Any) -> Any:
-    """A dataclass field with a default and the values it may have.
-
-    Args:
-        default: The default; left out, the field must be given.
-        allowed: Fields of :class:`Allowed`; none: any finite number.
-    """
-    return field(default=default, metadata={_KEY: Allowed(**allowed)})
+Settings = TypeVar("Settings")
+_EXPECTED = re.compile(r"Expected (?P<what>.*?)(, got .*?)?( - at `.*`)?")
+_PLAIN_WORDS = {
+    r"`(int|float)` >= (\S+?)(\.0)?$": r"at least \2",
+    r"`(int|float)` > (\S+?)(\.0)?$": r"above \2",
+    r"`(int|float)` <= (\S+?)(\.0)?$": r"at most \2",
+    r"\bint\b": "a whole number", r"\bfloat\b": "a finite number", r"\bstr\b": "a text", r"\bbool\b": "True or False",
+    r"\barray\b": "a tuple", r"\bnull\b": "None", r" \| ": " or ", "`": "",
+}  # fmt: skip
+"""What msgspec calls a type or a range, and what a user does."""
 
 
 def problems(settings: Any, prefix: str = "") -> list[str]:
-    """What is wrong with the values of a settings dataclass and of those inside it, one line each.
-
-    A value must be of the type that its field is annotated with, and in the range that :func:`setting` gives it.
+    """What is wrong with the values of a settings dataclass and of those inside it: a line each, its field first.
 
     Args:
         settings: The dataclass.
         prefix: Stands before each field's name, for example ``task.``.
     """
-    found = []
-    for own in fields(settings):
-        value = getattr(settings, own.name)
-        complaint = _mismatch(own.type, value)
-        if complaint is None and is_dataclass(value):
-            found += problems(value, f"{prefix}{own.name}.")
-        elif complaint is None and value is not None and _KEY in own.metadata:
-            complaint = own.metadata[_KEY].complaint(value)
-        if complaint:
-            found.append(f"{prefix}{own.name} must {complaint}, got {_brief(value)}")
-    return found
+    lines: list[str] = []
+    for setting in fields(settings):
+        value, name = getattr(settings, setting.name), f"{prefix}{setting.name}"
+        if is_dataclass(value):
+            lines += problems(value, f"{name}.")
+        elif expected := _mismatch(setting.type, value) or _out_of_range(setting, value):
+            lines.append(f"{name} must be {expected}, got {_brief(value)}")
+        elif setting.type is Interval and value[0] > value[1]:
+            lines.append(f"{name} must have its lower limit first, got {_brief(value)}")
+    return lines
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """Refuses settings of which a value may not stand.
-
-    Raises:
-        ValueError: If there is one; the message names all of them.
-    """
-    found = problems(settings, prefix)
-    if found:
-        raise ValueError("; ".join(found))
+    """Raises a ValueError that names every value of settings that is of another type or out of its range."""
+    lines = problems(settings, prefix)
+    if lines:
+        raise ValueError("; ".join(lines))
 
 
-def built(kind: type[Built], values: Any, name: str) -> Built:
-    """A settings class from JSON values.
+def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
+    """A settings dataclass of JSON values, which it must know by name.
 
     Args:
-        kind: The class; fields may be of such classes, or tuples of them.
-        values: By the names of fields.
-        name: What to call it in an error.
-
-    Raises:
-        TypeError: If a field without a default is missing.
-        ValueError: If there is no such field, or a value is of another type or out of range.
+        cls: The dataclass; fields may be such dataclasses, or tuples of them.
+        data: Values by the names of fields.
+        name: What an error calls it.
     """
-    if not isinstance(values, dict):
-        raise ValueError(f"{name} must be an object, got {_brief(values)}")
-    hints = get_type_hints(kind)
-    unknown = [str(key) for key in values if key not in hints]
+    try:
+        settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
+    except (msgspec.ValidationError, TypeError) as error:
+        raise ValueError(f"{name}: {error}") from None
+    unknown = list(_unknown(data, msgspec.to_builtins(settings, enc_hook=str)))
     if unknown:
         raise ValueError(f"{name} has no setting {', '.join(unknown)}")
-    return kind(**{key: _from_json(hints[key], value, key) for key, value in values.items()})
+    check(settings)
+    return settings
 
 
-def _from_json(hint: Any, value: Any, name: str) -> Any:
-    if is_dataclass(hint):
-        return built(hint, value, name)  # pyright: ignore[reportArgumentType] - a hint is a class, no instance
-    found = value
-    if get_origin(hint) is tuple and isinstance(value, list | tuple):
-        parts = _parts(hint, value)
-        found = tuple(value)
-        if len(parts) == len(value):
-            found = tuple(_from_json(part, item, name) for part, item in zip(parts, value, strict=True))
-    complaint = _mismatch(hint, found)
-    if complaint:
-        raise ValueError(f"{name} must {complaint}, got {_brief(value)}")
-    return found
+def _unknown(given: Any, known: Any) -> Iterator[str]:
+    for key, value in given.items():
+        if key not in known:
+            yield str(key)
+        elif isinstance(value, dict) and isinstance(known[key], dict):
+            yield from _unknown(value, known[key])
 
 
-def _mismatch(hint: Any, value: Any) -> str | None:
-    """What a value should have been by its annotation; None if it fits, or if the annotation is beyond this check."""
-    origin = get_origin(hint)
-    if origin in (Union, UnionType):
-        complaints = [_mismatch(part, value) for part in get_args(hint)]
-        words = [complaint.removeprefix("be ") for complaint in complaints if complaint]
-        return None if None in complaints else f"be {' or '.join(words)}"
-    if origin is Literal:
-        return None if value in get_args(hint) else f"be one of {', '.join(map(str, get_args(hint)))}"
-    if origin is tuple:
-        parts = get_args(hint)
-        if not isinstance(value, tuple):
-            return "be a tuple"
-        if parts[-1] is not ... and len(parts) != len(value):
-            return f"have {len(parts)} values"
-        wrong = [_mismatch(part, item) for part, item in zip(_parts(hint, value), value, strict=True)]
-        wrong = [words.removeprefix("be ") for words in wrong if words]
-        return f"be a tuple, each value {wrong[0]}" if wrong else None
-    if not isinstance(hint, type) or _fits(hint, value):
+def _mismatch(annotation: Any, value: Any) -> str | None:
+    """What a value should have been; None if it fits or its annotation is beyond msgspec."""
+    if any(isinstance(number, float) and not math.isfinite(number) for number in _numbers(value)):
+        return "a finite number"
+    plain = tuple(map(_plain, value)) if isinstance(value, tuple) else _plain(value)
+    try:
+        converted = msgspec.convert(plain, annotation)
+    except msgspec.ValidationError as error:
+        match = _EXPECTED.fullmatch(str(error))
+        return _in_words(match["what"]) if match else f"one of {', '.join(map(str, _choices(annotation)))}"
+    except TypeError:
         return None
-    return f"be {_NAMES.get(hint, hint.__name__)}"
+    return "a tuple" if isinstance(value, list) and isinstance(converted, tuple) else None
 
 
-def _fits(kind: type, value: Any) -> bool:
-    if isinstance(value, bool):
-        return kind in (bool, object)
-    if kind is float:
-        return abs(value) < _MAX_WHOLE if isinstance(value, int) else isinstance(value, float) and math.isfinite(value)
-    return isinstance(value, kind)
+def _in_words(expected: str) -> str:
+    for pattern, words in _PLAIN_WORDS.items():
+        expected = re.sub(pattern, words, expected)
+    return expected
 
 
-def _parts(hint: Any, value: Any) -> tuple[Any, ...]:
-    parts = get_args(hint)
-    return parts[:1] * len(value) if parts[-1] is ... else parts
+def _plain(number: Any) -> Any:
+    """A NumPy float as Python's."""
+    return float(number) if isinstance(number, float) else number
+
+
+def _choices(annotation: Any) -> tuple[Any, ...]:
+    """Values of the literals in an annotation."""
+    parts = get_args(annotation)
+    return parts if get_origin(annotation) is Literal else tuple(value for part in parts for value in _choices(part))
+
+
+def _numbers(value: Any) -> tuple[Any, ...]:
+    return value if isinstance(value, tuple) else (value,)
 
 
 def _brief(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def setting(default: Any = MISSING, **limits: Any) -> Any:
+    """A dataclass field with a default and limits of its numbers: least, above, most, one_of, rising."""
+    return field(default=default, metadata=limits)
+
+
+def _out_of_range(setting: Any, value: Any) -> str | None:
+    limits = setting.metadata
+    if value is None or not limits:
+        return None
+    if "one_of" in limits:
+        return None if value in limits["one_of"] else f"one of {', '.join(map(str, limits['one_of']))}"
+    low, above, high = (limits.get(key) for key in ("least", "above", "most"))
+    numbers = _numbers(value)
+    if any(
+        (low is not None and number < low)
+        or (above is not None and number <= above)
+        or (high is not None and number > high)
+        for number in numbers
+    ):
+        words = [f"at least {low:g}" if low is not None else "", f"above {above:g}" if above is not None else ""]
+        return " and ".join(filter(None, [*words, f"at most {high:g}" if high is not None else ""]))
+    return "rising" if limits.get("rising") and list(numbers) != sorted(numbers) else None

@@ -5,10 +5,12 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -16,7 +18,6 @@ import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from kernels.episode import Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
@@ -42,7 +43,7 @@ from sim.robots.model import build_robot
 from sim.robots.robot import RobotCfg
 from sim.simulation import SolverCfg
 from sim.simulation import resolved as with_contact_resolved
-from sim.space import TerrainSpace
+from sim.spaces.base import TerrainSpace
 
 _mj: Any = mujoco  # its types are not written down
 _WARNINGS = [
@@ -67,13 +68,11 @@ class PlainCrossings:
     """Simulated time up to the end [s], shape (num_episodes,)."""
 
 
-def join(parts: Sequence[PlainCrossings]) -> PlainCrossings:
-    """Crossings of one terrain that were run in parts, in their order."""
-    return PlainCrossings(
-        outcome=np.concatenate([part.outcome for part in parts]),
-        penalties=np.concatenate([part.penalties for part in parts]),
-        duration_s=np.concatenate([part.duration_s for part in parts]),
-    )
+@lru_cache(maxsize=8)
+def _base_com(robot: RobotCfg) -> tuple[float, float, float]:
+    """Mass centre of the base in its frame [m]."""
+    x, y, z = build_robot(robot).body_com[0]
+    return float(x), float(y), float(z)
 
 
 def draw_starts(
@@ -94,14 +93,13 @@ def draw_starts(
         device: Warp device name.
         cfg: The crossing.
     """
-    builder = build_robot(robot)
     bank = TerrainBank(1, device=device)
     bank.set_heights(heights[None])
     with wp.ScopedDevice(device):
         joint_q = wp.zeros((count, 7 + robot.num_joints), dtype=float)
         joint_qd = wp.zeros((count, 6 + robot.num_joints), dtype=float)
         episodes, terrain_of_env, sensors = make_episodes(count), wp.zeros(count, dtype=int), Sensors()
-        sensors.base_com = base_com = wp.vec3(*builder.body_com[0])
+        sensors.base_com = base_com = wp.vec3(*_base_com(robot))
         sensors.default_joint_pos = wp.array(robot.default_joint_pos, dtype=float)
         queue = make_queue(count, 1, count, 0, rewarded=False, device=device)
         queue.seed.fill_(int(seed))
@@ -222,11 +220,10 @@ def cross(
 
 
 _CHUNK = 25  # episodes at a time: enough for the policy's batch, few enough to share out
-
 _worker: dict[str, Any] = {}
 
 
-def _end_with(parent: int) -> None:
+def _exit_with_parent(parent: int) -> None:
     """Ends this process once its parent is gone, which a pool's workers would otherwise outlive."""
     while os.getppid() == parent:
         time.sleep(1.0)
@@ -235,7 +232,7 @@ def _end_with(parent: int) -> None:
 
 def _start_worker(robot: RobotCfg, policy: str, parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its workers
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     prepare_torch("cpu")
     _worker.update(robot=robot, policy=load_policy(policy, robot, "cpu"))
 
@@ -247,107 +244,6 @@ def _cross_chunk(
     return cross(robot, policy, heights, starts, time_constant_s=time_constant_s, ground=ground)
 
 
-def _chunks(rows: Array) -> list[Array]:
-    return [rows[k : k + _CHUNK] for k in range(0, len(rows), _CHUNK)]
-
-
-def run_plain(
-    robot: RobotCfg,
-    policy: str,
-    heights: NDArray[np.float32],
-    starts: list[Starts],
-    *,
-    processes: int,
-    time_constant_s: float | None = None,
-    ground: GroundMaps | None = None,
-    crossed: Callable[[int, PlainCrossings], None] | None = None,
-) -> list[PlainCrossings]:
-    """Cross every terrain from its starts in plain MuJoCo, shared out over processes.
-
-    Args:
-        robot: Robot settings.
-        policy: The controller, as :func:`sim.policy.loaders.load_policy` takes it.
-        heights: Height grids [m], shape (num_terrains, nrow, ncol).
-        starts: Of each terrain.
-        processes: How many at once.
-        time_constant_s: Contact time constant [s]; that of the robot's file if None.
-        ground: Friction and softness of the terrains.
-        crossed: Called with the number of a terrain and its crossings once it has been crossed from all its starts.
-
-    Raises:
-        OSError: If a process dies.
-    """
-    grounds = [None if ground is None else ground[k : k + 1] for k in range(len(heights))]
-    context = multiprocessing.get_context("spawn")
-    others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
-        processes, mp_context=context, initializer=_start_worker, initargs=(robot, policy, os.getpid())
-    )
-    try:
-        parts = [
-            [
-                pool.submit(_cross_chunk, grid, own, Starts(qpos=qpos, qvel=qvel), time_constant_s)
-                for qpos, qvel in zip(_chunks(start.qpos), _chunks(start.qvel), strict=True)
-            ]
-            for grid, own, start in zip(heights, grounds, starts, strict=True)
-        ]
-        terrain_of = {part: number for number, terrain in enumerate(parts) for part in terrain}
-        with tqdm(desc="plain MuJoCo", total=sum(len(s.qpos) for s in starts), unit="episode", disable=None) as bar:
-            for done in as_completed(terrain_of):
-                bar.update(len(done.result().outcome))
-                number = terrain_of.pop(done)
-                if crossed is not None and number not in terrain_of.values():
-                    crossed(number, join([part.result() for part in parts[number]]))
-    except BrokenProcessPool as error:
-        raise OSError(f"a process of plain MuJoCo died: {error}") from None
-    except KeyboardInterrupt:
-        for process in set(multiprocessing.active_children()) - others:
-            process.terminate()  # a part may have minutes to go
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return [join([part.result() for part in terrain]) for terrain in parts]
-
-
-def cross_plain(
-    robot: RobotCfg,
-    policy: str,
-    heights: NDArray[np.float32],
-    seeds: NDArray[np.uint32],
-    *,
-    num_episodes: int,
-    device: str,
-    processes: int,
-    time_constant_s: float | None = None,
-    ground: GroundMaps | None = None,
-    crossed: Callable[[int, PlainCrossings], None] | None = None,
-) -> list[PlainCrossings]:
-    """Cross terrains in plain MuJoCo from the starts that a rollout of the same seeds has (:func:`run_plain`).
-
-    Args:
-        robot: Robot settings.
-        policy: The controller.
-        heights: Height grids [m], shape (num_terrains, nrow, ncol).
-        seeds: One a terrain, uint32.
-        num_episodes: Episodes a terrain; the first of them begin as a rollout's do, which may have fewer.
-        device: Warp device that draws the starts.
-        processes: How many at once.
-        time_constant_s: Contact time constant [s]; that of the robot's file if None.
-        ground: Friction and softness of the terrains.
-        crossed: As of :func:`run_plain`.
-
-    Raises:
-        OSError: If a process dies.
-    """
-    starts = [
-        draw_starts(robot, grid, int(seed), num_episodes, device) for grid, seed in zip(heights, seeds, strict=True)
-    ]
-    return run_plain(
-        robot, policy, heights, starts, processes=processes, time_constant_s=time_constant_s, ground=ground,
-        crossed=crossed,
-    )  # fmt: skip
-
-
 def cross_terrains(
     robot: RobotCfg,
     policy: str,
@@ -356,31 +252,71 @@ def cross_terrains(
     *,
     space: TerrainSpace,
     num_episodes: int,
-    device: str,
     processes: int,
     resolved: bool,
-    crossed: Callable[[int, PlainCrossings], None] | None = None,
-) -> list[PlainCrossings]:
-    """:func:`cross_plain` of terrains as a search has them, at its settings or with contact resolved.
+    device: str = "cpu",
+    progress: Callable[[int], object] = lambda episodes: None,
+) -> Iterator[tuple[int, PlainCrossings]]:
+    """Cross terrains in plain MuJoCo, shared out over processes, from the starts that a rollout of their seeds has.
 
     Args:
         robot: Robot settings, those of the search.
-        policy: The controller.
+        policy: The controller, as :func:`sim.policy.loaders.load_policy` takes it.
         terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
         seeds: One a terrain, uint32.
         space: What genes mean.
-        num_episodes: Episodes a terrain.
-        device: Warp device that makes the terrains and draws the starts.
+        num_episodes: Episodes a terrain; the first of them begin as a rollout's do, which may have fewer.
         processes: How many at once.
-        resolved: Whether contact is resolved (:func:`sim.simulation.resolved`).
-        crossed: As of :func:`run_plain`.
+        resolved: Whether contact is resolved (:func:`sim.simulation.resolved`), else the search's settings hold.
+        device: Warp device that makes the terrains and draws the starts.
+        progress: Called with the number of episodes that were just crossed.
 
-    Raises:
-        OSError: If a process dies.
+    Yields:
+        The number of each terrain with its crossings, as they are done.
     """
     robot, solver = with_contact_resolved(robot) if resolved else (robot, SolverCfg())
     heights, ground = (terrains, None) if terrains.ndim == 3 else terrains_of(terrains, space, device=device)
-    return cross_plain(
-        robot, policy, heights, seeds, num_episodes=num_episodes, device=device, processes=processes,
-        time_constant_s=solver.time_constant_s, ground=ground, crossed=crossed,
-    )  # fmt: skip
+    with _process_pool(robot, policy, processes) as pool:
+        chunks: list[list[Future[PlainCrossings]]] = []
+        for number, (grid, seed) in enumerate(zip(heights, seeds, strict=True)):
+            starts = draw_starts(robot, grid, int(seed), num_episodes, device)
+            patches = None if ground is None else ground[number : number + 1]
+            parts = [starts[first : first + _CHUNK] for first in range(0, num_episodes, _CHUNK)]
+            chunks.append([pool.submit(_cross_chunk, grid, patches, part, solver.time_constant_s) for part in parts])
+        terrain_of = {chunk: number for number, parts in enumerate(chunks) for chunk in parts}
+        for chunk in as_completed(list(terrain_of)):
+            progress(len(chunk.result().outcome))
+            number = terrain_of.pop(chunk)
+            if number not in terrain_of.values():
+                yield number, _joined([part.result() for part in chunks[number]])
+
+
+@contextmanager
+def _process_pool(robot: RobotCfg, policy: str, processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that have the controller loaded; an OSError if one of them dies."""
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        processes,
+        multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(robot, policy, os.getpid()),
+    )
+    try:
+        yield pool
+    except BrokenProcessPool as error:
+        raise OSError(f"a process of plain MuJoCo died: {error}") from None
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()  # a part may have minutes to go
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _joined(parts: Sequence[PlainCrossings]) -> PlainCrossings:
+    """Crossings of one terrain that were run in parts, in their order."""
+    return PlainCrossings(
+        outcome=np.concatenate([part.outcome for part in parts]),
+        penalties=np.concatenate([part.penalties for part in parts]),
+        duration_s=np.concatenate([part.duration_s for part in parts]),
+    )

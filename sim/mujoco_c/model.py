@@ -21,7 +21,7 @@ from sim.ground import PATCHES, GroundMaps
 from sim.maps.terrain_files import Margins, as_hfield
 from sim.robots.robot import RobotCfg
 from sim.simulation import GROUND_FRICTION
-from sim.space import TerrainSpace
+from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
@@ -41,6 +41,10 @@ class Starts:
     qvel: Array
     """Velocity of the base's origin, world frame [m/s]; its angular velocity, base frame [rad/s]; joint velocities
     [rad/s]; shape (num_episodes, 6 + num_joints)."""
+
+    def __getitem__(self, rows: slice) -> "Starts":
+        """Some of the episodes."""
+        return Starts(qpos=self.qpos[rows], qvel=self.qvel[rows])
 
 
 def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:

@@ -20,7 +20,8 @@ from sim.files.records import robot_digest
 from sim.policy.onnx_file import load_onnx
 from sim.policy.runner import action_problem, with_rows_of_zeros
 from sim.policy.spec import ControllerSpec, find_named, in_one_line, place_of_code
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 
 _CALLED_WITH = {"factory": "robot, device", "adapter": "controller, robot"}
 _FORMATS = (

@@ -12,14 +12,25 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from sim.robots.robot import RobotCfg
+from typing import Any, Protocol
 
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
 _NAMED = re.compile(r"(?P<place>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
+
+
+class RobotWithController(Protocol):
+    """What the names of controllers take of a robot's settings."""
+
+    @property
+    def name(self) -> str:
+        """What files are called after it."""
+        ...
+
+    @property
+    def policy_file(self) -> Path:
+        """The controller that comes with it."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +81,12 @@ class ControllerSpec:
         return ControllerSpec(place=place, name=self.name, file=file and str(folder / Path(file).name))
 
 
-def spec_of(policy: str, robot: "RobotCfg") -> str:
+def spec_of(policy: str, robot: RobotWithController) -> str:
     """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
     return str(robot.policy_file) if policy == SHIPPED else policy
 
 
-def name_of(policy: str | Path, robot: "RobotCfg") -> str:
+def name_of(policy: str | Path, robot: RobotWithController) -> str:
     """How files of results and settings name a controller, the inverse of :func:`spec_of`.
 
     The robot's own is :data:`SHIPPED` there, since its file lies elsewhere on each machine.
@@ -229,7 +240,7 @@ def firsts(names: Iterable[str]) -> list[str]:
     return list(found.values())
 
 
-def about_controllers(controllers: Mapping[str, str], robot: "RobotCfg") -> dict[str, dict[str, str | None]]:
+def about_controllers(controllers: Mapping[str, str], robot: RobotWithController) -> dict[str, dict[str, str | None]]:
     """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own.
 
     Args:
@@ -242,7 +253,7 @@ def about_controllers(controllers: Mapping[str, str], robot: "RobotCfg") -> dict
     }
 
 
-def controllers_of(policies: Sequence[str], robot: "RobotCfg", *, flag: str = "policies") -> dict[str, str]:
+def controllers_of(policies: Sequence[str], robot: RobotWithController, *, flag: str = "policies") -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
 
     Args:
@@ -296,7 +307,7 @@ def label_suffix(policy: str) -> str:
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
-def who_crossed(robot: "RobotCfg", policy: str) -> str:
+def who_crossed(robot: RobotWithController, policy: str) -> str:
     """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
     return robot.name + ("" if is_same(policy, str(robot.policy_file)) else label_suffix(policy))
 

@@ -20,7 +20,7 @@ from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.ground import PATCHES
 from sim.recording.recorder import FRAME_ARRAYS, Recording, space_in
-from sim.space import get_space, is_own
+from sim.spaces.registry import get_space, is_own
 
 FORMAT = "faultline recording 1"
 """Name and version in every file."""

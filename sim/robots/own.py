@@ -7,10 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import warp as wp
+
+from kernels.penalties import PENALTIES
+from sim.device import host_device
 from sim.files.settings import problems
 from sim.policy.spec import run_file
+from sim.robots.model import read_robot
 from sim.robots.model_files import read_model_files
-from sim.robots.robot import ROBOTS, RobotCfg
+from sim.robots.probes import make_probes, start_height
+from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
 
 _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 
@@ -22,13 +29,6 @@ def load_robot(path: Path) -> RobotCfg:
         ValueError: If the file is missing or fails, sets no ``ROBOT``, or something in the settings or the model is
             wrong. The message names all that is wrong.
     """
-    import warp as wp
-
-    from sim.bank import host_device
-    from sim.robots.model import read_robot
-    from sim.robots.probes import make_probes
-    from sim.robots.stand import start_height
-
     robot: Any = getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
@@ -79,8 +79,6 @@ def settings_problems(robot: RobotCfg) -> list[str]:
 
 
 def _name_problems(robot: RobotCfg) -> list[str]:
-    from kernels.penalties import PENALTIES  # with Warp, which only checking needs
-
     found = [f"{name} must name at least one" for name in ("base_geoms", "foot_geoms", "joint_names")
              if not getattr(robot, name)]  # fmt: skip
     found += [f"{name} must hold each name once, got {', '.join(getattr(robot, name))}" for name in _NAMES

@@ -3,6 +3,7 @@
 A mesh is covered by balls that touch its convex hull from inside.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -12,8 +13,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
 from kernels.contact import Probes
+from sim.crossing import CrossingCfg
+from sim.device import host_device
+from sim.robots.model import geom_names
+from sim.robots.robot import RobotCfg
+
+_DRAWS = 64  # of start poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,3 +348,42 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
     probes.strip_body = wp.array(body, dtype=int)
     probes.strip_shape = wp.array(shape, dtype=int)
     return probes
+
+
+def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
+    """Height of the base over flat ground at which a crossing starts with no foot in the ground [m], to the next mm.
+
+    Crossings start with every joint up to a fifth from its default angle.
+    """
+    rng, spread = np.random.default_rng(0), CrossingCfg().start_joint_range
+    scale = rng.uniform(1.0 - spread, 1.0 + spread, (_DRAWS, robot.num_joints))
+    scale[0] = 1.0
+    feet = (bottoms[name] for bottoms, _ in extents(builder, scale * robot.default_joint_pos)
+            for name in robot.foot_geoms)  # fmt: skip
+    return float(np.ceil(-1e3 * min(feet) - 1e-3) / 1e3)
+
+
+def extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str, float], float]]:
+    """Of each pose, shape (num_joints,) [rad], relative to the upright base: lowest points, and the farthest one [m].
+
+    The lowest points are by the names of their geoms.
+    """
+    with wp.ScopedDevice(host_device()):
+        model, probes = builder.finalize(), make_probes(builder)
+        state: Any = model.state()
+        counts = np.diff(np.append(probes.strip_start.numpy(), len(probes.position))).astype(int)
+        counts = counts[: len(probes.strip_radius)]
+        body, shape, radius = (
+            np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("body", "shape", "radius")
+        )
+        points, names = probes.position.numpy(), np.array(geom_names(builder))[shape]
+        for pose in poses:
+            state.joint_q.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *pose], dtype=np.float32))
+            newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+            poses_of_bodies = state.body_q.numpy()[body]
+            at = poses_of_bodies[:, :3] + Rotation.from_quat(poses_of_bodies[:, 3:]).apply(points)
+            bottom = at[:, 2] - radius
+            yield (
+                {name: float(bottom[names == name].min()) for name in dict.fromkeys(names)},
+                float((np.linalg.norm(at, axis=1) + radius).max()),
+            )

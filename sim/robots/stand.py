@@ -1,6 +1,5 @@
 """What a robot's files hold, whether it stands, and how many contacts it needs when it lies."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,15 +7,14 @@ import newton
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from sim.bank import TerrainBank, host_device
-from sim.crossing import CrossingCfg
+from sim.bank import TerrainBank
+from sim.crossing import CAPACITY_OVERFLOWS
 from sim.robots.model import build_robot, effort_limits, geom_names, leaf_name
-from sim.robots.probes import make_probes
+from sim.robots.probes import extents, start_height
 from sim.robots.robot import RobotCfg
-from sim.simulation import CAPACITY_OVERFLOWS, Simulation
-from sim.space import SUPER_GAUSSIAN
+from sim.simulation import Simulation
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import SPACING
 
 _GRAVITY = 9.81
@@ -25,7 +23,6 @@ _ROOM = 1.5  # highest ground that a dropped robot could touch is looked for thi
 _UPRIGHT_DEG = 15.0
 _SUNK = 0.005  # deeper than this in the ground at the start is a mistake [m]
 _FALL = 0.1  # a start so much above the right one is a mistake [m]
-_DRAWS = 64  # of start poses
 _REST_S = 0.5  # the end of the time that a robot stands, at which it should rest
 _RESTLESS = 0.1  # feet whose force changes by more than this share of the weight a step, on average, bounce
 _TURN = 2.0 * np.pi
@@ -44,7 +41,7 @@ class Standing:
     lowest: str
     """The geom that was lowest then."""
     right_height: float
-    """The lowest ``default_base_height`` at which no foot starts in the ground [m] (:func:`start_height`)."""
+    """The lowest ``default_base_height`` at which no foot starts in the ground [m]."""
     height: tuple[float, float]
     """Of the base, at the start and at the end [m]."""
     tilt_deg: float
@@ -91,7 +88,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     q = np.zeros((1 + drops, 7 + robot.num_joints), dtype=np.float32)
     q[:, :3], q[:, 6], q[:, 7:] = (8.0, 4.0, robot.default_base_height), 1.0, robot.default_joint_pos
     sim.targets.assign(q)
-    ((bottoms, reach),) = _extents(builder, [robot.default_joint_pos])
+    ((bottoms, reach),) = extents(builder, [robot.default_joint_pos])
     bottoms = {name: robot.default_base_height + bottom for name, bottom in bottoms.items()}
     q[1:, :2] = rng.uniform([5.0, 2.0], [11.0, 6.0], (drops, 2))
     turn = rng.normal(size=(drops, 4))
@@ -102,45 +99,6 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     sim.joint_q.assign(q)
     contacts, rows, overflowed, forces = _let_fall(sim, seconds)
     return _judged(sim, robot, bottoms, start_height(robot, builder), contacts, rows, overflowed, forces)
-
-
-def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
-    """Height of the base over flat ground at which a crossing starts with no foot in the ground [m], to the next mm.
-
-    Crossings start with every joint up to a fifth from its default angle.
-    """
-    rng, spread = np.random.default_rng(0), CrossingCfg().start_joint_range
-    scale = rng.uniform(1.0 - spread, 1.0 + spread, (_DRAWS, robot.num_joints))
-    scale[0] = 1.0
-    feet = (bottoms[name] for bottoms, _ in _extents(builder, scale * robot.default_joint_pos)
-            for name in robot.foot_geoms)  # fmt: skip
-    return float(np.ceil(-1e3 * min(feet) - 1e-3) / 1e3)
-
-
-def _extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str, float], float]]:
-    """Of each pose, shape (num_joints,) [rad], relative to the upright base: lowest points, and the farthest one [m].
-
-    The lowest points are by the names of their geoms.
-    """
-    with wp.ScopedDevice(host_device()):
-        model, probes = builder.finalize(), make_probes(builder)
-        state: Any = model.state()
-        counts = np.diff(np.append(probes.strip_start.numpy(), len(probes.position))).astype(int)
-        counts = counts[: len(probes.strip_radius)]
-        body, shape, radius = (
-            np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("body", "shape", "radius")
-        )
-        points, names = probes.position.numpy(), np.array(geom_names(builder))[shape]
-        for pose in poses:
-            state.joint_q.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *pose], dtype=np.float32))
-            newton.eval_fk(model, state.joint_q, state.joint_qd, state)
-            poses_of_bodies = state.body_q.numpy()[body]
-            at = poses_of_bodies[:, :3] + Rotation.from_quat(poses_of_bodies[:, 3:]).apply(points)
-            bottom = at[:, 2] - radius
-            yield (
-                {name: float(bottom[names == name].min()) for name in dict.fromkeys(names)},
-                float((np.linalg.norm(at, axis=1) + radius).max()),
-            )
 
 
 def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
@@ -233,7 +191,7 @@ def describe_model(robot: RobotCfg) -> str:
 def unit_warnings(robot: RobotCfg, builder: newton.ModelBuilder) -> list[str]:
     """Numbers that no legged robot has in metres, kilograms and radians, one line each."""
     masses, warnings = np.array(builder.body_mass), []
-    ((_, reach),) = _extents(builder, [robot.default_joint_pos])
+    ((_, reach),) = extents(builder, [robot.default_joint_pos])
     if not _SIZES[0] <= reach <= _SIZES[1]:
         warnings.append(f"it reaches {reach:.3g} m from its base: are lengths in the model in metres?")
     if not _MASSES[0] <= masses.sum() <= _MASSES[1]:

@@ -1,9 +1,11 @@
 """What the training of a controller takes of its robot: the rewards, and how its starts and its body are varied."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from sim.files.settings import setting
+from msgspec import Meta
+
+from sim.files.settings import Interval, NonNegativeFloat, PositiveFloat, PositiveInt, Share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,17 +43,17 @@ class TrainingCfg:
     rewards: RewardCfg = field(default_factory=RewardCfg)
     only_positive: bool = True
     """Clip the reward of a step at 0, so that ending early never pays."""
-    min_air_time_s: float = setting(0.5, least=0)
+    min_air_time_s: NonNegativeFloat = 0.5
     """Feet are to be in the air for longer than this in each step [s]."""
-    soft_joint_limit: float = setting(1.0, above=0, most=1)
+    soft_joint_limit: Annotated[float, Meta(gt=0, le=1)] = 1.0
     """Soft joint limits span this share of the range between the hard ones, about its middle."""
     steady_joints: tuple[str, ...] = ()
     """Joints that are to keep near their default angle."""
-    added_base_mass: tuple[float, float] = setting((0.0, 0.0), rising=True)
+    added_base_mass: Interval = (0.0, 0.0)
     """Range of the mass added to the bases [kg]; ANYmal's is -5 to 5."""
-    push_speed: float = setting(1.0, least=0)
+    push_speed: NonNegativeFloat = 1.0
     """A push sets the horizontal velocity to a random one of up to this along x and y [m/s]."""
-    start_joint_range: float = setting(0.5, least=0)
+    start_joint_range: NonNegativeFloat = 0.5
     """Joints start at the default pose times 1 +- this."""
 
 
@@ -59,11 +61,11 @@ class TrainingCfg:
 class PaceCfg:
     """The settings of the learner that belong to the robot; the defaults are legged_gym's."""
 
-    init_noise_std: float = setting(1.0, above=0)
+    init_noise_std: PositiveFloat = 1.0
     """Standard deviation of the actions before the first update."""
-    desired_kl: float = setting(0.01, above=0)
+    desired_kl: PositiveFloat = 0.01
     """KL divergence an update aims at."""
-    entropy: float = setting(0.01, least=0)
+    entropy: NonNegativeFloat = 0.01
     """Weight of the entropy bonus."""
 
 
@@ -71,8 +73,8 @@ class PaceCfg:
 class LearningCfg(PaceCfg):
     """How the robot's controller is learned from scratch on a GPU; the defaults are ANYmal's."""
 
-    num_envs: int = setting(8192, least=1)
-    iterations: int = setting(2240, least=1)
+    num_envs: PositiveInt = 8192
+    iterations: PositiveInt = 2240
 
 
 Draw = Literal["uniform", "failing", "learnable"]
@@ -91,9 +93,9 @@ class TuningCfg:
     """Weight of :attr:`RewardCfg.tracking_lin_vel` in place of the robot's own."""
     draw: Draw = "learnable"
     """How elites are drawn."""
-    start_spread: float = setting(8.0, least=0.0, most=MOST_SPREAD)
+    start_spread: Annotated[float, Meta(ge=0, le=MOST_SPREAD)] = 8.0
     """Robots start up to so far along the way [m]."""
-    entropy: float = setting(0.005, least=0.0)
+    entropy: NonNegativeFloat = 0.005
     """Weight of the entropy bonus. It widens the noise of the actions, which a further training begins with."""
-    average: float = setting(0.2, least=0.0, most=1.0)
+    average: Share = 0.2
     """Share of all iterations, the last ones, whose actors are averaged into the controller."""

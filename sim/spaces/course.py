@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels import course
 from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, PARAMETERS, SPACING, Kind
+from sim.device import host_device
 from sim.spaces.base import Seed, TerrainSpace, clipped
 
 _KIND, _LENGTH = GENES.index("kind"), GENES.index("length")
@@ -93,8 +94,6 @@ class Course(TerrainSpace):
         Raises:
             ValueError: If the shape differs or a gene is not finite.
         """
-        from sim.bank import host_device  # it needs the spaces
-
         with wp.ScopedDevice(host_device()):
             found: Any = course.lay_out(wp.array(self.validate(genes), dtype=float)).numpy()
         return found.copy()

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from kernels import course
 from kernels.course import SPACING, Element, Kind
 from kernels.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S
-from sim.bank import host_device
+from sim.device import host_device
 from sim.ground import GROUND_KINDS, joined_name
-from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.ground import gene_of
+from sim.spaces.registry import get_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS
 
 FIRST_COL, NUM_PLACES = 100, 20

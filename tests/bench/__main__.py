@@ -16,10 +16,10 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from sim.device import resolve_device
 from sim.files.records import provenance
 from sim.policy.loaders import prepare_torch
-from sim.robots.robot import get_robot
-from sim.simulation import resolve_device
+from sim.robots.find import get_robot
 from tests.bench.cases import Case, build_scene, make_cases
 from tests.bench.ceiling import Ceiling, measure_ceiling
 from tests.bench.timing import Timing, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import SPACING, crossing_terrain
 from tests.builders import make_terrain
 from tests.kernels import oracle

@@ -16,7 +16,7 @@ from kernels.training import (
     seed_restarts,
 )
 from sim.crossing import CrossingCfg, make_task
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 
 NUM_JOINTS = 2
 NUM_LEVELS, NUM_COLUMNS = 4, 3

@@ -10,7 +10,7 @@ import torch
 
 from sim.policy.export import export_onnx
 from sim.policy.loaders import load_policy
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.kills import commands, searches, trainings
 from tests.kills.children import run_child
 from tests.kills.damage import copied, damages, snapshot

@@ -25,7 +25,8 @@ from sim.policy.export import to_onnx
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import Recording
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from tests.builders import small_archive
 from tests.kills import searches, trainings
 from tests.kills.children import run_child

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sim.policy.loaders import load_policy
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.kills import searches, trainings
 from tests.kills.children import Child, run_child
 from tests.kills.searches import search_watched

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from sim.files.command import run_command
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.kills.steps import Steps
 from train.base import Train
 from train.ppo import run

@@ -7,7 +7,7 @@ import numpy as np
 from kernels.episode import Outcome
 from sim.files.records import identity
 from sim.recording.recorder import Recording
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 
 NAMES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 FRAMES = 21

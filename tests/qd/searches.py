@@ -15,14 +15,14 @@ from qd.run.settings import SchedulerCfg, SearchCfg
 from qd.search import run_search
 from qd.show import figures
 from qd.workers.evaluator import EvaluatorCfg
-from sim.files.records import PENALTY_DEFINITION, provenance
+from sim.files.records import provenance, robot_identity
 from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 
 CFG = SearchCfg(
-    penalty_definition=PENALTY_DEFINITION,
+    **robot_identity(get_robot("anymal")),
     robot="anymal",
     preset="small",
     policy="shipped",

@@ -5,8 +5,8 @@ import pytest
 
 from qd.causes import effects_of, on_the_way, shape_of
 from sim.bank import heights_of
-from sim.space import SUPER_GAUSSIAN
 from sim.spaces.course import COURSE
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels.course_oracle import course, element
 

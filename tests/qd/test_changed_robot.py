@@ -26,7 +26,9 @@ from qd.show.view.command import View
 from sim.files.command import run_command
 from sim.files.records import identity, robot_digest
 from sim.recording.file import write_recording
-from sim.robots.robot import ROBOTS, RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
 from tests.builders import hashes, rsl_rl_actor, save_checkpoint
 from tests.qd import stand_in
 from tests.qd.show.view.made import make_recording

@@ -137,20 +137,18 @@ def test_a_name_is_of_one_controller_and_a_controller_of_one_name(failing, certi
 def test_more_in_mujoco_c_are_the_same_and_others(failing, monkeypatch):
     asked = []
 
-    def run_plain(robot, policy, heights, starts, *, processes, time_constant_s, ground, crossed):
-        asked.append((robot.physics_dt, time_constant_s, len(heights), [len(start.qpos) for start in starts]))
+    def cross_terrains(robot, policy, terrains, seeds, *, num_episodes, resolved, **_):
+        asked.append((resolved, len(terrains), num_episodes))
         outcome = np.array([Outcome.GOAL] * 3 + [Outcome.TIME_OUT] * 15 + [Outcome.INVALID] + [Outcome.BASE_COLLISION])
         nothing = np.zeros((EPISODES, 6))
-        return [
-            crossing.PlainCrossings(outcome=outcome.astype(np.uint8), penalties=nothing, duration_s=nothing[:, 0])
-            for _ in heights
-        ]
+        record = crossing.PlainCrossings(outcome=outcome.astype(np.uint8), penalties=nothing, duration_s=nothing[:, 0])
+        yield from ((number, record) for number in range(len(terrains)))
 
-    monkeypatch.setattr(crossing, "run_plain", run_plain)
+    monkeypatch.setattr(crossing, "cross_terrains", cross_terrains)
     nobody = work(lambda cfg, genes: pytest.fail("only MuJoCo C crosses"))
     two = confirm_in_mujoco_c(failing, range(6), 2, nobody)
     three = confirm_in_mujoco_c(two, range(6), 3, nobody)
-    assert asked == [(0.001, 0.003, 2, [20, 20]), (0.001, 0.003, 1, [20])]
+    assert asked == [(True, 2, 20), (True, 1, 20)]
     drawn = [set(np.flatnonzero(archive.faults.mujoco_c_outcomes.any(axis=1)).tolist()) for archive in (two, three)]
     assert drawn[0] < drawn[1] and [len(some) for some in drawn] == [2, 3]
     assert three.faults.mujoco_c_outcomes[min(drawn[1])].tolist() == [3, 1, 15, 1]

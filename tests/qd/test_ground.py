@@ -27,7 +27,7 @@ from sim.recording.recorder import record
 from sim.recording.scene import ground_paint
 from sim.robots.robot import RobotCfg
 from sim.rollout import CrossingCfg, Rollout
-from sim.space import get_space
+from sim.spaces.registry import get_space
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.builders import fresh_values
 from tests.qd import stand_in

@@ -6,7 +6,7 @@ import numpy as np
 
 from qd.groups import KIN_M, ORDERS, elites_of, families_of, joined, rank, rms_distances
 from sim.bank import heights_of
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import judged_archive, small_archive
 from tests.qd.show.report.test_numbers import grouped_archive
 

@@ -8,7 +8,7 @@ import pytest
 
 from qd.minimal import SCALE_STEPS, Case, Trial, fresh_counts, minimise
 from qd.workers.evaluator import EvaluatorCfg
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.stand_in import make_result
 

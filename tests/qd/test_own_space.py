@@ -19,14 +19,14 @@ from qd.show.export import Export, export
 from qd.show.recordings import on_elite
 from qd.show.report import command
 from qd.show.report.command import Report
-from sim import space as spaces
 from sim.bank import heights_of
 from sim.files.command import run_command
 from sim.maps.heightmap import read_heightmap
 from sim.policy.spec import controller_hash
 from sim.recording.file import read_recording, write_recording
 from sim.robots.robot import RobotCfg
-from sim.space import load_space
+from sim.spaces import registry as spaces
+from sim.spaces.registry import load_space
 from tests.qd import stand_in
 from tests.qd.recordings import stand_in_cross
 from tests.sim.spaces.spaces import move, write_ridges
@@ -63,7 +63,7 @@ class RasterisingArchive(Archive):
 
 def forget(patch):
     """As in a program that has just begun."""
-    patch.setattr(spaces, "_named", [])
+    patch.setattr(spaces, "_loaded", [])
 
 
 def search(*words: str) -> int:
@@ -144,7 +144,7 @@ def test_a_run_alone_runs_nothing(searched, monkeypatch, look):
     (searched.parent / "moved").rename(searched.parent / "runs/anymal-1")
     with pytest.raises(ValueError, match=r"which is code: name it again \(--space mine/space.py:Ridges\)"):
         look()
-    assert not spaces._named
+    assert not spaces._loaded
 
 
 def test_fresh_episodes(ridges, searched):

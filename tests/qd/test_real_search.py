@@ -12,9 +12,9 @@ from qd.run.settings import SchedulerCfg
 from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
 from sim.crossing import CrossingCfg
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.searches import make_job, rows_of
 

@@ -15,8 +15,10 @@ from qd.run.settings import SchedulerCfg
 from qd.scheduler import Scheduler
 from qd.surrogate import Surrogate
 from sim.corridor import SHAPE, corridor_heights
-from sim.space import SUPER_GAUSSIAN, clipped, get_space, load_space
+from sim.spaces.base import clipped
 from sim.spaces.course import COURSE
+from sim.spaces.registry import get_space, load_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.sim.spaces.spaces import write_ridges
 
@@ -191,7 +193,7 @@ def test_training_is_the_same_on_every_device(device, monkeypatch):
 
 @pytest.mark.parametrize("name", ["super_gaussian", "course+friction", "{own}+softness"])
 def test_it_learns_and_proposes_on_every_device(device, name, tmp_path, monkeypatch):
-    monkeypatch.setattr("sim.space._named", [])
+    monkeypatch.setattr("sim.spaces.registry._loaded", [])
     space = load_space(name.format(own=write_ridges(tmp_path)))
     cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=2, candidates=8, generations=2)
     search = Surrogate(cfg, CELLS, space, np.random.SeedSequence(0))

@@ -4,7 +4,7 @@ import torch
 
 from qd.run.settings import SchedulerCfg
 from qd.variation import varied
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))
 LINE = (PAIR[1] - PAIR[0]).numpy()

@@ -12,7 +12,7 @@ from qd.fitness import FitnessCfg, evaluation_of
 from qd.show.elites import Found
 from qd.show.figures import draw_archive, look_of
 from qd.show.replay import Replay, describe
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.qd import stand_in
 from tests.qd.recordings import recording_of
 from tests.qd.run.test_arguments import TINY, fails, in_a_folder_of_its_own, run_main  # noqa: F401 - a fixture for all of these

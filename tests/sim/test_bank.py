@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sim.bank import TerrainBank, heights_of
-from sim.space import SUPER_GAUSSIAN, SuperGaussian
 from sim.spaces.course import COURSE
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN, SuperGaussian
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.kernels import oracle
 from tests.sim.scenes import NODE_X, NODE_Y

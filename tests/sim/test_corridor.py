@@ -5,8 +5,9 @@ import torch
 from kernels.ground import PATCHES
 from sim.bank import heights_of, terrains_of
 from sim.corridor import SHAPE, corridor_ground, corridor_heights
-from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.course import COURSE
+from sim.spaces.registry import get_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 
 def test_every_second_node_around_the_way():

@@ -15,7 +15,7 @@ from sim.mujoco_c.model import crossing_model
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.simulation import Simulation
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.scenes import FLAT, PHYSICS_DT, Stepper, free_body, lying, positions, put, slope
 
 GRAVITY = 9.81

@@ -11,7 +11,7 @@ from sim.crossing import CrossingCfg
 from sim.policy.loaders import load_policy
 from sim.recording.recorder import FRAME_ARRAYS, record
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
 from tests.sim.policies import stretch
 from tests.sim.scenes import FLAT, spike

@@ -13,7 +13,7 @@ from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import step_penalties, to_mujoco
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout, evaluate
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
 from tests.sim.policies import NanAfterASecond, stand, stretch
 from tests.sim.scenes import FLAT, positions, put, spike, velocities

@@ -9,9 +9,10 @@ import pytest
 import warp as wp
 
 from sim.bank import TerrainBank
+from sim.device import _cpu_instead, resolve_device
 from sim.mujoco_c.model import to_mujoco
-from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg, _cpu_instead, resolve_device
-from sim.space import SUPER_GAUSSIAN
+from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, Stepper, lying, positions, put, velocities
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim import terrain
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import CROSSING_TYPES, TILE_TYPES, crossing_terrain, training_tile
 
 GRID = (161, 321)

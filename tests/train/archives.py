@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from qd.archive import Archive, FaultCounts
-from sim.files.records import PENALTY_DEFINITION
-from sim.space import SUPER_GAUSSIAN
+from sim.files.records import PENALTY_DEFINITION, robot_digest
+from sim.robots.shipped import ROBOTS
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
@@ -19,6 +20,7 @@ def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Ar
     counts = np.zeros(num_elites, np.int64)
     return Archive(
         robot=robot,
+        robot_sha256=robot_digest(ROBOTS[robot]) if robot in ROBOTS else None,
         penalty_definition=PENALTY_DEFINITION,
         space="super_gaussian",
         penalties=PENALTIES,

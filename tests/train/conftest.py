@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
 

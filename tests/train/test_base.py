@@ -12,7 +12,7 @@ import tyro
 from sim.files.atomic import locked
 from sim.files.command import run_command
 from sim.policy.loaders import load_policy
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import Train
 from train.ppo.cfg import PpoCfg

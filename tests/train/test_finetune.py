@@ -12,13 +12,13 @@ import torch
 from qd.archive import FaultCounts, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.evaluate.sets import split_elites
-from sim import space as spaces
 from sim.files.atomic import locked
 from sim.files.command import run_command
-from sim.files.settings import built
+from sim.files.settings import from_builtins
 from sim.policy.loaders import load_policy
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.robots.training import TuningCfg
+from sim.spaces import registry as spaces
 from tests.builders import fresh_values
 from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
@@ -566,7 +566,7 @@ def test_a_run_of_before_actors_were_averaged_goes_on_without(places, finished):
     older = {**settings, "ppo": {key: value for key, value in settings["ppo"].items() if key != "average"}}
     old = {**saved, "extra": {**saved["extra"], "settings": older}}
     assert check_resumed(config(places), old, settings) == []
-    assert built(Finetune, Finetune.begun(ROBOT, older), "a training").ppo.average == 0.0
+    assert from_builtins(Finetune, Finetune.begun(ROBOT, older), "a training").ppo.average == 0.0
 
 
 def test_a_run_of_before_starts_were_spread_goes_on(places, finished):
@@ -596,7 +596,7 @@ def test_a_training_in_a_space_of_ones_own_goes_on_only_with_it(places, tmp_path
     ridges = write_ridges(tmp_path / "mine")
     own = {"mix": "hard-random", "archive": (), "space": ridges, "iterations": 1, "run_dir": tmp_path / "run"}
     assert finetune(config(places, **own)) == 0
-    monkeypatch.setattr(spaces, "_named", [])  # as in a program that has just begun
+    monkeypatch.setattr(spaces, "_loaded", [])  # as in a program that has just begun
     with pytest.raises(ValueError, match=r"which is code: name it again \(--space .*space.py:Ridges\)"):
         job_of(resumed(tmp_path / "run", iterations=2))
     there = move(ridges, tmp_path / "elsewhere")

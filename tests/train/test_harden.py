@@ -18,7 +18,7 @@ from qd.evaluate.sets import make_sets, split_elites
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
 from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.rollout import RolloutResult
 from tests.train.results import result_of
 from tests.train.starts import write_actor

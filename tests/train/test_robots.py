@@ -9,7 +9,7 @@ import torch
 import tyro
 
 from sim.policy.loaders import load_policy
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import Train
 from train.ppo.cfg import PpoCfg

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from sim.files.command import OnDevice
-from sim.files.settings import built, check, problems, setting
+from sim.files.settings import check, from_builtins, problems, setting
 from sim.robots.training import PaceCfg
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class TrainingFlags(OnDevice):
         Raises:
             ValueError: If there is no such robot, no such run, or one whose settings cannot be read.
         """
-        from sim.robots.robot import get_robot
+        from sim.robots.find import get_robot
 
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--robot", default=_ROBOT)
@@ -121,7 +121,7 @@ class TrainingFlags(OnDevice):
         saved = read_saved(named.resume, robot, cls.command)
         try:
             values = cls.begun(robot, saved["extra"]["settings"])
-            flags = built(cls, {**values, "robot": named.robot, "resume": named.resume}, "a training")
+            flags = from_builtins(cls, {**values, "robot": named.robot, "resume": named.resume}, "a training")
             check(flags)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(

@@ -12,14 +12,14 @@ import torch
 
 from qd.evaluate.marks import TRAINED_ON
 from qd.run.settings import differences
+from sim.device import resolve_device
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import command_line
 from sim.files.records import check_robot, provenance, robot_digest
 from sim.files.settings import problems
 from sim.policy.spec import is_same
 from sim.robots.robot import RobotCfg
-from sim.simulation import resolve_device
-from sim.space import to_be_named
+from sim.spaces.registry import is_own
 from train.ppo.cfg import PpoCfg, TrainingFlags, ppo_problems
 from train.ppo.learner import Learner, Ranks, check_entries, read_checkpoint
 from train.ppo.progress import STATE, Progress
@@ -330,7 +330,7 @@ def run_training(job: Job, begin: Callable[[], Training]) -> int:
     """
     run_dir, checkpoint = job.run_dir, job.run_dir / CHECKPOINT
     space = getattr(job.flags, "space", None)
-    named = space and to_be_named(space)
+    named = space if space and is_own(space) else None
     again = {"resume": run_dir, "space": named, "export": job.flags.export, "overwrite": job.flags.overwrite}
     go_on = f"Go on with: {command_line(job.flags.command, robot=job.robot.spec, **again)}"
     busy = f"another training works in {run_dir}: let it end, or name another --run-dir"

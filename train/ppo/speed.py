@@ -36,9 +36,9 @@ class TrainSpeed(OfRobot, OnDevice):
         Raises:
             ValueError: If a flag's value cannot be used; raised before any long work.
         """
+        from sim.device import resolve_device
         from sim.files.records import provenance
-        from sim.robots.robot import get_robot
-        from sim.simulation import resolve_device
+        from sim.robots.find import get_robot
         from train.ppo.learner import Ranks
 
         check(self)

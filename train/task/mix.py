@@ -10,7 +10,8 @@ from sim.bank import terrains_of
 from sim.files.settings import check, setting
 from sim.ground import GroundMaps
 from sim.robots.training import Draw
-from sim.space import SUPER_GAUSSIAN, TerrainSpace
+from sim.spaces.base import TerrainSpace
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import (
     CROSSING_TYPES,
     NUM_COLS,

@@ -25,10 +25,11 @@ from kernels.training import (
 )
 from sim import crossing
 from sim.bank import TerrainBank
+from sim.crossing import CAPACITY_OVERFLOWS
 from sim.policy.loaders import prepare_torch
 from sim.reward import Reward
 from sim.robots.robot import RobotCfg
-from sim.simulation import CAPACITY_OVERFLOWS, Simulation
+from sim.simulation import Simulation
 from train.task.cfg import TaskCfg, task_problems
 from train.task.curriculum import Tiles, first_levels, make_tiles
 

@@ -21,7 +21,8 @@ from sim.files.atomic import prepare_output
 from sim.files.command import command_line
 from sim.policy.spec import ControllerSpec, spec_of
 from sim.robots.robot import RobotCfg
-from sim.space import TerrainSpace, get_space
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import get_space
 
 if TYPE_CHECKING:
     from qd.show.report.command import Report

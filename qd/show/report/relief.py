@@ -11,7 +11,7 @@ from sim.terrain import SPACING
 
 if TYPE_CHECKING:
     from sim.ground import GroundMaps
-    from sim.space import TerrainSpace
+    from sim.spaces.base import TerrainSpace
 
 _AT_ONCE = 50  # height maps that are made at once
 _FEW = 1_000  # terrains, up to which pictures are large

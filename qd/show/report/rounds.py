@@ -26,7 +26,7 @@ from sim.files.atomic import has_shape, prepare_output, read_json
 from sim.files.command import plain_command
 from sim.files.figures import bar_lengths, new_figure
 from sim.files.records import without_machine
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

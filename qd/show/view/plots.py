@@ -14,7 +14,7 @@ from qd.groups import ORDERS, VERDICTS, Elites, Ranking, rank
 from qd.show.crossed import ARRIVED, Rate
 from qd.show.figures import label_of, look_of, mode_words
 from sim.files.intervals import rate_words
-from sim.space import TerrainSpace
+from sim.spaces.base import TerrainSpace
 
 _SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites in the list's order, the first darkest
 _GREY, _PICKED, _BRUSH = "#d8d8d8", "#d55e00", "#e69f00"

@@ -8,7 +8,7 @@ import numpy as np
 from qd.evaluate.measures import Measured, measure
 from qd.evaluate.sets import TerrainSet, plain_set
 from qd.evaluate.tables import Controller, Tables, make_tables
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
 
@@ -27,9 +27,7 @@ def make_measured(goals: Sequence[int], *, of: int = 20, reward: float = 10.0, b
 
 def make_report(goals: Mapping[str, Mapping[str, Sequence[int]]], *, of: int = 4) -> Tables:
     """Tables of ANYmal: set -> controller -> on each terrain, in how many of ``of`` episodes it reached the goal."""
-    crossed = {
-        name: {who: make_measured(counts, of=of) for who, counts in row.items()} for name, row in goals.items()
-    }
+    crossed = {name: {who: make_measured(counts, of=of) for who, counts in row.items()} for name, row in goals.items()}
     sets = {name: make_set(name, len(next(iter(row.values())))) for name, row in goals.items()}
     controllers = {who: Controller(policy=who, sha256=None) for who in next(iter(goals.values()))}
     return make_tables(crossed, sets, get_robot("anymal"), controllers=controllers, episodes=of, seed=0)

@@ -14,7 +14,8 @@ from qd.run.arguments import Archive, job_of
 from qd.search import run_search
 from qd.show import figures
 from sim.files.command import run_command
-from sim.robots.robot import RobotCfg, get_robot
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
 
 TINY = ["--device", "cpu", "--emitters", "1", "--batch-size", "4", "--replicas", "1", "--iterations", "1"]

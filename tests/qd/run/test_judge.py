@@ -18,7 +18,7 @@ from qd.show.evidence import evidence_file, read_evidence
 from qd.show.replay import ReplayElite, describe, replay
 from sim.files.command import Interrupted
 from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.qd.recordings import stand_in_cross
 from tests.qd.searches import SHIPPED, make_job, run
 from tests.qd.stand_in import make_result, open_stand_in

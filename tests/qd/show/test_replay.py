@@ -14,7 +14,7 @@ from qd.show.elites import Found, find_archive
 from qd.show.replay import Replay, ReplayElite, describe, draw, replay
 from sim.files.command import run_command
 from sim.policy.spec import controller_hash
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.builders import fresh_values, small_archive
 from tests.qd import stand_in
 from tests.qd.recordings import FRAMES, recording_of

@@ -10,7 +10,7 @@ from qd.studies.calibrate import Calibrate, Crossed, penalty_scales
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from sim.files.records import identity
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.stand_in import make_result
 
@@ -50,7 +50,8 @@ def any_policy(monkeypatch):
 
 
 def test_the_file_is_what_the_robot_reads(tmp_path, any_policy, monkeypatch):
-    from sim.robots.robot import RobotCfg, get_robot
+    from sim.robots.find import get_robot
+    from sim.robots.robot import RobotCfg
 
     out = tmp_path / "anymal.scales.json"
     Calibrate(device="cpu", terrains=12, most_terrains=12, replicas=4, out=out).execute(

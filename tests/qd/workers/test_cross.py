@@ -12,8 +12,8 @@ from qd.workers import cross as service
 from qd.workers.cross import Cache, Crossings, cross
 from qd.workers.evaluator import Compute
 from qd.workers.invalid import AllInvalidError
-from sim.robots.robot import get_robot
-from sim.space import SUPER_GAUSSIAN
+from sim.robots.find import get_robot
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 
 ROBOT = get_robot("anymal")
@@ -243,7 +243,7 @@ def test_mujoco_c_gives_the_robots_penalties_and_is_stored_apart(tmp_path, monke
         outcome[0] = Outcome.INVALID
         penalties = np.where(outcome[:, None] == Outcome.INVALID, np.nan, np.arange(6.0))
         record = SimpleNamespace(outcome=outcome, penalties=penalties, duration_s=np.full(num_episodes, 20.0))
-        return [record] * len(terrains)
+        yield from ((number, record) for number in reversed(range(len(terrains))))
 
     monkeypatch.setattr(service, "cross_terrains", cross_terrains)
     cross_all(StandIn(), tmp_path)

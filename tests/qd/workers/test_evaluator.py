@@ -20,7 +20,7 @@ from qd.workers.evaluator import (
 )
 from qd.workers.process import _serve
 from qd.workers.shards import merged
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.qd import crossers, stand_in
 
 CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", workers="1")

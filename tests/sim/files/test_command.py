@@ -18,6 +18,7 @@ from sim.files.command import (
     chosen_elites,
     command_line,
     naming_what_is_next,
+    peek,
     plain_command,
     publish,
     run_command,
@@ -210,3 +211,11 @@ def test_elites_are_named_by_numbers_or_all():
             chosen_elites(text, 3, "a run")
     with pytest.raises(ValueError, match="the archive is empty"):
         chosen_elites("all", 0, "a run")
+
+
+@pytest.mark.parametrize(
+    ("line", "value"),
+    [("--preset wide --seed 3", "wide"), ("--preset=wide", "wide"), ("--seed 3", None), ("--preset b --preset=a", "a")],
+)
+def test_a_flag_is_looked_at_before_the_others_are_parsed(line, value):
+    assert peek(line.split(), "--preset") == value

@@ -13,7 +13,7 @@ from sim.bank import heights_of
 from sim.maps.heightmap import as_terrain, read_heightmap
 from sim.maps.terrain_files import FORMATS, as_hfield, gray_scale, mjcf_of, png_of, stl_of, triangles_of, write_terrain
 from sim.mujoco_c.model import surface_heights
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
 

@@ -10,7 +10,7 @@ import torch
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
-from sim.mujoco_c.crossing import _Episodes, cross, draw_starts, join, run_plain
+from sim.mujoco_c.crossing import _Episodes, cross, cross_terrains, draw_starts
 from sim.mujoco_c.model import (
     crossing_model,
     goal_commands,
@@ -22,7 +22,7 @@ from sim.mujoco_c.model import (
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.simulation import GROUND_FRICTION, SolverCfg
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
 from tests.sim.policies import stand
@@ -219,24 +219,27 @@ def test_what_ends_a_crossing(robot):
     assert found.outcome.tolist() == [Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]
     assert np.isnan(found.penalties[3]).all() and np.isfinite(found.penalties[:3]).all()
     np.testing.assert_allclose(found.duration_s, 0.005)
-    both = join([found, found])
-    assert both.outcome.shape == (8,) and both.penalties.shape == (8, len(PENALTIES))
 
 
 @pytest.mark.slow
-def test_episodes_shared_out_over_processes_come_back_in_order(anymal):
+def test_episodes_shared_out_over_processes_come_back_in_order(cassie, monkeypatch):
+    """Those of a terrain in two parts, at the search's settings, are what one process says of each start."""
     flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    heights = np.stack([flat, flat + np.float32(0.2)])
-    starts = [draw_starts(anymal, grid, seed, 30, "cpu") for seed, grid in enumerate(heights)]
-    for start in starts:
-        start.qpos[:, 1] = 10.5  # over at once, but for one
-        start.qpos[27, :2] = 13.8, 4.0
-    told = {}
-    found = run_plain(anymal, str(anymal.policy_file), heights, starts, processes=1, crossed=told.__setitem__)
-    assert sorted(told) == [0, 1] and all((told[k].outcome == found[k].outcome).all() for k in told)
-    for crossings in found:
-        assert len(crossings.outcome) == 30
-        assert np.flatnonzero(crossings.outcome == Outcome.GOAL).tolist() == [27]
+    heights, seeds, crossed = np.stack([flat, flat + np.float32(0.2)]), np.array([3, 4], np.uint32), []
+    policy = "tests.sim.policies:stand"
+    records = dict(
+        cross_terrains(
+            cassie, policy, heights, seeds, space=SUPER_GAUSSIAN, num_episodes=27, processes=2, resolved=False,
+            progress=crossed.append,
+        )
+    )  # fmt: skip
+    assert sorted(records) == [0, 1] and sorted(crossed) == [2, 2, 25, 25]
+    for number, record in records.items():
+        starts = draw_starts(cassie, heights[number], int(seeds[number]), 27, "cpu")
+        expected = cross(cassie, stand, heights[number], starts[25:])
+        assert record.outcome.shape == (27,) and record.penalties.shape == (27, len(PENALTIES))
+        np.testing.assert_array_equal(record.duration_s[25:], expected.duration_s)
+        np.testing.assert_array_equal(record.penalties[25:], expected.penalties)
 
 
 class Remembers:

@@ -14,7 +14,7 @@ from sim.policy.adapters import read_row
 from sim.policy.loaders import load_policy
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.kernels import oracle
 from tests.sim.policies import stretch

@@ -15,7 +15,7 @@ from sim.policy import export as module
 from sim.policy.export import export_onnx, to_onnx
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.policy.onnx_file import OnnxPolicy, load_onnx
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.terrain import crossing_terrain
 

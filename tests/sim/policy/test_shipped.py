@@ -3,7 +3,7 @@
 import numpy as np
 
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, crossing_terrain
 
 FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)

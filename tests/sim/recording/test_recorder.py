@@ -15,7 +15,7 @@ from sim.mujoco_c.model import surface_heights
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import FRAME_ARRAYS, Recording, record
 from sim.rollout import Rollout
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.scenes import FLAT, slope, spike
 
 SHORT = CrossingCfg(max_duration_s=1.0, poll_every_s=0.5)

@@ -11,7 +11,7 @@ from sim.mujoco_c.model import surface_heights
 from sim.recording.recorder import record
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.recording.scene import MARGIN_NODES, ground_paint, scene_model
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.sim.dogs import KINDS, write_dog

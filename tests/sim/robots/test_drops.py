@@ -15,7 +15,7 @@ from kernels.heightfield import Terrain, nearest_surface_point
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg, make_task
 from sim.simulation import Simulation
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import CROSSING_TYPES, crossing_terrain
 from tests.sim.scenes import positions, put, velocities
 

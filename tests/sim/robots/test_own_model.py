@@ -9,10 +9,10 @@ import warp as wp
 from kernels.episode import Outcome
 from sim.bank import TerrainBank
 from sim.mujoco_c.model import crossing_model
+from sim.robots.find import get_robot
 from sim.robots.model import build_robot, geom_names, joint_names
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes
-from sim.robots.robot import get_robot
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from tests.kernels import oracle

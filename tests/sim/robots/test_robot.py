@@ -9,8 +9,9 @@ import pytest
 
 from kernels.penalties import BASE, FOOT, LIMB
 from sim.files.records import robot_identity
+from sim.robots.find import get_robot
 from sim.robots.model import build_robot, leaf_name
-from sim.robots.robot import ROBOTS, get_robot
+from sim.robots.shipped import ROBOTS
 from tests.kernels import oracle
 from tests.sim import plain_mujoco
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE, lying

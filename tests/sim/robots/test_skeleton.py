@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from sim.robots.find import get_robot
 from sim.robots.model import build_robot, geom_names
-from sim.robots.robot import get_robot
 from sim.robots.skeleton import Skeleton
 from tests.sim.dogs import KINDS, mjcf, with_mesh, write_dog
 

@@ -7,7 +7,7 @@ import pytest
 
 from sim.commands import Stand
 from sim.files.command import run_command
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from sim.robots.stand import describe_model, describe_standing, stand
 from tests.sim.dogs import GAINS, KINDS, LEGS, MASS, urdf, write_dog
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from sim.robots.model import build_robot
 from sim.simulation import GROUND_FRICTION, SolverCfg
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import SPACING
 from tests.kernels import oracle
 from tests.sim import plain_mujoco

@@ -4,8 +4,8 @@ import numpy as np
 
 from kernels.course import GENES_PER_ELEMENT, PARAMETERS, Kind
 from sim.bank import heights_of
-from sim.space import get_space
 from sim.spaces.course import COURSE
+from sim.spaces.registry import get_space
 from tests.kernels.course_oracle import course, element
 
 

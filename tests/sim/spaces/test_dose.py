@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sim.bank import terrains_of
-from sim.space import get_space
 from sim.spaces.dose import DOSES, FIRST_COL, LEVEL_SPACE, NUM_PLACES, chosen_doses, parse_doses
+from sim.spaces.registry import get_space
 from tests.kernels import course_oracle as oracle
 from tests.kernels.course_oracle import course, element
 

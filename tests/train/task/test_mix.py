@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from sim.bank import TerrainBank, terrains_of
-from sim.space import SUPER_GAUSSIAN, get_space
 from sim.spaces.course import COURSE
+from sim.spaces.registry import get_space
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import CROSSING_TYPES, TILE_TYPES
 from train.task.mix import Mix, MixCfg
 

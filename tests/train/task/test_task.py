@@ -9,7 +9,7 @@ import warp as wp
 
 from kernels.episode import Outcome
 from kernels.observation import Noise, write_observation
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.sim.dogs import STAND, mjcf, write_dog
 from tests.train.conftest import CURRICULUM, NUM_ENVS
 from train.task.cfg import NoiseCfg, TaskCfg

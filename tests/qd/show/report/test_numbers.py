@@ -10,7 +10,7 @@ from qd.groups import MAX_MODES, elites_of, failure_modes, find_modes, rank
 from qd.show.crossed import crossed_of, penalties_by_place
 from qd.show.report.elites import choice_told
 from qd.show.report.page import percent
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.recordings import NAMES, recording_of
 

@@ -24,8 +24,8 @@ from qd.show.report.page import MAX_BYTES, Section, absent, at_a_glance, heading
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
 from sim.files.figures import as_png, new_figure
-from sim.robots.robot import get_robot
-from sim.space import SUPER_GAUSSIAN
+from sim.robots.find import get_robot
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values
 from tests.qd.recordings import stand_in_cross
 from tests.qd.show.report.test_numbers import grouped_archive

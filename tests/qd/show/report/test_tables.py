@@ -16,7 +16,7 @@ from qd.show.report.evaluation import fates, most_mended
 from qd.show.report.tables import by_kind, changes_of
 from sim.files.atomic import to_json
 from sim.files.records import robot_identity
-from sim.robots.robot import get_robot
+from sim.robots.find import get_robot
 from tests.qd.show.report.test_report import DOT, Page, make_run, reporter
 from tests.train.results import GOAL, LATE, result_of
 

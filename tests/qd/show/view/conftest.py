@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.show.view.plots import axes_of
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import small_archive
 
 collect_ignore = [] if find_spec("viser") else ["test_app.py", "test_panels.py", "test_address.py", "test_browser.py"]

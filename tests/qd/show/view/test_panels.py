@@ -8,7 +8,7 @@ from qd.show.crossed import ENDINGS
 from qd.show.view.legend import legend_html
 from qd.show.view.panels import PAGE, Clock, Selection
 from qd.show.view.plots import FITNESS_WORDS, KINDS, Choice, axes_of, axes_svg
-from sim.space import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
 
 

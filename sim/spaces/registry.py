@@ -1,0 +1,75 @@
+"""Terrain spaces by name: the shipped ones, and those of a user that the command line named."""
+
+import shlex
+from collections.abc import Sequence
+
+from sim.ground import check_kinds, joined_name, split_name
+from sim.policy.spec import ControllerSpec, controller_hash
+from sim.spaces.base import TerrainSpace
+from sim.spaces.course import COURSE
+from sim.spaces.ground import OnGround
+from sim.spaces.own import load_own
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+
+SPACES: dict[str, TerrainSpace] = {space.name: space for space in (SUPER_GAUSSIAN, COURSE)}
+"""Every shipped space by its name. Another one is one more class, and its place here."""
+_loaded: list[TerrainSpace] = []
+"""A user's own spaces that this process was told to run, the latest first."""
+
+
+def is_own(name: str) -> bool:
+    """Whether a space is code of a user's own."""
+    base, _ = split_name(name)
+    return base not in SPACES and ControllerSpec.parse(base).runs_code
+
+
+def identity(name: str, sha256: str | None) -> str:
+    """What terrains depend on: the space's name, or the hash of its code if it has one, and its ground."""
+    base, kinds = split_name(name)
+    return joined_name(sha256 or base, kinds)
+
+
+def load_space(name: str | None, ground: Sequence[str] | None = None) -> TerrainSpace:
+    """A space that the command line names; a user's own is run, and :func:`get_space` finds it from then on.
+
+    Args:
+        name: A shipped space's name, ``file.py:Space`` or ``module:Space``, and behind it the maps of its ground, for
+            example ``course+friction+softness``; the paper's space if None.
+        ground: The maps of its ground, if the name does not say them.
+    """
+    base, kinds = split_name(name or SUPER_GAUSSIAN.name)
+    if ground is not None:
+        wanted = check_kinds(ground)
+        if kinds and kinds != wanted:
+            raise ValueError(f"the space {name} has its own ground, got --ground {' '.join(wanted)}: leave one out")
+        kinds = wanted
+    if is_own(base):
+        sha256 = controller_hash(base)
+        if sha256 is None or not any((space.name, space.sha256) == (base, sha256) for space in _loaded):
+            _loaded.insert(0, load_own(base))
+    return get_space(joined_name(base, kinds))
+
+
+def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
+    """A space that a record names; no code runs that :func:`load_space` did not run.
+
+    Args:
+        name: What the record calls it.
+        sha256: Hash of its code in the record, by which code that has moved is known.
+    """
+    base, kinds = split_name(name)
+    space = SPACES.get(base) or _find_loaded(base, sha256)
+    if kinds and space.ground:
+        raise ValueError(f"the space {base} has ground of its own, got {name}: leave --ground out")
+    return OnGround(inner=space, kinds=kinds) if kinds else space
+
+
+def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:
+    if not is_own(name):
+        raise ValueError(f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS")
+    for space in _loaded:
+        if space.name == name if sha256 is None else space.sha256 == sha256:
+            return space
+    if any(space.name == name for space in _loaded):
+        raise ValueError(f"the code of the space {name} has changed since: put it back, or search anew")
+    raise ValueError(f"the space {name} is code, which runs only if named: give --space {shlex.quote(name)}")

@@ -1,0 +1,85 @@
+"""The paper's terrains: sums of rotated Super-Gaussian bumps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kernels import super_gaussian
+from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
+from sim.spaces.base import Seed, TerrainSpace, clipped
+
+_HEIGHT = PARAMETERS.index("w")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuperGaussian(TerrainSpace):
+    """Eq. 1, with genes rescaled by Table I."""
+
+    num_bumps: int = 8
+
+    def __post_init__(self) -> None:
+        if self.num_bumps < 1:
+            raise ValueError(f"num_bumps must be at least 1, got {self.num_bumps}")
+
+    @property
+    def name(self) -> str:
+        """What files and command lines call the space."""
+        return "super_gaussian"
+
+    @property
+    def num_genes(self) -> int:
+        """Eight genes a bump, in the order of :data:`kernels.super_gaussian.PARAMETERS`, bump after bump."""
+        return self.num_bumps * GENES_PER_BUMP
+
+    @property
+    def any_spacing(self) -> bool:
+        """A bump has a height everywhere."""
+        return True
+
+    @property
+    def genes_per_part(self) -> int:
+        """A part is a bump."""
+        return GENES_PER_BUMP
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
+        """Turns genes into heights on the device (:func:`kernels.super_gaussian.rasterise`)."""
+        super_gaussian.rasterise(genes, spacing, heights_out)
+
+    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Uniform genes, but every bump at its lowest or highest height: the paper's hard-random terrains."""
+        genes = self.uniform_random(count, seed)
+        heights = genes[:, _HEIGHT::GENES_PER_BUMP]
+        heights[:] = np.where(heights < 0.0, -1.0, 1.0)
+        return genes
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """Each bump in words."""
+        bumps = clipped(genes).reshape(self.num_bumps, GENES_PER_BUMP)
+        return tuple(map(_in_words, LOWER + (bumps + 1.0) / 2.0 * (UPPER - LOWER)))
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes with the heights of some bumps at zero."""
+        flattened = self.validate(genes).copy()
+        flattened[:, np.asarray(parts, dtype=int) * GENES_PER_BUMP + _HEIGHT] = 0.0  # the middle of -0.25 m to 0.25 m
+        return flattened
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32]:
+        """Genes with the height of every bump times ``scale``."""
+        lower = clipped(self.validate(genes))
+        lower[:, _HEIGHT::GENES_PER_BUMP] *= scale  # 0 is the height in the middle of its range
+        return lower
+
+
+def _in_words(bump: NDArray[np.float64]) -> str:
+    x, y, sigma_x, sigma_y, _, _, theta, height = bump
+    kind = "bump" if height >= 0.0 else "hollow"
+    return (
+        f"{kind} of {abs(height):.2f} m at ({x:.1f}, {y:.1f}) m, half widths {sigma_x:.1f} m and {sigma_y:.1f} m, "
+        f"turned by {np.rad2deg(theta):.0f} degrees"
+    )
+
+
+SUPER_GAUSSIAN = SuperGaussian()

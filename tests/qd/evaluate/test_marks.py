@@ -1,0 +1,61 @@
+"""Marks of the elites that a controller was trained on."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from qd.evaluate.marks import TRAINED_ON, check_untrained, marks_of, recorded_marks
+from tests.train.archives import make_archive
+from tests.train.starts import write_actor, write_trained
+
+GENES = make_archive(20).genes
+
+
+def test_marks_are_of_the_genes_alone():
+    marks = marks_of(GENES)
+    assert len(set(marks)) == 20 and all(len(mark) == 12 for mark in marks)
+    assert marks_of(GENES[::-1].astype(np.float64)) == marks[::-1]
+
+
+def test_the_records_of_all_files_of_a_controller_are_read(tmp_path):
+    path = write_trained(tmp_path, GENES[:3])
+    for policy in (str(path), str(tmp_path / "tuned.onnx"), f"some.module:adapter@{path}"):
+        assert recorded_marks(policy) == set(marks_of(GENES[:3]))
+    assert recorded_marks("some.module:walk") == set() == recorded_marks(str(tmp_path / "other.pt"))
+    path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: 5}))
+    with pytest.raises(ValueError, match=TRAINED_ON):
+        recorded_marks(str(path))
+
+
+@pytest.mark.parametrize("inside", ["checkpoint", "controller"])
+def test_marks_in_the_file_itself_count_where_no_record_lies_beside_it(inside, tmp_path):
+    path = write_actor(tmp_path / "policy.pt")
+    content = torch.load(path, weights_only=True)
+
+    def write(marks):
+        part = {TRAINED_ON: marks}
+        torch.save(content | ({"extra": part} if inside == "checkpoint" else part), path)
+
+    write(marks_of(GENES))
+    assert recorded_marks(str(path)) == recorded_marks(f"some.module:adapter@{path}") == set(marks_of(GENES))
+    write([5])
+    with pytest.raises(ValueError, match=TRAINED_ON):
+        recorded_marks(str(path))
+
+
+def test_a_file_of_another_kind_has_no_marks(tmp_path):
+    torch.jit.script(torch.nn.Linear(2, 3)).save(tmp_path / "script.pt")
+    torch.save([1, 2], tmp_path / "list.pt")
+    torch.save({"extra": 5}, tmp_path / "number.pt")
+    (tmp_path / "text.pt").write_text("no weights")
+    for file in tmp_path.iterdir():
+        assert recorded_marks(str(file)) == set()
+
+
+def test_a_controller_is_not_tested_on_what_it_was_trained_on(tmp_path):
+    controllers = {"base": "some.module:walk", "C-G": str(write_trained(tmp_path, GENES[:8]))}
+    check_untrained(controllers, GENES[8:], "run")
+    with pytest.raises(ValueError, match=r"C-G .* got 2 of the 14"):
+        check_untrained(controllers, GENES[6:], "run")
