@@ -79,9 +79,6 @@ class Simulation:
         column_of_geom: Column in ``geom_force`` of each solver geom, -1 for none.
     """
 
-    solver_collides = False
-    """Whether the solver finds the contacts itself; here kernels.contact does."""
-
     def __init__(
         self,
         robot: RobotCfg,
@@ -165,7 +162,7 @@ class Simulation:
             ls_iterations=cfg.ls_iterations,
             cone="elliptic",
             integrator="implicitfast",
-            use_mujoco_contacts=self.solver_collides,
+            use_mujoco_contacts=False,
             kinematic_switchable_roots=False,
         )
         self.solver.mjw_model.opt.warn_overflow = 0
@@ -243,9 +240,8 @@ class Simulation:
         self.sensors.scan_x = wp.array(scan_x, dtype=float)
         self.sensors.scan_y = wp.array(scan_y, dtype=float)
         self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
-        if not self.solver_collides:
-            self._coordinates = self._build_coordinates()
-            self._dynamics = dynamics_of(self.solver.mjw_model, data)
+        self._coordinates = self._build_coordinates()
+        self._dynamics = dynamics_of(self.solver.mjw_model, data)
 
     def _build_coordinates(self) -> SolverState:
         """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
