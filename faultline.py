@@ -34,17 +34,14 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "export": Command("qd.show.export:Export", "elites as npz, 16-bit PNG, MJCF and STL"),
     },
     "Train": {
-        "train": Command("train.base:Train", "train a base controller from scratch"),
-        "finetune": Command("train.finetune:Finetune", "train a controller further on terrains that broke it"),
+        "train": Command("train.commands:Train", "train a base controller from scratch"),
+        "finetune": Command("train.commands:Finetune", "train a controller further on terrains that broke it"),
         "harden": Command("train.harden:Harden", "rounds of search and training, until little breaks it"),
         "export-policy": Command("sim.commands:ExportPolicy", "a controller as one ONNX file"),
     },
     "Bring a robot": {
         "stand": Command("sim.commands:Stand", "look at a robot: its joints and geoms, whether it stands"),
         "calibrate": Command("qd.studies.calibrate:Calibrate", "measure the penalty scales of a robot"),
-    },
-    "Measure speed": {
-        "train-speed": Command("train.ppo.speed:TrainSpeed", "environment steps a second of training"),
     },
 }
 """What can be done, by what it is for."""

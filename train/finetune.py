@@ -1,134 +1,265 @@
 """Fine-tune a controller on the terrains that broke it."""
 
-import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any
 
-from sim.files.command import OnGround
-from sim.files.settings import setting
-from sim.robots.training import MOST_SPREAD, Draw, RewardCfg
-from train.ppo.cfg import PpoCfg, TrainingFlags
+import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from sim.robots.robot import RobotCfg
+from qd.archive import Archive
+from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
+from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, split_elites
+from qd.run.directory import RunDirectory, published_or_newest
+from sim.policy.export import export_onnx
+from sim.policy.loaders import MlpPolicy, load_policy
+from sim.policy.spec import SHIPPED, controller_hash, is_same
+from sim.robots.robot import RobotCfg
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import identity, load_space
+from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
+from train.ppo.checkpoint import CHECKPOINT, Start, read_start
+from train.ppo.learner import Ranks
+from train.ppo.training import (
+    POLICY,
+    Kind,
+    Training,
+    check_settings,
+    deadline_of,
+    device_of,
+    is_finished,
+    read_saved,
+    run_directory,
+    settings_of,
+)
+from train.task.mix import Mix
 
-_PPO = PpoCfg(steps_per_env=24, desired_kl=0.005)  # beside it the robot's recipe
+CERTIFIERS = "certifiers"
+"""Folder of a run with controllers that may certify its faults."""
+_CRITIC_ITERATIONS = 50
 
 
-def shipped_space(settings: dict[str, Any]) -> str | None:
-    """The terrain space that a training's settings name; None for one of a user's own, which its command line names."""
-    return None if settings.get("space_sha256") else settings.get("space")
+def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN) -> Path:
+    """Trains a controller further by PPO, on hand-crafted terrains and on those of archives; returns its file.
+
+    Where the directory holds a checkpoint of the same settings, the training goes on; one that is over is left as it
+    is.
+
+    Args:
+        robot: Who learns.
+        cfg: What, and on which terrains.
+        run_dir: Where checkpoint, controller, record and TensorBoard's file go.
+        run: Where and for how long.
+
+    Raises:
+        ValueError: If controller, archives or a setting cannot be used; raised before any long work.
+        Interrupted: On Ctrl-C, when all is saved.
+        FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
+    """
+    deadline_s, device = deadline_of(run.max_seconds), device_of(run.device)
+    if Ranks.of_environment().size > 1:
+        raise ValueError("a fine-tuning must be one process, got several by torchrun: begin it without")
+    cfg = cfg.sized(robot, device)
+    saved = read_saved(run_dir, "finetune", robot.name) if (run_dir / CHECKPOINT).exists() else None
+    start = _read_start(robot, cfg) if saved is None else None  # of a checkpoint it may be gone
+    hidden_dims = start.hidden_dims if start else saved["settings"]["ppo"]["hidden_dims"] if saved else ()
+    cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=tuple(hidden_dims)))
+    elites = elites_of(robot, cfg)
+    settings = {
+        **settings_of(cfg, robot),
+        "elites": elites.about,
+        "spaces": list(dict.fromkeys(map(_identity, elites.spaces))),
+    }
+    if saved is not None:
+        check_settings(run_dir, saved, settings)
+        is_exported = run.export is None or is_same(str(run.export), str(run_dir / POLICY))
+        if is_exported and is_finished(run_dir, cfg.iterations):
+            return run_dir / POLICY
+    with run_directory(run_dir, run.export, overwrite=run.overwrite):
+        sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
+        what = f"on {cfg.terrains} terrains at a time ({cfg.mix})"
+        print(f"Fine-tuning '{robot.name}' {what}: {sizes}, in {run_dir}", flush=True)
+        training = FineTuning(
+            robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
+        )
+        policy = training.run(deadline_s, run.export)
+    actor = load_policy(policy, robot, "cpu")
+    assert isinstance(actor, MlpPolicy)
+    export_onnx(actor, policy.with_suffix(".onnx"))
+    return policy
 
 
-def archive_paths(settings: dict[str, Any]) -> list[str]:
-    """Where the archives lie that a training's settings name; a single one stands there by itself."""
-    paths = (settings.get("archive") or {"path": []})["path"]
-    return [paths] if isinstance(paths, str) else paths
+def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> Path:
+    """Trains a search's own specialist and puts it with the certifiers of its run; returns its file.
+
+    It is the controller of the search, trained further on the elites that it fails, all of them: a certificate is a
+    proof of existence, so it may have trained on the terrain. The training works in ``<run>/specialist``.
+
+    Args:
+        robot: Who learns.
+        run: Directory of a search whose elites have fresh episodes.
+        cfg: As of :meth:`FinetuneCfg.specialist`; controller and archive are those of the search.
+        options: Where and for how long.
+
+    Raises:
+        ValueError: If the run has no failing elites, its controller is not at hand, or as of :func:`finetune`.
+    """
+    archive = read_elites(run, robot, cfg.space)
+    searched = RunDirectory(run).read_config()["settings"]["policy"]
+    policy = cfg.policy or (None if searched == SHIPPED else searched)
+    if controller_hash(policy or robot.policy_file) != archive.policy_sha256:
+        raise ValueError(f"the controller of {run} must be the one that was searched, got {policy or SHIPPED}, another "
+                         "now: name it by --policy")  # fmt: skip
+    cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, device_of(options.device), **SPECIALIST)
+    specialist = run / CERTIFIERS / "specialist.pt"
+    finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
+    return specialist
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finetune(OnGround, TrainingFlags):
-    """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
+class Elites:
+    """Elites to train on."""
 
-    On CUDA the sizes are the paper's, on the CPU small ones, enough to see that it runs. Ctrl-C or --max-seconds saves
-    and stops; --resume RUN_DIR goes on with the settings of that run.
+    genes: tuple[NDArray[np.float32], ...]
+    """A part of each archive, shape (E, genes of its space); E sums up over the parts."""
+    spaces: tuple[TerrainSpace, ...]
+    """Of each part; without elites one, that of hard-random terrains."""
+    goal_rate: NDArray[np.float64] | None = None
+    """Of each, as its archive has it, shape (E,)."""
+    about: list[dict[str, Any]] = field(default_factory=list)
+    """Of each archive, for the record."""
+
+
+def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
+    """The elites to train on.
+
+    Raises:
+        ValueError: If there are none.
     """
+    if cfg.mix != "generated":
+        space = load_space(cfg.space, cfg.ground)
+        return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
+    paths = tuple(map(Path, cfg.archive)) or (published_or_newest(robot, cfg.policy, flag="archive"),)
+    archives = [read_elites(path, robot, cfg.space) for path in paths]
+    spaces = tuple(map(space_of, archives))
+    splits = [_split(cfg, archive) for archive in archives]
+    held_out = set[str]()  # searches that begin alike may share an elite
+    for archive, split in zip(archives, splits, strict=True):
+        held_out.update(marks_of(archive.genes[np.concatenate([split.test, split.validation])]))
+    parts = []
+    for archive, split, path in zip(archives, splits, paths, strict=True):
+        rows = split.train
+        if cfg.recipe.only == "failing":
+            if archive.fresh is None:
+                raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: judge it first")
+            rows = rows[archive.failing[rows]]
+        is_free = [mark not in held_out for mark in marks_of(archive.genes[rows])]
+        parts.append(rows[np.array(is_free, bool)])
+    if not any(map(len, parts)):
+        raise ValueError(f"{_joined(paths)} must have elites to train on that are {cfg.recipe.only}, got none")
+    rates = [(archive.fresh or archive).goal_rate[rows] for archive, rows in zip(archives, parts, strict=True)]
+    counts = zip(archives, parts, splits, strict=True)
+    return Elites(
+        genes=tuple(archive.genes[rows] for archive, rows in zip(archives, parts, strict=True)),
+        spaces=spaces,
+        goal_rate=np.concatenate(rates),
+        about=[
+            {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation),
+             "sha256": elites_sha256(archive)} for archive, rows, split in counts
+        ],
+    )  # fmt: skip
 
-    command: ClassVar[str] = "finetune"
-    policy: Path | None = None
-    """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one. The checkpoint.pt of a
-    training is its last actor, with its critic; its policy.pt is the mean of the last actors."""
-    noise_of: Path | None = None
-    """Controller with whose noise of the actions to begin, if its file says it; that of --policy. Noise grows in a
-    training, and a hardening lets each begin with the base's."""
-    mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
-    """Terrains: hand-crafted ones, and as many elites (generated, the paper's C-G) or hard-random ones (C-HR), or
-    nothing else (C-HC)."""
-    archive: tuple[Path, ...] = ()
-    """Runs of searches, or their archive.npz, for mix generated; results/<robot>/archive, or of a robot without one
-    its newest run under runs/."""
-    shares: Literal["equal", "size"] = "equal"
-    """How often elites of several archives are drawn. equal: as often from each archive, so that a small one counts as
-    much as a large one. size: every elite equally often."""
-    space: str | None = None
-    """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Name a
-    space of your own here too, for its elites and for a resumed training on it."""
-    split_seed: int = setting(0, least=0)
-    """Which elites are held out for the evaluation."""
-    only: Literal["all", "failing", "certified", "uncertified"] = "all"
-    """Which elites to train on. failing: those that fail by their fresh episodes. certified: those of them that a
-    certifier crosses. uncertified: those of them that none is known to cross."""
-    held_out: bool = True
-    """Whether elites are held out for the evaluation. A specialist, which is to certify, may train on all."""
-    draw: Draw | None = None
-    """How elites are drawn at each exchange. uniform: all alike. failing: rather those that were seldom crossed.
-    learnable: rather those that were crossed about half of the time, so that harder ones come later; so if
-    left out."""
-    task: Literal["crossing", "commands"] = "crossing"
-    """What robots are told. crossing: to cross the terrain, as in a search. commands: random velocities, as in the
-    base's training."""
-    start_spread: float | None = setting(None, least=0.0, most=MOST_SPREAD)
-    """Robots start up to so far along the way, drawn uniformly [m]. The goal stays where it is. Only for task crossing.
-    So robots also learn what lies behind a hard beginning. If left out: 8."""
-    rewards: RewardCfg
-    """Weights of the reward terms in this training: the robot's own, but -200 for a fall and 6 for tracking_lin_vel
-    (Cassie: 4, a robot of your own: 2). The rewards of an evaluation keep the robot's own."""
-    terrains: int | None = setting(None, least=1)
-    """Terrains at a time; on CUDA 500 (Cassie: 100), on the CPU 12."""
-    swap_every: int | None = setting(None, least=1)
-    """Iterations after which they are exchanged; on CUDA 400 (Cassie: 200), on the CPU 50."""
-    critic_iterations: int | None = setting(None, least=0)
-    """How many iterations the critic learns alone at first, if the controller comes without one. 50, or half of all if
-    there are fewer than 100."""
-    ppo: PpoCfg = field(default_factory=lambda: _PPO)
-    """The learner; its layers are those of the controller."""
 
-    @classmethod
-    def begun(cls, robot: "RobotCfg", settings: dict[str, Any] | None) -> dict[str, Any]:
-        """The flags that follow from a robot, or that a run was begun with."""
-        if settings is None:
-            own = robot.tuning
-            weights = {"termination": own.termination, "tracking_lin_vel": own.tracking_lin_vel}
-            ppo = replace(_PPO, entropy=own.entropy, average=own.average)
-            return {"rewards": replace(robot.training.rewards, **weights), "ppo": ppo}
-        same = ("seed", "num_envs", "iterations", "critic_iterations", "split_seed", "ppo")
-        policy, task = settings["policy"], settings["task"]
-        return {
-            **{name: settings[name] for name in same},
-            **settings["mix"],
-            "policy": None if policy == "shipped" else Path(policy),
-            "noise_of": Path(settings["noise_of"]) if settings.get("noise_of") else None,
-            "archive": tuple(map(Path, archive_paths(settings))),
-            "shares": settings.get("shares", "equal"),
-            "space": shipped_space(settings),
-            "task": "crossing" if task["crosses"] else "commands",
-            "start_spread": task.get("start_spread", 0.0),
-            "only": (settings["archive"] or {}).get("only", "all"),
-            "held_out": (settings["archive"] or {}).get("held_out", True),
-            "rewards": task["rewards"],
-        }
+def _split(cfg: FinetuneCfg, archive: Archive) -> EliteSplit:
+    """Which elites of an archive to train on: as the evaluation splits them, or all."""
+    if cfg.recipe.held_out:
+        return split_elites(archive)
+    nobody = np.zeros(0, np.int64)  # beside all, in an order that does not depend on that of the file
+    return EliteSplit(train=np.lexsort(archive.genes.T[::-1]), validation=nobody, test=nobody)
 
-    def execute(self) -> int:
-        """Fine-tunes; returns the exit status: 0, or 130 after Ctrl-C.
 
-        Raises:
-            ValueError: If a flag's value cannot be used; raised before any long work.
-            FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
-        """
-        from train.ppo.run import run_training
-        from train.tuning import FineTuning, job_of, other_weights
+def _joined(paths: Sequence[Path]) -> str:
+    return ", ".join(map(str, paths))
 
-        job = job_of(self, time.monotonic())
-        print(
-            f"Fine-tuning '{job.robot.name}' on {job.mix.cfg.terrains} terrains at a time ({self.mix}): "
-            f"{job.num_envs} robots on {job.device}, {job.iterations} iterations, in {job.run_dir}",
-            flush=True,
+
+def _identity(space: TerrainSpace) -> str:
+    """What the terrains of a space depend on, wherever its code lies."""
+    return identity(space.name, space.sha256)
+
+
+class FineTuning(Training):
+    """A fine-tuning at work: the terrains are exchanged under the learner."""
+
+    kind: Kind = "finetune"
+
+    def __init__(
+        self,
+        robot: RobotCfg,
+        cfg: FinetuneCfg,
+        run_dir: Path,
+        *,
+        device: str,
+        settings: dict[str, Any],
+        saved: dict[str, Any] | None,
+        elites: Elites,
+        start: Start | None,
+    ) -> None:
+        """Begin with networks and elites, or go on from a checkpoint; as of :class:`Training`."""
+        self.mix = Mix(
+            kind=cfg.mix, num_terrains=cfg.terrains, draw=cfg.recipe.draw, genes=elites.genes, spaces=elites.spaces,
+            crosses=cfg.task.crosses, seed=cfg.seed, device=device,
+            goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
+        )  # fmt: skip
+        if start is not None:
+            before = recorded_marks(str(cfg.policy or robot.policy_file))
+            self._alone = 0 if start.critic is not None else _critic_iterations(cfg)
+            self._trained_on = sorted({*chain(*map(marks_of, elites.genes)), *before})
+            tiles = self.mix.next()
+        else:
+            assert saved is not None
+            self._alone, self._trained_on = saved["critic_iterations"], saved[TRAINED_ON]
+            tiles = self.mix.restore(saved["mix"])
+        self._swap_every = cfg.recipe.swap_every
+        # Every episode is whole, at the beginning as after an exchange: who crossed which terrain is counted.
+        super().__init__(
+            robot, cfg, run_dir, device=device, settings=settings, saved=saved, tiles=tiles, random_ages=False
         )
-        print(other_weights(job.task.rewards, job.robot.training.rewards))
-        if job.critic_iterations >= job.iterations:
-            print(
-                f"The critic learns alone for the first {job.critic_iterations} iterations: the controller stays as it "
-                "is. To change it, give more --iterations or fewer --critic-iterations."
-            )
-        return run_training(job, lambda: FineTuning(job))
+        if start is not None:
+            self.learner.start_from(start.actor, start.critic)
+
+    def before_iteration(self) -> None:
+        """Exchanges the terrains where that is due, and lets the actor learn once its critic has had its time."""
+        iteration = self.learner.iteration
+        if iteration // self._swap_every > self.mix.swap:
+            self.task.exchange(self.mix.next(self.task.counts()))
+            self.learner.begin_again()
+        self.learner.alg.let_actor_learn(iteration >= self._alone)
+        if iteration == self._alone:
+            self.learner.alg.begin_actor()
+
+    @property
+    def averaged_from(self) -> int:
+        """Likewise; while the critic learns alone, the actor is what it was."""
+        return max(super().averaged_from, self._alone)
+
+    def facts(self) -> dict[str, Any]:
+        """Marks of all elites that the controller has been trained on in the end, and how long its critic was alone."""
+        return {TRAINED_ON: self._trained_on, "critic_iterations": self._alone}
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps, the terrains among it."""
+        return {**super().state(), "mix": self.mix.state(self.task.counts())}
+
+
+def _read_start(robot: RobotCfg, cfg: FinetuneCfg) -> Start:
+    start = read_start(Path(cfg.policy or robot.policy_file), robot)
+    noise_of = cfg.recipe.noise_of
+    return start if noise_of is None else start.with_noise_of(read_start(Path(noise_of), robot))
+
+
+def _critic_iterations(cfg: FinetuneCfg) -> int:
+    """Iterations at first in which the critic learns alone."""
+    asked_for = cfg.recipe.critic_iterations
+    return min(_CRITIC_ITERATIONS, cfg.iterations // 2) if asked_for is None else asked_for

@@ -60,8 +60,6 @@ class Harden(OfRobot, OnGround, Where):
     """Episodes a terrain in a search; the preset's."""
     draw: Draw | None = None
     """How a training draws elites at each exchange, as of `faultline finetune`."""
-    shares: Literal["equal", "size"] = "equal"
-    """Whether a training draws as often from each archive (equal), or each elite as often (size)."""
     by: tuple[str, ...] = ()
     """Certifiers as NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt. The controller that is
     searched never certifies itself."""

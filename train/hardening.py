@@ -32,13 +32,13 @@ from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.spaces.registry import is_own, load_space
+from train.cfg import LARGE, FinetuneCfg, RunCfg
 from train.choice import choose, known_choice
-from train.finetune import Finetune
+from train.finetune import finetune
 from train.harden import Harden
-from train.ppo.learner import read_start
-from train.ppo.run import CHECKPOINT, POLICY
+from train.ppo.checkpoint import CHECKPOINT, read_start
+from train.ppo.training import POLICY
 from train.rounds import begin, divisible, read_rounds, record, tell
-from train.tuning import check_sizes, hardening_sizes
 
 BASE = "base"
 """Name of the controller that a hardening begins with."""
@@ -242,8 +242,10 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     search = changed(preset(flags.preset or ("wide" if on_cuda else "small"), robot, str(policy)), sizes)
     an_iteration = search.episodes_per_iteration
     wanted = flags.search_episodes or (_GPU_EPISODES if on_cuda else search.iterations * an_iteration)
-    tuned = {name: getattr(flags, f"tune_{name}") for name in ("iterations", "num_envs", "terrains")}
-    tuning = replace(Finetune.defaults(["--robot", robot.spec]), **tuned)
+    tuned = {name: getattr(flags, f"tune_{name}") or 0 for name in ("iterations", "num_envs", "terrains")}
+    large = {} if robot.name == "cassie" else LARGE
+    tuning = replace(FinetuneCfg.of(robot), **tuned).sized(robot, device, **large)
+    tuning.check(robot)
     compute, full = Compute(device, flags.workers, flags.num_envs), (paper_terrains(robot.name), EPISODES)
     terrains, episodes = sizes_for(compute, flags.terrains, flags.episodes, full=full, small=(24, 4))
     found = Hardening(
@@ -256,14 +258,13 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         terrains=terrains,
         episodes=episodes,
         search_iterations=-(-wanted // an_iteration),
-        tune_sizes=hardening_sizes(tuning, robot, device),
+        tune_sizes={name: getattr(tuning, name) for name in tuned},
         settings={},
         compared=dict.fromkeys(flags.against, flags.rounds),
         open_evaluator=open_evaluator,
     )
     found = replace(found, settings=_settings_of(found, search, sizes))
     found = replace(found, compared={**_known_comparisons(found), **found.compared})
-    check_sizes(found.tune_sizes, "tune_")
     for certifier in found.certifiers(str(policy)).values():
         check_policy(certifier, robot, device)
     _refuse_another(found)
@@ -292,7 +293,7 @@ def _settings_of(job: Hardening, search: SearchCfg, sizes: dict[str, Any]) -> di
         "seed": flags.seed,
         "space": job.space.name,
         "search": searched,
-        "tune": {**job.tune_sizes, "shares": flags.shares, "noise_of": BASE, **recipe},
+        "tune": {**job.tune_sizes, "noise_of": BASE, **recipe},
         "keep": flags.keep,
         "evaluation": {"terrains": job.terrains, "episodes": job.episodes},
     }
@@ -434,18 +435,16 @@ def _run(job: Hardening, number: int) -> None:
 
 def _tune(job: Hardening, tune: Tune) -> None:
     """Trains, or goes on; raises KeyboardInterrupt where it was asked to stop."""
-    flags, robot = job.flags, job.robot.spec
-    own = {"device": flags.device, "iterations": job.tune_sizes["iterations"], "archive": divisible(tune.archives)}
-    if (tune.run / CHECKPOINT).exists():
-        training = Finetune.defaults(["--robot", robot, "--resume", str(tune.run)])
-    else:
-        training = Finetune.defaults(["--robot", robot])
-        own |= {"run_dir": tune.run, "policy": tune.start, "seed": tune.seed, "shares": flags.shares, **job.tune_sizes}
-        own |= {"noise_of": Path(job.base)} if tune.start != flags.policy else {}
-        own |= {"draw": flags.draw} if tune.archives else {"mix": "hard-random"}
-    own["space"] = job.space.name if is_own(job.space.name) or not tune.archives else None
-    if replace(training, **own).execute():
-        raise KeyboardInterrupt
+    flags = job.flags
+    cfg = FinetuneCfg.of(job.robot)
+    noise_of = job.base if tune.start != flags.policy else None
+    recipe = replace(cfg.recipe, draw=flags.draw or cfg.recipe.draw, noise_of=noise_of)
+    cfg = replace(
+        cfg, **job.tune_sizes, seed=tune.seed, policy=None if tune.start is None else str(tune.start),
+        archive=tuple(map(str, divisible(tune.archives))), mix="generated" if tune.archives else "hard-random",
+        space=job.space.name if is_own(job.space.name) or not tune.archives else None, recipe=recipe,
+    )  # fmt: skip
+    finetune(job.robot, cfg, tune.run, RunCfg(device=flags.device))
 
 
 def _search(job: Hardening, stage: Stage) -> None:

@@ -32,7 +32,7 @@ from tests.kills import searches, trainings
 from tests.kills.children import run_child
 from tests.kills.damage import flipped, npz, other_arrays, other_values
 from tests.qd.recordings import recording_of
-from train.ppo.learner import read_checkpoint
+from train.ppo.checkpoint import FORMAT, read_checkpoint
 
 SEED = 5
 ANYMAL = get_robot("anymal")
@@ -123,8 +123,9 @@ def search_state(file: Path) -> bytes:
 
 
 def training_state(file: Path) -> bytes:
-    content = read_checkpoint(file, "anymal")
-    return pickle.dumps([sorted(content), content["levels"].tolist(), content["iter"], content["extra"]["env_steps"]])
+    content = read_checkpoint(file)
+    counts = content["iter"], content["progress"]["env_steps"]
+    return pickle.dumps([sorted(content), content["levels"].tolist(), *counts])
 
 
 def recorded(file: Path) -> bytes:
@@ -242,7 +243,7 @@ class Bomb:
 def bombs(target: Path) -> dict[str, bytes]:
     """Files that would make ``target`` if anything in them ran."""
     bomb = Bomb(target)
-    state = {"actor_state_dict": {"mlp.0.weight": bomb}, "format": "faultline training checkpoint 1", "extra": bomb}
+    state = {"actor_state_dict": {"mlp.0.weight": bomb}, "format": FORMAT, "extra": bomb}
     packed = io.BytesIO()
     torch.save(state, packed)
     payload = zlib.compress(pickle.dumps({"archive": bomb}))

@@ -8,10 +8,9 @@ import torch
 from sim.files.command import run_command
 from sim.robots.find import get_robot
 from tests.kills.steps import Steps
-from train.base import Train
-from train.ppo import run
-from train.ppo.learner import read_checkpoint
-from train.ppo.run import CHECKPOINT
+from train.commands import Train
+from train.ppo import training
+from train.ppo.checkpoint import CHECKPOINT, read_checkpoint
 from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
 
@@ -22,7 +21,7 @@ TASK = CommandTask(_ROBOT, _CFG, num_envs=6, device="cpu", seed=0)
 
 
 _FLAGS = (
-    "--device cpu --num-envs 6 --rows 100 --save-every-s 0 --task.curriculum.num-columns 2 "
+    "--device cpu --num-envs 6 --task.curriculum.num-columns 2 "
     "--task.curriculum.noise-columns 1 --ppo.hidden-dims 16 8 --ppo.steps-per-env 4 --ppo.epochs 1 --ppo.mini-batches 2"
 )  # every iteration is saved
 
@@ -33,11 +32,11 @@ def train(run_dir: Path, *, iterations: int, resume: Path | None = None) -> int:
     Args:
         run_dir: Where it works, and goes on if there is a checkpoint.
         iterations: Iterations in all.
-        resume: Run to go on from in any case.
+        resume: The same directory, to go on by its own settings.
     """
-    run.CommandTask = lambda *_, **__: TASK
-    resume = resume or (run_dir if (run_dir / CHECKPOINT).exists() else None)
-    flags = ["--run-dir", str(run_dir), *(["--resume", str(resume)] if resume else [])]
+    training.CommandTask = lambda *_, **__: TASK  # pyright: ignore[reportAttributeAccessIssue]
+    training.SAVE_EVERY_S = 0.0
+    flags = ["--run-dir", str(run_dir)] if resume is None else ["--resume", str(resume)]
     return run_command(Train, [*_FLAGS.split(), *flags, "--iterations", str(iterations)], name="train")
 
 
@@ -52,8 +51,7 @@ def saved(run_dir: Path) -> dict[str, Any]:
     path = run_dir / CHECKPOINT
     if not path.exists():
         return {}
-    content = read_checkpoint(path, "anymal")
-    return {key: value for key, value in content.items() if key != "extra"}
+    return {key: value for key, value in read_checkpoint(path).items() if key != "progress"}
 
 
 def equal(first: Any, second: Any) -> bool:

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from qd.archive import read_archive, write_archive
 from qd.commands import Evaluate
@@ -33,10 +32,9 @@ from tests.builders import hashes, rsl_rl_actor, save_checkpoint
 from tests.qd import stand_in
 from tests.qd.show.view.made import make_recording
 from tests.sim.dogs import KINDS, write_dog
-from train.base import Train
-from train.finetune import Finetune
-from train.ppo.learner import CHECKPOINT_FORMAT
-from train.ppo.run import read_saved
+from train.cfg import TrainCfg
+from train.commands import Finetune
+from train.ppo.training import check_settings, settings_of
 
 SIZE = {"emitters": 1, "batch_size": 4, "replicas": 2, "iterations": 1, "device": "cpu"}
 NAMES = ("yaw_rate", "vel_x", "vel_y", "collision")
@@ -236,22 +234,13 @@ def test_recordings_of_the_robot_before_are_made_anew_or_refused(dog, capsys):
     assert line.startswith("named.recording.npz is of robot 'dog' as it was")
 
 
-@pytest.mark.parametrize("kind", ["train", "finetune"])
-def test_a_training_does_not_go_on_with_the_robot_after_it_changed(dog, capsys, kind):
-    settings = {"robot_sha256": robot_digest(get_robot(str(dog)))}
-    progress = {"settings": settings, "curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
-    content = {
-        "format": CHECKPOINT_FORMAT, "robot": "dog", "iter": 1, "levels": torch.zeros(1), "counter": 0,
-        "rng_cpu": torch.get_rng_state(), "rng_cuda": None,
-        "extra": progress if kind == "train" else {**progress, "mix": {}},
-    }  # fmt: skip
-    Path("training").mkdir()
-    torch.save(content, "training/checkpoint.pt")
-    command = {"train": Train, "finetune": Finetune}[kind]
-    assert read_saved(Path("training"), get_robot(str(dog)), kind)["iter"] == 1
+def test_a_training_does_not_go_on_with_the_robot_after_it_changed(dog):
+    cfg = TrainCfg(num_envs=4, iterations=1)
+    saved = {"settings": settings_of(cfg, get_robot(str(dog))), "iter": 1}
+    check_settings(Path("training"), saved, settings_of(cfg, get_robot(str(dog))))
     change_robot(dog)
-    line = refused(capsys, command, "--robot", str(dog), "--resume", "training")
-    assert line.startswith("training/checkpoint.pt is of robot 'dog' as it was") and "begin a new run" in line
+    with pytest.raises(ValueError, match="robot_sha256"):
+        check_settings(Path("training"), saved, settings_of(cfg, get_robot(str(dog))))
 
 
 def test_a_controller_trained_with_the_robot_before_is_told_so(dog, capsys):

@@ -13,7 +13,7 @@ import torch
 
 from kernels.episode import Outcome
 from qd.archive import read_archive, write_archive
-from qd.evaluate.marks import marks_of, recorded_marks
+from qd.evaluate.marks import marks_of
 from qd.evaluate.sets import make_sets, split_elites
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
@@ -22,8 +22,7 @@ from sim.robots.find import get_robot
 from sim.rollout import RolloutResult
 from tests.train.results import result_of
 from tests.train.starts import write_actor
-from train import choice, hardening, tuning
-from train.finetune import Finetune
+from train import choice, hardening
 from train.harden import Harden
 from train.hardening import harden, hardening_of
 
@@ -439,35 +438,6 @@ def test_a_comparison_that_began_with_a_training_of_its_own_goes_on_so(places):
     assert tunes[1].start == places / "run" / "tune-first_archive-1" / "checkpoint.pt"
 
 
-@pytest.mark.parametrize(("robot", "sizes"), [("anymal", (8192, 2000, 1200)), ("cassie", (600, 100, 3000))])
-def test_on_a_gpu_trainings_of_anymal_are_larger_than_the_papers(robot, sizes):
-    flags = Finetune.defaults(["--robot", robot])
-    found = tuning.hardening_sizes(flags, get_robot(robot), "cuda:0")
-    assert (found["num_envs"], found["terrains"], found["iterations"]) == sizes
-    found = tuning.hardening_sizes(replace(flags, num_envs=70, terrains=60), get_robot(robot), "cuda:0")
-    assert (found["num_envs"], found["terrains"], found["iterations"]) == (70, 60, sizes[2])
-
-
-def test_a_real_training_draws_from_all_archives_and_brings_its_critic_along(places, monkeypatch):
-    small = {"num_envs": 24, "terrains": 12, "swap_every": 2, "iterations": 1}
-    monkeypatch.setattr(tuning, "_SMALL", small)
-    sizes = {"tune_iterations": 1, "tune_num_envs": 6, "tune_terrains": 4}
-    assert harden(config(places, **sizes), open_evaluator=Crossings().open) == 0
-    run = places / "run"
-    record = read_json(run / "tune-2" / "policy.train.json")
-    assert record["settings"]["policy"] == str(run / "tune-1" / "checkpoint.pt")
-    assert record["settings"]["critic_iterations"] == 0
-    assert (record["settings"]["num_envs"], record["settings"]["mix"]["terrains"]) == (6, 4)
-    assert record["settings"]["noise_of"] == str(places / "start.pt")
-    assert record["settings"]["archive"]["path"] == [str(run / "search-0"), str(run / "search-1")]
-    marks = recorded_marks(str(run / "tune-2" / "policy.pt"))
-    for name in ("search-0", "search-1"):
-        archive = read_archive(run / name)
-        split = split_elites(archive)
-        assert set(marks_of(archive.genes[split.train])) <= marks
-        assert not set(marks_of(archive.genes[split.test])) & marks
-
-
 def test_the_time_limit_stops_it_as_ctrl_c_does(places, monkeypatch, capsys):
     def endless(job, tune):
         time.sleep(60)
@@ -500,7 +470,7 @@ def test_the_time_limit_holds_in_the_background_where_ctrl_c_is_ignored(places, 
         ({"by": ()}, "panel must hold certifiers of anymal"),
         ({"preset": "huge"}, "unknown preset 'huge'"),
         ({"rounds": 1, "against": ("first_archive",)}, "needs rounds of at least 2, got 1"),
-        ({"tune_num_envs": 5}, "tune_num_envs must be at least as many as tune_terrains, 12, got 5"),
+        ({"tune_num_envs": 5}, "num_envs must be at least as many as terrains, 12, got 5"),
         ({"run_dir": "full"}, "is not empty and holds no rounds.json"),
         ({"run_dir": "other"}, "holds a hardening of other settings: "),
     ],

@@ -29,7 +29,7 @@ def run(*words: str) -> str:
 def test_from_a_file_of_the_user_to_the_tables(tmp_path, published):
     mine, tuned = write_actor(tmp_path / "mine.pt", hidden=(24, 20, 16)), tmp_path / "tuned"
     archive = ("--archive", str(published / "anymal" / "archive"))
-    sizes = ("--num-envs", "8", "--terrains", "4", "--swap-every", "1", "--iterations", "2", "--critic-iterations", "1")
+    sizes = ("--num-envs", "8", "--terrains", "4", "--recipe.swap-every", "1", "--iterations", "2")
     said = run("finetune", "--policy", str(mine), "--device", "cpu", "--run-dir", str(tuned), *archive, *sizes)
     assert "Fine-tuning 'anymal' on 4 terrains at a time (generated): 8 robots on cpu, 2 iterations" in said
     state = torch.load(tuned / "policy.pt", weights_only=True)["actor_state_dict"]

@@ -7,35 +7,18 @@ import contextlib
 import io
 import os
 import time
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 from torch import distributed
 
-from sim.files.atomic import write_atomically
-from sim.policy.loaders import MlpPolicy, load_policy, read_weights, reason_of
-from sim.robots.robot import RobotCfg
+from sim.policy.loaders import reason_of
 from train.ppo.cfg import PpoCfg
+from train.ppo.checkpoint import STD, State
 from train.ppo.ppo import CapturedPPO, runner_settings
 from train.task.vec_env import CommandVecEnv
-
-CHECKPOINT_FORMAT = "faultline training checkpoint 1"
-_ENTRIES = {
-    "robot": (str,),
-    "iter": (int,),
-    "levels": (torch.Tensor,),
-    "counter": (int,),
-    "rng_cpu": (torch.Tensor,),
-    "rng_cuda": (torch.Tensor, type(None)),
-    "extra": (dict,),
-}
-_STD = "distribution.std_param"
-State = dict[str, torch.Tensor]
-"""Weights under rsl_rl's keys."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +179,7 @@ class Learner:
     @property
     def noise_std(self) -> float:
         """Mean standard deviation of the actions."""
-        return float(self.actor_state()[_STD].mean())
+        return float(self.actor_state()[STD].mean())
 
     def actor_state(self) -> State:
         """The actor under rsl_rl's keys, on the CPU."""
@@ -215,12 +198,11 @@ class Learner:
             if value.is_floating_point():
                 self._mean.setdefault(key, value.detach().clone()).lerp_(value.detach(), 1.0 / self.averaged)
 
-    def save(self, path: Path, extra: dict[str, Any]) -> None:
-        """Write a checkpoint, whole or not at all; ``extra`` is plain data that comes back from a read."""
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps: networks, optimiser, terrain levels and random numbers, all on the CPU."""
         task = self.env.task
-        content = {
+        return {
             **self.alg.save(),
-            "format": CHECKPOINT_FORMAT,
             "robot": task.robot.name,
             "iter": self.iteration,
             "levels": task.levels.to(torch.uint8),
@@ -229,21 +211,17 @@ class Learner:
             "mean_actor_state_dict": {key: value.cpu() for key, value in self._mean.items()},
             "rng_cpu": torch.get_rng_state(),
             "rng_cuda": torch.cuda.get_rng_state(task.observation.device) if task.observation.is_cuda else None,
-            "extra": extra,
         }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        write_atomically(path, buffer.getvalue())
 
     def start_from(self, actor: State, critic: State | None) -> None:
-        """Begin with a trained actor, and its critic where it is known, as :func:`read_start` gives them.
+        """Begin with a trained actor, and its critic where it is known (:class:`train.ppo.checkpoint.Start`).
 
         Args:
             actor: State under rsl_rl's keys; without a standard deviation of the actions, the configured one is kept.
             critic: Likewise.
         """
         policy = self.alg.get_policy()
-        policy.load_state_dict({_STD: policy.state_dict()[_STD], **actor})
+        policy.load_state_dict({STD: policy.state_dict()[STD], **actor})
         if critic is not None:
             self.alg.critic.load_state_dict(critic)
 
@@ -252,156 +230,36 @@ class Learner:
         self._observations = self.env.get_observations()
 
     def resume(self, content: dict[str, Any]) -> None:
-        """Go on from a checkpoint: networks, optimiser, learning rate, terrain levels, random numbers.
-
-        Episodes begin anew. With another number of environments the levels are dealt out in turn.
+        """Go on from :meth:`state`; episodes begin anew.
 
         Raises:
-            ValueError: If the networks have other shapes, or something in it is damaged.
+            ValueError: If something in it is damaged.
         """
         try:
             self.alg.load(content, None, True)
-        except Exception as error:  # torch answers states that do not fit with many types
-            raise ValueError(
-                f"the checkpoint's networks do not fit: {' '.join(str(error).splitlines()[-1:]).strip()}; "
-                "give the --ppo.hidden-dims it was trained with"
-            ) from error
-        try:
             self._restore(content)
-        except Exception as error:
-            raise ValueError(f"the checkpoint is damaged: {reason_of(error)}; give a copy of it to --resume") from error
+        except Exception as error:  # torch answers states that do not fit with many types
+            raise ValueError(f"the checkpoint is damaged: {reason_of(error)}; put a copy of it back") from error
         self._begin()
 
     def _restore(self, content: dict[str, Any]) -> None:
-        """Iteration, terrain levels and random numbers of a checkpoint."""
-        task = self.env.task
-        self.iteration = content["iter"]
-        self.averaged, self._mean = self._read_mean(content)
-        most = task.tiles.num_levels - 1
-        if len(content["levels"]) == 0 or int(content["levels"].max()) > most:
-            raise ValueError(f"levels must be at least one, and at most {most} each")
-        levels = content["levels"].to(task.levels.device, task.levels.dtype)
+        """Iteration, mean, terrain levels and random numbers of a checkpoint."""
+        task, levels = self.env.task, content["levels"]
+        self.iteration, self.averaged = content["iter"], content["averaged"]
+        mean = content["mean_actor_state_dict"]
+        weights = [value for value in self.actor_state().values() if value.is_floating_point()]
+        shapes = [value.shape for value in weights] if self.averaged else []
+        if [value.shape for value in mean.values()] != shapes or not 0 <= self.averaged <= self.iteration:
+            raise ValueError("mean_actor_state_dict must have the actor's weights, or none if averaged is 0")
+        if not all(bool(value.isfinite().all()) for value in mean.values()):
+            raise ValueError("mean_actor_state_dict has weights that are not finite")
+        self._mean = {key: value.to(self.alg.device) for key, value in mean.items()}
+        if levels.shape != (task.num_envs,) or int(levels.max()) >= task.tiles.num_levels:
+            raise ValueError(f"levels must be {task.num_envs}, each below {task.tiles.num_levels}")
         task.counter.fill_(content["counter"])
-        task.restart_all(levels[torch.arange(task.num_envs, device=levels.device) % len(levels)])
+        task.restart_all(levels.to(task.levels.device, task.levels.dtype))
         torch.set_rng_state(content["rng_cpu"])
         if content["rng_cuda"] is not None and task.observation.is_cuda:
             torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)
         if self.ranks.size > 1:  # the state is the first process's
             self._draw_apart(int(torch.initial_seed()) % 2**31)
-
-    def _read_mean(self, content: dict[str, Any]) -> tuple[int, State]:
-        """How many actors the mean of a checkpoint is of, and the mean; an older checkpoint has none."""
-        count, mean = content.get("averaged", 0), content.get("mean_actor_state_dict", {})
-        if type(count) is not int or not 0 <= count <= content["iter"]:
-            raise ValueError(f"averaged must be a number of iterations, at most {content['iter']}, got {count}")
-        floats = {key: value for key, value in self.actor_state().items() if value.is_floating_point()}
-        expected = {key: (value.shape, value.dtype) for key, value in floats.items() if count}
-        if {key: (value.shape, value.dtype) for key, value in mean.items()} != expected:
-            raise ValueError("mean_actor_state_dict must be none if averaged is 0, and else have the actor's weights")
-        if not all(bool(value.isfinite().all()) for value in mean.values()):
-            raise ValueError("mean_actor_state_dict has weights that are not finite")
-        return count, {key: value.to(self.alg.device) for key, value in mean.items()}
-
-
-def read_checkpoint(path: Path, robot: str) -> dict[str, Any]:
-    """Content of a checkpoint that :meth:`Learner.save` wrote, tensors on the CPU; no code in it is run.
-
-    Raises:
-        ValueError: If the file is absent, truncated, foreign or of another robot.
-    """
-    remedy = "give the run directory of a training run to --resume"
-    if not os.path.isfile(path):
-        raise ValueError(f"no checkpoint at {path}: {remedy}, or leave --resume out to begin one")
-    try:
-        content = read_weights(path)
-    except Exception as error:  # a stream of pickle opcodes can fail with anything
-        raise ValueError(
-            f"{path} is no checkpoint (truncated, foreign, or holding code): {reason_of(error)}; {remedy}"
-        ) from error
-    if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:
-        raise ValueError(f"{path} must be a '{CHECKPOINT_FORMAT}', got another kind of file: {remedy}")
-    if content.get("robot") != robot:
-        raise ValueError(
-            f"{path} is of robot '{content.get('robot')}', expected '{robot}': name its robot, or {remedy} of '{robot}'"
-        )
-    check_entries(content, _ENTRIES, path)
-    return content
-
-
-def check_entries(content: dict[str, Any], expected: dict[str, tuple[type, ...]], path: Path) -> None:
-    """That a part of a checkpoint has its entries, each of one of its types.
-
-    Raises:
-        ValueError: If one is absent or of another type.
-    """
-    found = [(name, kinds[0].__name__, type(content.get(name))) for name, kinds in expected.items()]
-    wrong = [f"{name} must be {kind}, got {got.__name__}" for name, kind, got in found if got not in expected[name]]
-    if wrong:
-        raise ValueError(f"{path} is a damaged checkpoint: {', '.join(wrong)}; put a copy of it back")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Start:
-    """A trained actor, and its critic where it is known."""
-
-    actor: State
-    critic: State | None
-    hidden_dims: tuple[int, ...]
-    """Hidden layers of both."""
-
-    def with_noise_of(self, other: "Start") -> "Start":
-        """The same with another's standard deviation of the actions, where that is known."""
-        noise = {_STD: other.actor[_STD]} if _STD in other.actor else {}
-        return replace(self, actor={**self.actor, **noise})
-
-
-def read_start(path: Path, robot: RobotCfg) -> Start:
-    """Networks of an rsl_rl checkpoint, fit to be trained on.
-
-    A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
-    such a file is left: its own normaliser is another.
-
-    Raises:
-        ValueError: If it is no such file, of another robot, or its standard deviation or critic cannot be trained on.
-    """
-    policy = load_policy(path, robot, "cpu")
-    if not isinstance(policy, MlpPolicy):
-        raise ValueError(
-            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: "
-            f"{path}; train one with `{robot.train_command}`, and leave --policy out"
-        )
-    content = read_weights(path)
-    actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
-    if policy.normalised:
-        weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
-        actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
-    hidden = tuple(layer.out_features for layer in policy.layers if isinstance(layer, torch.nn.Linear))[:-1]
-    critic = None if policy.normalised else content.get("critic_state_dict")
-    _check_std(actor, robot, path)
-    if critic is not None:
-        _check_critic(critic, (policy.sizes[0], *hidden, 1), path)
-    return Start(actor=actor, critic=critic, hidden_dims=hidden)
-
-
-def _check_std(actor: State, robot: RobotCfg, path: Path) -> None:
-    std = actor.get(_STD)
-    fits = std is None or (std.shape == (robot.num_joints,) and bool((std > 0.0).all()) and bool(std.isfinite().all()))
-    if not fits:
-        raise ValueError(
-            f"{path}: {_STD}, the standard deviation of the actions, must be {robot.num_joints} numbers above 0, got "
-            f"{' '.join(str(std).split())}: leave it out, or give another controller"
-        )
-
-
-def _check_critic(critic: Any, sizes: tuple[int, ...], path: Path) -> None:
-    expected = {}
-    for k, (width, out) in enumerate(pairwise(sizes)):
-        expected |= {f"mlp.{2 * k}.weight": (out, width), f"mlp.{2 * k}.bias": (out,)}
-    tensors = isinstance(critic, dict) and all(isinstance(value, torch.Tensor) for value in critic.values())
-    if not tensors or {key: tuple(value.shape) for key, value in critic.items()} != expected:
-        raise ValueError(
-            f"{path}: its critic (critic_state_dict) must have the actor's hidden layers {list(sizes[1:-1])}, "
-            f"{sizes[0]} inputs and one output, got another: leave it out of the file, and one is trained"
-        )
-    if not all(bool(value.isfinite().all()) for value in critic.values()):
-        raise ValueError(f"{path}: its critic (critic_state_dict) has weights that are not finite: leave it out")

@@ -1,24 +1,18 @@
-"""How training goes: printed rows, TensorBoard scalars, and the training record."""
+"""How a training goes: printed rows, TensorBoard's scalars, and the training record."""
 
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from torch.utils.tensorboard import FileWriter
-from torch.utils.tensorboard.summary import scalar
+from torch.utils.tensorboard import SummaryWriter
 
 from kernels.rewards import REWARDS
 from qd.run.progress import clock
-from sim.files.atomic import unwritable
 from sim.files.intervals import value_words
 from train.ppo.learner import Iteration, Learner
 
+_ROWS = 100  # over a whole training
 _ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out")
-STATE = {"settings": (dict,), "curve": (list,), "pieces": (list,), "env_steps": (int,), "wall_s": (float, int)}
-"""Entries of :meth:`Progress.state` and their types."""
 _HEADER = (
     f"{'iteration':>12} {'env-steps':>10} {'steps/s':>9} {'collect':>8} {'learn':>8} {'reward':>7} {'length':>7} "
     f"{'falls':>6} {'goal':>6} {'v err':>6} {'w err':>6} {'level':>6} {'std':>5} {'rate':>8} {'ETA':>7}"
@@ -29,52 +23,44 @@ class Progress:
     """Collects iterations into rows; a row is printed, written to TensorBoard and kept for the record.
 
     Attributes:
-        iterations: Iterations in all.
-        warm: False until the first iteration, which compiles and captures, is over.
+        slowest_s: Time of the slowest iteration but the first, which compiles and captures [s].
     """
 
     def __init__(
-        self,
-        run_dir: Path,
-        learner: Learner,
-        iterations: int,
-        *,
-        rows: int,
-        about: dict[str, Any],
-        saved: dict[str, Any] | None = None,
+        self, run_dir: Path, learner: Learner, iterations: int, *, about: dict[str, Any], saved: dict[str, Any] | None
     ) -> None:
         """Begin a piece of training.
 
         Args:
             run_dir: Where TensorBoard's file goes.
-            learner: What is trained.
+            learner: What is trained; of several processes the first prints and writes.
             iterations: In all.
-            rows: Over all iterations.
-            about: Provenance and ``settings`` of this piece.
+            about: Provenance of this piece.
             saved: :meth:`state` of the pieces before.
         """
-        self._learner = learner
-        self.iterations = iterations
-        self._every = max(1, iterations // rows)
         before = saved or {"curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
+        self._learner = learner
+        self._iterations = iterations
+        self._every = max(1, iterations // _ROWS)
+        self._about = about
         self._curve: list[dict[str, Any]] = list(before["curve"])
         self._pieces = [*before["pieces"], {**about, "from_iteration": learner.iteration}]
-        self._env_steps, self._wall_s = before["env_steps"], before["wall_s"]
-        self._about = about
-        self._run_dir = run_dir
-        threading.excepthook = _without_traceback
-        with self._naming_the_run():
-            self._scalars = FileWriter(str(run_dir))
+        self._env_steps, self._wall_before_s = before["env_steps"], before["wall_s"]
+        self._began = time.monotonic()
         self._window: list[Iteration] = []
-        self._piece_began = time.monotonic()
-        self.warm = False
-        print(_HEADER, flush=True)
+        self._is_warm = False
+        self.slowest_s = 0.0
+        self._writer = SummaryWriter(str(run_dir)) if learner.ranks.is_first else None
+        if self._writer is not None:
+            print(_HEADER, flush=True)
 
     def add(self, step: Iteration) -> None:
         """Count an iteration; finish a row where one is due."""
         self._window.append(step)
         self._env_steps += self._learner.steps_per_iteration
-        self.warm = True
+        if self._is_warm:
+            self.slowest_s = max(self.slowest_s, step.collection_s + step.learning_s)
+        self._is_warm = True
         if self._learner.iteration % self._every == 0:
             self._finish_row()
 
@@ -82,23 +68,20 @@ class Progress:
         """Finish the last row and TensorBoard's file."""
         if self._window:
             self._finish_row()
-        self._scalars.close()
-        self._wall_s += time.monotonic() - self._piece_began
-        self._piece_began = time.monotonic()
+        if self._writer is not None:
+            self._writer.close()
 
     def state(self) -> dict[str, Any]:
         """What the next piece needs, plain data."""
-        wall_s = self._wall_s + time.monotonic() - self._piece_began
         return {
-            "settings": self._about["settings"],
             "curve": self._curve,
             "pieces": self._pieces,
             "env_steps": self._env_steps,
-            "wall_s": wall_s,
+            "wall_s": self._wall_before_s + time.monotonic() - self._began,
         }
 
     def record(self) -> dict[str, Any]:
-        """The training record: provenance, settings, totals, the pieces it was trained in, and the curve."""
+        """The training record: provenance, totals, the pieces it was trained in, and the curve."""
         return {
             **self._about,
             "robot": self._learner.env.task.robot.name,
@@ -111,12 +94,12 @@ class Progress:
         }
 
     def _finish_row(self) -> None:
-        learner, window = self._learner, self._window
+        learner, window, task = self._learner, self._window, self._learner.env.task
         collection_s = sum(step.collection_s for step in window)
         learning_s = sum(step.learning_s for step in window)
-        sums = learner.env.task.read_statistics()
+        sums = task.read_statistics()
         episodes, steps = sums["episodes"], max(sums["steps"], 1.0)
-        dt = learner.env.task.robot.control_dt
+        dt = task.robot.control_dt
         row = {
             "iteration": learner.iteration,
             "env_steps": self._env_steps,
@@ -128,13 +111,13 @@ class Progress:
             "reward": sums["episode_reward"] / episodes if episodes else None,
             "length_s": sums["episode_steps"] / episodes * dt if episodes else None,
             "fall_rate": (sums["base_collision"] + sums["tilt"]) / episodes if episodes else None,
-            "goal_rate": sums["goal"] / episodes if episodes and learner.env.task.cfg.crosses else None,
+            "goal_rate": sums["goal"] / episodes if episodes and task.cfg.crosses else None,
             "ends": {name: int(sums[name]) for name in _ENDS},
             "overflows": int(sums["overflow"]),
             "lin_vel_error": sums["lin_vel_error"] / steps,
             "yaw_rate_error": sums["yaw_rate_error"] / steps,
-            "level": float(learner.env.task.levels.float().mean()),
-            "level_by_type": learner.env.task.level_by_type(),
+            "level": float(task.levels.float().mean()),
+            "level_by_type": task.level_by_type(),
             "terms": {name: sums[name] / (steps * dt) for name in REWARDS},
             "losses": window[-1].losses,
             "learning_rate": learner.alg.learning_rate,
@@ -142,48 +125,33 @@ class Progress:
         }
         self._curve.append(_rounded(row))
         self._window = []
-        self._print(row)
-        self._write_scalars(row)
+        if self._writer is not None:
+            self._print(row)
+            _write_scalars(self._writer, row)
 
     def _print(self, row: dict[str, Any]) -> None:
-        left = (self.iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
+        left_s = (self._iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
         forms = {"reward": ".2f", "length_s": ".1f", "fall_rate": ".3f", "goal_rate": ".3f"}
         reward, length, falls, goals = (value_words(row[name], None, form) for name, form in forms.items())
         print(
-            f"{row['iteration']:>6}/{self.iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
+            f"{row['iteration']:>6}/{self._iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
             f"{row['env_steps_per_s']:>9,.0f} {row['collection_s'] * 1e3:>6.0f}ms {row['learning_s'] * 1e3:>6.0f}ms "
             f"{reward:>7} {length:>6}s {falls:>6} {goals:>6} {row['lin_vel_error']:>6.3f} "
             f"{row['yaw_rate_error']:>6.3f} {row['level']:>6.2f} {row['noise_std']:>5.2f} "
-            f"{row['learning_rate']:>8.1e} {clock(left):>7}",
+            f"{row['learning_rate']:>8.1e} {clock(left_s):>7}",
             flush=True,
         )
         if row["ends"]["invalid"] or row["overflows"]:
             print(f"  {row['ends']['invalid']} invalid states reset, {row['overflows']} steps with a solver overflow")
 
-    def _write_scalars(self, row: dict[str, Any]) -> None:
-        """Adds the row to TensorBoard's file and waits until it is there: a killed run keeps it."""
-        summary = scalar("train/iteration", row["iteration"])
-        for group, value in row.items():
-            for name, number in (value if isinstance(value, dict) else {"": value}).items():
-                if number is not None and group != "iteration":
-                    summary.MergeFrom(scalar(f"{group}/{name}" if name else f"train/{group}", number))
-        with self._naming_the_run():
-            self._scalars.add_summary(summary, row["iteration"])
-            self._scalars.flush()
 
-    @contextmanager
-    def _naming_the_run(self) -> Iterator[None]:
-        """An error of TensorBoard's file says what was to be written, and what to do."""
-        try:
-            yield
-        except OSError as error:
-            raise unwritable(self._run_dir, error) from error
-
-
-def _without_traceback(args: threading.ExceptHookArgs) -> None:
-    """TensorBoard writes in a thread; its error on a full disk is raised again by the next flush, in one line."""
-    if not issubclass(args.exc_type, OSError):
-        threading.__excepthook__(args)
+def _write_scalars(writer: SummaryWriter, row: dict[str, Any]) -> None:
+    """Adds the numbers of a row to TensorBoard's file, whole before the next row: a killed run keeps them."""
+    for group, value in row.items():
+        for name, number in (value if isinstance(value, dict) else {"": value}).items():
+            if number is not None:
+                writer.add_scalar(f"{group}/{name}" if name else f"train/{group}", number, row["iteration"])
+    writer.flush()
 
 
 def _rounded(value: Any) -> Any:

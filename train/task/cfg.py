@@ -2,26 +2,26 @@
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, Self
 
-from sim.files.settings import problems, setting
+from msgspec import Meta
+
+from sim.files.settings import Interval, NonNegativeFloat, NonNegativeInt, PositiveFloat, problems
+from sim.robots.robot import RobotCfg
 from sim.robots.training import MOST_SPREAD, TrainingCfg
 from sim.terrain import NUM_LEVELS
-
-if TYPE_CHECKING:
-    from sim.robots.robot import RobotCfg
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseCfg:
     """Half widths of the uniform observation noise, in the units of the measured quantity."""
 
-    lin_vel: float = setting(0.1, least=0)
-    ang_vel: float = setting(0.2, least=0)
-    gravity: float = setting(0.05, least=0)
-    joint_pos: float = setting(0.01, least=0)
-    joint_vel: float = setting(1.5, least=0)
-    scan: float = setting(0.1, least=0)
+    lin_vel: NonNegativeFloat = 0.1
+    ang_vel: NonNegativeFloat = 0.2
+    gravity: NonNegativeFloat = 0.05
+    joint_pos: NonNegativeFloat = 0.01
+    joint_vel: NonNegativeFloat = 1.5
+    scan: NonNegativeFloat = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +32,11 @@ class CurriculumCfg:
     columns of ``noise`` tiles are added beside them.
     """
 
-    num_columns: int = setting(20, least=0)
+    num_columns: NonNegativeInt = 20
     """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
-    noise_columns: int = setting(2, least=0)
+    noise_columns: NonNegativeInt = 2
     """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
-    max_first_level: int = setting(5, least=0, most=NUM_LEVELS - 1)
+    max_first_level: Annotated[int, Meta(ge=0, le=NUM_LEVELS - 1)] = 5
     """Robots begin on levels 0 to this, drawn uniformly."""
 
 
@@ -49,46 +49,46 @@ class TaskCfg(TrainingCfg):
     crosses: bool = False
     """Robots start at one side of a terrain and are told to go to the other, as in a search, instead of random
     velocities and headings from its middle."""
-    start_spread: float = setting(0.0, least=0.0, most=MOST_SPREAD)
+    start_spread: Annotated[float, Meta(ge=0, le=MOST_SPREAD)] = 0.0
     """Where robots cross, they start up to so far along the way, uniformly [m]; the goal stays where it is."""
-    episode_s: float = setting(20.0, above=0)
-    command_interval_s: float = setting(10.0, above=0)
+    episode_s: PositiveFloat = 20.0
+    command_interval_s: PositiveFloat = 10.0
     """Time between commands [s]."""
-    lin_vel_x: tuple[float, float] = setting((-1.0, 1.0), rising=True)
+    lin_vel_x: Interval = (-1.0, 1.0)
     """Range of the commanded forward velocity [m/s]."""
-    lin_vel_y: tuple[float, float] = setting((-1.0, 1.0), rising=True)
+    lin_vel_y: Interval = (-1.0, 1.0)
     """Range of the commanded sideward velocity [m/s]."""
-    min_speed: float = setting(0.2, least=0)
+    min_speed: NonNegativeFloat = 0.2
     """Slower commands become 0 [m/s]."""
-    yaw_gain: float = setting(0.5, least=0)
+    yaw_gain: NonNegativeFloat = 0.5
     """Commanded yaw rate per heading error [1/s]."""
-    max_yaw_rate: float = setting(1.0, least=0)
+    max_yaw_rate: NonNegativeFloat = 1.0
     """Largest commanded yaw rate [rad/s]."""
-    push_interval_s: float = setting(15.0, least=0)
+    push_interval_s: NonNegativeFloat = 15.0
     """Time between pushes [s]; 0 for none."""
-    friction: tuple[float, float] = setting((0.5, 1.25), least=0, rising=True)
+    friction: Interval = (0.5, 1.25)
     """Range of the robots' friction coefficients."""
-    start_position_range: float = setting(1.0, least=0)
+    start_position_range: NonNegativeFloat = 1.0
     """Starts lie within this of the tile's centre along x and y [m]."""
-    start_yaw_range: float = setting(math.pi, least=0)
+    start_yaw_range: NonNegativeFloat = math.pi
     """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
-    start_velocity_range: float = setting(0.5, least=0)
+    start_velocity_range: NonNegativeFloat = 0.5
     """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
-    base_force: float = setting(1.0, least=0)
+    base_force: NonNegativeFloat = 1.0
     """Contact force on the base that ends an episode [N]."""
-    max_gravity_z: float = setting(-0.1)
+    max_gravity_z: float = -0.1
     """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
 
     @classmethod
-    def of(cls, robot: "RobotCfg", **changes: Any) -> "TaskCfg":
+    def of(cls, robot: RobotCfg, **changes: Any) -> Self:
         """The task with a robot's own settings.
 
         Args:
             robot: Robot settings.
             changes: Fields to set otherwise.
         """
-        own = {own.name: getattr(robot.training, own.name) for own in fields(TrainingCfg)}
-        return cls(**{**own, **changes})
+        training = {setting.name: getattr(robot.training, setting.name) for setting in fields(TrainingCfg)}
+        return cls(**{**training, **changes})
 
 
 def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
@@ -98,8 +98,10 @@ def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
         cfg: The settings.
         control_dt: Control step of the robot [s].
     """
-    return problems(cfg, "task.") + [
-        f"task.{name} must be at least a control step, {control_dt:g} s, got {getattr(cfg, name):g}"
-        for name in ("episode_s", "command_interval_s")
-        if 0 < getattr(cfg, name) < control_dt
-    ]
+    lines = problems(cfg, "task.")
+    for name in ("episode_s", "command_interval_s"):
+        if 0 < getattr(cfg, name) < control_dt:
+            lines.append(f"task.{name} must be at least a control step, {control_dt:g} s, got {getattr(cfg, name):g}")
+    if not lines and cfg.friction[0] < 0:
+        lines.append(f"task.friction must be at least 0, got {cfg.friction[0]:g}")
+    return lines

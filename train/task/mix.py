@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.bank import terrains_of
-from sim.files.settings import check, setting
 from sim.ground import GroundMaps
 from sim.robots.training import Draw
 from sim.spaces.base import TerrainSpace
@@ -28,36 +27,6 @@ _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy
 _LEAST_WEIGHT = 0.1  # of a terrain that is drawn least, beside 1 more for one that is drawn most
 
 
-@dataclass(frozen=True, kw_only=True)
-class MixCfg:
-    """The terrains of a fine-tuning."""
-
-    mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
-    """What a controller is fine-tuned on, the paper's C-G, C-HR and C-HC: half hand-crafted terrains and half of the
-    kind that it is named after; the last has hand-crafted ones alone."""
-    terrains: int = setting(500, least=1)
-    """Terrains trained on at a time."""
-    swap_every: int = setting(400, least=1)
-    """They are exchanged for others every so many iterations."""
-    draw: Draw = "uniform"
-    """How elites are drawn: uniform; failing: the likelier, the less often they were crossed the last time; or
-    learnable: the likelier, the nearer to half of the time (goal rate times its rest: Rutherford et al. 2024)."""
-
-    def __post_init__(self) -> None:
-        check(self)
-        if self.draw != "uniform" and self.mix != "generated":
-            raise ValueError(
-                f"draw {self.draw} chooses among elites, of which mix {self.mix} has none: use mix generated"
-            )
-        if self.terrains < 2 and self.mix != "hand-crafted":
-            raise ValueError(f"terrains must be at least 2 for mix {self.mix}, half of each kind, got {self.terrains}")
-
-    @property
-    def hand_crafted(self) -> int:
-        """How many of the terrains are hand-crafted."""
-        return self.terrains if self.mix == "hand-crafted" else self.terrains // 2
-
-
 @dataclass(kw_only=True)
 class Mix:
     """Draws the terrains of each exchange, and remembers how often each elite was crossed when it was last trained on.
@@ -66,7 +35,12 @@ class Mix:
     crossed before, all of which a checkpoint keeps: a resumed training goes on with the same terrains.
     """
 
-    cfg: MixCfg
+    kind: Literal["generated", "hard-random", "hand-crafted"]
+    """What half of the terrains are, the paper's C-G and C-HR, beside hand-crafted ones; or those alone, its C-HC."""
+    num_terrains: int
+    """Terrains at a time."""
+    draw: Draw = "uniform"
+    """How elites are drawn (:class:`train.cfg.RecipeCfg`)."""
     genes: tuple[NDArray[np.float32], ...]
     """Elites to train on, a part of each archive, shape (E, genes of its space); E sums up over the parts. None except
     with mix generated."""
@@ -78,8 +52,6 @@ class Mix:
     """What the genes of each part mean; the first is that of hard-random terrains."""
     goal_rate: NDArray[np.float64] | None = None
     """Goal rate of each elite as its archive has it, shape (E,), which stands in until it is trained on; None: 0."""
-    equal: bool = True
-    """Whether a draw takes as much of each part as of the others, as far as it has so many; else each elite counts."""
     swap: int = -1
     """Number of the present exchange, from 0."""
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -90,11 +62,16 @@ class Mix:
     """How many of them reached the goal; where robots do not cross, the end of the time."""
 
     def __post_init__(self) -> None:
-        if self.cfg.mix == "generated" and self.num_elites == 0:
+        if self.kind == "generated" and self.num_elites == 0:
             raise ValueError("mix generated needs elites to train on, got none: give an archive that has some")
         self.episodes = np.zeros(self.num_elites, np.int64)
         self.crossed = np.zeros(self.num_elites, np.int64)
         self._before_resume = np.zeros((2, self.num_elites), np.int64)
+
+    @property
+    def num_hand_crafted(self) -> int:
+        """How many of the terrains are hand-crafted."""
+        return self.num_terrains if self.kind == "hand-crafted" else self.num_terrains // 2
 
     @property
     def num_elites(self) -> int:
@@ -117,18 +94,17 @@ class Mix:
         """The terrains of the present exchange: one level, a terrain a column, hand-crafted ones first."""
         rng = self._rng(0)
         heights, types = self._hand_crafted(rng)
-        if self.cfg.mix != "hand-crafted":
-            count = self.cfg.terrains - self.cfg.hand_crafted
-            if self.cfg.mix == "generated":
-                others, ground = self._elites()
-            else:
-                others, ground = terrains_of(self.spaces[0].hard_random(count, rng), self.spaces[0], device=self.device)
-            heights = np.concatenate([heights, others])
-            types += (self.cfg.mix,) * count
-            if ground is not None:
-                ground = GroundMaps.plain(self.cfg.hand_crafted).joined(ground)
-            return Tiles(heights=heights, type_of_column=types, ground=ground)
-        return Tiles(heights=heights, type_of_column=types)
+        if self.kind == "hand-crafted":
+            return Tiles(heights=heights, type_of_column=types)
+        count = self.num_terrains - self.num_hand_crafted
+        if self.kind == "generated":
+            others, ground = self._elites()
+        else:
+            others, ground = terrains_of(self.spaces[0].hard_random(count, rng), self.spaces[0], device=self.device)
+        if ground is not None:
+            ground = GroundMaps.plain(self.num_hand_crafted).joined(ground)
+        heights = np.concatenate([heights, others])
+        return Tiles(heights=heights, type_of_column=(*types, *(self.kind,) * count), ground=ground)
 
     def state(self, counts: dict[str, NDArray[Any]]) -> dict[str, Any]:
         """Plain values for a checkpoint, with what was counted on the present terrains so far."""
@@ -149,24 +125,20 @@ class Mix:
         Raises:
             ValueError: If the state is none of this mix.
         """
-        count = self.num_elites
-        expected = self.cfg.terrains - self.cfg.hand_crafted if self.cfg.mix == "generated" else 0
-        of_elites = ("episodes", "crossed", "present_episodes", "present_crossed")
-        whole = {key: np.asarray(state.get(key, ()), np.int64) for key in ("rows", *of_elites)}
-        shapes = {"rows": (expected,), **dict.fromkeys(of_elites, (count,))}
-        rows = whole["rows"]
-        if type(state.get("swap")) is not int or any(whole[key].shape != shape for key, shape in shapes.items()):
-            raise ValueError(f"the terrains of the checkpoint are not those of a mix of {count} elites")
-        if state["swap"] < 0 or (len(rows) and not 0 <= rows.min() <= rows.max() < count):
-            raise ValueError(f"the terrains of the checkpoint name elites beyond the {count} there are")
-        rate = state.get("goal_rate")  # none in older ones: that of the archive, which may have changed
+        num_rows = self.num_terrains - self.num_hand_crafted if self.kind == "generated" else 0
+        per_elite = ("episodes", "crossed", "present_episodes", "present_crossed")
+        shapes = {"rows": (num_rows,), **dict.fromkeys(per_elite, (self.num_elites,))}
+        arrays = {name: np.asarray(state.get(name, ()), np.int64) for name in shapes}
+        rows, rate = arrays["rows"], state.get("goal_rate")
+        swap = state.get("swap")
+        fits = all(arrays[name].shape == shape for name, shape in shapes.items())
+        if not fits or not isinstance(swap, int) or swap < 0 or np.any((rows < 0) | (rows >= self.num_elites)):
+            raise ValueError(f"the terrains of the checkpoint must be of {self.num_elites} elites, got others")
         if rate is not None:
-            if np.shape(rate) != (count,):
-                raise ValueError(f"the terrains of the checkpoint have {np.shape(rate)} goal rates, expected {count}")
-            self.goal_rate = np.asarray(rate, np.float64)
-        self.swap, self.rows = state["swap"], rows
-        self.episodes, self.crossed = whole["episodes"], whole["crossed"]
-        self._before_resume = np.stack([whole["present_episodes"], whole["present_crossed"]])
+            self.goal_rate = np.asarray(rate, np.float64).reshape(self.num_elites)
+        self.swap, self.rows = swap, rows
+        self.episodes, self.crossed = arrays["episodes"], arrays["crossed"]
+        self._before_resume = np.stack([arrays["present_episodes"], arrays["present_crossed"]])
         return self.terrains()
 
     def success(self) -> NDArray[np.float64]:
@@ -180,12 +152,11 @@ class Mix:
         ground = GroundMaps.plain(len(self.rows)) if any(space.ground for space in self.spaces) else None
         first = 0
         for genes, space in zip(self.genes, self.spaces, strict=True):
-            (there,) = np.nonzero((first <= self.rows) & (self.rows < first + len(genes)))
-            if len(there):
-                own = genes[self.rows[there] - first]
-                heights[there], maps = terrains_of(own, space, device=self.device)
+            (places,) = np.nonzero((first <= self.rows) & (self.rows < first + len(genes)))
+            if len(places):
+                heights[places], maps = terrains_of(genes[self.rows[places] - first], space, device=self.device)
                 if ground is not None and maps is not None:
-                    ground.friction[there], ground.time_constant_s[there] = maps.friction, maps.time_constant_s
+                    ground.friction[places], ground.time_constant_s[places] = maps.friction, maps.time_constant_s
             first += len(genes)
         return heights, ground
 
@@ -193,7 +164,7 @@ class Mix:
         return np.random.default_rng([_MIX_KEY, self.seed, self.swap, stream])
 
     def _hand_crafted(self, rng: np.random.Generator) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-        count = self.cfg.hand_crafted
+        count = self.num_hand_crafted
         if count == 0:
             return np.zeros((0, NUM_ROWS, NUM_COLS), np.float32), ()
         if self.crosses:
@@ -210,17 +181,17 @@ class Mix:
 
     def _draw_rows(self) -> NDArray[np.int64]:
         """Elites of the next exchange: none twice, unless there are too few."""
-        if self.cfg.mix != "generated":
+        if self.kind != "generated":
             return np.zeros(0, np.int64)
-        rng, count, wanted = self._rng(1), self.num_elites, self.cfg.terrains - self.cfg.hand_crafted
+        rng, count, wanted = self._rng(1), self.num_elites, self.num_terrains - self.num_hand_crafted
         whole = np.tile(np.arange(count), wanted // count)
         rate = self.success()
         preferred = {
             "uniform": np.ones(count),
             "failing": 1.0 - rate + _LEAST_WEIGHT,
             "learnable": 4.0 * rate * (1.0 - rate) + _LEAST_WEIGHT,
-        }[self.cfg.draw]
-        weights = self._in_equal_shares(preferred) if self.equal and len(self.genes) > 1 else preferred
+        }[self.draw]
+        weights = self._in_equal_shares(preferred) if len(self.genes) > 1 else preferred
         rest = rng.choice(count, size=wanted - len(whole), replace=False, p=weights / weights.sum())
         return np.concatenate([whole, rest])
 
@@ -239,11 +210,11 @@ class Mix:
     def _present(self, counts: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         """Valid episodes on each elite since the last exchange, and those that crossed it, shape (2, E)."""
         present = self._before_resume.copy()
-        if self.cfg.mix == "generated":
+        if self.kind == "generated":
             num_envs = len(counts["episodes"])
-            terrain = np.arange(num_envs) * self.cfg.terrains // num_envs  # as Tiles.columns_of deals them out
-            on_elite = terrain >= self.cfg.hand_crafted
-            rows = self.rows[terrain[on_elite] - self.cfg.hand_crafted]
+            terrain = np.arange(num_envs) * self.num_terrains // num_envs  # as Tiles.columns_of deals them out
+            on_elite = terrain >= self.num_hand_crafted
+            rows = self.rows[terrain[on_elite] - self.num_hand_crafted]
             valid = counts["episodes"] - counts["invalid"]
             for sums, part in zip(present, (valid, counts["goal" if self.crosses else "time_out"]), strict=True):
                 sums += np.bincount(rows, part[on_elite], self.num_elites).astype(np.int64)

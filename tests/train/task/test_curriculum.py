@@ -57,5 +57,5 @@ def test_first_levels_are_uniform():
 def test_bad_settings_are_refused():
     with pytest.raises(ValueError, match="at least one column"):
         make_tiles(CurriculumCfg(num_columns=0, noise_columns=0), seed=0)
-    with pytest.raises(ValueError, match="max_first_level must be at least 0 and at most 9, got 10"):
+    with pytest.raises(ValueError, match="max_first_level"):
         check(CurriculumCfg(max_first_level=10))

@@ -1,0 +1,175 @@
+"""Settings of trainings. Nothing here loads torch or Warp: the help of a command shows them."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, Self, TypeVar
+
+from sim.files.settings import NonNegativeInt, PositiveFloat, check
+from sim.robots.robot import RobotCfg
+from sim.robots.training import Draw
+from train.ppo.cfg import PpoCfg, ppo_problems
+from train.task.cfg import TaskCfg, task_problems
+
+_Cfg = TypeVar("_Cfg", bound="TrainCfg")
+Sizes = dict[str, int]
+"""Sizes of a training by the names of their settings."""
+_BASE_ON_CPU: Sizes = {"num_envs": 32, "iterations": 20}
+_PAPER: Sizes = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}  # its ANYmal
+_PAPER_CASSIE: Sizes = {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}
+_TUNING_ON_CPU: Sizes = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain
+LARGE: Sizes = {"num_envs": 8192, "terrains": 2000}
+"""Sizes that left ANYmal a third of the faults that the paper's left."""
+SPECIALIST: Sizes = {**LARGE, "iterations": 1000}
+"""Sizes of the training of a search's own specialist."""
+_SPECIALIST_SEED = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCfg:
+    """How a training runs, which does not change what it learns."""
+
+    device: str | None = None
+    """cpu, cuda or cuda:N; CUDA where there is one."""
+    max_seconds: PositiveFloat | None = None
+    """Save and stop in time to be done this many seconds after the start."""
+    export: Path | None = None
+    """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
+    <name>.pt beside the settings file of another robot makes it that robot's own."""
+    overwrite: bool = False
+    """Replace the file that --export names if it is there and of another training."""
+
+
+RUN = RunCfg()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainCfg:
+    """The training of a base controller. With the robot it says all that the result depends on."""
+
+    seed: NonNegativeInt = 0
+    """Seed of everything drawn."""
+    num_envs: NonNegativeInt = 0
+    """Robots trained at once, per process; 0: as many as suit robot and device."""
+    iterations: NonNegativeInt = 0
+    """Iterations in all, with those before a resume; 0: as many as suit robot and device."""
+    task: TaskCfg = field(default_factory=TaskCfg)
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+
+    @classmethod
+    def of(cls, robot: RobotCfg) -> Self:
+        """The settings of a robot."""
+        return cls(task=TaskCfg.of(robot), ppo=PpoCfg.of(robot))
+
+    def sized(self, robot: RobotCfg, device: str) -> Self:
+        """The same with sizes that suit the robot and the Warp device in place of those that are 0."""
+        on_cuda = {"num_envs": robot.learning.num_envs, "iterations": robot.learning.iterations}
+        return _with_sizes(self, on_cuda if device.startswith("cuda") else _BASE_ON_CPU)
+
+    def check(self, robot: RobotCfg) -> None:
+        """Refuses settings that nothing can be learned with; sizes are given.
+
+        Raises:
+            ValueError: If there are some, naming all that are wrong.
+        """
+        check(self)
+        lines = [*task_problems(self.task, robot.control_dt), *ppo_problems(self.ppo, self.num_envs)]
+        if lines:
+            raise ValueError("; ".join(lines))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipeCfg:
+    """What seldom differs between fine-tunings."""
+
+    swap_every: NonNegativeInt = 0
+    """Iterations after which the terrains are exchanged; 0: on CUDA 400 (Cassie: 200), on the CPU 50."""
+    draw: Draw = "learnable"
+    """How elites are drawn at each exchange. uniform: all alike. failing: the likelier, the less often they were
+    crossed the last time. learnable: the likelier, the nearer to half of the time (goal rate times its rest: Rutherford
+    et al. 2024), so that harder ones come later."""
+    critic_iterations: NonNegativeInt | None = None
+    """Iterations in which the critic learns alone at first, if the controller comes without one; 50, or half of all if
+    there are fewer than 100."""
+    noise_of: str | None = None
+    """Controller with whose noise of the actions to begin, if its file has it; that of --policy. Noise grows in a
+    training, and a hardening lets each begin with the noise of the base controller."""
+    only: Literal["all", "failing"] = "all"
+    """Which elites to train on. failing: those that fail by their fresh episodes."""
+    held_out: bool = True
+    """Whether elites are held out for the evaluation. A specialist, which is to certify, trains on all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetuneCfg(TrainCfg):
+    """A fine-tuning. With the robot and the files it names, it says all that the result depends on."""
+
+    policy: str | None = None
+    """Controller to begin with: an rsl_rl checkpoint with layers of any size; the robot's own. The checkpoint.pt of a
+    training is its last actor, with its critic; its policy.pt is the mean of the last actors."""
+    mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
+    """Terrains: half hand-crafted ones, and half elites (generated, the paper's C-G) or hard-random ones (C-HR); or
+    hand-crafted ones alone (C-HC)."""
+    terrains: NonNegativeInt = 0
+    """Terrains at a time; 0: on CUDA 500 (Cassie: 100), on the CPU 12."""
+    archive: tuple[str, ...] = ()
+    """Runs of searches, or their archive.npz, for mix generated; each is drawn from equally often. Left out,
+    results/<robot>/archive, or of a robot without one its newest run under runs/."""
+    space: str | None = None
+    """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Name a
+    space of your own here too, for its elites and for a resumed training on it."""
+    ground: tuple[str, ...] | None = None
+    """What the ground of hard-random terrains differs in from patch to patch of 2 m: friction, softness, or both."""
+    recipe: RecipeCfg = field(default_factory=RecipeCfg)
+
+    @classmethod
+    def of(cls, robot: RobotCfg) -> Self:
+        """The settings of a robot: robots cross, and falls cost more than in the training of its base controller."""
+        tuning = robot.tuning
+        rewards = replace(
+            robot.training.rewards, termination=tuning.termination, tracking_lin_vel=tuning.tracking_lin_vel
+        )
+        return cls(
+            task=TaskCfg.of(robot, crosses=True, rewards=rewards, start_spread=tuning.start_spread),
+            ppo=PpoCfg(steps_per_env=24, desired_kl=0.005, entropy=tuning.entropy, average=tuning.average),
+            recipe=RecipeCfg(draw=tuning.draw),
+        )
+
+    @classmethod
+    def specialist(cls, robot: RobotCfg) -> Self:
+        """The settings that a search's own specialist is trained with."""
+        cfg = cls.of(robot)
+        return replace(cfg, seed=_SPECIALIST_SEED, recipe=replace(cfg.recipe, only="failing", held_out=False))
+
+    def sized(self, robot: RobotCfg, device: str, **on_cuda: int) -> Self:
+        """The same with sizes that suit the robot and the Warp device in place of those that are 0.
+
+        Args:
+            robot: The robot.
+            device: Warp device name.
+            on_cuda: Sizes on CUDA that are not the paper's.
+        """
+        paper = _PAPER_CASSIE if robot.name == "cassie" else _PAPER
+        sizes = paper | on_cuda if device.startswith("cuda") else _TUNING_ON_CPU
+        recipe = replace(self.recipe, swap_every=self.recipe.swap_every or sizes["swap_every"])
+        return replace(_with_sizes(self, sizes), recipe=recipe)
+
+    def check(self, robot: RobotCfg) -> None:
+        """Refuses settings that nothing can be learned with; sizes are given.
+
+        Raises:
+            ValueError: If there are some, naming what is wrong.
+        """
+        super().check(robot)
+        if self.terrains < 2 and self.mix != "hand-crafted":
+            raise ValueError(f"terrains must be at least 2 for mix {self.mix}, half of each kind, got {self.terrains}")
+        if self.num_envs < self.terrains:
+            raise ValueError(f"num_envs must be at least as many as terrains, {self.terrains}, got {self.num_envs}")
+        if self.mix != "generated" and self.archive:
+            raise ValueError(f"mix {self.mix} takes no terrains from an archive, got --archive: leave it out")
+        if self.mix == "generated" and self.ground is not None:
+            raise ValueError("mix generated takes the ground of its archives, got --ground: leave it out")
+
+
+def _with_sizes(cfg: _Cfg, sizes: Sizes) -> _Cfg:
+    """Gives sizes to those settings that are 0."""
+    return replace(cfg, **{name: getattr(cfg, name) or size for name, size in sizes.items() if hasattr(cfg, name)})

@@ -1,0 +1,125 @@
+"""The flags of train, finetune and harden."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import count
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from sim.files.command import peek
+from sim.files.settings import from_builtins
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from train.cfg import FinetuneCfg, RunCfg, TrainCfg
+
+_Cfg = TypeVar("_Cfg")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OfTraining(RunCfg):
+    """The flags of every training."""
+
+    robot: str = "anymal"
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
+    run_dir: Path | None = None
+    """Where to write; a new directory under runs/."""
+    resume: Path | None = None
+    """Directory of a training to go on with, by its own settings."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(_OfTraining, TrainCfg):
+    """Train a base controller from scratch: PPO on legged_gym's rough-terrain task.
+
+    On CUDA ANYmal trains 8192 robots for 2240 iterations, Cassie 2048 for 3400; on the CPU 32 for 20, enough to see
+    that it runs. Ctrl-C or --max-seconds saves and stops; --resume RUN_DIR goes on. On several GPUs: torchrun
+    --nproc-per-node 4 -m faultline train --run-dir RUN_DIR, each with --num-envs.
+    """
+
+    @classmethod
+    def defaults(cls, argv: Sequence[str]) -> Self:
+        """The settings of the robot, or of the training to go on with, that a command line names."""
+        robot, resume = _peek(argv)
+        cfg = TrainCfg.of(robot) if resume is None else _resumed(TrainCfg, resume, robot)
+        return cls(robot=robot.spec, resume=resume, **_values(cfg))
+
+    def execute(self) -> None:
+        """Trains."""
+        from train.base import train
+
+        robot = get_robot(self.robot)
+        train(robot, _part(TrainCfg, self), _run_dir(self, f"{robot.name}-base"), _part(RunCfg, self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finetune(_OfTraining, FinetuneCfg):
+    """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
+
+    On CUDA the sizes are the paper's, on the CPU small ones, enough to see that it runs. Ctrl-C or --max-seconds saves
+    and stops; --resume RUN_DIR goes on. With --specialist RUN it trains a certifier for a search.
+    """
+
+    specialist: Path | None = None
+    """Run of a search. Trains its controller further on all elites that it fails (on CUDA 8192 robots, 2000 terrains at
+    a time, 1000 iterations) and writes RUN/certifiers/specialist.pt, which `faultline judge` asks. The same command
+    goes on."""
+
+    @classmethod
+    def defaults(cls, argv: Sequence[str]) -> Self:
+        """The settings of the robot, or of the training to go on with, that a command line names."""
+        robot, resume = _peek(argv)
+        if resume is not None:
+            cfg = _resumed(FinetuneCfg, resume, robot)
+        else:
+            cfg = FinetuneCfg.of(robot) if peek(argv, "--specialist") is None else FinetuneCfg.specialist(robot)
+        return cls(robot=robot.spec, resume=resume, **_values(cfg))
+
+    def execute(self) -> None:
+        """Fine-tunes."""
+        from train.finetune import finetune, train_specialist
+
+        robot, cfg, run = get_robot(self.robot), _part(FinetuneCfg, self), _part(RunCfg, self)
+        if self.specialist is None:
+            finetune(robot, cfg, _run_dir(self, f"{robot.name}-{self.mix}"), run)
+            return
+        given = [name for name in ("resume", "run_dir", "export", "archive") if getattr(self, name)]
+        if given or self.mix != "generated":
+            raise ValueError(f"--specialist takes archive and places of its run, got {', '.join(given) or self.mix}")
+        train_specialist(robot, self.specialist, cfg, run)
+
+
+def _peek(argv: Sequence[str]) -> tuple[RobotCfg, Path | None]:
+    """The robot and the training to go on with that a command line names."""
+    resume = peek(argv, "--resume")
+    return get_robot(peek(argv, "--robot") or "anymal"), None if resume is None else Path(resume)
+
+
+def _resumed(kind: type[_Cfg], run_dir: Path, robot: RobotCfg) -> _Cfg:
+    """The settings of a training; code of a space of one's own is named again."""
+    from train.ppo.training import read_saved
+
+    settings = read_saved(run_dir, "train" if kind is TrainCfg else "finetune", robot.name)["settings"]
+    values = {one.name: settings.get(one.name) for one in fields(kind)}  # pyright: ignore[reportArgumentType]
+    if ":" in str(values.get("space")):
+        del values["space"]
+    return from_builtins(kind, values, str(run_dir))
+
+
+def _run_dir(flags: _OfTraining, name: str) -> Path:
+    """Where a training works; a new directory is called after ``name`` and the time."""
+    if flags.resume is not None and flags.run_dir is not None:
+        raise ValueError("--resume goes on where it is, got --run-dir too: leave it out")
+    stamp = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    names = (stamp if number == 1 else f"{stamp}-{number}" for number in count(1))  # two may begin in one second
+    new = (place for place in map(Path("runs").joinpath, names) if not place.exists())
+    return flags.run_dir or flags.resume or next(new)
+
+
+def _values(cfg: Any) -> dict[str, Any]:
+    return {one.name: getattr(cfg, one.name) for one in fields(cfg)}
+
+
+def _part(kind: type[_Cfg], flags: Any) -> _Cfg:
+    """The settings among flags."""
+    return kind(**{one.name: getattr(flags, one.name) for one in fields(kind)})  # pyright: ignore[reportArgumentType]

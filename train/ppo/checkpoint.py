@@ -1,0 +1,129 @@
+"""Checkpoints of trainings, and the networks that a fine-tuning begins with; no code in a file is run."""
+
+import io
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sim.files.atomic import write_atomically
+from sim.policy.loaders import MlpPolicy, load_policy, read_weights, reason_of
+from sim.robots.robot import RobotCfg
+
+FORMAT = "faultline training checkpoint 2"
+CHECKPOINT = "checkpoint.pt"
+"""File of a training's directory that it goes on from."""
+STD = "distribution.std_param"
+"""Key of the standard deviation of the actions in an actor's state."""
+State = dict[str, torch.Tensor]
+"""Weights under rsl_rl's keys."""
+_ENTRIES: dict[str, tuple[type, ...]] = {
+    "kind": (str,),
+    "robot": (str,),
+    "iter": (int,),
+    "levels": (torch.Tensor,),
+    "counter": (int,),
+    "averaged": (int,),
+    "mean_actor_state_dict": (dict,),
+    "rng_cpu": (torch.Tensor,),
+    "rng_cuda": (torch.Tensor, type(None)),
+    "settings": (dict,),
+    "progress": (dict,),
+}
+
+
+def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    """Writes a checkpoint, whole or not at all."""
+    buffer = io.BytesIO()
+    torch.save({"format": FORMAT, **content}, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Content of a checkpoint that :func:`write_checkpoint` wrote, tensors on the CPU.
+
+    Raises:
+        ValueError: If the file is absent, truncated or foreign.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path} must be the checkpoint of a training, got no file: name its directory")
+    try:
+        content = read_weights(path)
+    except Exception as error:  # a stream of pickle opcodes can fail with anything
+        raise ValueError(f"{path} must be a checkpoint, got {reason_of(error)}: put a copy of it back") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{path} must be a '{FORMAT}', got another kind of file: name the directory of a training")
+    wrong = [name for name, kinds in _ENTRIES.items() if type(content.get(name)) not in kinds]
+    if wrong:
+        raise ValueError(f"{path} must have the entries of a checkpoint, got it damaged at {', '.join(wrong)}: put a "
+                         "copy of it back")  # fmt: skip
+    return content
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """A trained actor, and its critic where it is known."""
+
+    actor: State
+    critic: State | None
+    hidden_dims: tuple[int, ...]
+    """Hidden layers of both."""
+
+    def with_noise_of(self, other: "Start") -> "Start":
+        """The same with another's standard deviation of the actions, where that is known."""
+        noise = {STD: other.actor[STD]} if STD in other.actor else {}
+        return replace(self, actor={**self.actor, **noise})
+
+
+def read_start(path: Path, robot: RobotCfg) -> Start:
+    """Networks of an rsl_rl checkpoint, fit to be trained on.
+
+    A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
+    such a file is left: its own normaliser is another.
+
+    Raises:
+        ValueError: If it is no such file, of another robot, or its standard deviation or critic cannot be trained on.
+    """
+    policy = load_policy(path, robot, "cpu")
+    if not isinstance(policy, MlpPolicy):
+        raise ValueError(
+            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: "
+            f"{path}; train one with `{robot.train_command}`, and leave --policy out"
+        )
+    content = read_weights(path)
+    actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
+    if policy.normalised:
+        weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
+        actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
+    hidden = tuple(layer.out_features for layer in policy.layers if isinstance(layer, torch.nn.Linear))[:-1]
+    critic = None if policy.normalised else content.get("critic_state_dict")
+    _check_std(actor, robot, path)
+    if critic is not None:
+        _check_critic(critic, (policy.sizes[0], *hidden, 1), path)
+    return Start(actor=actor, critic=critic, hidden_dims=hidden)
+
+
+def _check_std(actor: State, robot: RobotCfg, path: Path) -> None:
+    std = actor.get(STD)
+    fits = std is None or (std.shape == (robot.num_joints,) and bool((std > 0.0).all()) and bool(std.isfinite().all()))
+    if not fits:
+        raise ValueError(
+            f"{path}: {STD}, the standard deviation of the actions, must be {robot.num_joints} numbers above 0, got "
+            f"{' '.join(str(std).split())}: leave it out, or give another controller"
+        )
+
+
+def _check_critic(critic: Any, sizes: tuple[int, ...], path: Path) -> None:
+    expected = {}
+    for k, (width, out) in enumerate(pairwise(sizes)):
+        expected |= {f"mlp.{2 * k}.weight": (out, width), f"mlp.{2 * k}.bias": (out,)}
+    tensors = isinstance(critic, dict) and all(isinstance(value, torch.Tensor) for value in critic.values())
+    if not tensors or {key: tuple(value.shape) for key, value in critic.items()} != expected:
+        raise ValueError(
+            f"{path}: its critic (critic_state_dict) must have the actor's hidden layers {list(sizes[1:-1])}, "
+            f"{sizes[0]} inputs and one output, got another: leave it out of the file, and one is trained"
+        )
+    if not all(bool(value.isfinite().all()) for value in critic.values()):
+        raise ValueError(f"{path}: its critic (critic_state_dict) has weights that are not finite: leave it out")

@@ -1,0 +1,314 @@
+"""What trainings share: iterating until told to stop, checkpoints, and the controller at the end."""
+
+import io
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from qd.archive import ARCHIVE_FILE
+from qd.evaluate.marks import TRAINED_ON
+from qd.run.directory import CHECKPOINT_FILE
+from qd.run.settings import differences
+from sim.device import resolve_device
+from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
+from sim.files.command import Interrupted
+from sim.files.records import provenance, robot_digest
+from sim.policy.spec import is_same
+from sim.robots.robot import RobotCfg
+from train.cfg import TrainCfg
+from train.ppo.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
+from train.ppo.learner import Learner, Ranks
+from train.ppo.progress import Progress
+from train.task.curriculum import Tiles
+from train.task.task import CommandTask
+from train.task.vec_env import CommandVecEnv
+
+POLICY = "policy.pt"
+"""File of a training's directory with its controller."""
+CONFIG = "config.json"
+SAVE_EVERY_S = 60.0
+_RESERVE_S = 10.0  # of a time limit, for the last save
+_SEED_STEP = 1_000_003  # between the tasks of two processes
+_FREE = ("iterations", "archive", "space")
+"""Settings that may differ where a training goes on: of archives and space hashes are compared."""
+
+Kind = Literal["train", "finetune"]
+"""What a training is, by the command that makes it."""
+
+
+class StopRequest:
+    """Set by Ctrl-C or SIGTERM: the iteration at hand is finished, then everything is saved. A second one kills."""
+
+    def __init__(self) -> None:
+        """Not asked yet; listens inside a ``with`` block."""
+        self.requested = False
+
+    def __enter__(self) -> "StopRequest":
+        self._before = {kind: signal.signal(kind, self._handle) for kind in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for kind, handler in self._before.items():
+            signal.signal(kind, handler)
+
+    def _handle(self, kind: int, _frame: object) -> None:
+        self.requested = True
+        signal.signal(kind, signal.SIG_DFL)
+
+
+def device_of(name: str | None) -> str:
+    """Warp device name of this process of a training, where ``name`` was asked for.
+
+    Raises:
+        ValueError: If there is no such device, or torch has no CUDA for it.
+    """
+    device = Ranks.of_environment().device(resolve_device(name))
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(
+            f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build "
+            "or use --device cpu"
+        )
+    return device
+
+
+def deadline_of(max_seconds: float | None) -> float:
+    """When a training that begins now is to be done, on the clock of :func:`time.monotonic` [s]."""
+    return float("inf") if max_seconds is None else time.monotonic() + max_seconds
+
+
+def settings_of(cfg: TrainCfg, robot: RobotCfg) -> dict[str, Any]:
+    """What makes a training what it is, checked, as plain values.
+
+    Raises:
+        ValueError: If nothing can be learned with the settings.
+    """
+    cfg.check(robot)
+    return {**asdict(cfg), "robot_sha256": robot_digest(robot)}
+
+
+@contextmanager
+def run_directory(run_dir: Path, export: Path | None, *, overwrite: bool) -> Iterator[None]:
+    """Makes the directory of a training, checks that it can be written to, and keeps other trainings out of it.
+
+    Raises:
+        ValueError: If it holds something else, another training works in it, or the export cannot be written.
+    """
+    if not Ranks.of_environment().is_first:
+        yield
+        return
+    if any((run_dir / name).exists() for name in (ARCHIVE_FILE, CHECKPOINT_FILE)):
+        raise ValueError(f"{run_dir} must be the directory of a training, got that of a search: give another")
+    if export is not None:
+        if export.suffix != ".pt":
+            raise ValueError(f"export must be a file named *.pt, got {export}")
+        if export.exists() and not overwrite and not is_same(str(export), str(run_dir / POLICY)):
+            raise ValueError(f"{export} must not be there yet, got another training's: --overwrite replaces it")
+        prepare_output(export)
+    prepare_output(run_dir / CONFIG)  # last: what is refused leaves no directory
+    with locked(run_dir, f"another training works in {run_dir}: let it end, or give another directory"):
+        yield
+
+
+def read_saved(run_dir: Path, kind: Kind, robot: str) -> dict[str, Any]:
+    """The checkpoint of a training's directory.
+
+    Args:
+        run_dir: The directory.
+        kind: What goes on with it.
+        robot: Name of the robot.
+
+    Raises:
+        ValueError: As of :func:`read_checkpoint`, or if it is of another kind or robot.
+    """
+    saved = read_checkpoint(run_dir / CHECKPOINT)
+    if (saved["kind"], saved["robot"]) != (kind, robot):
+        raise ValueError(
+            f"{run_dir} must hold a run of `faultline {kind} --robot {robot}`, got one of `faultline {saved['kind']}` "
+            f"with robot {saved['robot']}: give another directory"
+        )
+    return saved
+
+
+def check_settings(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
+    """Refuses to go on with other settings than a training was begun with, but for :data:`_FREE`.
+
+    Raises:
+        ValueError: If one differs, or more iterations are done than are asked for.
+    """
+    before, now = ({name: part[name] for name in part if name not in _FREE} for part in (saved["settings"], settings))
+    if different := differences(before, now):
+        raise ValueError(f"{run_dir} was begun with other settings: {', '.join(different)}: give those")
+    if saved["iter"] > settings["iterations"]:
+        raise ValueError(
+            f"iterations must be at least {saved['iter']}, which {run_dir} has done, got {settings['iterations']}"
+        )
+
+
+def is_finished(run_dir: Path, iterations: int) -> bool:
+    """Whether a training has done its iterations and written its controller."""
+    record = (run_dir / POLICY).with_suffix(".train.json")
+    return record.exists() and read_json(record).get("iterations") == iterations
+
+
+class Training:
+    """A training at work: the task, what learns on it, and how far it is.
+
+    Attributes:
+        task: The robots.
+        learner: PPO on them.
+        progress: Rows and record.
+    """
+
+    kind: Kind = "train"
+
+    def __init__(
+        self,
+        robot: RobotCfg,
+        cfg: TrainCfg,
+        run_dir: Path,
+        *,
+        device: str,
+        settings: dict[str, Any],
+        saved: dict[str, Any] | None,
+        tiles: Tiles | None = None,
+        random_ages: bool = True,
+    ) -> None:
+        """Begin, or go on from a checkpoint.
+
+        Args:
+            robot: Who learns.
+            cfg: What, with its sizes.
+            run_dir: Where to write.
+            device: Warp device name.
+            settings: What a checkpoint and the record say of it.
+            saved: The checkpoint.
+            tiles: Terrains; those of the curriculum if left out.
+            random_ages: As of :class:`Learner`.
+        """
+        self._robot, self._cfg, self._run_dir, self._settings = robot, cfg, run_dir, settings
+        ranks = Ranks.of_environment()
+        self.task = CommandTask(
+            robot, cfg.task, num_envs=cfg.num_envs, device=device, seed=cfg.seed + _SEED_STEP * ranks.rank, tiles=tiles
+        )
+        self.learner = Learner(CommandVecEnv(self.task), cfg.ppo, seed=cfg.seed, random_ages=random_ages)
+        if saved is not None:
+            self.learner.resume(saved)
+        self.progress = Progress(
+            run_dir,
+            self.learner,
+            cfg.iterations,
+            about={**provenance(device, cfg.seed), "settings": settings, "processes": ranks.size},
+            saved=saved and saved["progress"],
+        )
+
+    def before_iteration(self) -> None:
+        """What a kind of training does before each iteration: nothing."""
+
+    @property
+    def averaged_from(self) -> int:
+        """The iteration after which actors count into the controller."""
+        return round((1.0 - self._cfg.ppo.average) * self._cfg.iterations)
+
+    def facts(self) -> dict[str, Any]:
+        """What checkpoint and record say beside settings and progress: nothing."""
+        return {}
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {
+            **self.learner.state(),
+            "kind": self.kind,
+            "settings": self._settings,
+            "progress": self.progress.state(),
+            **self.facts(),
+        }
+
+    def run(self, deadline_s: float, export: Path | None) -> Path:
+        """Iterates until all is done, time is up or a stop is requested, and saves; returns the controller's file.
+
+        Args:
+            deadline_s: When it is to be done, on the clock of :func:`time.monotonic` [s].
+            export: Another place for the controller and its record.
+
+        Raises:
+            Interrupted: On Ctrl-C, when all is saved.
+            FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
+        """
+        if self.learner.ranks.is_first:
+            write_atomically(self._run_dir / CONFIG, to_json(self._settings))
+        with StopRequest() as stop:
+            try:
+                self._iterate(stop, deadline_s)
+            except FloatingPointError as error:
+                raise FloatingPointError(
+                    f"{error}, in {self._run_dir}: begin again with a lower --ppo.learning-rate"
+                ) from error
+            self._finish(export)
+        done = f"{self.learner.iteration} of {self._cfg.iterations} iterations"
+        if stop.requested:
+            raise Interrupted(f"Stopped after {done}; the same command goes on in {self._run_dir}.")
+        if self.learner.iteration < self._cfg.iterations and self.learner.ranks.is_first:
+            print(f"The time is up after {done}; the same command goes on in {self._run_dir}.")
+        return self._run_dir / POLICY
+
+    def _iterate(self, stop: StopRequest, deadline_s: float) -> None:
+        learner = self.learner
+        last_save = time.monotonic()
+        if learner.iteration - learner.averaged < self.averaged_from:  # it was shorter: its last actors are others
+            learner.count_into_mean(False)
+
+        def wants_more() -> bool:
+            in_time = time.monotonic() + self.progress.slowest_s < deadline_s - _RESERVE_S
+            return learner.iteration < self._cfg.iterations and not stop.requested and in_time
+
+        while learner.ranks.all_want(wants_more(), learner.env.device):
+            self.before_iteration()
+            step = learner.iterate()
+            learner.count_into_mean(learner.iteration > self.averaged_from)
+            self.progress.add(step)
+            if time.monotonic() - last_save > SAVE_EVERY_S:
+                self._save()
+                last_save = time.monotonic()
+
+    def _save(self) -> None:
+        if self.learner.ranks.is_first:
+            write_checkpoint(self._run_dir / CHECKPOINT, self.state())
+
+    def _finish(self, export: Path | None) -> None:
+        """Writes the last checkpoint, and the controller with its record at every place asked for."""
+        learner = self.learner
+        learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
+        self.progress.close()
+        self._save()
+        if not learner.ranks.is_first:
+            return
+        record = {**self.progress.record(), "averaged": learner.averaged, **self.facts()}
+        for path in (self._run_dir / POLICY, *([export] if export else [])):
+            write_controller(path, learner, record)
+            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+
+
+def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> None:
+    """Writes the actor, or the mean of the last ones, and the training record ``<stem>.train.json`` beside it.
+
+    Layers are in half precision, which takes half of the room and is finer than what training leaves to chance. All
+    who read the file compute in single precision, so that a controller is its file, wherever it is measured.
+    """
+    buffer = io.BytesIO()
+    marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
+    actor = {key: _in_half(value) if value.ndim > 1 else value for key, value in learner.mean_actor_state().items()}
+    torch.save({"actor_state_dict": actor, "iter": learner.iteration, **marks}, buffer)
+    write_atomically(path, buffer.getvalue())
+    write_atomically(path.with_suffix(".train.json"), to_json(record))
+
+
+def _in_half(weights: torch.Tensor) -> torch.Tensor:
+    """In half precision; as they are where it has no such large numbers."""
+    half = weights.half()
+    return half if bool(half.isfinite().all()) else weights
