@@ -160,7 +160,7 @@ class MakePack(Who, Where):
 
     def execute(self) -> None:
         """Makes it."""
-        from qd.evaluate.pack import make_pack
+        from qd.evaluate.make_pack import make_pack
         from qd.run.directory import newest_run
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of
