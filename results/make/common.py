@@ -14,12 +14,12 @@ import numpy as np
 from qd.archive import Archive
 from qd.run.directory import read_archive_of
 from qd.workers.evaluator import Compute
+from sim.device import resolve_device
 from sim.files.atomic import write_atomically
 from sim.files.intervals import t_interval
 from sim.files.records import identity, provenance, sources_sha256
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from sim.simulation import resolve_device
 
 SEEDS = (0, 1, 2)
 """Seeds of everything that is done several times."""
