@@ -69,8 +69,10 @@ def spoil(name, outputs):
         one_value.view(-1)[one_value.view(-1).abs().argmax()] *= 1.01
         return [one_value, outputs.roll(1, 0), outputs[:-1]]
     probe, point, centre, normal, offset = outputs
+    nothing = torch.full_like(probe, -1)
     return [
-        (torch.full_like(probe, -1), point, centre, normal, offset),
+        (nothing, point, centre, normal, offset),
+        (torch.cat([probe[..., :1], nothing[..., 1:]], dim=2), point, centre, normal, offset),
         (probe[..., :1].expand_as(probe), point, centre, normal, offset),
         (probe, point + 0.001, centre, normal, offset),
         (probe, point, centre.flip(-1), normal, offset),
