@@ -16,7 +16,7 @@ class Command(NamedTuple):
 
 COMMANDS: dict[str, dict[str, Command]] = {
     "Find what breaks a controller": {
-        "archive": Command("qd.run.arguments:Archive", "search the terrains on which a controller fails"),
+        "archive": Command("qd.commands:Archive", "search the terrains on which a controller fails"),
         "reevaluate": Command("qd.fresh:Reevaluate", "cross every elite of an archive again in fresh episodes"),
         "confirm": Command("qd.run.judge:Confirm", "cross the failing elites again with contact resolved"),
         "certify": Command("qd.run.judge:Certify", "which failing elites other controllers cross: faults"),

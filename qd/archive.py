@@ -4,7 +4,6 @@ Training and figures read archives without the search's libraries.
 """
 
 import os
-from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,7 @@ from numpy.typing import NDArray
 from qd.descriptors import Cells
 from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
-from sim.files.intervals import wilson_interval
 from sim.files.npz import array_names, npz_bytes, read_arrays
-from sim.files.records import PENALTY_DEFINITION
 from sim.rates import MAX_INVALID_SHARE
 
 ARCHIVE_FILE = "archive.npz"
@@ -98,17 +95,6 @@ class FaultCounts:
         """Those of some of the elites alone, in the order given."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in COUNTS})
 
-    def of_certifiers(self, sha256: Collection[str]) -> "FaultCounts":
-        """Those of some of the certifiers alone, by their hashes."""
-        places = [place for place, digest in enumerate(self.certifier_sha256) if digest in sha256]
-        return replace(
-            self,
-            certifiers=tuple(self.certifiers[place] for place in places),
-            certifier_sha256=tuple(self.certifier_sha256[place] for place in places),
-            certifier_outcomes=self.certifier_outcomes[:, places],
-            certifier_resolved_outcomes=self.certifier_resolved_outcomes[:, places],
-        )
-
     def certificates(self) -> NDArray[np.bool_]:
         """Whether a controller reaches the goal in at least half of both kinds of episodes, shape (N, C)."""
         both = (self.certifier_outcomes, self.certifier_resolved_outcomes)
@@ -130,19 +116,15 @@ def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.where(known, counts[..., 0] / np.maximum(episodes - invalid, 1), np.nan)
 
 
-def _goal_intervals(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """95 % intervals of the rates (Wilson), shape (..., 2); 0 to 1 without an episode."""
-    valid = counts.sum(axis=-1) - counts[..., OUTCOMES.index("invalid")]
-    pairs = zip(counts[..., 0].ravel().tolist(), valid.ravel().tolist(), strict=True)
-    limits = [wilson_interval(*pair) for pair in pairs]
-    return np.array(limits, np.float64).reshape(*counts.shape[:-1], 2)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Archive(Evaluation):
     """Elites as they were found, by descending fitness, the corrected one if there are fresh values."""
 
     robot: str
+    robot_sha256: str
+    """Hash of the robot that was searched."""
+    penalty_definition: str
+    """How its penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
     space: str
     """Name of the terrain space of the genes (:func:`sim.spaces.registry.get_space`)."""
     penalties: tuple[str, ...]
@@ -159,14 +141,10 @@ class Archive(Evaluation):
     """Clipped genes, shape (N, num_genes)."""
     iteration: NDArray[np.int64]
     """Iteration that found the elite, from 1, shape (N,)."""
-    robot_sha256: str | None = None
-    """Hash of the robot that was searched; None in a file of a version before there was one."""
     policy_sha256: str | None = None
     """Hash of its controller; None where it has no file."""
     space_sha256: str | None = None
     """Hash of the code of the terrain space; None of a shipped one."""
-    penalty_definition: str = PENALTY_DEFINITION
-    """How its penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
     fresh: FreshValues | None = None
     """What fresh episodes say of the elites; None if there were none."""
     faults: FaultCounts | None = None
@@ -174,7 +152,7 @@ class Archive(Evaluation):
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and definition of the penalties, as :func:`sim.files.records.identity` names them."""
-        return {name: getattr(self, name) for name in ("robot", *_OF_IDENTITY)}
+        return {name: getattr(self, name) for name in _OF_IDENTITY}
 
     def __len__(self) -> int:
         """Number of elites."""
@@ -245,29 +223,23 @@ class Archive(Evaluation):
         """The archive with what fresh episodes say, by descending corrected fitness, the invalid elites last."""
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
-    def with_faults_of(self, other: "Archive") -> "Archive":
-        """The archive with the fault counts of another that has its elites, in whatever order; else as it is."""
-        if other.faults is None or not self.has_elites_of(other):
-            return self
-        place = np.argsort(other.cell)[np.searchsorted(np.sort(other.cell), self.cell)]
-        return replace(self, faults=other.faults.rows(place))
 
-
-_OF_IDENTITY = ("robot_sha256", "policy_sha256", "penalty_definition")
-_HASHES = (*_OF_IDENTITY, "space_sha256")  # which a file may lack
-_SETTINGS = ("robot", "space", "penalties", "scales", "intervals", "collision_bit", "iterations", *_HASHES)
+_OF_IDENTITY = ("robot", "robot_sha256", "policy_sha256", "penalty_definition")
+_OPTIONAL = ("policy_sha256", "space_sha256")  # of controllers and spaces without files
+_TEXTS = ("robot", "robot_sha256", "penalty_definition", "space", *_OPTIONAL)
+_SETTINGS = (*_TEXTS, "penalties", "scales", "intervals", "collision_bit", "iterations")
 _PREFIX = "fresh_"
 _CERTIFIERS = ("certifiers", "certifier_sha256")
-_KINDS = {
-    **dict.fromkeys(("robot", "space", "penalties", *_HASHES), "U"),
-    **dict.fromkeys(_CERTIFIERS, "U"),
-    **dict.fromkeys(("collision_bit", "reproduced", "confirmed", "certified"), "b"),
-    **dict.fromkeys(COUNTS, "i"),
-    **dict.fromkeys(("intervals", "iterations", "cell", "invalid_episodes", "episodes", "iteration"), "i"),
-}
-_BESIDE = ("fresh", "faults")
-_MAX_ITEM_BYTES = 4096  # a name's; a damaged header may claim any
-PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, *_BESIDE))
+_SHAPES = {
+    **dict.fromkeys((*_TEXTS, "intervals", "collision_bit", "iterations"), ""),
+    **dict.fromkeys(("penalties", "scales"), "P"),
+    **dict.fromkeys(_CERTIFIERS, "C"),
+    "genes": "NG", **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
+    **dict.fromkeys(("resolved_outcomes", "mujoco_c_outcomes"), "N4"),
+    **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
+}  # fmt: skip
+"""Dimensions of arrays in N elites, G genes, P penalties and C certifiers; N alone of all others."""
+PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, "fresh", "faults"))
 """Names of the arrays that have one row an elite."""
 
 
@@ -279,35 +251,15 @@ def write_archive(path: Path, archive: Archive) -> None:
         archive: What to write.
     """
     settings = {name: getattr(archive, name) for name in _SETTINGS}
-    content: dict[str, Any] = {name: np.asarray(value) for name, value in settings.items() if value is not None}
-    content |= _arrays(archive) | _fault_arrays(archive)
+    content = {name: np.asarray(value) for name, value in settings.items() if value is not None}
+    content |= {name: np.asarray(getattr(archive, name)) for name in PER_ELITE}
+    if archive.fresh is not None:
+        content |= {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
+    if archive.faults is not None:
+        content |= {name: np.array(getattr(archive.faults, name), dtype=np.str_) for name in _CERTIFIERS}
+        content |= {name: getattr(archive.faults, name) for name in COUNTS}
+        content |= {"confirmed": archive.confirmed, "certified": archive.certified}
     write_atomically(path, npz_bytes(content))
-
-
-def _arrays(archive: Archive) -> dict[str, NDArray[Any]]:
-    """All that has one row an elite, by its name in the file."""
-    arrays = {name: np.asarray(getattr(archive, name)) for name in PER_ELITE}
-    if archive.fresh is None:
-        return arrays
-    return arrays | {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
-
-
-_RATES = tuple(name.replace("_outcomes", ending) for name in COUNTS for ending in ("_goal_rate", "_goal_interval"))
-_FAULT_NAMES = (*_CERTIFIERS, *COUNTS, *_RATES, "confirmed", "certified")
-_KNOWN = {*_SETTINGS, *PER_ELITE, *(_PREFIX + name for name in FRESH), *_FAULT_NAMES}
-
-
-def _fault_arrays(archive: Archive) -> dict[str, NDArray[Any]]:
-    """Fault counts by their names in the file, and what follows from them; nothing where there are none."""
-    faults = archive.faults
-    if faults is None:
-        return {}
-    arrays: dict[str, NDArray[Any]] = {name: np.array(getattr(faults, name), dtype=np.str_) for name in _CERTIFIERS}
-    for name in COUNTS:
-        counts, what = getattr(faults, name), name.removesuffix("_outcomes")
-        arrays |= {name: counts, f"{what}_goal_rate": goal_rates(counts)}
-        arrays[f"{what}_goal_interval"] = _goal_intervals(counts)
-    return arrays | {"confirmed": archive.confirmed, "certified": archive.certified}
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -315,9 +267,6 @@ def read_archive(path: str | Path) -> Archive:
 
     Args:
         path: ``archive.npz``, or the run directory that holds it.
-
-    Returns:
-        The archive.
 
     Raises:
         FileNotFoundError: If there is none.
@@ -328,89 +277,40 @@ def read_archive(path: str | Path) -> Archive:
     if not os.path.isfile(file):  # False too for a name that no file can have
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
-        there = set(array_names(file))
-        if unknown := there - _KNOWN:  # a damaged name of an array that older archives lack
-            raise ValueError(f"no archive has an array {', '.join(sorted(unknown))}")
-        names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _HASHES or name in there]
-        if any(name.startswith(_PREFIX) for name in there):  # then all of them, or it is damage
-            names += [_PREFIX + name for name in FRESH]
-        if not there.isdisjoint(_FAULT_NAMES):  # likewise
-            names += _FAULT_NAMES
-        content = read_arrays(file, names)
-        _check_kinds(content)
-        judged = {name: content.pop(name) for name in _FAULT_NAMES if name in content}
-        fresh = {name.removeprefix(_PREFIX): content.pop(name) for name in list(content) if name.startswith(_PREFIX)}
-        found = {name: _from_array(name, value) for name, value in content.items()}
-        archive = Archive(**found, fresh=FreshValues(**fresh) if fresh else None)
-        _check_shapes(archive)
-        _check_values(archive)
-        if judged:
-            archive = _with_faults(archive, judged)
+        stored = set(array_names(file))
+        names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _OPTIONAL or name in stored]
+        fresh_names = [_PREFIX + name for name in FRESH] if any(name.startswith(_PREFIX) for name in stored) else []
+        fault_names = [*_CERTIFIERS, *COUNTS] if not stored.isdisjoint((*_CERTIFIERS, *COUNTS)) else []
+        arrays = read_arrays(file, [*names, *fresh_names, *fault_names])
+        _check_shapes(arrays)
+        fresh = {name.removeprefix(_PREFIX): arrays[name] for name in fresh_names}
+        faults = {name: _as_field(name, arrays[name]) for name in fault_names}
+        return Archive(
+            **{name: _as_field(name, arrays[name]) for name in names},
+            fresh=FreshValues(**fresh) if fresh else None,
+            faults=FaultCounts(**faults) if faults else None,
+        )
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         raise ValueError(
-            f"{file} must be the archive of a search, but it is damaged or another file: {error}: going on with its "
-            "run (--resume) writes it again"
+            f"{file} must be the archive of a search, but it is damaged or another file: {error}"
         ) from None
-    return archive
 
 
-def _from_array(name: str, value: NDArray) -> Any:
-    """A field as the dataclass wants it: settings as Python values, arrays as they are."""
-    if name not in _SETTINGS:
-        return value
-    return tuple(value.tolist()) if value.ndim else value.item()
+def _as_field(name: str, array: NDArray[Any]) -> Any:
+    """A field as the dataclass has it: settings and names as Python values, arrays as they are."""
+    if name not in (*_SETTINGS, *_CERTIFIERS):
+        return array
+    return tuple(array.tolist()) if array.ndim else array.item()
 
 
-def _check_kinds(content: dict[str, NDArray[Any]]) -> None:
-    """That every field holds numbers, strings or flags as it should, and every setting one or a row of them."""
-    for name, value in content.items():
-        expected = _KINDS.get(name.removeprefix(_PREFIX), "f")
-        if value.dtype.kind != expected or value.dtype.itemsize > _MAX_ITEM_BYTES:
-            raise ValueError(f"{name} must be of kind '{expected}', got {value.dtype}")
-        if name in _SETTINGS and value.ndim != int(name in ("penalties", "scales")):
-            raise ValueError(f"{name} has shape {value.shape}")
-
-
-def _check_shapes(archive: Archive) -> None:
-    from sim.spaces.registry import get_space, is_own  # which imports Warp: not for `--help`
-
-    num_elites, num_penalties = archive.fitness.size, len(archive.penalties)
-    # How many genes a space of one's own has only its code says, and reading an archive runs none.
-    num_genes = archive.genes.shape[-1] if is_own(archive.space) else get_space(archive.space).num_genes
-    columns = {"genes": num_genes, "ratios": num_penalties}
-    columns |= {"penalty_mean": num_penalties, "penalty_std": num_penalties}
-    for name, array in _arrays(archive).items():
-        column = columns.get(name.removeprefix(_PREFIX))
-        expected = (num_elites,) if column is None else (num_elites, column)
+def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
+    """Refuses arrays of other shapes, texts in place of numbers, and numbers in place of texts."""
+    sizes = {"4": len(OUTCOMES), "P": arrays["penalties"].size, "N": arrays["fitness"].size}
+    sizes |= {"G": arrays["genes"].shape[-1], "C": arrays["certifiers"].size if "certifiers" in arrays else 0}
+    for name, array in arrays.items():
+        expected = tuple(sizes[letter] for letter in _SHAPES.get(name.removeprefix(_PREFIX), "N"))
         if array.shape != expected:
             raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
-
-
-def _check_values(archive: Archive) -> None:
-    finite = all(np.isfinite(array).all() for array in _arrays(archive).values())
-    if not finite or not (np.abs(archive.genes) <= 1.0).all():
-        raise ValueError("it must hold finite numbers, and genes in [-1, 1]")
-    if len(archive.scales) != len(archive.penalties) or not all(0.0 < scale < np.inf for scale in archive.scales):
-        raise ValueError(f"scales must be one positive number a penalty, got {archive.scales}")
-    num_cells = archive.cells.num_cells
-    cells = [archive.cell] if archive.fresh is None else [archive.cell, archive.fresh.cell]
-    if not all(((cell >= 0) & (cell < num_cells)).all() for cell in cells):
-        raise ValueError(f"cell must lie in 0 to {num_cells - 1}")
-
-
-def _with_faults(archive: Archive, judged: dict[str, NDArray[Any]]) -> Archive:
-    """The archive with the fault counts of its file, whose other arrays must follow from them."""
-    names = [tuple(judged[name].tolist()) for name in _CERTIFIERS]
-    num_elites, num_certifiers = len(archive), len(names[0])
-    if archive.fresh is None or len(names[1]) != num_certifiers:
-        raise ValueError("faults need fresh episodes, and every certifier a hash")
-    for name in COUNTS:
-        expected = (num_elites, num_certifiers, 4) if name.startswith("certifier") else (num_elites, 4)
-        if judged[name].shape != expected or (judged[name] < 0).any():
-            raise ValueError(f"{name} must be counts of shape {expected}, got {judged[name].shape}")
-    counts = {name: judged[name].astype(np.int64) for name in COUNTS}
-    archive = replace(archive, faults=FaultCounts(certifiers=names[0], certifier_sha256=names[1], **counts))
-    for name, value in _fault_arrays(archive).items():
-        if not np.array_equal(judged[name], value, equal_nan=value.dtype.kind == "f"):
-            raise ValueError(f"{name} must follow from the outcomes")
-    return archive
+        is_text = name in (*_TEXTS, *_CERTIFIERS, "penalties")
+        if array.dtype.kind not in ("U" if is_text else "bif"):
+            raise ValueError(f"{name} must hold {'texts' if is_text else 'numbers'}, got {array.dtype}")

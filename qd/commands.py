@@ -1,11 +1,119 @@
 """The commands of searching and evaluating: their flags, and nothing else."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from sim.files.command import OfRobot, Where, Who
+from qd.run.settings import PRESETS, SchedulerCfg, preset_of
+from sim.files.command import OfRobot, OnGround, Where, Who, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArchiveFitness:
+    """What makes a terrain an elite."""
+
+    penalties: tuple[str, ...] = ()
+    """Penalties that count, for fitness, ratios and cells; all of the robot's if left out."""
+    alpha: float = 1.0
+    """Weight of the standard deviations."""
+    lam: float = 2.0
+    """Weight of u, the share of episodes without base collision; u is 0 if none collided."""
+    intervals: int = 10
+    """Intervals of each ratio."""
+    reevaluate_every: int = 50
+    """After every so many iterations up to 200 elites cross 40 fresh episodes each. 0: never."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Archive(Who, OnGround, Where):
+    """Search the terrains on which a controller fails, each in its own way.
+
+    Every iteration lets robots cross the terrains that --method asks for, and files each terrain by the proportions of
+    what went wrong. State is saved after every iteration: stop with Ctrl-C whenever you like and go on with --resume.
+    With the presets wide and paper the elites are judged at the end, as `faultline judge` does.
+    """
+
+    preset: str = "small"
+    """Size of the search: wide (the default on a GPU), paper (the paper's), or small (the default on the CPU)."""
+    iterations: int = 20
+    """Iterations to reach; with --resume, more than before extend a finished run."""
+    seed: int = 0
+    """Seed of everything drawn."""
+    resume: Path | None = None
+    """Go on with the run in this directory."""
+    run_dir: Path | None = None
+    """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
+    space: str | None = None
+    """Terrain space: super_gaussian, the paper's eight bumps; course, man-made elements; or one of your own,
+    file.py:CLASS. super_gaussian if left out."""
+    replicas: int = 4
+    """Episodes a terrain."""
+    method: str | None = None
+    """Where terrains come from: surrogate (the default), cma_mae (the paper's), cma_me, map_elites, hard_random,
+    uniform_random; several joined by +."""
+    scheduler: SchedulerCfg = PRESETS["small"]["scheduler"]
+    fitness: ArchiveFitness = ArchiveFitness()
+
+    @classmethod
+    def defaults(cls, argv: Sequence[str]) -> Self:
+        """The flags' defaults: those of the preset, or of the run to go on with."""
+        folder = peek(argv, "--resume")
+        if folder is None:
+            preset = peek(argv, "--preset") or default_preset(argv)
+            return cls(preset=preset, **preset_of(preset))
+        from qd.run.directory import RunDirectory
+
+        cfg = RunDirectory(Path(folder)).read_cfg()
+        fitness = ArchiveFitness(
+            penalties=cfg.fitness.penalties,
+            alpha=cfg.fitness.alpha,
+            lam=cfg.fitness.lam,
+            intervals=cfg.intervals,
+            reevaluate_every=cfg.reevaluate_every,
+        )
+        sizes = {name: getattr(cfg, name) for name in ("preset", "iterations", "seed", "replicas", "scheduler")}
+        return cls(**sizes, fitness=fitness)
+
+    def execute(self) -> None:
+        """Searches, and judges what was found."""
+        from qd.run.directory import free_path
+        from qd.run.judge import find_search, judge
+        from qd.run.settings import preset
+        from qd.search import search
+        from qd.workers.evaluator import Compute
+        from sim.robots.find import get_robot
+        from sim.spaces.registry import load_space
+
+        compute = Compute.resolve(self.device, self.workers, self.num_envs)
+        if self.resume is None:
+            robot, policy = get_robot(self.robot), None
+            space = load_space(self.space, self.ground)
+            cfg = preset(self.preset, robot, self.policy, space=space.name, space_sha256=space.sha256)
+        elif self.run_dir or self.ground:
+            raise ValueError("--resume goes on with a run as it is, got --run-dir or --ground too: leave them out")
+        else:
+            run = find_search(self.resume, robot=self.robot, policy=self.policy, space=self.space)
+            robot, policy, cfg = run.robot, run.policy, run.cfg
+        fitness = cfg.fitness.of_penalties(self.fitness.penalties or cfg.fitness.penalties)
+        cfg = replace(
+            cfg,
+            preset=self.preset,
+            iterations=self.iterations,
+            seed=self.seed,
+            replicas=self.replicas,
+            intervals=self.fitness.intervals,
+            reevaluate_every=self.fitness.reevaluate_every,
+            fitness=replace(fitness, alpha=self.fitness.alpha, lam=self.fitness.lam),
+            scheduler=replace(self.scheduler, method=self.method or self.scheduler.method),
+        )
+        path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
+        search(cfg, path, compute, robot=robot, policy=policy)
+        if cfg.preset == "small":
+            print(f"Preset small judges nothing: `faultline judge --run {path}` says which elites are faults.")
+        else:
+            judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,15 +269,25 @@ class MakePack(Who, Where):
     def execute(self) -> None:
         """Makes it."""
         from qd.evaluate.make_pack import make_pack
-        from qd.run.directory import newest_run
+        from qd.run.directory import find_run
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of
         from sim.robots.find import get_robot
 
         robot = get_robot(self.robot)
         make_pack(
-            self.run or newest_run(robot, self.policy),
+            find_run(robot, self.run, published="never"),
             controllers_of(self.controllers, robot) if self.controllers else {},
             compute=Compute.resolve(self.device, self.workers, self.num_envs), robot=self.robot, policy=self.policy,
             space=self.space, size=self.size, episodes=self.episodes, seed=self.seed, out=self.out,
         )  # fmt: skip
+
+
+def default_preset(argv: Sequence[str]) -> str:
+    """The preset that suits the device of a command line: wide on a GPU, small on the CPU."""
+    device = peek(argv, "--device")
+    if device is None and not {"-h", "--help"} & {*argv}:
+        from qd.workers.evaluator import resolve_device
+
+        device = resolve_device(None, peek(argv, "--workers"))
+    return "wide" if device is not None and device.startswith("cuda") else "small"

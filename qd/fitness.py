@@ -1,7 +1,7 @@
 """Fitness: how hard, and how reliably hard, a terrain is for the controller (the paper's fitness equation)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,6 +35,13 @@ class FitnessCfg:
 
     def __post_init__(self) -> None:
         check(self)
+
+    def of_penalties(self, names: Sequence[str]) -> "FitnessCfg":
+        """The same of some of the penalties alone, which must be at least 2: a single ratio is always 1."""
+        scales = dict(zip(self.penalties, self.scales, strict=True))
+        if not scales.keys() >= {*names} or len(names) < 2:
+            raise ValueError(f"penalties must be at least 2 of {', '.join(self.penalties)}, got {', '.join(names)}")
+        return replace(self, penalties=tuple(names), scales=tuple(scales[name] for name in names))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,17 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, FreshValues
+from qd.archive import ARCHIVE_FILE, Archive, FreshValues, read_archive, write_archive
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, FitnessCfg, evaluation_of
 from qd.run.arguments import evaluator_of
-from qd.run.directory import RunDirectory, archive_of, claimed, newest_run, origin_in, write_results
+from qd.run.directory import SUMMARY_FILE, RunDirectory, claimed, find_run
 from qd.run.progress import share_bar
-from qd.run.settings import SearchCfg, as_settings, own_policy, suffix_of
+from qd.run.settings import SearchCfg, as_settings, is_searched, own_policy
 from qd.workers.evaluator import Evaluate, EvaluatorCfg, open_evaluator, origin_of, resolve_device
 from qd.workers.invalid import tell_invalid
 from qd.workers.shards import taken
-from sim.files.command import InSpace, Where, Who, command_line, naming_what_is_next
+from sim.files.atomic import to_json, write_atomically
+from sim.files.command import InSpace, Where, Who
 from sim.files.intervals import bootstrap_interval, wilson_interval
 from sim.files.records import identity
 from sim.policy.spec import spec_of
@@ -238,9 +239,9 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
     from sim.robots.find import get_robot, robot_of
     from sim.spaces.registry import get_space, load_space
 
-    path = args.run or newest_run(get_robot(args.robot or "anymal"), args.policy)
+    path = find_run(get_robot(args.robot), args.run, published="never")
     run = RunDirectory(path)
-    config, cfg = run.read_config(), run.read_cfg()
+    cfg = run.read_cfg()
     if args.space is not None:
         load_space(args.space)
     get_space(cfg.space, cfg.space_sha256)
@@ -250,26 +251,21 @@ def reevaluate_run(args: Reevaluate, *, open_evaluator: Open = open_evaluator) -
         raise ValueError(f"seed must be at least 0, got {seed}")
     device = resolve_device(args.device, args.workers)
     policy = own_policy(path, cfg, robot) if args.policy is None else spec_of(args.policy, robot)
-    suffix = suffix_of(cfg, policy, robot)
+    if not is_searched(cfg, policy, robot):
+        raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}")
     evaluator = evaluator_of(cfg, robot, policy, device, args.workers, num_envs=args.num_envs)
-    given = {"run": path, "policy": args.policy, "space": args.space, "seed": args.seed}
-    given |= {"device": args.device, "workers": args.workers}
-    again = f"Start again with:  {command_line('reevaluate', robot=robot.spec, **given)}"
     with claimed(path):
-        loaded = run.load(cfg)
-        if loaded is None:
-            go_on = command_line(
-                "archive", robot=robot.spec, resume=path, policy=args.policy, space=args.space, device=args.device
-            )
-            raise ValueError(f"{path} has no finished iteration, expected at least one: go on with it with `{go_on}`")
-        search, metrics = loaded
-        with naming_what_is_next(f"{path} is as it was", lambda: again):
-            found = archive_of(cfg, search, len(metrics))
-            archive = corrected(found, cfg, evaluator, open_evaluator, seed)
-            archive = archive if suffix else run.with_faults(archive)
+        archive = corrected(read_archive(path), cfg, evaluator, open_evaluator, seed)
         by = {**origin_of(device, seed, args.workers), **identity(robot, policy)}
-        with naming_what_is_next("some files may not be written", lambda: again):
-            if suffix:
-                print(f"With another controller than was searched, {policy}: the run's own files stay as they are.")
-            write_results(run, archive, metrics, origin_in(config), reproduced_by=by, suffix=suffix)
+        _write_corrected(run, archive, by)
     return archive
+
+
+def _write_corrected(run: RunDirectory, archive: Archive, by: dict[str, Any]) -> None:
+    from qd.show.figures import summary, write_figures
+
+    metrics, before = run.read_metrics(), run.read_summary()
+    write_archive(run.path / ARCHIVE_FILE, archive)
+    write_figures(run.path, archive, metrics)
+    numbers = summary(archive, metrics, gpus=before.get("gpus", 0), origin={})
+    write_atomically(run.path / SUMMARY_FILE, to_json({**before, **numbers, "reproduced_by": by}))

@@ -7,7 +7,7 @@ clipped genes as data.
 
 from collections.abc import Iterator
 from itertools import cycle
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,10 @@ from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.run.settings import SchedulerCfg
+from qd.surrogate import Surrogate
 from sim.spaces.base import TerrainSpace, clipped
 from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-
-if TYPE_CHECKING:
-    from qd.surrogate import Surrogate
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
 
@@ -38,8 +36,6 @@ class RandomEmitter:
         stream: Seed.
     """
 
-    space_sha256: str | None = None  # a checkpoint of a shipped space may lack it
-
     def __init__(
         self, archive: GridArchive, space: TerrainSpace, method: str, batch_size: int, stream: np.random.SeedSequence
     ) -> None:
@@ -53,7 +49,7 @@ class RandomEmitter:
         draw = space.uniform_random if self.method == "uniform_random" else space.hard_random
         return draw(self.batch_size, self._rng)
 
-    def tell(self, **told: Any) -> None:
+    def tell(self, **results: Any) -> None:
         """Learns nothing."""
 
 
@@ -66,10 +62,10 @@ class SurrogateEmitter:
         batch_size: Terrains asked for at once.
     """
 
-    def __init__(self, archive: GridArchive, surrogate: "Surrogate", batch_size: int) -> None:
+    def __init__(self, archive: GridArchive, surrogate: Surrogate, batch_size: int) -> None:
         self.archive, self.surrogate, self.batch_size = archive, surrogate, batch_size
 
-    def tell(self, **told: Any) -> None:
+    def tell(self, **results: Any) -> None:
         """Learns nothing by itself: the surrogate learns from the terrains of all emitters."""
 
 
@@ -90,34 +86,22 @@ class Scheduler:
         seed: Seed of emitters and archives.
     """
 
-    def __init__(
-        self,
-        cfg: SchedulerCfg,
-        *,
-        cells: Cells,
-        seed: int,
-        space: TerrainSpace = SUPER_GAUSSIAN,
-    ) -> None:
-        *streams, shared = np.random.SeedSequence(seed).spawn(cfg.emitters + 3)
-        learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
+    def __init__(self, cfg: SchedulerCfg, *, cells: Cells, seed: int, space: TerrainSpace = SUPER_GAUSSIAN) -> None:
+        *streams, surrogate_stream = np.random.SeedSequence(seed).spawn(cfg.emitters + 3)
+        methods = list(zip(cycle(cfg.methods), streams[2:], strict=False))
+        names = {method for method, _ in methods}
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
-        shapes = space.num_genes, cells.num_cells, cells.num_ratios
-        self.result = _make_archive(*shapes, streams[1], {})
-        in_turn = list(zip(cycle(cfg.methods), streams[2:], strict=False))
-        learns = any(name == "cma_mae" for name, _ in in_turn)
-        self.archive = self.result
-        if learns:
-            self.archive = _make_archive(*shapes, streams[0], learning)
-        self.surrogate: Surrogate | None = None
-        if any(name == "surrogate" for name, _ in in_turn):
-            from qd import surrogate  # with torch
+        self.result = self.archive = _make_archive(space.num_genes, cells, streams[1])
+        if "cma_mae" in names:
+            self.archive = _make_archive(
+                space.num_genes, cells, streams[0], learning_rate=cfg.learning_rate, threshold_min=FITNESS_FLOOR
+            )
+        self.surrogate = Surrogate(cfg, cells, space, surrogate_stream) if "surrogate" in names else None
+        self.emitters: list[Emitter] = [self._make_emitter(cfg, method, space, stream) for method, stream in methods]
+        self._asked: list[NDArray[np.float32] | None] = [None] * cfg.num_groups
 
-            self.surrogate = surrogate.Surrogate(cfg, cells, space, shared)
-        self.emitters: list[Emitter] = [self._emitter(cfg, name, space, stream) for name, stream in in_turn]
-        self._asked: list[NDArray[np.float32] | None] = [None] * cfg.groups
-
-    def _emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
+    def _make_emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
         if method.endswith("random"):
             return RandomEmitter(self.result, space, method, cfg.batch_size, stream)
         if method == "surrogate":
@@ -134,32 +118,27 @@ class Scheduler:
                 batch_size=cfg.batch_size,
                 seed=later,
             )
-        restart_rule: Any = int(cfg.restart_rule) if cfg.restart_rule.isdecimal() else cfg.restart_rule
         improves = method == "cma_me"  # ranks and selects by what is new in the archive, and restarts without it
         return EvolutionStrategyEmitter(
             self.result if improves else self.archive,
             x0=np.zeros(space.num_genes),
-            sigma0=cfg.sigma0,
+            sigma0=space.sigma0 if cfg.sigma0 is None else cfg.sigma0,
             ranker="2imp" if improves else "imp",
-            es=cfg.es,
             selection_rule="filter" if improves else "mu",
-            restart_rule="no_improvement" if improves else restart_rule,
+            restart_rule="no_improvement" if improves else cfg.restart_rule,
             batch_size=cfg.batch_size,
             seed=stream,
         )
 
-    def _part(self, group: int, whole: int) -> slice:
-        """A group's part of a number of things: equal parts, as far as that goes."""
-        emitters = len(self.emitters)
-        return slice(*(whole // emitters * (k * emitters // len(self._asked)) for k in (group, group + 1)))
-
-    def _group(self, group: int) -> list[Emitter]:
-        """The emitters of a group."""
-        return self.emitters[self._part(group, len(self.emitters))]
+    def _emitters_of(self, group: int) -> slice:
+        """Places of a group's emitters: groups are of the same size, as far as that goes."""
+        count, num_groups = len(self.emitters), len(self._asked)
+        return slice(group * count // num_groups, (group + 1) * count // num_groups)
 
     def places(self, group: int) -> slice:
         """Places of a group's terrains among those of an iteration."""
-        return self._part(group, len(self.emitters) * int(self.emitters[0].batch_size))
+        emitters, batch_size = self._emitters_of(group), int(self.emitters[0].batch_size)
+        return slice(emitters.start * batch_size, emitters.stop * batch_size)
 
     def ask(self, group: int = 0) -> NDArray[np.float32]:
         """The next terrains of a group of emitters; the same ones until the group is told their results.
@@ -172,14 +151,14 @@ class Scheduler:
         """
         asked = self._asked[group]
         if asked is None:
-            emitters = self._group(group)
-            proposed = self._proposed([emitter for emitter in emitters if isinstance(emitter, SurrogateEmitter)])
+            emitters = self.emitters[self._emitters_of(group)]
+            proposals = self._propose([emitter for emitter in emitters if isinstance(emitter, SurrogateEmitter)])
             asked = self._asked[group] = np.concatenate(
-                [next(proposed) if isinstance(emitter, SurrogateEmitter) else emitter.ask() for emitter in emitters]
+                [next(proposals) if isinstance(emitter, SurrogateEmitter) else emitter.ask() for emitter in emitters]
             )
         return clipped(asked)
 
-    def _proposed(self, emitters: list[SurrogateEmitter]) -> Iterator[NDArray[np.float32]]:
+    def _propose(self, emitters: list[SurrogateEmitter]) -> Iterator[NDArray[np.float32]]:
         """What the surrogate proposes for some emitters: one search for all, so that no two ask for the same."""
         if self.surrogate is None or not emitters:
             return iter(())
@@ -197,48 +176,42 @@ class Scheduler:
             self.surrogate.compute_on(device)
 
     def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
-        """What became of the terrains that a group last asked for.
+        """Tells a group of emitters what became of the terrains that it last asked for.
 
         Args:
             evaluation: One row a terrain, in the order asked.
             iteration: Number of the iteration, from 1.
             group: Number of the group.
-
-        Raises:
-            RuntimeError: If it asked for nothing.
-            ValueError: If the number of rows differs.
         """
         asked = self._asked[group]
         if asked is None:
             raise RuntimeError("tell() must follow ask(), got no terrains asked for")
         if len(evaluation.fitness) != len(asked):
             raise ValueError(f"evaluation must have {len(asked)} rows, got {len(evaluation.fitness)}")
-        told = _rows(asked, evaluation, iteration)
+        rows = _archive_rows(asked, evaluation, iteration)
         self._asked[group] = None
         if self.surrogate is not None:
-            self.surrogate.learn(asked, evaluation, told["objective"])
-        accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
-        plain = self._add(told, accepted)
-        learned = plain if self.archive is self.result else self.archive.add(**told)
+            self.surrogate.learn(asked, evaluation)
+        added_to_result = self._add_to_result(rows, evaluation.valid & (evaluation.fitness > FITNESS_FLOOR))
+        added = added_to_result if self.archive is self.result else self.archive.add(**rows)
         if self.archive.empty:
             return  # nothing valid yet: an emitter that restarts now would have no elite to start from
         first = 0
-        for emitter in self._group(group):
-            own = slice(first, first + int(emitter.batch_size))
-            added = plain if emitter.archive is self.result else learned
+        for emitter in self.emitters[self._emitters_of(group)]:
+            batch = slice(first, first + int(emitter.batch_size))
+            add_info = added_to_result if emitter.archive is self.result else added
             emitter.tell(
-                **{name: rows[own] for name, rows in told.items()},
-                add_info={name: rows[own] for name, rows in added.items()},
+                **{name: values[batch] for name, values in rows.items()},
+                add_info={name: values[batch] for name, values in add_info.items()},
             )
-            first = own.stop
+            first = batch.stop
 
-    def _add(self, told: dict[str, NDArray[Any]], accepted: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    def _add_to_result(self, rows: dict[str, NDArray[Any]], accepted: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
         """Fills ``result``; status and value of each terrain as pyribs gives them to its emitters."""
-        kept = {name: rows[accepted] for name, rows in told.items()}
         added = {"status": np.zeros(len(accepted), np.int32), "value": np.full(len(accepted), _INVALID_VALUE)}
         if accepted.any():
-            for name, rows in self.result.add(**kept).items():
-                added[name][accepted] = rows
+            for name, values in self.result.add(**{name: column[accepted] for name, column in rows.items()}).items():
+                added[name][accepted] = values
         return added
 
     def elites(self) -> dict[str, NDArray[Any]]:
@@ -254,12 +227,7 @@ class Scheduler:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Scheduler":
-        """A search that goes on where another stood.
-
-        Raises:
-            ValueError: If the state is none of a search.
-        """
-        state = {"asked": [None], **state}  # one of before there were groups was saved when all were told
+        """A search that goes on where another stood; a state of something else is a ValueError."""
         archive, result, emitters, asked = (state.get(name) for name in ("archive", "result", "emitters", "asked"))
         if not (
             isinstance(archive, GridArchive)
@@ -272,47 +240,43 @@ class Scheduler:
             and all(isinstance(genes, np.ndarray | None) for genes in asked)
         ):
             raise ValueError("a search has two archives, emitters, and what they asked for, got something else")
-        search = cls.__new__(cls)
-        search.archive, search.result, search.emitters, search._asked = archive, result, emitters, asked
-        shared = [emitter.surrogate for emitter in emitters if isinstance(emitter, SurrogateEmitter)]
-        search.surrogate = shared[0] if shared else None
-        return search
+        scheduler = cls.__new__(cls)
+        scheduler.archive, scheduler.result, scheduler.emitters, scheduler._asked = archive, result, emitters, asked
+        surrogates = [emitter.surrogate for emitter in emitters if isinstance(emitter, SurrogateEmitter)]
+        scheduler.surrogate = surrogates[0] if surrogates else None
+        return scheduler
 
 
-_FIELDS = (
-    "genes", "ratios", "penalty_mean", "penalty_std", "collision_rate", "goal_rate", "fallen_rate", "invalid_episodes",
-    "episodes", "iteration",
-)  # fmt: skip
+_RATES = ("collision_rate", "goal_rate", "fallen_rate")
+_COUNTS = ("invalid_episodes", "episodes", "iteration")
+_BY_RATIO = ("ratios", "penalty_mean", "penalty_std")
+_FIELDS = ("genes", *_BY_RATIO, *_RATES, *_COUNTS)
 
 
-def _make_archive(
-    num_genes: int,
-    num_cells: int,
-    num_ratios: int,
-    stream: np.random.SeedSequence,
-    learning: dict[str, Any],
-) -> GridArchive:
-    per_ratio = ((num_ratios,), np.float64)
-    rate, count = ((), np.float64), ((), np.int64)
-    shapes = ((num_genes,), np.float32), per_ratio, per_ratio, per_ratio, rate, rate, rate, count, count, count
-    own: dict[str, Any] = dict(zip(_FIELDS, shapes, strict=True))
+def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: float) -> GridArchive:
+    extra_fields: dict[str, Any] = {
+        "genes": ((num_genes,), np.float32),
+        **dict.fromkeys(_BY_RATIO, ((cells.num_ratios,), np.float64)),
+        **dict.fromkeys(_RATES, ((), np.float64)),
+        **dict.fromkeys(_COUNTS, ((), np.int64)),
+    }
     return GridArchive(
         solution_dim=num_genes,
-        dims=[num_cells],
-        ranges=[(0, num_cells)],
+        dims=[cells.num_cells],
+        ranges=[(0, cells.num_cells)],
         seed=stream,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
         solution_dtype=np.float32,
         objective_dtype=np.float64,
         measures_dtype=np.float64,
-        extra_fields=own,
+        extra_fields=extra_fields,
         **learning,
     )
 
 
-def _rows(solutions: NDArray[np.float32], evaluation: Evaluation, iteration: int) -> dict[str, NDArray[Any]]:
+def _archive_rows(solutions: NDArray[np.float32], evaluation: Evaluation, iteration: int) -> dict[str, NDArray[Any]]:
     """What both archives are told: one row a terrain."""
-    taken = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
-    return taken | {
+    columns = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
+    return columns | {
         "solution": solutions,
         "objective": evaluation.fitness,
         "measures": evaluation.cell[:, None] + 0.5,

@@ -1,35 +1,102 @@
 """The search: ask for terrains, let robots cross them, tell the emitters what became of them."""
 
 import time
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive
-from qd.faults import confirm_all, fault_words
+from qd.archive import Archive, read_archive
 from qd.fitness import Evaluation, concatenated, evaluation_of
-from qd.fresh import Open, corrected, drawn_elites, numbers_of, reevaluate
-from qd.run.arguments import Job
-from qd.run.directory import CONFIG_FILE, Metrics, RunDirectory, archive_of, claimed, reached, write_results
-from qd.run.progress import ProgressBar, plan
-from qd.run.settings import SearchCfg, code_of
-from qd.workers.evaluator import Evaluate, episode_seeds, open_evaluator, origin_of, pipeline_of, worker_status
+from qd.fresh import drawn_elites, numbers_of, reevaluate
+from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
+from qd.run.progress import ProgressBar, clock, plan
+from qd.run.settings import SearchCfg
+from qd.scheduler import Scheduler
+from qd.show.figures import summary, write_figures
+from qd.workers.evaluator import (
+    Compute,
+    Evaluate,
+    EvaluatorCfg,
+    OpenEvaluator,
+    check_policy,
+    episode_seeds,
+    open_evaluator,
+    origin_of,
+    pipeline_of,
+    worker_status,
+)
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import merged
-from sim.files.command import command_line, naming_what_is_next
-
-if TYPE_CHECKING:
-    from qd.scheduler import Scheduler
-    from sim.rollout import RolloutResult
+from sim.files.atomic import to_json, write_atomically
+from sim.files.command import Interrupted
+from sim.policy.spec import spec_of
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from sim.rollout import RolloutResult
+from sim.spaces.registry import get_space
 
 MOST_DRAWN = 200
 """Elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)."""
 
 
-def search_terrains(
-    cfg: SearchCfg, run: RunDirectory, scheduler: "Scheduler", metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
+def search(
+    cfg: SearchCfg,
+    path: Path,
+    compute: Compute,
+    *,
+    robot: RobotCfg | None = None,
+    policy: str | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> Archive:
+    """Searches, or goes on with the search in a directory, until it has done its iterations.
+
+    Args:
+        cfg: The search.
+        path: Its run directory. Nothing is written before the simulation stands.
+        compute: Where terrains are crossed.
+        robot: The robot, if it is not shipped.
+        policy: Where the controller lies, if not where ``cfg`` says.
+        open_evaluator: Opens what crosses terrains.
+
+    Returns:
+        The archive; with what judging says of its elites if nothing was left to do.
+
+    Raises:
+        Interrupted: On Ctrl-C or SIGTERM; all iterations that ended are saved.
+        EvaluatorError: If a worker is lost; likewise.
+        AllInvalidError: If no episode of a group is valid; likewise.
+    """
+    robot = robot or get_robot(cfg.robot)
+    policy = policy or spec_of(cfg.policy, robot)
+    check_policy(policy, robot, compute.device)
+    evaluator = _evaluator_cfg(cfg, robot, policy, compute)
+    run = RunDirectory(path)
+    with claimed(path):
+        saved = run.load(cfg)
+        scheduler, metrics = begin(cfg) if saved is None else (Scheduler.from_state(saved[0]), saved[1])
+        scheduler.compute_on(compute.device)
+        done = len(metrics)
+        print(plan(cfg, path, done, compute.device, evaluator.num_workers), flush=True)
+        if note := robot.scaled_by_another(policy):
+            print(note)
+        if done < cfg.iterations:
+            with _saying_what_is_saved(path), open_evaluator(evaluator) as evaluate:
+                run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
+                with ProgressBar(cfg.iterations, done) as bar:
+                    run_iterations(cfg, run, scheduler, metrics, evaluate, bar)
+        archive = archive_of(cfg, scheduler, len(metrics))
+        if (stored := _written_archive(run, archive)) is not None:
+            return stored
+        write_results(run, archive, metrics)
+    return archive
+
+
+def run_iterations(
+    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
 ) -> None:
     """Runs the iterations that are left, and saves each.
 
@@ -45,7 +112,7 @@ def search_terrains(
         evaluate: Crosses terrains.
         bar: Shows progress.
     """
-    pipeline, num_groups = pipeline_of(evaluate), cfg.scheduler.groups
+    pipeline, num_groups = pipeline_of(evaluate), cfg.scheduler.num_groups
     pipeline.clear()
     num_under_way, began = 0, time.perf_counter()
     for iteration in range(len(metrics) + 1, cfg.iterations + 1):
@@ -75,12 +142,12 @@ def search_terrains(
         row |= _timing(row, ended - began, evaluate)  # from the end of the iteration before, so saving counts
         began = ended
         metrics.append(row)
-        run.save(cfg, scheduler, metrics, archive)
+        run.save(cfg, scheduler.state(), metrics, archive)
         status = worker_status(evaluate)
         bar.show(row, None if status is None else str(status))
 
 
-def _group_seeds(cfg: SearchCfg, scheduler: "Scheduler", iteration: int, group: int) -> NDArray[np.uint32]:
+def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: int) -> NDArray[np.uint32]:
     """Seeds of a group's terrains, which are those of their places in the iteration."""
     return episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
 
@@ -97,7 +164,7 @@ def samples_elites(cfg: SearchCfg, iteration: int) -> bool:
 
 
 def metrics_row(
-    archive: Archive, result: "RolloutResult", evaluation: Evaluation, iteration: int, search_s: float
+    archive: Archive, result: RolloutResult, evaluation: Evaluation, iteration: int, search_s: float
 ) -> dict[str, Any]:
     """An iteration's row of metrics without its timing.
 
@@ -129,109 +196,83 @@ def _sample_elites(cfg: SearchCfg, archive: Archive, evaluate: Evaluate) -> dict
     return numbers_of(fresh, cfg.cells, sampled=True)
 
 
-def begin(
-    cfg: SearchCfg, device: str, loaded: "tuple[Scheduler, Metrics] | None" = None
-) -> "tuple[Scheduler, Metrics]":
-    """A search and its metrics: one that goes on, or one that has asked for nothing yet.
-
-    Args:
-        cfg: The search.
-        device: Warp device of what it computes beside the simulation.
-        loaded: One that goes on.
-    """
-    search, metrics = loaded or (_new(cfg), [])
-    search.compute_on(device)
-    return search, metrics
-
-
-def _new(cfg: SearchCfg) -> "Scheduler":
-    from qd.scheduler import Scheduler  # pyribs takes two seconds to import
-    from sim.spaces.registry import get_space
-
-    return Scheduler(
-        cfg.scheduler,
-        space=get_space(cfg.space, cfg.space_sha256),
-        cells=cfg.cells,
-        seed=cfg.seed,
+def _evaluator_cfg(cfg: SearchCfg, robot: RobotCfg, policy: str, compute: Compute) -> EvaluatorCfg:
+    """What crosses an iteration's terrains, all of them at once."""
+    return EvaluatorCfg(
+        robot=robot,
+        policy=policy,
+        num_terrains=cfg.scheduler.num_terrains,
+        num_replicas=cfg.replicas,
+        device=compute.device,
+        workers=compute.workers,
+        lots=cfg.scheduler.num_groups,
+        num_envs=compute.num_envs,
+        space=get_space(cfg.space, cfg.space_sha256).name,  # where its code is now
     )
 
 
-def run_search(job: Job, *, open_evaluator: Open = open_evaluator) -> Archive:
-    """Runs a search to its end: the loop, figures, numbers, and what to do next.
+def begin(cfg: SearchCfg) -> tuple[Scheduler, Metrics]:
+    """A search that has asked for nothing yet, and its metrics."""
+    space = get_space(cfg.space, cfg.space_sha256)
+    return Scheduler(cfg.scheduler, space=space, cells=cfg.cells, seed=cfg.seed), []
+
+
+@contextmanager
+def _saying_what_is_saved(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(f"Stopped; finished iterations are saved: go on with --resume {path}") from None
+
+
+def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive:
+    """What a search has found after a number of iterations."""
+    return Archive(
+        robot=cfg.robot,
+        robot_sha256=cfg.robot_sha256,
+        policy_sha256=cfg.policy_sha256,
+        space=cfg.space,
+        space_sha256=cfg.space_sha256,
+        penalty_definition=cfg.penalty_definition,
+        penalties=cfg.fitness.penalties,
+        scales=cfg.fitness.scales,
+        intervals=cfg.intervals,
+        collision_bit=cfg.collision_bit,
+        iterations=iterations,
+        **scheduler.elites(),
+    )
+
+
+def _written_archive(run: RunDirectory, archive: Archive) -> Archive | None:
+    """The archive of a run's file where it is this one, judged or not, and its numbers lie beside it."""
+    try:
+        stored = read_archive(run.path)
+    except (OSError, ValueError):
+        return None  # it is made again
+    is_whole = stored.has_elites_of(archive) and run.read_summary().get("iterations") == archive.iterations
+    return stored if is_whole else None
+
+
+def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None:
+    """Writes what a search leaves to look at, and says what it is.
 
     Args:
-        job: What to do; nothing is written before the simulation stands.
-        open_evaluator: Opens what crosses the terrains.
-
-    Returns:
-        The archive.
-
-    Raises:
-        ValueError: If the run directory does not fit the job.
-        Interrupted: On Ctrl-C or SIGTERM; all iterations that ended are saved.
-        EvaluatorError: If a worker is lost; likewise.
-        AllInvalidError: If no episode of an iteration is valid; likewise.
+        run: The run directory, claimed.
+        archive: What was found.
+        metrics: One row an iteration.
     """
-    cfg, run = job.cfg, RunDirectory(job.path)
-    with claimed(job.path):
-        loaded = run.load(cfg) if job.resumes else None
-        done = len(loaded[1]) if loaded else 0
-        if done > cfg.iterations:
-            raise ValueError(
-                f"iterations must be at least {done}, as many as {job.path} has done, got {cfg.iterations}"
-            )
-        search, metrics = begin(cfg, job.device, loaded)
-        print(plan(cfg, job.path, done, job.device, job.evaluator.num_workers), flush=True)
-        _mention_fresh_values(job, run, done)
-        own = [{**job.session, "iterations": cfg.iterations}] if done < cfg.iterations else []
-        origin = {**job.origin, "sessions": [*reached(job.origin["sessions"], done), *own]}
-        with naming_what_is_next("finished iterations are saved", lambda: _how_to_go_on(job)):
-            with ExitStack() as opened:
-                evaluate = None
-                if done < cfg.iterations:
-                    evaluate = opened.enter_context(open_evaluator(job.evaluator))
-                run.write_config(cfg, origin)
-                if evaluate is not None:
-                    with ProgressBar(cfg.iterations, done) as bar:
-                        search_terrains(cfg, run, search, metrics, evaluate, bar)
-            found = archive_of(cfg, search, len(metrics))
-            archive = run.with_fresh_values(found)
-            write_results(run, archive, metrics, origin)
-        if job.reproduce:
-            again = f"Go on with:  {job.reevaluate_command}"
-            with naming_what_is_next("the archive is saved as found", lambda: again):
-                archive = run.with_faults(corrected(found, cfg, job.evaluator, open_evaluator, cfg.seed))
-                # The run's numbers are of the machine that searched, the fresh episodes of this one.
-                by = origin_of(job.device, cfg.seed, job.evaluator.workers)
-                write_results(run, archive, metrics, origin, reproduced_by=by)
-        if job.confirm:
-            later = f"Go on with:  {job.confirm_command}"
-            with naming_what_is_next("what was crossed is kept", lambda: later):
-                archive = confirm_all(run, archive, job.evaluator, open_evaluator, cfg.seed)
-        for line in fault_words(archive):
-            print(line)
-    invalid = invalid_iterations(metrics)
-    if invalid is not None:
+    config = run.read_config()
+    origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
+    run.write_derived(metrics, archive)
+    figures = write_figures(run.path, archive, metrics)
+    gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
+    numbers = summary(archive, metrics, gpus=gpus, origin=origin)
+    write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
+    print(
+        f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
+        f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
+        f"in {clock(numbers['wall_s'])}"
+    )
+    print(f"Figures: {', '.join(map(str, figures))}")
+    if invalid := invalid_iterations(metrics):
         print(f"Warning: {invalid}")
-    if len(archive):
-        from sim.spaces.registry import is_own
-
-        space = job.evaluator.space if is_own(job.evaluator.space) else None
-        worst = command_line("replay", robot=job.robot, run=job.path, elite=0, policy=code_of(cfg), space=space)
-        print(f"Next, see the worst terrain:  {worst}")
-    return archive
-
-
-def _mention_fresh_values(job: Job, run: RunDirectory, done: int) -> None:
-    """Says so before a run loses what fresh episodes said of its elites."""
-    if job.resumes and not job.reproduce and done < job.cfg.iterations and run.fresh_archive():
-        print(
-            "Its elites were evaluated again with fresh episodes; the first new iteration drops those values. "
-            f"Afterwards:  {job.reevaluate_command}"
-        )
-
-
-def _how_to_go_on(job: Job) -> str:
-    if not (job.path / CONFIG_FILE).exists():
-        return "No iteration is finished: start it again"
-    return f"Go on with:  {job.resume_command}"

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.networks import MEMBERS, Networks, Training
-from qd.run.settings import SchedulerCfg, still_there
+from qd.run.settings import SchedulerCfg
 from qd.variation import varied
 from sim.corridor import corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch
@@ -133,17 +133,16 @@ class Surrogate:
         moments = self._training.moments
         self._training = Training(self._networks.to(self.device), self._loss, self.device, moments)
 
-    def learn(self, genes: NDArray[np.float32], evaluation: Evaluation, fitness: NDArray[np.float64]) -> None:
+    def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
         """Remembers terrains, and trains for their share of an iteration's steps; draws from all that it remembers.
 
         Args:
             genes: Of the terrains told, shape (N, num_genes).
             evaluation: What became of them; invalid ones are left out.
-            fitness: What they are told with, shape (N,).
         """
         valid = evaluation.valid
         if valid.any():
-            self._remember(clipped(genes[valid]), _targets_of(evaluation, fitness)[valid])
+            self._remember(clipped(genes[valid]), _targets_of(evaluation)[valid])
         if len(self) >= FEWEST:
             self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
@@ -326,12 +325,10 @@ class Surrogate:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """On the CPU, until :meth:`compute_on` moves it."""
         num_ratios, intervals, collision_bit = state["cells"]
-        self.cfg, self.device = SchedulerCfg(**still_there(state["cfg"])), "cpu"
+        self.cfg, self.device = SchedulerCfg(**state["cfg"]), "cpu"
         self.cells = Cells(num_ratios, intervals, collision_bit=collision_bit)
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets, self._scale = (state[k] for k in ("rng", "genes", "targets", "scale"))
-        if self._genes.dtype != np.int16:  # of before they were kept so
-            self._genes = _in_units(self._genes)
         self._make_networks()
         learned = [{name: torch.from_numpy(value).clone() for name, value in one.items()} for one in state["learned"]]
         values, weights = [one.pop("weights") for one in learned], list(self._networks.parameters())
@@ -346,13 +343,13 @@ def _in_units(genes: NDArray[np.float32]) -> NDArray[np.int16]:
     return np.rint(genes * _GENE_UNITS).astype(np.int16)
 
 
-def _targets_of(evaluation: Evaluation, fitness: NDArray[np.float64]) -> NDArray[np.float32]:
+def _targets_of(evaluation: Evaluation) -> NDArray[np.float32]:
     """What is to be predicted of terrains, shape (N, 3 P + 4)."""
     columns = (
         evaluation.ratios,
         np.log(evaluation.penalty_mean + _LEAST_PENALTY),
         np.log(evaluation.penalty_std + _LEAST_PENALTY),
-        np.arcsinh(fitness)[:, None],
+        np.arcsinh(evaluation.fitness)[:, None],
         evaluation.goal_rate[:, None],
         evaluation.collision_rate[:, None],
         (evaluation.collision_rate > 0.0)[:, None],

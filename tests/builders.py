@@ -16,7 +16,8 @@ from tensordict import TensorDict
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
 from qd.archive import ARCHIVE_FILE, FRESH, Archive, FaultCounts, FreshValues, read_archive, write_archive
 from qd.run.directory import CONFIG_FILE
-from sim.files.records import PENALTY_DEFINITION
+from sim.files.records import PENALTY_DEFINITION, robot_identity
+from sim.robots.shipped import ROBOTS
 
 SPACING = 0.05
 RNG_SEED = 5
@@ -36,7 +37,7 @@ def small_archive(num_elites: int = 3) -> Archive:
     rows = rng.random(num_elites)
     return Archive(
         robot="anymal",
-        penalty_definition=PENALTY_DEFINITION,
+        **robot_identity(ROBOTS["anymal"]),
         space="super_gaussian",
         penalties=("yaw_rate", "vel_x"),
         scales=(0.5, 2.0),

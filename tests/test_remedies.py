@@ -25,7 +25,7 @@ SMALL = {
     "report": [*CPU, "--elites", "1", "--episodes", "1"],
     "export": ["--formats", "npz"],
 }
-SEARCH = ["--emitters", "1", "--batch-size", "4", "--replicas", "2"]
+SEARCH = ["--scheduler.emitters", "1", "--scheduler.batch-size", "4", "--replicas", "2"]
 KICKED = ["--robot", "kicked/dog.py", "--policy", "kicked/kick.py:act"]
 RUN = ["--run", "runs/dog-small-0"]
 TRAIN = ["--robot", "bare/dog.py", "--run-dir", "runs/base"]

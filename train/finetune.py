@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from qd.archive import Archive
 from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
 from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, split_elites
-from qd.run.directory import RunDirectory, published_or_newest
+from qd.run.directory import RunDirectory, find_run
 from sim.policy.export import export_onnx
 from sim.policy.loaders import MlpPolicy, load_policy
 from sim.policy.spec import SHIPPED, controller_hash, is_same
@@ -141,7 +141,7 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
     if cfg.mix != "generated":
         space = load_space(cfg.space, cfg.ground)
         return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
-    paths = tuple(map(Path, cfg.archive)) or (published_or_newest(robot, cfg.policy, flag="archive"),)
+    paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
     archives = [read_elites(path, robot, cfg.space) for path in paths]
     spaces = tuple(map(space_of, archives))
     splits = [_split(cfg, archive) for archive in archives]

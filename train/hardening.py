@@ -12,16 +12,15 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from qd.archive import read_archive
+from qd.archive import Archive, read_archive
 from qd.evaluate.evaluate import EPISODES, sizes_for
 from qd.evaluate.sets import paper_terrains
 from qd.faults import is_judged
-from qd.fresh import Open
-from qd.run.arguments import Archive, job_of
-from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, RunDirectory, claimed
+from qd.fresh import Open, Reevaluate, reevaluate_run
+from qd.run.directory import ROUNDS_FILE, RunDirectory, claimed
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
-from qd.run.settings import SearchCfg, changed, differences, preset
-from qd.search import run_search
+from qd.run.settings import SearchCfg, differences, preset
+from qd.search import search
 from qd.workers.evaluator import Compute, check_policy, open_evaluator, resolve_device
 from sim.files.atomic import is_leftover, read_json
 from sim.files.command import Interrupted, command_line, naming_what_is_next
@@ -193,7 +192,7 @@ class Hardening:
     def is_searched(self, stage: Stage) -> bool:
         """Whether the search against a controller is over, its fresh episodes included."""
         run = RunDirectory(stage.search)
-        archive = run.fresh_archive()
+        archive = judged_archive(run)
         whole = run.read_summary().get("reproduced_by")  # a kill may come between the archive and its numbers
         return archive is not None and archive.iterations >= self.search_iterations and bool(whole)
 
@@ -239,9 +238,9 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
     flags = replace(flags, space=flags.space and space.name, ground=None)
     on_cuda = device.startswith("cuda")
     sizes = {name: getattr(flags, name) for name in ("emitters", "batch_size", "replicas")}
-    search = changed(preset(flags.preset or ("wide" if on_cuda else "small"), robot, str(policy)), sizes)
-    an_iteration = search.episodes_per_iteration
-    wanted = flags.search_episodes or (_GPU_EPISODES if on_cuda else search.iterations * an_iteration)
+    searched = search_cfg(flags, robot, str(policy), space, "wide" if on_cuda else "small")
+    an_iteration = searched.episodes_per_iteration
+    wanted = flags.search_episodes or (_GPU_EPISODES if on_cuda else searched.iterations * an_iteration)
     tuned = {name: getattr(flags, f"tune_{name}") or 0 for name in ("iterations", "num_envs", "terrains")}
     large = {} if robot.name == "cassie" else LARGE
     tuning = replace(FinetuneCfg.of(robot), **tuned).sized(robot, device, **large)
@@ -263,7 +262,7 @@ def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Har
         compared=dict.fromkeys(flags.against, flags.rounds),
         open_evaluator=open_evaluator,
     )
-    found = replace(found, settings=_settings_of(found, search, sizes))
+    found = replace(found, settings=_settings_of(found, searched, sizes))
     found = replace(found, compared={**_known_comparisons(found), **found.compared})
     for certifier in found.certifiers(str(policy)).values():
         check_policy(certifier, robot, device)
@@ -328,7 +327,7 @@ def _refuse_changed(job: Hardening, stage: Stage) -> None:
         ValueError: If it was made longer, its controller is another now, a training before it is gone, or one certified
             that is not asked elsewhere.
     """
-    archive = RunDirectory(stage.search).fresh_archive()
+    archive = judged_archive(RunDirectory(stage.search))
     if archive is None:
         return
     if archive.iterations > job.search_iterations:
@@ -451,17 +450,31 @@ def _search(job: Hardening, stage: Stage) -> None:
     """Searches against a controller, or goes on; ends with fresh episodes, and with contact resolved."""
     if job.is_searched(stage):
         return
-    if (stage.search / CONFIG_FILE).exists():
-        own: dict[str, Any] = {"resume": stage.search}
-    else:
-        sizes = ("preset", "emitters", "batch_size", "replicas")
-        own = {name: getattr(job.flags, name) for name in sizes}
-        own |= {"run_dir": stage.search, "seed": stage.seed}
-    args = Archive(
-        **_where(job), **own, policy=_named(job, stage), iterations=job.search_iterations, reproduce="yes",
-        confirm="yes",
-    )  # fmt: skip
-    run_search(job_of(args), open_evaluator=job.open_evaluator)
+    policy = stage.policy if _named(job, stage) else None
+    default = "wide" if job.device.startswith("cuda") else "small"
+    cfg = replace(
+        search_cfg(job.flags, job.robot, policy, job.space, default), seed=stage.seed, iterations=job.search_iterations
+    )
+    compute = Compute(job.device, job.flags.workers, job.flags.num_envs)
+    search(cfg, stage.search, compute, robot=job.robot, policy=stage.policy, open_evaluator=job.open_evaluator)
+    again = Reevaluate(**_where(job), run=stage.search, policy=_named(job, stage))
+    reevaluate_run(again, open_evaluator=job.open_evaluator)
+
+
+def judged_archive(run: RunDirectory) -> Archive | None:
+    """The archive of a run if it has fresh values; a damaged one, which is made again, has none."""
+    try:
+        archive = read_archive(run.path)
+    except (OSError, ValueError):
+        return None
+    return None if archive.fresh is None else archive
+
+
+def search_cfg(flags: Harden, robot: RobotCfg, policy: str | None, space: TerrainSpace, default: str) -> SearchCfg:
+    """The searches of a hardening, with the default preset if the flags have none."""
+    cfg = preset(flags.preset or default, robot, policy, space=space.name, space_sha256=space.sha256)
+    sizes = {name: size for name in ("emitters", "batch_size") if (size := getattr(flags, name)) is not None}
+    return replace(cfg, replicas=flags.replicas or cfg.replicas, scheduler=replace(cfg.scheduler, **sizes))
 
 
 def _judge(job: Hardening, stage: Stage) -> None:

@@ -31,46 +31,30 @@ _ADMITTED = {
     "ribs.emitters._evolution_strategy_emitter": ("EvolutionStrategyEmitter",),
     "ribs.emitters._iso_line_emitter": ("IsoLineEmitter",),
     "ribs.emitters.opt._cma_es": ("CMAEvolutionStrategy", "DecompMatrix"),
-    "ribs.emitters.opt._sep_cma_es": ("DiagonalMatrix", "SeparableCMAEvolutionStrategy"),
     "ribs.emitters.rankers": ("ImprovementRanker", "TwoStageImprovementRanker"),
     "qd.scheduler": ("RandomEmitter", "SurrogateEmitter"),
     "qd.surrogate": ("Surrogate",),
 }
 """Classes that a state may hold, by their modules."""
-_FORMER = {("qd.scheduler", "VariationEmitter")}
-"""Classes of former versions, whose searches cannot go on."""
 
 
 class _StateUnpickler(pickle.Unpickler):
     """Builds plain values and the admitted classes."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in _FORMER:
-            raise pickle.UnpicklingError("it is of a former version, whose map_elites was another")
         if name not in _ADMITTED.get(module, ()):
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is no part of a search")
         return super().find_class(module, name)
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Writes the state of a search, atomically.
-
-    Args:
-        path: File to write.
-        state: Plain values, NumPy arrays and pyribs objects.
-    """
+    """Writes the state of a search, plain values, NumPy arrays and pyribs objects, atomically."""
     payload = zlib.compress(pickle.dumps(state, protocol=5), level=1)  # higher levels save 2 % and cost twice the time
     write_atomically(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Reads the state of a search.
-
-    Args:
-        path: A file that :func:`save_checkpoint` wrote.
-
-    Returns:
-        The state.
+    """Reads the state of a search that :func:`save_checkpoint` wrote.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -93,7 +77,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     try:
         state = _StateUnpickler(io.BytesIO(_decompress(payload))).load()
     except Exception as error:  # a stream of pickle opcodes can fail with anything
-        raise ValueError(f"{path} is no checkpoint of a search: {_one_line(error)}; {_REMEDY}") from None
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"{path} is no checkpoint of a search: {reason}; {_REMEDY}") from None
     if not isinstance(state, dict):
         raise ValueError(f"{path} is no checkpoint of a search: expected a dictionary, got {type(state).__name__}")
     return state
@@ -105,7 +90,3 @@ def _decompress(payload: bytes) -> bytes:
     if not stream.eof:
         raise ValueError(f"its state is cut off or larger than {_MAX_STATE_BYTES >> 20} MB")
     return data
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())

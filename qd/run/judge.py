@@ -4,17 +4,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from qd.archive import ARCHIVE_FILE, Archive, read_archive
 from qd.faults import Work, certify, confirm, confirm_in_mujoco_c, fault_words, known_names, saving
-from qd.fresh import Open
+from qd.fresh import Open, Reevaluate, reevaluate_run
 from qd.run.arguments import check_certifiers, evaluator_of
-from qd.run.directory import CONFIG_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed, newest_run
-from qd.run.settings import SearchCfg, as_settings, code_of, is_searched, own_policy
-from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
+from qd.run.directory import CONFIG_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed, find_run
+from qd.run.settings import SearchCfg, as_settings, is_searched, own_policy
+from qd.workers.evaluator import Compute, open_evaluator, origin_of, resolve_device
 from sim.files.atomic import read_json
 from sim.files.command import InSpace, OfRobot, Where, Who, chosen_elites, command_line, naming_what_is_next
 from sim.files.intervals import rate_words
@@ -92,8 +92,7 @@ def config_of(args: OfRobot, run: Path | None, space: str | None) -> tuple[Path,
     from sim.robots.find import get_robot, robot_of
     from sim.spaces.registry import get_space, load_space
 
-    policy = args.policy if isinstance(args, Who) else None
-    path = run or newest_run(get_robot(args.robot or "anymal"), policy)
+    path = find_run(get_robot(args.robot), run, published="never")
     cfg = RunDirectory(path).read_cfg()
     if space is not None:
         load_space(space)
@@ -121,7 +120,7 @@ def judged_run(path: Path, cfg: SearchCfg, robot: "RobotCfg", elite: str) -> Ite
                 "other penalties or scales: put back the one that is not this run's"
             )
         if archive.fresh is None:
-            remedy = command_line("reevaluate", robot=robot.spec, run=path, policy=code_of(cfg))
+            remedy = command_line("reevaluate", robot=robot.spec, run=path, policy=cfg.policy)
             raise ValueError(
                 f"{path} must have fresh episodes of its elites, which say what fails, got none: run `{remedy}` first"
             )
@@ -323,3 +322,38 @@ def _tell(archive: Archive, path: Path) -> None:
     for line in fault_words(archive):
         print(line)
     print(f"In {path / SUMMARY_FILE} and {path / ARCHIVE_FILE}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """A search whose elites are judged."""
+
+    run: Path
+    cfg: SearchCfg
+    robot: "RobotCfg"
+    policy: str
+    """The controller that was searched, where it is now."""
+
+
+def find_search(run: Path, *, robot: str | None = None, policy: str | None = None, space: str | None = None) -> Search:
+    """The search of a run; robot, controller and space are named if they are code or have moved."""
+    path, cfg, body = config_of(OfRobot(robot=robot), run, space)
+    return Search(run=path, cfg=cfg, robot=body, policy=searched_policy(path, cfg, body, policy, "searched"))
+
+
+def judge(
+    run: Path,
+    *,
+    compute: Compute,
+    robot: str | None = None,
+    policy: str | None = None,
+    space: str | None = None,
+    open_evaluator: Open = open_evaluator,
+) -> Archive:
+    """Fresh episodes of all elites of a run, and contact resolved for those that fail."""
+    flags: dict[str, Any] = {
+        "run": run, "robot": robot, "policy": policy, "space": space, "device": compute.device,
+        "workers": compute.workers, "num_envs": compute.num_envs,
+    }  # fmt: skip
+    reevaluate_run(Reevaluate(**flags), open_evaluator=open_evaluator)
+    return confirm_run(Confirm(**flags), open_evaluator=open_evaluator)

@@ -18,7 +18,6 @@ from qd.minimal import MOST_PARTS, Case, How, Minimal, Trial, fresh_counts, gene
 from qd.run.arguments import evaluator_of
 from qd.run.judge import certifiers_of, config_of, judged_run, searched_policy
 from qd.run.minimal_file import MINIMAL_FILE, NUMBERS_FILE, Known, read_minimal, write_minimal
-from qd.run.settings import code_of
 from qd.workers.evaluator import open_evaluator, origin_of, resolve_device
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import InSpace, Where, Who, command_line, naming_what_is_next
@@ -272,7 +271,7 @@ def minimise_run(args: Minimise, *, open_evaluator: Open = open_evaluator) -> di
         print(line)
     print(f"In {path / NUMBERS_FILE}, {path / MINIMAL_FILE} and {path / FIGURE_FILE}." if numbers["elites"] else "")
     if numbers["elites"] and not (args.confirm or certifiers):
-        named = {"robot": robot.spec, "run": path, "elite": args.elite, "policy": code_of(cfg), "confirm": True}
+        named = {"robot": robot.spec, "run": path, "elite": args.elite, "policy": cfg.policy, "confirm": True}
         print(f"Next, confirm them with contact resolved:  {command_line('minimise', **named)}")
     return numbers
 

@@ -25,15 +25,7 @@ def clock(seconds: float) -> str:
 
 
 def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
-    """What a search is about to do, in words.
-
-    Args:
-        cfg: The search.
-        path: Its run directory.
-        done: Iterations already done.
-        device: Warp device name.
-        workers: How many processes or GPUs evaluate.
-    """
+    """What a search is about to do, in words, after ``done`` iterations, by so many processes or GPUs."""
     left = cfg.iterations - done
     on_gpu = device.startswith("cuda")
     where = f"{workers} process{'es' * (workers > 1)} on the CPU"
@@ -41,7 +33,7 @@ def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> st
         where = device if workers == 1 else f"{workers} GPUs"
     controller = "its shipped controller" if cfg.policy == SHIPPED else f"controller {cfg.policy}"
     if not left:
-        return f"All {done} iterations of {path} are done; writing its figures and results again."
+        return f"All {done} iterations of {path} are done."
     iterations = f"{left:,} iterations" + (f" after {done:,} done" if done else "")
     steps_per_s = workers * _STEPS_PER_S["cuda" if on_gpu else "cpu"]
     duration = clock(left * cfg.episodes_per_iteration * _EPISODE_STEPS / steps_per_s)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from qd.archive import Archive, read_archive
 from qd.fitness import FitnessCfg
-from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, named_by, newest_or_published
+from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
 from qd.run.settings import SearchCfg, own_policy, suffix_of
 from sim.files.command import chosen_elites, command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, label_suffix, spec_of
@@ -166,10 +166,10 @@ def find_archive(named: str | None, run: Path | None, policy: str | None = None,
 
     if run is None or named is not None:
         robot_named(named)  # an unknown name is said first
-    run = run or newest_or_published(robot_named(named), policy)
+    run = run or find_run(robot_named(named))
     archive = read_archive(run)
-    robot = robot_of(named_by(run, archive), named, run)
-    check_space(archive, run, space)
+    robot = robot_of(archive.named(), named, run)
+    check_space(archive, space)
     unknown = [name for name in archive.penalties if name not in robot.penalties]
     if unknown:
         raise ValueError(

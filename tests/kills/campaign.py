@@ -16,7 +16,7 @@ from qd.run.directory import CONFIG_FILE
 from tests.kills import searches
 
 ROOT = Path(__file__).resolve().parents[2]
-REAL_SIZE = ["--emitters", "1", "--batch-size", "4", "--replicas", "2", "--seed", "7", "--reproduce", "no"]
+REAL_SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "4", "--replicas", "2", "--seed", "7"]
 _LINGER_S = 30.0  # a worker learns that its parent is gone when it next has something to say: once it is built
 _PATIENCE_S = 600.0
 

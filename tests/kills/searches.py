@@ -6,23 +6,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from qd import search as searching
 from qd.archive import ARCHIVE_FILE, read_archive
-from qd.run.arguments import Archive as ArchiveCommand
-from qd.run.arguments import job_of
+from qd.commands import Archive as ArchiveCommand
 from qd.run.checkpoint import load_checkpoint
 from qd.run.directory import CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE
 from qd.scheduler import Scheduler
-from qd.search import run_search
 from qd.show import figures
 from sim.files.atomic import write_atomically
 from sim.files.command import run_command
 from tests.kills.steps import Steps
-from tests.qd.searches import TIMES
+from tests.qd.searches import TIMES, crossing_by
 from tests.qd.stand_in import open_stand_in
 
 POLICY = "tests.sim.policies:stand"
-SIZE = ["--emitters", "2", "--batch-size", "4", "--replicas", "2", "--seed", "5", "--restart-rule", "4"]
-SIZE += ["--intervals", "3"]  # few cells: a small checkpoint
+SIZE = ["--scheduler.emitters", "2", "--scheduler.batch-size", "4", "--replicas", "2", "--seed", "5"]
+SIZE += ["--scheduler.restart-rule", "4", "--fitness.intervals", "3"]  # few cells: a small checkpoint
 SIZE += ["--method", "cma_mae+map_elites"]  # networks of a surrogate would learn longer than the stand-in takes
 _TIMES = (*TIMES, "rollout_s", "physics_steps", "robot_steps", "idle_share")  # of this machine and session
 
@@ -52,7 +51,8 @@ class StandInArchive(ArchiveCommand):
 
     def execute(self) -> None:
         """Runs the search."""
-        run_search(job_of(self), open_evaluator=open_stand_in)
+        with crossing_by(open_stand_in):
+            super().execute()
 
 
 def run(argv: list[str]) -> None:
@@ -64,7 +64,8 @@ def run(argv: list[str]) -> None:
 
 def without_figures() -> None:
     """From now on figures take no time to draw."""
-    figures.write_figures = _write_plain_figures
+    for module in (figures, searching):
+        module.write_figures = _write_plain_figures
 
 
 def _write_plain_figures(folder: Path, archive: Any, metrics: Any) -> list[Path]:

@@ -1,79 +1,72 @@
 """Searches over the stand-in evaluator, for tests of several files."""
 
 import dataclasses
+import functools
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from qd import search as searching
+from qd.archive import Archive
 from qd.fitness import FitnessCfg
 from qd.fresh import Reevaluate, reevaluate_run
-from qd.run.arguments import Job
-from qd.run.directory import RunDirectory, origin_in
 from qd.run.settings import SchedulerCfg, SearchCfg
-from qd.search import run_search
+from qd.search import search
 from qd.show import figures
-from qd.workers.evaluator import EvaluatorCfg
-from sim.files.records import provenance, robot_identity
+from qd.workers.evaluator import Compute, OpenEvaluator
+from sim.files.records import robot_identity
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import open_stand_in
 
+ANYMAL = get_robot("anymal")
 CFG = SearchCfg(
-    **robot_identity(get_robot("anymal")),
     robot="anymal",
+    **robot_identity(ANYMAL),
     preset="small",
     policy="shipped",
-    policy_sha256=None,
+    policy_sha256=controller_hash(ANYMAL.policy_file),
     seed=3,
     iterations=2,
     replicas=4,
-    intervals=10,
     collision_bit=False,
     fitness=FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES),
-    scheduler=SchedulerCfg(method="cma_mae+map_elites", emitters=2, batch_size=6, sigma0=0.5, restart_rule="3"),
+    scheduler=SchedulerCfg(method="cma_mae+map_elites", emitters=2, batch_size=6, sigma0=0.5, restart_rule=3),
 )
+ALONE = Compute(workers="1")
 
 
-def make_job(path: Path, *, resumes: bool = False, reproduce: bool = False, confirm: bool = False, **changes) -> Job:
-    cfg = dataclasses.replace(CFG, **changes)
-    evaluator = EvaluatorCfg(
-        robot="anymal", policy="p", num_terrains=cfg.scheduler.num_terrains, num_replicas=cfg.replicas, workers="1"
-    )
-    begun = {**provenance("cpu", cfg.seed), "sessions": []}
-    origin = origin_in(RunDirectory(path).read_config()) if resumes else begun
-    return Job(
-        cfg=cfg,
-        path=path,
-        resumes=resumes,
-        evaluator=evaluator,
-        reproduce=reproduce,
-        confirm=confirm,
-        origin=origin,
-        session={"command": f"to {cfg.iterations}", "commit": "c", "device": "d"},
-        resume_command=f"faultline archive --resume {path}",
-        reevaluate_command=f"faultline reevaluate --run {path}",
-        confirm_command=f"faultline confirm --run {path}",
-    )
+def run(path: Path, *, open_evaluator: OpenEvaluator = open_stand_in, **changes) -> Archive:
+    """A search, begun or gone on with, whose settings differ from CFG's by some."""
+    return search(dataclasses.replace(CFG, **changes), path, ALONE, open_evaluator=open_evaluator)
 
 
-SHIPPED = {"policy": "shipped", "policy_sha256": controller_hash(get_robot("anymal").policy_file)}
-"""Settings of a search against the robot's own controller, which has a file."""
+def without_figures(patch: pytest.MonkeyPatch) -> None:
+    """Figures take longer to draw than a search over the stand-in takes."""
+    for module in (figures, searching):
+        patch.setattr(module, "write_figures", lambda folder, archive, metrics: [])
 
 
-def run(path: Path, **settings):
-    return run_search(make_job(path, **settings), open_evaluator=open_stand_in)
+@contextmanager
+def crossing_by(open_evaluator: OpenEvaluator) -> Iterator[None]:
+    """``faultline archive`` crosses terrains by this meanwhile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(searching, "search", functools.partial(search, open_evaluator=open_evaluator))
+        yield
 
 
 def found_and_fresh(folder: Path) -> Path:
     """Two runs of one search, without figures: ``found`` as it ended, ``fresh`` with fresh episodes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
-        run(folder / "found", iterations=6, **SHIPPED)
+        without_figures(patch)
+        run(folder / "found", iterations=6)
         shutil.copytree(folder / "found", folder / "fresh")
-        reevaluate_run(Reevaluate(run=folder / "fresh", device="cpu"), open_evaluator=open_stand_in)
+        reevaluate_run(Reevaluate(run=folder / "fresh", device="cpu", workers="1"), open_evaluator=open_stand_in)
     return folder
 
 

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.commands import Evaluate
+from qd.commands import Archive, Evaluate
 from qd.fresh import Reevaluate, reevaluate_run
-from qd.run.arguments import Archive, job_of
-from qd.search import run_search
-from qd.show import figures
+from qd.run.settings import SchedulerCfg
 from qd.show.elites import find_archive
 from qd.show.export import Export
 from qd.show.film import Film
@@ -30,13 +28,14 @@ from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from tests.builders import hashes, rsl_rl_actor, save_checkpoint
 from tests.qd import stand_in
+from tests.qd.searches import crossing_by, without_figures
 from tests.qd.show.view.made import make_recording
 from tests.sim.dogs import KINDS, write_dog
 from train.cfg import TrainCfg
 from train.commands import Finetune
 from train.ppo.training import check_settings, settings_of
 
-SIZE = {"emitters": 1, "batch_size": 4, "replicas": 2, "iterations": 1, "device": "cpu"}
+SIZE = {"scheduler": SchedulerCfg(emitters=1, batch_size=4), "replicas": 2, "iterations": 1, "device": "cpu"}
 NAMES = ("yaw_rate", "vel_x", "vel_y", "collision")
 
 
@@ -55,7 +54,7 @@ def open_dog(cfg):
 def dog(tmp_path, monkeypatch):
     """The dog's settings, beside them its controller's scales, and a run of it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(figures, "write_figures", lambda *_: [])
+    without_figures(monkeypatch)
     file = write_dog(tmp_path / "mine", **KINDS["urdf"])
     (tmp_path / "mine" / "bad.py").write_text(
         "from dog_trot import Trot as First\n\n\nclass Trot(First):\n    faultline_factory = True\n"
@@ -63,10 +62,13 @@ def dog(tmp_path, monkeypatch):
     robot, policy = get_robot(str(file)), trot(file)
     content = {**identity(robot, policy), "scales": dict.fromkeys(NAMES, 1.0)}
     robot.scales_file.write_text(json.dumps(content))
-    run_search(
-        job_of(Archive(robot=str(file), policy=policy, run_dir=Path("runs/dog"), **SIZE)), open_evaluator=open_dog
-    )
+    search(robot=str(file), policy=policy, run_dir=Path("runs/dog"))
     return file
+
+
+def search(**flags) -> None:
+    with crossing_by(open_dog):
+        Archive(**SIZE, **flags).execute()
 
 
 def trot(file: Path) -> str:
@@ -148,10 +150,10 @@ def test_no_command_compares_numbers_of_another_definition(dog, capsys, monkeypa
 
 def test_scales_of_another_robot_are_refused_and_those_of_another_controller_told(dog, capsys):
     other = f"{dog.parent}/bad.py:Trot"
-    job_of(Archive(robot=str(dog), policy=other, run_dir=Path("runs/other"), **SIZE))
+    search(robot=str(dog), policy=other, run_dir=Path("runs/other"))
     said = capsys.readouterr()
     assert f"scaled by those of dog_trot.py:Trot, with which {dog.parent}/dog.scales.json was measured" in said.out
-    job_of(Archive(robot=str(dog), policy=trot(dog), run_dir=Path("runs/other"), **SIZE))
+    search(robot=str(dog), policy=trot(dog), run_dir=Path("runs/own"))
     assert "scaled by" not in capsys.readouterr().out
     change_robot(dog)
     argv = ("--robot", str(dog), "--policy", trot(dog), "--run-dir", "runs/new", "--device", "cpu")
@@ -183,9 +185,7 @@ def test_a_controller_that_changed_is_another_and_writes_other_files(dog, capsys
 
 def test_a_lost_or_changed_file_of_the_search_is_refused_unless_named(dog, capsys):
     policy = save_checkpoint(dog.parent / "mine.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())
-    run_search(
-        job_of(Archive(robot=str(dog), policy=str(policy), run_dir=Path("runs/file"), **SIZE)), open_evaluator=open_dog
-    )
+    search(robot=str(dog), policy=str(policy), run_dir=Path("runs/file"))
     found = find_archive(str(dog), Path("runs/file"))
     assert found.policy(None) == str(policy)
     save_checkpoint(policy, rsl_rl_actor(12 + 24 + 15, 8, normalised=True).state_dict())

@@ -11,7 +11,6 @@ import pytest
 from qd.archive import read_archive, write_archive
 from qd.causes import effects_of
 from qd.run.minimise import Minimise, minimise_run
-from qd.show import figures
 from qd.show.crossed import crossed_of
 from qd.show.crossing_figures import draw_paths
 from qd.show.elites import find_archive
@@ -32,6 +31,7 @@ from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.recordings import NAMES
+from tests.qd.searches import without_figures
 from tests.qd.test_own_space import TINY, search
 from tests.sim.policies import stand
 
@@ -42,7 +42,7 @@ FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(figures, "write_figures", lambda *_: [])
+    without_figures(monkeypatch)
     monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
     before = signal.getsignal(signal.SIGTERM)
     yield

@@ -55,6 +55,7 @@ def test_an_added_penalty_is_one_function(project):
         "vel_y",
         name,
     ]
-    run("archive", "--emitters", "1", "--batch-size", "4", "--replicas", "2", "--iterations", "1", "--run-dir", "run")
+    size = ("--scheduler.emitters", "1", "--scheduler.batch-size", "4", "--replicas", "2", "--iterations", "1")
+    run("archive", *size, "--run-dir", "run")
     config = json.loads((folder / "run" / "config.json").read_text())
     assert config["settings"]["fitness"]["penalties"][-1] == name

@@ -9,14 +9,13 @@ import pytest
 from qd.fitness import FitnessCfg
 from qd.minimal import Case, Trial, minimise
 from qd.run.settings import SchedulerCfg
-from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
 from sim.crossing import CrossingCfg
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
-from tests.qd.searches import make_job, rows_of
+from tests.qd.searches import rows_of, run, without_figures
 
 ROBOT = get_robot("anymal")
 CFG = EvaluatorCfg(
@@ -69,11 +68,11 @@ def test_a_resumed_search_equals_the_uninterrupted_one(tmp_path, evaluate, devic
         yield evaluate_twice
 
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    archive = run_search(make_job(whole, iterations=3, **SETTINGS), open_evaluator=opened)
+    archive = run(whole, iterations=3, **SETTINGS, open_evaluator=opened)
     with pytest.raises(EvaluatorError):
-        run_search(make_job(killed, iterations=3, **SETTINGS), open_evaluator=lost_in_the_third)
+        run(killed, iterations=3, **SETTINGS, open_evaluator=lost_in_the_third)
     assert len(rows_of(killed)) == 2
-    run_search(make_job(killed, iterations=3, resumes=True, **SETTINGS), open_evaluator=opened)
+    run(killed, iterations=3, **SETTINGS, open_evaluator=opened)
     assert [row["iteration"] for row in rows_of(killed)] == [1, 2, 3]
     if device == "cpu":  # a GPU's crossings are not repeated bit for bit
         assert (whole / "archive.npz").read_bytes() == (killed / "archive.npz").read_bytes()
@@ -93,20 +92,20 @@ def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go(tmp_path, 
     """Robots go on with the terrains of other groups; three emitters make groups of one and two, or of one each."""
     if device != "cpu":
         pytest.skip("a GPU adds in any order")
-    monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
+    without_figures(monkeypatch)
     scheduler = SchedulerCfg(method="cma_mae+map_elites", emitters=3, batch_size=2, sigma0=1.0, groups=groups)
     settings = {**SETTINGS, "scheduler": scheduler, "replicas": 3, "reevaluate_every": 0}
 
-    def searched(path, iterations, *, workers="1", resumes=False):
+    def searched(path, iterations, *, workers="1"):
         def opened(cfg):
             mine = dataclasses.replace(cfg, policy=CFG.policy, workers=workers)
             return open_evaluator(mine, build=short_rollout)
 
-        return run_search(make_job(path, iterations=iterations, resumes=resumes, **settings), open_evaluator=opened)
+        return run(path, iterations=iterations, **settings, open_evaluator=opened)
 
     whole = searched(tmp_path / "whole", 3)
     searched(tmp_path / "pieces", 1, workers="2")
-    pieces = searched(tmp_path / "pieces", 3, workers="1", resumes=True)
+    pieces = searched(tmp_path / "pieces", 3, workers="1")
     assert len(whole) > 1
     for name in ("genes", "cell", "fitness", "iteration", "ratios"):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name), err_msg=name)

@@ -68,7 +68,7 @@ def learned() -> Surrogate:
     for seed in range(4):
         genes = SUPER_GAUSSIAN.hard_random(100, seed)
         evaluation = crossed(genes, seed)
-        found.learn(genes, evaluation, evaluation.fitness)
+        found.learn(genes, evaluation)
     return found
 
 
@@ -105,7 +105,7 @@ def test_it_learns_from_friction_where_heights_say_nothing():
     search = Surrogate(cfg, CELLS, space, np.random.SeedSequence(0))
     for seed in range(4):
         genes, told = slipped(seed, 100)
-        search.learn(genes, told, told.fitness)
+        search.learn(genes, told)
     genes, truth = slipped(9, 150)
     mean = predicted(search, genes)["ratios"].mean(axis=0)
     error, spread = ((mean - truth.ratios) ** 2).sum(), ((truth.ratios - truth.ratios.mean(axis=0)) ** 2).sum()
@@ -176,8 +176,8 @@ def test_training_is_the_same_on_every_device(device, monkeypatch):
     for seed in range(3):
         genes = SUPER_GAUSSIAN.hard_random(100, seed)
         told = crossed(genes, seed)
-        here.learn(genes, told, told.fitness)
-        there.learn(genes, told, told.fitness)
+        here.learn(genes, told)
+        there.learn(genes, told)
         there = pickle.loads(pickle.dumps(there))  # on the CPU
         there.compute_on("cpu" if seed == 1 else device)
     found, wanted = learned_numbers(there), learned_numbers(here)
@@ -297,7 +297,7 @@ def test_invalid_terrains_are_not_learned():
     invalid = np.zeros((4, 4), bool)
     invalid[1:3] = True
     told = evaluation_of(stand_in.make_result(penalties, invalid=invalid), CELLS, FITNESS)
-    search.learn(genes, told, told.fitness)
+    search.learn(genes, told)
     assert len(search) == 2
 
 
@@ -307,7 +307,7 @@ def test_the_newest_are_kept(monkeypatch):
     for seed in range(3):
         genes = SUPER_GAUSSIAN.hard_random(40, seed)
         told = crossed(genes, seed)
-        search.learn(genes, told, told.fitness)
+        search.learn(genes, told)
     assert len(search) == 70
     np.testing.assert_allclose(search._genes[-40:] / 32767, genes, atol=2e-5)
     assert torch.equal(search._maps[-40:], search._mapped(search._genes[-40:]))

@@ -161,7 +161,7 @@ def _archive_of(tables: dict[str, Any], chosen: tuple[Change, ...], beside: Path
     for path in (beside / "archive", Path(about.get("path", ""))):
         try:
             archive = read_archive(path)
-            check_space(archive, path, None)
+            check_space(archive, None)
         except (OSError, ValueError) as error:
             reason = f"The archive of the tables cannot be read: {error}"
             continue

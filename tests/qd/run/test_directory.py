@@ -1,13 +1,25 @@
-import itertools
+import dataclasses
+import json
 import os
+from pathlib import Path
 
 import pytest
 
-from qd.run.directory import RunDirectory, claimed, numbered
+from qd.archive import write_archive
+from qd.run import directory
+from qd.run.directory import RunDirectory, claimed, find_run, folder_for, free_path, read_archive_of, search_seed
+from sim.robots.find import get_robot
+from tests.builders import small_archive
+from tests.qd.searches import CFG
+
+ORIGIN = {"command": "faultline archive", "commit": "c", "device": "CPU", "seed": 3}
 
 
-def test_numbered_directories(tmp_path):
-    assert [path.name for path in itertools.islice(numbered(tmp_path, "a"), 3)] == ["a", "a-2", "a-3"]
+def test_a_run_without_a_name_gets_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "a-2", "a-3"):
+        assert free_path("a") == Path("runs") / name
+        free_path("a").mkdir(parents=True)
 
 
 def test_a_claimed_directory_that_stays_empty_goes_away(tmp_path):
@@ -20,39 +32,111 @@ def test_a_claimed_directory_that_stays_empty_goes_away(tmp_path):
     assert (tmp_path / "mine").exists()
 
 
-def test_a_claim_ends_with_its_context(tmp_path):
+def test_a_claim_keeps_others_out_and_ends_with_its_context(tmp_path):
     with claimed(tmp_path), pytest.raises(ValueError, match="another command works in"), claimed(tmp_path):
         pass
     with claimed(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("name", ["a\nb", "a\tb", os.fsdecode(b"\xff"), "\x1b[31m"])
-def test_a_name_that_no_command_can_take_is_refused(tmp_path, name):
-    with pytest.raises(ValueError, match="must have a name of printable characters"), claimed(tmp_path / name):
+@pytest.mark.parametrize("name", ["a\nb", os.fsdecode(b"\xff"), "\x1b[31m", "a" * 300])
+def test_a_name_that_no_directory_or_command_can_have_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match="run directory"), claimed(tmp_path / name):
         pass
     assert not any(tmp_path.iterdir())
 
 
-def test_a_name_that_is_too_long_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="cannot be made: File name too long"), claimed(tmp_path / ("a" * 300)):
+@pytest.mark.parametrize("path", ["/dev/null/run", "/proc/run"])
+def test_a_directory_that_cannot_be_made_is_refused(path):
+    with pytest.raises(ValueError, match="cannot be made"), claimed(Path(path)):
         pass
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "must be a JSON file"),
-        ("[]", "must hold a JSON object, got list"),
-        ('{"seed": 1}', "must hold settings, iterations, device and sessions, got seed"),
-    ],
-)
-def test_damaged_config(tmp_path, content, message):
+def test_what_a_run_was_asked_to_do_comes_back_with_all_its_sessions(tmp_path):
+    run = RunDirectory(tmp_path)
+    run.begin_session(CFG, ORIGIN, 0)
+    longer = dataclasses.replace(CFG, iterations=9)
+    run.begin_session(longer, ORIGIN | {"command": "faultline archive --resume"}, 2)
+    assert run.read_cfg() == longer and search_seed(tmp_path) == 3
+    config = run.read_config()
+    assert config["command"] == "faultline archive"  # that of the beginning
+    assert [(one["command"], one["from_iteration"]) for one in config["sessions"]] == [
+        ("faultline archive", 0), ("faultline archive --resume", 2),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"seed": 1}', '{"settings": {}, "iterations": 1}'])
+def test_a_damaged_config_is_refused(tmp_path, content):
     (tmp_path / "config.json").write_text(content)
-    with pytest.raises(ValueError, match=message):
-        RunDirectory(tmp_path).read_config()
+    with pytest.raises(ValueError, match=r"config\.json"):
+        RunDirectory(tmp_path).read_cfg()
 
 
-def test_no_run(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no run at .*: it has no config\.json"):
-        RunDirectory(tmp_path).read_config()
+def test_settings_of_another_version_are_refused_by_name(tmp_path):
+    run = RunDirectory(tmp_path)
+    run.begin_session(CFG, ORIGIN, 0)
+    config = json.loads((tmp_path / "config.json").read_text())
+    config["settings"]["mirror_share"] = 0.0
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match="mirror_share"):
+        run.read_cfg()
+
+
+def test_what_is_no_run_or_has_not_begun_has_no_state(tmp_path):
+    run = RunDirectory(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"config\.json"):
+        run.read_config()
+    assert run.load(CFG) is None and search_seed(tmp_path) is None
+    (tmp_path / ".config.json.tmp").write_text("{")  # what a killed beginning leaves
+    assert run.load(CFG) is None
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(ValueError, match="holds no run"):
+        run.load(CFG)
+
+
+@pytest.mark.parametrize("content", ["", "{", "1\n2"])
+def test_damaged_metrics_are_refused(tmp_path, content):
+    (tmp_path / "metrics.jsonl").write_text(content)
+    with pytest.raises(ValueError, match=r"metrics\.jsonl"):
+        RunDirectory(tmp_path).read_metrics()
+
+
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    """An empty folder of published results, beside an empty one to work in."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(directory, "RESULTS", tmp_path / "results")
+    return tmp_path / "results"
+
+
+def make_run(path: Path, time: float = 0.0, **changes) -> Path:
+    path.mkdir(parents=True)
+    write_archive(path / "archive.npz", dataclasses.replace(small_archive(), **changes))
+    os.utime(path / "archive.npz", (time, time))
+    return path
+
+
+def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(results):
+    robot = get_robot("anymal")
+    with pytest.raises(FileNotFoundError, match="anymal"):
+        find_run(robot)
+    published = make_run(results / "anymal" / "archive")
+    assert find_run(robot) == published and folder_for(published, "anymal") == Path("runs/anymal-published")
+    with pytest.raises(FileNotFoundError):
+        find_run(robot, published="never")
+    for number in (1, 3, 2):
+        make_run(Path(f"runs/{number}"), number)
+    make_run(Path("runs/cassie"), 9, robot="cassie")
+    assert find_run(robot) == find_run(robot, published="never") == Path("runs/3")
+    assert folder_for(Path("runs/3/archive.npz"), "anymal") == Path("runs/3")
+    assert find_run(robot, published="first") == published
+    assert find_run(robot, Path("elsewhere")) == Path("elsewhere")
+
+
+def test_an_archive_of_the_robot_as_it_was_is_refused_and_one_of_another_robot_is_not(results):
+    robot = get_robot("anymal")
+    assert len(read_archive_of(robot, make_run(Path("now")))) == 3
+    assert len(read_archive_of(robot, make_run(Path("other"), robot="cassie", robot_sha256="0" * 64))) == 3
+    for name, changes in (("a", {"robot_sha256": "0" * 64}), ("b", {"penalty_definition": "cubed"})):
+        with pytest.raises(ValueError, match=r"anymal|cubed"):
+            read_archive_of(robot, make_run(Path(name), **changes))

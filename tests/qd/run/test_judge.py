@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.fresh import Reevaluate, reevaluate_run
 from qd.run.judge import Certify, Confirm, certify_run, confirm_run
-from qd.search import run_search
 from qd.show import figures
 from qd.show.evidence import evidence_file, read_evidence
 from qd.show.replay import ReplayElite, describe, replay
@@ -20,8 +18,7 @@ from sim.files.command import Interrupted
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from tests.qd.recordings import stand_in_cross
-from tests.qd.searches import SHIPPED, make_job, run
-from tests.qd.stand_in import make_result, open_stand_in
+from tests.qd.stand_in import make_result
 
 RESULTS = Path(__file__).parents[3] / "results"
 OTHER = f"C-G={RESULTS}/anymal/C-G.pt"
@@ -120,39 +117,6 @@ def test_some_elites_alone(path):
     number = int(np.flatnonzero(archive.failing)[1])
     judged = confirmed(path, elite=str(number))
     assert np.flatnonzero(judged.faults.resolved_outcomes.any(axis=1)).tolist() == [number]
-
-
-def test_new_fresh_episodes_keep_the_counts_and_new_iterations_drop_them(path):
-    confirmed(path)
-    before = certified(path)
-    reevaluate_run(Reevaluate(run=path, device="cpu", seed=7), open_evaluator=open_stand_in)
-    after, numbers = read_archive(path), numbers_in(path)
-    cells = {cell: row.tolist() for cell, row in zip(before.cell, before.faults.resolved_outcomes, strict=True)}
-    for cell, row in zip(after.cell, after.faults.resolved_outcomes, strict=True):
-        assert row.tolist() == cells[cell]
-    assert numbers["faults"] == (after.confirmed & after.certified).sum()
-    assert numbers["confirmed_by"]["seed"] == 3 and "C-G" in numbers["certified_by"]
-    run(path, iterations=7, resumes=True, **SHIPPED)
-    assert read_archive(path).faults is None
-    assert numbers_in(path)["faults"] is None and "confirmed_by" not in numbers_in(path)
-
-
-def test_a_search_confirms_at_its_end(tmp_path, capsys):
-    @contextmanager
-    def opened(cfg):
-        with (judges() if cfg.resolved else open_stand_in)(cfg) as evaluate:
-            yield evaluate
-
-    archive = run_search(make_job(tmp_path / "run", reproduce=True, confirm=True, iterations=6), open_evaluator=opened)
-    assert numbers_in(tmp_path / "run")["confirmed"] == archive.confirmed.sum() > 0
-    assert archive.faults.resolved_outcomes.any(axis=1).sum() == archive.failing.sum()
-    assert "crossed with contact resolved" in capsys.readouterr().out
-    with pytest.raises(Interrupted, match=r"what was crossed is kept\. Go on with:  faultline confirm --run"):
-        run_search(
-            make_job(tmp_path / "stopped", reproduce=True, confirm=True, iterations=6),
-            open_evaluator=lambda cfg: (judges(stop_after=0) if cfg.resolved else open_stand_in)(cfg),
-        )
-    assert read_archive(tmp_path / "stopped").fresh is not None
 
 
 def test_certificates_are_recorded_once_and_replayed(path, monkeypatch, tmp_path):

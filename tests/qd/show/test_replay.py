@@ -8,7 +8,7 @@ from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
-from qd.run.directory import RunDirectory, folder_for, newest_or_published, newest_run
+from qd.run.directory import RunDirectory
 from qd.run.settings import suffix_of
 from qd.show.elites import Found, find_archive
 from qd.show.replay import Replay, ReplayElite, describe, draw, replay
@@ -124,37 +124,9 @@ def test_a_config_of_another_search_is_refused(tmp_path, change):
     fitness = dataclasses.replace(CFG.fitness, **change)
     run(tmp_path / "run")
     cfg = dataclasses.replace(CFG, fitness=fitness)
-    RunDirectory(tmp_path / "run").write_config(cfg, {"device": "cpu", "sessions": []})
+    RunDirectory(tmp_path / "run").begin_session(cfg, {"command": "", "commit": "", "device": "cpu"}, 0)
     with pytest.raises(ValueError, match=r"config\.json must have the penalties and scales of its archive, yaw_rate"):
         replay(ReplayElite(run=tmp_path / "run", device="cpu"))
-
-
-def test_no_run_yet(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(
-        FileNotFoundError, match=r"no archive of anymal under runs/.*`.*faultline archive --robot anymal`"
-    ):
-        newest_run(get_robot("anymal"))
-    with pytest.raises(FileNotFoundError, match=r"no archive of anymal under runs/"):
-        newest_or_published(get_robot("anymal"))
-
-
-def test_the_published_run_is_taken_where_there_is_none_and_nothing_is_written_into_it(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    published = tmp_path / "results" / "anymal" / "archive"
-    published.mkdir(parents=True)
-    write_archive(published / "archive.npz", small_archive())
-    with pytest.raises(FileNotFoundError, match=r"or give --run, such as the published results/anymal/archive$"):
-        newest_run(get_robot("anymal"))
-    found = newest_or_published(get_robot("anymal"))
-    assert found == Path("results/anymal/archive")
-    for named in (found, published, published / "archive.npz", published / ".." / "archive"):
-        assert folder_for(named, "anymal") == Path("runs/anymal-published")
-    own = Path("runs/anymal-small-0")
-    own.mkdir(parents=True)
-    write_archive(own / "archive.npz", small_archive())
-    assert newest_or_published(get_robot("anymal")) == own
-    assert folder_for(own, "anymal") == folder_for(own / "archive.npz", "anymal") == own
 
 
 @pytest.mark.parametrize("changes", [{"replicas": 0}, {"seed": -1}])

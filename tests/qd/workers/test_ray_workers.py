@@ -3,17 +3,15 @@
 import dataclasses
 import os
 import time
-from functools import partial
 
 import numpy as np
 import pytest
 
 from qd.run.directory import RunDirectory
-from qd.search import run_search
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device
 from qd.workers.shards import flaw_of
 from tests.qd import crossers, stand_in
-from tests.qd.searches import make_job
+from tests.qd.searches import run, without_figures
 from tests.qd.workers.test_evaluator import same
 
 pytestmark = pytest.mark.ray
@@ -105,13 +103,14 @@ def test_a_worker_that_died_is_started_again(tmp_path):
 
 
 def test_three_deaths_in_a_search_change_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("qd.show.figures.write_figures", lambda folder, archive, metrics: [])
-    alone = run_search(make_job(tmp_path / "alone"), open_evaluator=stand_in.open_stand_in)
-    job = make_job(tmp_path / "on-ray")
-    deadly = dataclasses.replace(job.evaluator, workers="ray:2", policy=f"die:{tmp_path}:3")
-    found = run_search(
-        dataclasses.replace(job, evaluator=deadly), open_evaluator=partial(open_evaluator, build=crossers.Failing)
-    )
+    without_figures(monkeypatch)
+    alone = run(tmp_path / "alone")
+
+    def deadly(cfg):
+        cfg = dataclasses.replace(cfg, workers="ray:2", policy=f"die:{tmp_path}:3")
+        return open_evaluator(cfg, build=crossers.Failing)
+
+    found = run(tmp_path / "on-ray", open_evaluator=deadly)
     assert RunDirectory(tmp_path / "on-ray").read_metrics()[-1]["retries"] == 3
     for name in ("genes", "cell", "iteration", "fitness", "ratios"):
         np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))

@@ -1,0 +1,199 @@
+"""The command that searches: what its flags come to, what it refuses in one line, and that existing runs stay whole."""
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+
+from qd.archive import read_archive
+from qd.commands import Archive
+from sim.files.command import run_command
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from tests.qd import stand_in
+from tests.qd.searches import crossing_by, without_figures
+
+SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "4", "--replicas", "1", "--iterations", "1"]
+TINY = ["--device", "cpu", *SIZE]
+MORE = ["--device", "cpu", "--iterations"]
+_OF_NO_GPU = ("Warp CUDA warning", "No CUDA device was found")  # said once a process
+
+
+def fine_policy(observation: torch.Tensor) -> torch.Tensor:
+    return observation[:, :12]
+
+
+def narrow_policy(observation: torch.Tensor) -> torch.Tensor:
+    return observation[:, :3]
+
+
+def nan_policy(observation: torch.Tensor) -> torch.Tensor:
+    return observation[:, :12] * float("nan")
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    without_figures(monkeypatch)
+    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
+    before = signal.getsignal(signal.SIGTERM)
+    with crossing_by(stand_in.open_stand_in):
+        yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def archive(*argv: str) -> int:
+    return run_command(Archive, argv, name="archive")
+
+
+def fails(capsys, *argv: str) -> str:
+    """The error line of a command that must fail as a user's mistake, and change nothing in a run called a."""
+    before = everything_in("a")
+    capsys.readouterr()
+    assert archive(*argv) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith(_OF_NO_GPU)]
+    assert len(lines) == 1, lines
+    assert everything_in("a") == before
+    return lines[0]
+
+
+def everything_in(folder: str) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in Path(folder).glob("*")}
+
+
+def config_of(folder: str) -> dict:
+    return json.loads(Path(folder, "config.json").read_text())
+
+
+def change_settings(folder: str, **changes) -> None:
+    config = config_of(folder)
+    config["settings"] |= changes
+    Path(folder, "config.json").write_text(json.dumps(config))
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        (["--robot", "dog"], "dog"), (["--robot", "dog.py"], "dog.py"), (["--preset", "huge"], "huge"),
+        (["--space", "blocks"], "blocks"), (["--device", "tpu"], "tpu"),
+        (["--policy", "missing.pt"], "missing.pt"), (["--policy", "truncated.pt"], "truncated.pt"),
+        (["--policy", f"{__name__}:narrow_policy"], "narrow_policy"), (["--policy", f"{__name__}:no"], "no"),
+        (["--policy", f"{__name__}:nan_policy"], "not finite"), (["--fitness.penalties", "vel_x", "slip"], "slip"),
+        (["--run-dir", "full"], "full"), (["--run-dir", "full/thesis.tex/run"], "cannot be made"),
+        (["--resume", "nowhere"], "nowhere"), (["--method", "guess"], "guess"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flags, name):
+    Path("full").mkdir()
+    Path("full/thesis.tex").write_text("years of work")
+    Path("truncated.pt").write_bytes(b"PK\x03\x04 and no more")
+    assert name in fails(capsys, *TINY, *flags)
+    assert sorted(os.listdir()) == ["full", "truncated.pt"]
+    assert Path("full/thesis.tex").read_text() == "years of work"
+
+
+def test_a_nested_setting_out_of_range_is_named(capsys):
+    with pytest.raises(SystemExit) as error:
+        archive(*TINY, "--scheduler.sigma0", "0")
+    assert error.value.code == 2 and "sigma0 must be" in capsys.readouterr().err
+
+
+def test_flags_come_to_the_settings_of_the_run():
+    flags = ["--method", "map_elites", "--seed", "4", "--fitness.alpha", "0.5", "--fitness.intervals", "5"]
+    flags += ["--fitness.penalties", "yaw_rate", "vel_x", "contact_force", "--fitness.reevaluate-every", "0"]
+    assert archive(*TINY, *flags, "--run-dir", "a") == 0
+    settings = config_of("a")["settings"]
+    assert (settings["preset"], settings["seed"], settings["intervals"], settings["replicas"]) == ("small", 4, 5, 1)
+    assert settings["fitness"] == {
+        "penalties": ["yaw_rate", "vel_x", "contact_force"], "scales": [1.0, 2.0, 4.0], "alpha": 0.5, "lam": 2.0,
+    }  # fmt: skip
+    assert settings["scheduler"]["method"] == "map_elites" and settings["scheduler"]["emitters"] == 1
+    assert archive("--resume", "a", *MORE, "2") == 0  # all of these are defaults now
+    found = read_archive("a")
+    assert (found.iterations, found.ratios.shape[1]) == (2, 3)
+
+
+def test_a_preset_has_its_own_defaults():
+    paper = Archive.defaults(["--preset", "paper"])
+    assert (paper.iterations, paper.replicas, paper.scheduler.emitters) == (1000, 20, 10)
+    assert Archive.defaults(["--device", "cuda"]).preset == "wide"
+    assert Archive.defaults(["--device", "cpu"]).preset == "small"
+
+
+def test_a_run_goes_on_as_it_is_or_not_at_all(capsys):
+    assert archive(*TINY, "--run-dir", "a") == 0
+    assert "seed" in fails(capsys, *TINY, "--run-dir", "a", "--seed", "1")
+    for flags, name in (
+        (["--scheduler.learning-rate", "0.5"], "learning_rate"),
+        (["--preset", "paper"], "preset"),
+        (["--method", "cma_mae"], "method"),
+        (["--fitness.penalties", "vel_x", "vel_y"], "penalties"),
+        (["--iterations", "0"], "iterations"),
+        (["--robot", "cassie"], "cassie"),
+        (["--run-dir", "b"], "--run-dir"),
+    ):
+        assert name in fails(capsys, "--device", "cpu", "--resume", "a", *flags), flags
+    assert archive(*TINY, "--run-dir", "a") == 0  # it is the same search
+    assert [session["from_iteration"] for session in config_of("a")["sessions"]] == [0]
+
+
+def test_new_runs_get_directories_of_their_own():
+    assert archive(*TINY) == 0
+    assert archive(*TINY) == 0
+    assert sorted(os.listdir("runs")) == ["anymal-small-0", "anymal-small-0-2"]
+
+
+def test_a_damaged_checkpoint_is_reported_and_left_alone(capsys):
+    assert archive(*TINY, "--run-dir", "a") == 0
+    checkpoint = Path("a/checkpoint.bin")
+    whole = checkpoint.read_bytes()
+    for content in (whole[:-100], b"hello"):
+        checkpoint.write_bytes(content)
+        assert "checkpoint.bin" in fails(capsys, "--resume", "a", *MORE, "3")
+    checkpoint.write_bytes(whole)
+    assert archive("--resume", "a", *MORE, "3") == 0
+
+
+def test_a_controller_may_move_but_not_change(capsys):
+    shutil.copy(get_robot("anymal").policy_file, "mine.pt")
+    assert archive(*TINY, "--policy", "mine.pt", "--run-dir", "a") == 0
+    Path("mine.pt").rename("moved.pt")
+    Path("other.pt").write_bytes(Path("moved.pt").read_bytes() + b"\0")
+    assert "mine.pt" in fails(capsys, "--resume", "a", *MORE, "2")
+    assert "other.pt" in fails(capsys, "--resume", "a", *MORE, "2", "--policy", "other.pt")
+    assert archive("--resume", "a", *MORE, "2", "--policy", "moved.pt") == 0
+    assert config_of("a")["settings"]["policy"] == "mine.pt"
+    Path("moved.pt").rename("mine.pt")
+    assert archive("--resume", "a", *MORE, "3") == 0
+
+
+def test_code_runs_only_if_the_command_line_names_it(capsys):
+    fine = f"{__name__}:fine_policy"
+    assert archive(*TINY, "--policy", fine, "--run-dir", "a") == 0
+    whole = everything_in("a")
+    assert fine in fails(capsys, "--resume", "a", *MORE, "2")
+    Path("evil.py").write_text("open('it_ran', 'w').close()\ndef act(row): pass\nclass Space: pass\n")
+    evil = f"{Path.cwd()}/evil.py"
+    for policy in ("evil:act", f"{evil}:act", f"{evil}:act@a/checkpoint.bin"):
+        change_settings("a", policy=policy)
+        assert "code" in fails(capsys, "--resume", "a", *MORE, "2")
+    change_settings("a", policy=fine, space=f"{evil}:Space", space_sha256="0" * 64)
+    assert "evil.py" in fails(capsys, "--resume", "a", *MORE, "2", "--policy", fine)
+    change_settings("a", space="super_gaussian", space_sha256=None, robot=evil)
+    assert "evil.py" in fails(capsys, "--resume", "a", *MORE, "2", "--policy", fine)
+    assert not Path("it_ran").exists()
+    for name, content in whole.items():
+        Path("a", name).write_bytes(content)
+    assert archive("--resume", "a", *MORE, "2", "--policy", fine) == 0
+    assert read_archive("a").iterations == 2
+
+
+def test_what_is_said_names_the_run_and_what_comes_next(capsys):
+    assert archive(*TINY, "--run-dir", "a") == 0
+    output = capsys.readouterr().out
+    assert "1 iterations of 4 terrains x 1 episodes of up to 20 s" in output
+    assert "faultline judge --run a" in output
