@@ -8,12 +8,14 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from qd.judge import judge
+from qd.run.directory import RunDirectory
 from qd.run.settings import preset
 from qd.search import search
 from results.make.common import Script, parse
-from train.cfg import FinetuneCfg
+from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 
 SEARCHES = {"archive": (None, 0), "archive_cma_mae": ("cma_mae", 0), "independent": (None, 1)}
@@ -30,12 +32,18 @@ def make_archive(script: Script, name: str) -> Path:
     cfg = replace(cfg, scheduler=scheduler, seed=seed + script.seed, iterations=1 if script.small else cfg.iterations)
     run = script.runs / name
     search(cfg, run, script.compute)
-    if script.small:  # a second judging and a training take minutes on a CPU
-        return run
-    judge(run, stages=("fresh", "resolved"), compute=script.compute)
-    train_specialist(script.robot, run, FinetuneCfg.specialist(script.robot))
-    judge(run, stages=("others",), compute=script.compute)
+    if not script.small:  # on a CPU judging and a training take hours
+        judge_with_specialist(script, run)
     return run
+
+
+def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
+    """Judges a search with its own specialist among the certifiers; returns the content of archive.json."""
+    archive = judge(run, stages=("fresh", "resolved"), compute=script.compute)
+    if archive.failing.any():
+        train_specialist(script.robot, run, FinetuneCfg.specialist(script.robot), RunCfg(device=script.device))
+    judge(run, stages=("others",), compute=script.compute)
+    return RunDirectory(run).read_summary()
 
 
 def main(argv: Sequence[str] | None = None) -> None:

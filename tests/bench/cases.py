@@ -103,19 +103,20 @@ class Case:
     def compare(self, outputs: Any) -> None:
         """Refuses outputs of the counterpart that are not the kernel's: nothing may be timed then.
 
-        A value that is missing on one side (a probe that just touches, one of two that are equally deep) may go
-        either way in single precision, in 2 % of the rows.
+        On a knife edge single precision may go either way: one value in 10,000 may differ, and one in 50 may be missing
+        on one side (of a probe that just touches, or of two that are equally deep).
         """
         ours, theirs = self.run_kernel(), self.read_torch(outputs)
         if ours.shape != theirs.shape:
             raise ValueError(f"{self.name}: torch gives shape {theirs.shape}, the kernel {ours.shape}")
-        far = ~(np.abs(ours - theirs) <= self.atol + self.rtol * np.abs(theirs))
-        absent = np.isnan(ours) & np.isnan(theirs)
-        undecided = np.isnan(ours) != np.isnan(theirs)
-        present = (~np.isnan(theirs)).sum()
-        if (far & ~absent & ~undecided).any() or undecided.sum() > 0.02 * present or present == 0:
-            wrong = int((far & ~absent).sum())
-            raise ValueError(f"{self.name}: {wrong} of {ours.size} values of kernel and torch differ")
+        ours_present, theirs_present = ~np.isnan(ours), ~np.isnan(theirs)
+        count = int(theirs_present.sum())
+        one_sided = int((ours_present != theirs_present).sum())
+        apart = np.abs(ours - theirs) > self.atol + self.rtol * np.abs(theirs)
+        if not count or one_sided > 0.02 * count or apart.sum() > 1e-4 * count:
+            raise ValueError(
+                f"{self.name}: of {count} values {apart.sum()} of kernel and torch differ, {one_sided} are of one alone"
+            )
 
 
 def _share_within_reach(genes: np.ndarray) -> float:

@@ -1,0 +1,65 @@
+"""Rounds of hardening, and how much the count of faults differs between searches of one controller: rounds.json.
+
+The base and the last controller are searched twice more, each time with a specialist of its own. The last controller is
+published as results/<robot>/hardened.pt.
+"""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from qd.run.settings import preset
+from qd.search import search
+from results.make.archive import judge_with_specialist
+from results.make.common import Script, parse
+from train.cfg import HardenCfg
+from train.harden import harden
+
+COUNTS = (
+    "episodes", "elites", "corrected_elites", "families", "failing", "confirmed", "certified", "faults", "faults_panel",
+    "faults_unseen", "fault_families",
+)  # fmt: skip
+
+
+def last_policy(rounds: Sequence[Mapping[str, Any]], run: Path) -> Path | None:
+    """File of the last training that was kept; None if there is none."""
+    kept = [row["tuned"] for row in rounds if row["kept"]]
+    return run / kept[-1] / "policy.pt" if kept else None
+
+
+def search_again(script: Script, name: str, policy: Path | None, seed: int) -> dict[str, Any]:
+    """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None."""
+    cfg = preset("wide", script.robot, None if policy is None else str(policy))
+    run = script.runs / "rounds" / f"{name}-{seed}"
+    search(replace(cfg, seed=seed, iterations=13), run, script.compute)
+    counts = judge_with_specialist(script, run)
+    return {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Hardens in three rounds, and searches both ends again; a trial does neither the one nor the other to an end."""
+    script = parse(__doc__, argv, "rounds.json")
+    run = script.runs / "hardening"
+    cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
+    if script.small:
+        cfg = replace(
+            cfg, rounds=1, search=replace(cfg.search, episodes=128),
+            tune=replace(cfg.tune, num_envs=4, terrains=4, iterations=1),
+            evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
+        )  # fmt: skip
+    hardening = harden(script.robot, cfg, run, script.compute)
+    rounds, policy = hardening["rounds"], last_policy(hardening["rounds"], run)
+    seeds = () if script.small else (1000, 1001)  # far from those of the rounds
+    again = {
+        name: [rounds[place], *(search_again(script, name, file, seed) for seed in seeds)]
+        for name, place, file in (("last", -1, policy), ("base", 0, None))
+    }
+    if policy is not None and not script.small:
+        shutil.copyfile(policy, script.results / "hardened.pt")
+    return script.write({**hardening, "seed": script.seed, "searches": again["last"], "base_searches": again["base"]})
+
+
+if __name__ == "__main__":
+    main()
