@@ -90,6 +90,8 @@ class Case:
     work: Work
     atol: float
     rtol: float = 0.0
+    undecided: float = 0.0
+    """Share of values that may differ more, since single precision may go either way there."""
     read: Callable[[], np.ndarray] | None = None
     """What the kernel wrote; if left out, ``output`` as it is."""
     read_torch: Callable[[Any], np.ndarray] = lambda tensor: tensor.cpu().numpy()
@@ -103,20 +105,16 @@ class Case:
     def compare(self, outputs: Any) -> None:
         """Refuses outputs of the counterpart that are not the kernel's: nothing may be timed then.
 
-        On a knife edge single precision may go either way: one value in 10,000 may differ, and one in 50 may be missing
-        on one side (of a probe that just touches, or of two that are equally deep).
+        NaN stands for what is absent.
         """
         ours, theirs = self.run_kernel(), self.read_torch(outputs)
         if ours.shape != theirs.shape:
             raise ValueError(f"{self.name}: torch gives shape {theirs.shape}, the kernel {ours.shape}")
-        ours_present, theirs_present = ~np.isnan(ours), ~np.isnan(theirs)
-        count = int(theirs_present.sum())
-        one_sided = int((ours_present != theirs_present).sum())
-        apart = np.abs(ours - theirs) > self.atol + self.rtol * np.abs(theirs)
-        if not count or one_sided > 0.02 * count or apart.sum() > 1e-4 * count:
-            raise ValueError(
-                f"{self.name}: of {count} values {apart.sum()} of kernel and torch differ, {one_sided} are of one alone"
-            )
+        near = np.abs(ours - theirs) <= self.atol + self.rtol * np.abs(theirs)
+        differing = int((~near & ~(np.isnan(ours) & np.isnan(theirs))).sum())
+        present = int((~np.isnan(theirs)).sum())
+        if not present or differing > self.undecided * present:
+            raise ValueError(f"{self.name}: of {present} values of torch {differing} differ from the kernel's")
 
 
 def _share_within_reach(genes: np.ndarray) -> float:
@@ -211,7 +209,8 @@ def _contact_case(scene: Scene) -> Case:
             bytes=read + int(sim.contact_count.numpy()[0]) * RECORD,
             flops=2 * FLOPS_PER_TRIANGLE * cells + FLOPS_PER_PROBE * num_probes * sim.num_envs,
         ),
-        atol=5e-4,  # normals of probes whose centre is near the surface
+        atol=5e-4,
+        undecided=0.01,  # probes that just touch, that are equally deep, or whose centre lies on the surface
     )
 
 
