@@ -11,17 +11,13 @@ from typing import Any
 
 _TEMPORARY = ".tmp"
 _PROBE = ".write-test"
-_LINE = 120  # columns
 
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Replaces a file in one step that survives a kill and a power cut.
 
     The temporary file has a fixed name beside the target, so that what a kill leaves behind is overwritten by the next
-    write instead of piling up. The folder exists.
-
-    Raises:
-        OSError: If the file cannot be written, as on a full disk; the old file, or the new one, is then whole.
+    write instead of piling up. The folder exists. After an OSError, as on a full disk, the old file is whole.
     """
     temporary = path.with_name(f".{path.name}{_TEMPORARY}")
     try:
@@ -60,11 +56,7 @@ def is_leftover(path: Path) -> bool:
 
 
 def check_writable(folder: Path) -> None:
-    """Checks that files can be made in a folder, before long work whose result goes there.
-
-    Raises:
-        ValueError: If they cannot.
-    """
+    """Raises a ValueError, before long work, if files cannot be made in the folder that its result goes to."""
     probe = folder / _PROBE
     try:
         probe.touch()
@@ -74,11 +66,7 @@ def check_writable(folder: Path) -> None:
 
 
 def prepare_output(file: Path) -> None:
-    """Makes the folder of a file and checks that the file can be written, before long work.
-
-    Raises:
-        ValueError: If it cannot.
-    """
+    """Makes the folder of a file; raises a ValueError, before long work, if the file cannot be written."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -89,53 +77,20 @@ def prepare_output(file: Path) -> None:
 
 
 def to_json(content: dict[str, Any]) -> bytes:
-    """A dictionary as JSON, indented; what fits a line and lists of numbers stand on one.
-
-    Raises:
-        ValueError: If a number is not finite.
-    """
-    return (_as_json(content, "", 0) + "\n").encode()
-
-
-def _as_json(value: Any, indent: str, before: int) -> str:
-    """A value, before which so many columns of its line are taken beside the indent."""
-    if not isinstance(value, dict | list | tuple) or not value:
-        return json.dumps(value, allow_nan=False)
-    inner = f"{indent} "
-    if isinstance(value, dict):
-        names = json.loads(json.dumps(dict.fromkeys(value), allow_nan=False))  # as JSON has them, words alone
-        heads = [f"{json.dumps(name)}: " for name in names]
-        parts = [head + _as_json(one, inner, len(head)) for head, one in zip(heads, value.values(), strict=True)]
-        opening, closing = "{}"
-    else:
-        parts = [_as_json(one, inner, 0) for one in value]
-        opening, closing = "[]"
-    line = f"{opening}{', '.join(parts)}{closing}"
-    numbers = opening == "[" and not any(isinstance(one, str | dict | list | tuple) for one in value)
-    if numbers or ("\n" not in line and len(indent) + before + len(line) < _LINE):  # a comma may follow
-        return line
-    rows = ",\n".join(f"{inner}{part}" for part in parts)
-    return f"{opening}\n{rows}\n{indent}{closing}"
+    """A dictionary as indented JSON; a ValueError if a number in it is not finite."""
+    return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The dictionary in a JSON file.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it cannot be read, or holds something else.
-    """
+    """The dictionary in a JSON file; FileNotFoundError if there is no file, ValueError if it holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ValueError(f"{path} must be a JSON file, got: {reason}: put a copy of it back") from None
+        raise ValueError(f"{path} must be a JSON file, got: {error}: put a copy of it back") from None
     if not isinstance(content, dict):
-        raise ValueError(
-            f"{path} must hold a JSON object, got {type(content).__name__}: put a copy of the right file there"
-        )
+        raise ValueError(f"{path} must hold a JSON object, got {type(content).__name__}: put a copy of it back")
     return content
 
 
@@ -159,10 +114,7 @@ def has_shape(value: Any, shape: Any) -> bool:
 def check_zip(path: Path) -> None:
     """Compares the parts of a zip file, such as torch and NumPy write, with their checksums.
 
-    Torch never looks at them when it loads: a flipped bit would be another weight.
-
-    Raises:
-        ValueError: If the file is no zip file or a part is damaged.
+    Torch never looks at them when it loads: a flipped bit would be another weight. A ValueError says what is damaged.
     """
     try:
         with zipfile.ZipFile(path) as file:
@@ -175,14 +127,9 @@ def check_zip(path: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, busy: str) -> Iterator[None]:
-    """Keeps other processes that ask for the same out of a directory; ends with the process, however that ends.
+    """Keeps other processes that ask for the same out of a folder, or raises a ValueError that says ``busy``.
 
-    Args:
-        folder: The directory.
-        busy: What to say if another process is in it.
-
-    Raises:
-        ValueError: If one is.
+    It ends with the process, however that ends.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:

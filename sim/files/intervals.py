@@ -1,4 +1,4 @@
-"""95 % intervals of measured rates and means."""
+"""95 % intervals of measured rates and means, and how they are written."""
 
 import math
 from collections.abc import Sequence
@@ -6,17 +6,14 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 _Z = 1.959963984540054  # the normal distribution's 97.5 % quantile
 _BOOTSTRAP_DRAWS = 10_000
 
 
 def wilson_interval(hits: int, count: int) -> tuple[float, float]:
-    """95 % Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials; 0 to 1 without any.
-
-    Raises:
-        ValueError: If there are more hits than trials, or fewer than 0.
-    """
+    """Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials; 0 to 1 without any."""
     if not 0 <= hits <= count:
         raise ValueError(f"a rate needs 0 <= hits <= count, got {hits} of {count}")
     if count == 0:
@@ -28,28 +25,13 @@ def wilson_interval(hits: int, count: int) -> tuple[float, float]:
     return (0.0 if hits == 0 else centre - half), (1.0 if hits == count else centre + half)
 
 
-def value_words(value: float | None, limits: Sequence[float] | None, form: str = ".3f") -> str:
-    """A number with its interval: ``0.750 (0.301 to 0.954)``, by ``.0%`` ``75% (30 to 95%)``.
-
-    Args:
-        value: The number; "-" stands for None.
-        limits: Lower and upper limit; None if none is known, which leaves the number alone.
-        form: Format of each.
-    """
-    if value is None:
-        return "-"
-    if limits is None:
-        return format(value, form)
-    low, high = (format(limit, form) for limit in limits)
-    return f"{value:{form}} ({low.removesuffix('%')} to {high})"
-
-
-def rate_words(hits: int, count: int, *, short: bool = False) -> str:
-    """A rate with its 95 % Wilson interval: ``3 of 4 (75%, 30 to 95%)``, in short ``75% (30 to 95%)``."""
-    if not count:
-        return "no valid episode"
-    words = value_words(hits / count, wilson_interval(hits, count), ".0%")
-    return words if short else f"{hits} of {count} ({words.replace(' (', ', ')}"
+def t_interval(values: NDArray[np.floating]) -> list[float] | None:
+    """Interval of the mean of a few independent measurements (Student 1908), one a training or search; None of one."""
+    count = len(values)
+    if count < 2:
+        return None
+    half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(count)
+    return [float(values.mean()) - half, float(values.mean()) + half]
 
 
 @lru_cache(maxsize=3)  # of a few sizes of sets, 80 kB a terrain
@@ -63,9 +45,7 @@ def _resamples(count: int, seed: int) -> NDArray[np.float64]:
 def bootstrap_interval(
     values: NDArray[np.floating], seed: int, *, families: NDArray[np.int64] | None = None
 ) -> list[float] | None:
-    """95 % interval of the mean of ``values`` (num_terrains,), resampling terrains.
-
-    None of fewer than two terrains or families, whose resamples are all the same and say nothing of their spread.
+    """Interval of the mean of ``values`` (num_terrains,), resampling terrains; None of fewer than two families.
 
     One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
 
@@ -74,36 +54,28 @@ def bootstrap_interval(
         seed: Of the resamples.
         families: Terrains of one number are not independent: they are drawn together, shape (num_terrains,).
     """
-    own = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
-    count = int(own.max(initial=-1)) + 1
+    family = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
+    count = int(family.max(initial=-1)) + 1
     if count < 2:
         return None
     drawn = _resamples(count, seed)
-    means = (drawn @ np.bincount(own, weights=values)) / (drawn @ np.bincount(own).astype(np.float64))
+    means = (drawn @ np.bincount(family, weights=values)) / (drawn @ np.bincount(family).astype(np.float64))
     return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
 
 
-_T_QUANTILES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)  # 97.5 %, of 1 to 9 degrees of freedom
-MAX_T_VALUES = len(_T_QUANTILES) + 1
-"""Most measurements that :func:`t_interval` takes."""
+def value_words(value: float | None, limits: Sequence[float] | None, form: str = ".3f") -> str:
+    """A number with its interval: ``0.750 (0.301 to 0.954)``, by ``.0%`` ``75% (30 to 95%)``; "-" for None."""
+    if value is None:
+        return "-"
+    if limits is None:
+        return format(value, form)
+    low, high = (format(limit, form) for limit in limits)
+    return f"{value:{form}} ({low.removesuffix('%')} to {high})"
 
 
-def t_interval(values: NDArray[np.floating]) -> list[float] | None:
-    """95 % interval of the mean of a few independent measurements (Student 1908), such as one a training or search.
-
-    Args:
-        values: Shape (count,); at most 10.
-
-    Returns:
-        Lower and upper limit; None for a single one, which says nothing of its spread.
-
-    Raises:
-        ValueError: If there are more.
-    """
-    count = len(values)
-    if count > MAX_T_VALUES:
-        raise ValueError(f"a t interval is of at most {MAX_T_VALUES} values, got {count}")
-    if count < 2:
-        return None
-    half = _T_QUANTILES[count - 2] * float(values.std(ddof=1)) / math.sqrt(count)
-    return [float(values.mean()) - half, float(values.mean()) + half]
+def rate_words(hits: int, count: int, *, short: bool = False) -> str:
+    """A rate with its Wilson interval: ``3 of 4 (75%, 30 to 95%)``, in short ``75% (30 to 95%)``."""
+    if not count:
+        return "no valid episode"
+    words = value_words(hits / count, wilson_interval(hits, count), ".0%")
+    return words if short else f"{hits} of {count} ({words.replace(' (', ', ')}"

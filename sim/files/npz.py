@@ -13,11 +13,7 @@ _ENDING = ".npy"
 
 
 def array_names(path: Path) -> list[str]:
-    """Names of the arrays in an npz file.
-
-    Raises:
-        Exception: Anything, if it is damaged or another file.
-    """
+    """Names of the arrays in an npz file; any Exception if it is damaged or another file."""
     with zipfile.ZipFile(path) as members:
         return [name.removesuffix(_ENDING) for name in members.namelist()]
 
@@ -35,11 +31,37 @@ def read_arrays(path: Path, names: Sequence[str], *, max_bytes: float = float("i
             types.
     """
     with zipfile.ZipFile(path) as members:
+        missing = set(names) - {name.removesuffix(_ENDING) for name in members.namelist()}
+        if missing:
+            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         large = {name: size for name in names if (size := members.getinfo(name + _ENDING).file_size) > max_bytes}
         if large:
             raise ValueError(f"{', '.join(large)} of {max(large.values()):,} bytes, at most {max_bytes:,} are read")
         data = {name: members.read(name + _ENDING) for name in names}  # np.load would leave some checksums unread
     return {name: np.lib.format.read_array(io.BytesIO(part), allow_pickle=False) for name, part in data.items()}
+
+
+def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Sequence[int | str]]) -> dict[str, int]:
+    """Raises ValueError for an array whose shape does not fit; arrays that are not there fit.
+
+    Args:
+        arrays: By name.
+        shapes: Of each array; a text stands for the same size wherever it is.
+
+    Returns:
+        The size that each text stands for.
+    """
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        got = arrays[name].shape if name in arrays else ()
+        if name in arrays and (
+            len(got) != len(shape)
+            or any(length != (sizes.setdefault(size, length) if isinstance(size, str) else size)
+                   for size, length in zip(shape, got, strict=True))
+        ):  # fmt: skip
+            expected = tuple(sizes.get(size, size) if isinstance(size, str) else size for size in shape)
+            raise ValueError(f"{name} must have shape {expected}, got {got}")
+    return sizes
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]], *, compression: int = zipfile.ZIP_DEFLATED) -> bytes:
@@ -52,9 +74,9 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]], *, compression: int = zipfile.
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w") as members:
         for name, values in arrays.items():
-            one = io.BytesIO()
-            np.lib.format.write_array(one, values, allow_pickle=False)
-            about = zipfile.ZipInfo(name + _ENDING)  # with the date that a zip file begins with
-            about.compress_type = compression
-            members.writestr(about, one.getvalue())
+            member = io.BytesIO()
+            np.lib.format.write_array(member, values, allow_pickle=False)
+            header = zipfile.ZipInfo(name + _ENDING)  # with the date that a zip file begins with
+            header.compress_type = compression
+            members.writestr(header, member.getvalue())
     return whole.getvalue()

@@ -1,5 +1,6 @@
 """How commands start, fail and end, and the command lines that are printed."""
 
+import json
 import os
 import signal
 import sys
@@ -191,7 +192,7 @@ def test_a_report_is_shown_and_written(tmp_path, capsys):
     file = tmp_path / "new" / "a.json"
     assert publish(file, lambda: {"a": 1}, lambda report: print("shown", report["a"])) == {"a": 1}
     assert capsys.readouterr().out == f"shown 1\nwritten to {file}\n"
-    assert file.read_text() == '{"a": 1}\n'
+    assert json.loads(file.read_text()) == {"a": 1}
     publish(None, lambda: {}, lambda report: None)
     assert capsys.readouterr().out == ""
 

@@ -1,15 +1,20 @@
 """Provenance, and files that are whole or absent."""
 
+import dataclasses
+import hashlib
 import json
 import re
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sim.files.atomic import to_json, write_atomically
-from sim.files.records import code_fingerprint, provenance
+from sim.files.atomic import locked, read_json, to_json, write_atomically
+from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
+from sim.files.records import check_identity, code_fingerprint, identity, provenance, robot_digest
+from sim.robots.training import TrainingCfg
 
 
 def test_provenance_has_its_keys(monkeypatch):
@@ -31,7 +36,7 @@ def test_commit_comes_from_git_otherwise(monkeypatch):
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.json"
     write_atomically(path, to_json({"x": 1}))
-    with pytest.raises(ValueError, match="not JSON compliant"):
+    with pytest.raises(ValueError, match="JSON"):
         write_atomically(path, to_json({"x": float("nan")}))
     assert json.loads(path.read_text()) == {"x": 1}
     with pytest.raises(OSError, match="absent"):
@@ -39,18 +44,19 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_what_fits_a_line_takes_one_and_means_what_it_meant():
-    content = {
-        "a": [0.1, -2e-30, None], "b": [[1, 2], []], "c": ["[\n 1,  2]", "x" * 90, "\u00e9"],
-        "e": [{"f": [3], "g": {}}],
-        "many": [k / 7 for k in range(50)], 3: (True, ()), "deep": [{"name": "x" * 50, "rate": [0.5, 1.0]}] * 3,
-    }  # fmt: skip
-    text = to_json(content).decode()
-    assert json.loads(text) == json.loads(json.dumps(content))
-    rows = text.splitlines()
-    assert {' "a": [0.1, -2e-30, null],', ' "e": [{"f": [3], "g": {}}],', ' "3": [true, []],'} <= set(rows)
-    assert all(len(row) <= 120 for row in rows if not row.startswith(' "many": ['))
-    assert sum(row.startswith('  {"name": ') for row in rows) == 3 and rows[-1] == "}"
+def test_json_comes_back_as_it_was(tmp_path):
+    content = {"a": [0.1, -2e-30, None], "b": {"c": "\u00e9", "d": [[1, 2], []]}}
+    (tmp_path / "a.json").write_bytes(to_json(content))
+    assert read_json(tmp_path / "a.json") == content
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"a": NaN}', '{"a": Infinity}', "\xff", "[" * 100_000])
+def test_what_is_no_json_object_is_refused(tmp_path, text):
+    (tmp_path / "a.json").write_text(text, encoding="latin-1")
+    with pytest.raises(ValueError, match=r"a\.json"):
+        read_json(tmp_path / "a.json")
+    with pytest.raises(FileNotFoundError):
+        read_json(tmp_path / "b.json")
 
 
 @pytest.mark.parametrize("content", [{(1, 2): 3}, {"a": np.zeros(2)}, {"a": {1, 2}}])
@@ -84,3 +90,46 @@ def test_the_command_recorded_is_the_one_to_type(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     given = ("bench", "--out", str(tmp_path / "a" / "b.json"), "--run=/home/me/runs/x")
     assert recorded("faultline", *given) == "faultline bench --out a/b.json --run=x"
+
+
+def test_records_name_robot_and_controller_by_hash(anymal, tmp_path):
+    record = identity(anymal, anymal.policy_file)
+    assert record["robot"] == "anymal" and record["policy"] == "anymal.pt"
+    assert record["robot_sha256"] == robot_digest(anymal)
+    assert record["policy_sha256"] == hashlib.sha256(anymal.policy_file.read_bytes()).hexdigest()
+    check_identity(record, anymal, Path("a.json"), "make it anew")
+    for key in ("robot_sha256", "penalty_definition"):
+        for changed in (record | {key: "other"}, {name: value for name, value in record.items() if name != key}):
+            with pytest.raises(ValueError, match=r"a\.json.*make it anew"):
+                check_identity(changed, anymal, Path("a.json"), "make it anew")
+
+
+def test_a_robots_hash_follows_its_settings_but_those_of_training(anymal):
+    digest = robot_digest(anymal)
+    assert robot_digest(dataclasses.replace(anymal, max_speed=99.0)) != digest
+    assert robot_digest(dataclasses.replace(anymal, training=TrainingCfg(push_speed=9.0))) == digest
+
+
+def test_a_locked_folder_has_one_owner(tmp_path):
+    with locked(tmp_path, "it is busy"), pytest.raises(ValueError, match="it is busy"), locked(tmp_path, "it is busy"):
+        pytest.fail("two are in")
+    with locked(tmp_path, "it is busy"):
+        pass
+
+
+def test_arrays_are_read_by_name_and_their_shapes_agree(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes({"a": np.zeros((2, 3)), "b": np.arange(3)}))
+    arrays = read_arrays(path, ["a", "b"])
+    assert sorted(array_names(path)) == ["a", "b"] and arrays["b"].tolist() == [0, 1, 2]
+    assert check_shapes(arrays, {"a": ("rows", "columns"), "b": ("columns",), "absent": (7,)}) == {
+        "rows": 2,
+        "columns": 3,
+    }
+    for shapes in ({"a": ("n", "n")}, {"a": ("n",)}, {"b": ("n",), "a": ("n", 3)}, {"b": (4,)}):
+        with pytest.raises(ValueError, match=r"must have shape"):
+            check_shapes(arrays, shapes)
+    with pytest.raises(ValueError, match="lacks c"):
+        read_arrays(path, ["a", "c"])
+    with pytest.raises(ValueError, match="a of "):
+        read_arrays(path, ["a", "b"], max_bytes=160)
