@@ -282,7 +282,6 @@ class Recordings:
 
     def _is(self, recording: "Recording", wanted: Wanted) -> bool:
         """Whether a recording is of just these crossings; a file may have been renamed."""
-        from sim.recording.recorder import space_in
         from sim.spaces.registry import get_space, identity
 
         origin = recording.origin
@@ -292,7 +291,7 @@ class Recordings:
             and self._about.items() <= recording.origin.items()
             and recording.joint_names == self._robot.joint_names
             and recording.origin.get("policy_sha256") == controller_hash(wanted.policy)
-            and identity(space_in(origin), origin.get("space_sha256"))
+            and identity(origin.get("space", ""), origin.get("space_sha256"))
             == identity(wanted.space, get_space(wanted.space).sha256)
             and np.array_equal(terrain, wanted.terrain[None])
             and (wanted.ground is None or _same_ground(recording.ground, wanted.ground))

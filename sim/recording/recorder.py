@@ -8,7 +8,7 @@ the state at ``k * dt``: frame 0 the start, the last one the end of the control 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,7 @@ from kernels.episode import Outcome
 from kernels.penalties import COLLISION_FORCE, PENALTIES
 from sim.files.records import identity, provenance
 from sim.ground import GroundMaps
-
-if TYPE_CHECKING:  # who reads a recording has no simulation to wait for
-    from sim.rollout import Rollout, RolloutResult
+from sim.rollout import Rollout, RolloutResult
 
 FRAME_ARRAYS: dict[str, type[np.floating]] = {
     "base_position": np.float32,
@@ -60,7 +58,7 @@ class Recording:
     outcome: NDArray[np.uint8]
     """:class:`kernels.episode.Outcome` of each episode, shape (T, K)."""
     invalidity: NDArray[np.uint8]
-    """:class:`kernels.episode.Invalidity` of each episode, shape (T, K); NONE throughout a file that lacks it."""
+    """:class:`kernels.episode.Invalidity` of each episode, shape (T, K)."""
     fallen: NDArray[np.bool_]
     """Tilt above 60 degrees at the end, shape (T, K)."""
     duration_s: NDArray[np.float32]
@@ -81,16 +79,15 @@ class Recording:
     """Command of the coming control step: v_x, v_y [m/s], yaw rate [rad/s], yaw frame; 0 once ended; (T, K, F, 3)."""
     origin: dict[str, Any]
     """Where it comes from: :func:`sim.files.records.identity`, command, commit, device, versions, seed, date."""
-    geom_names: tuple[str, ...] = ()
-    """Of the G geoms whose touch is known: base, limbs and feet; none in the first files."""
+    geom_names: tuple[str, ...]
+    """Of the G geoms whose touch is known: base, limbs and feet."""
+    touching: NDArray[np.bool_]
+    """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also
+    where its collision ended the episode, whenever in the last control step that was. False from ``num_frames`` on."""
     friction: NDArray[np.float32] | None = None
-    """Of the patches of each terrain, shape (T, rows, cols); None where ground is as always, as in the first files."""
+    """Of the patches of each terrain, shape (T, rows, cols); None where ground is as always."""
     time_constant_s: NDArray[np.float32] | None = None
     """Softness of the patches, with and without as ``friction`` (:class:`sim.ground.GroundMaps`)."""
-    touching: NDArray[np.bool_] | None = None
-    """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also
-    where its collision ended the episode, whenever in the last control step that was. False from ``num_frames`` on,
-    None in the first files."""
 
     @property
     def num_terrains(self) -> int:
@@ -115,11 +112,7 @@ class Recording:
         return GroundMaps(friction=self.friction, time_constant_s=self.time_constant_s)
 
     def of_terrain(self, terrain: int) -> "Recording":
-        """The recording of one of the terrains alone.
-
-        Args:
-            terrain: Its index.
-        """
+        """The recording of the terrain of one index alone."""
         num_frames = self.num_frames[terrain : terrain + 1]
         cut = {name: getattr(self, name)[terrain : terrain + 1, :, : num_frames.max()] for name in FRAME_ARRAYS}
         each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s")
@@ -127,25 +120,19 @@ class Recording:
         for name in ("genes", "friction", "time_constant_s"):
             whole = getattr(self, name)
             cut[name] = None if whole is None else whole[terrain : terrain + 1]
-        touching = None if self.touching is None else self.touching[terrain : terrain + 1, :, : num_frames.max()]
-        return replace(self, num_frames=num_frames, touching=touching, **cut)
+        cut["touching"] = self.touching[terrain : terrain + 1, :, : num_frames.max()]
+        return replace(self, num_frames=num_frames, **cut)
 
     def of_episode(self, episode: int) -> "Recording":
-        """The recording of one of the episodes alone, on every terrain.
+        """The recording of one of the episodes alone, by its index among those recorded, on every terrain."""
+        rows = slice(episode, episode + 1)
+        num_frames = self.num_frames[:, rows]
+        cut = {name: getattr(self, name)[:, rows, : num_frames.max()] for name in (*FRAME_ARRAYS, "touching")}
+        cut |= {name: getattr(self, name)[:, rows] for name in ("outcome", "invalidity", "fallen", "duration_s")}
+        return replace(self, replicas=self.replicas[rows], num_frames=num_frames, **cut)
 
-        Args:
-            episode: Its index among those recorded.
-        """
-        own = slice(episode, episode + 1)
-        num_frames = self.num_frames[:, own]
-        cut = {name: getattr(self, name)[:, own, : num_frames.max()] for name in FRAME_ARRAYS}
-        cut |= {name: getattr(self, name)[:, own] for name in ("outcome", "invalidity", "fallen", "duration_s")}
-        return replace(self, replicas=self.replicas[own], num_frames=num_frames, **cut)
-
-    def result(self) -> "RolloutResult":
+    def result(self) -> RolloutResult:
         """What came of the recorded episodes; positions are those of the last frame, what they took is not known."""
-        from sim.rollout import RolloutResult
-
         last = np.maximum(self.num_frames - 1, 0)[..., None, None]
         penalties, position = (
             np.take_along_axis(values, last, axis=2)[:, :, 0] for values in (self.penalties, self.base_position)
@@ -166,29 +153,16 @@ class Recording:
         )
 
     def qpos(self, terrain: int, episode: int) -> NDArray[np.float64]:
-        """MuJoCo's joint coordinates of an episode: position, quaternion w x y z, joints.
-
-        Args:
-            terrain: Index of the terrain.
-            episode: Index of the episode among those recorded.
-
-        Returns:
-            Shape (frames of the episode, 7 + J).
-        """
+        """MuJoCo's coordinates of an episode: position, quaternion w x y z, joints; shape (its frames, 7 + J)."""
         frames = slice(self.num_frames[terrain, episode])
         parts = (self.base_position, self.base_quaternion, self.joint_position)
         return np.concatenate([part[terrain, episode, frames].astype(np.float64) for part in parts], axis=1)
 
 
-def space_in(origin: dict[str, Any]) -> str:
-    """Terrain space of a recording's genes; recordings of the first search name none."""
-    return origin.get("space", "super_gaussian")
-
-
 class _Frames:
     """Collects the frames of a rollout's episodes, whichever robots run them (:class:`sim.rollout.Watcher`)."""
 
-    def __init__(self, rollout: "Rollout", num_terrains: int) -> None:
+    def __init__(self, rollout: Rollout, num_terrains: int) -> None:
         self._rollout = rollout
         robot = rollout.robot
         self._shape = (num_terrains, rollout.num_replicas)
@@ -255,7 +229,7 @@ class _Frames:
 
 
 def record(
-    rollout: "Rollout",
+    rollout: Rollout,
     terrains: NDArray[Any],
     seeds: NDArray[Any],
     *,
@@ -264,7 +238,7 @@ def record(
     labels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
-) -> "tuple[RolloutResult, Recording]":
+) -> tuple[RolloutResult, Recording]:
     """Runs a rollout's episodes and records them; the episodes are those that ``rollout.evaluate`` would run.
 
     On the host a frame of an episode takes some 110 bytes: 4,000 whole episodes are half a gigabyte.
@@ -278,12 +252,6 @@ def record(
         labels: What each terrain is, in words.
         seed: What the seeds were drawn with, for the record.
         progress: As of ``rollout.evaluate``.
-
-    Returns:
-        The result, and the recording.
-
-    Raises:
-        ValueError: If a shape does not fit.
     """
     frames = _Frames(rollout, len(terrains))
     result = rollout.evaluate(terrains, seeds, ground=ground, watcher=frames, progress=progress)

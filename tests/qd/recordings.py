@@ -43,6 +43,7 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0) -> Re
         foot_force=np.zeros((1, count, FRAMES, 1, 3), np.float32),
         penalties=(sums[None, :, None, :] * share[:, None]).astype(np.float32),
         command=np.zeros((1, count, FRAMES, 3), np.float32), origin={"policy": "made up"},
+        geom_names=(), touching=np.zeros((1, count, FRAMES, 0), bool),
     )  # fmt: skip
 
 
@@ -57,7 +58,7 @@ def stand_in_cross(crossed: list):
             ends = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT)
             outcomes = [ends[(number + k) % 4] for k in range(one.replicas)]
             recording = recording_of(outcomes, np.linspace(6.0, 14.0, one.replicas), seed=one.terrain_seed)
-            origin = identity(get_robot("anymal"), one.policy)
+            origin = identity(get_robot("anymal"), one.policy) | {"space": "super_gaussian"}
             made.append(replace(recording, genes=one.terrain[None], labels=(one.label,), origin=origin))
         progress(1.0)
         return made

@@ -69,7 +69,7 @@ def test_a_recording_under_another_name_is_not_taken_for_it(anymal, wanted, reco
         dataclasses.replace(recording, genes=-recording.genes),
         dataclasses.replace(recording, seeds=recording.seeds + np.uint32(1)),
         dataclasses.replace(recording, robot="cassie"),
-        dataclasses.replace(recording, origin={"policy_sha256": "another"}),
+        dataclasses.replace(recording, origin=recording.origin | {"policy_sha256": "another"}),
     ):
         (tmp_path / "cache").mkdir(exist_ok=True)
         write_recording(recordings.file_of(wanted), strange)

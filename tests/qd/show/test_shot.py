@@ -52,6 +52,7 @@ def recording():
         joint_position=np.zeros((*shape, 1), np.float32), foot_force=np.zeros((*shape, 1, 3), np.float32),
         penalties=sums[None, :, None] * np.linspace(0, 1, FRAMES, dtype=np.float32)[:, None],
         command=np.zeros((*shape, 3), np.float32), origin={},
+        geom_names=(), touching=np.zeros((*shape, 0), bool),
     )  # fmt: skip
 
 

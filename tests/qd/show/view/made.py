@@ -47,7 +47,10 @@ def make_recording(robot, genes, *, seeds, policy_sha256, replicas=3) -> Recordi
         foot_force=frames(force),
         penalties=frames(k * np.arange(1.0, len(robot.penalties) + 1)),
         command=frames(np.tile([0.75, 0.25, 0.5], (FRAMES, 1))),
+        geom_names=(),
+        touching=np.zeros((*each, FRAMES, 0), bool),
         origin={
+            "space": "super_gaussian",
             **robot_identity(robot),
             "policy_sha256": policy_sha256,
             "date": "2026-01-02T03:04:05",
