@@ -2,29 +2,25 @@
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from PIL import Image
 
 _DPI = 150
 _SHADES = 400  # colours of a map in shades of grey, with those of its marks and their edges
 
 
-def new_figure(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float) -> Figure:
     """An empty figure of a size in inches that needs no screen and no global state."""
-    from matplotlib.figure import Figure
-
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def as_png(figure: "Figure") -> bytes:
+def as_png(figure: Figure) -> bytes:
     """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold."""
-    from matplotlib.text import Text
-
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_parse_math(False)  # a file may be called $x$.npz, or something that is no formula
@@ -32,14 +28,8 @@ def as_png(figure: "Figure") -> bytes:
     return _png_of(figure)
 
 
-def _png_of(figure: "Figure") -> bytes:
-    """Of lines alone in 256 colours, which take a quarter of the room, and so a map in shades of grey.
-
-    In a map in colours they would show as contours.
-    """
-    from matplotlib.image import AxesImage
-    from PIL import Image
-
+def _png_of(figure: Figure) -> bytes:
+    """The PNG with 256 colours, a quarter of the size, where 256 are enough: not for a coloured map."""
     whole, few = io.BytesIO(), io.BytesIO()
     figure.savefig(whole, format="png", dpi=_DPI)
     image = Image.open(whole).convert("RGB")

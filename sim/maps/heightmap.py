@@ -11,18 +11,19 @@ that has the terrain's own nodes is taken as it is.
 """
 
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files.atomic import read_json
-from sim.files.npz import array_names, read_arrays
+from sim.files.npz import array_names, check_shapes, read_arrays
+from sim.files.settings import from_builtins
 from sim.ground import GroundMaps
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
@@ -47,6 +48,18 @@ class Heightmap:
     """Along x and along y, from the first node to the last."""
     ground: GroundMaps | None = None
     """Friction and softness, of a map that has the size of a terrain."""
+
+
+_Side = Annotated[float, Meta(ge=MIN_SIDE_M, le=MAX_SIDE_M)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Meaning:
+    """What a file or the caller says of a map."""
+
+    size_m: tuple[_Side, _Side]
+    scale_m: float = 1.0
+    offset_m: float = 0.0
 
 
 def read_heightmap(
@@ -77,65 +90,52 @@ def read_heightmap(
     path = Path(path)
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise FileNotFoundError(f"no heightmap at {path}: expected an .npz or a .png file")
-    given = {"size_m": size_m, "scale_m": scale_m, "offset_m": offset_m}
-    kind, ground = path.suffix.lower(), None
-    if kind == ".npz":
-        heights, inside = _read_npz(path)
-        ground = inside.pop("ground")
-    elif kind == ".png":
+    beside = path.with_suffix(".json")
+    values, arrays = dict[str, Any](), dict[str, NDArray[Any]]()
+    if path.suffix.lower() == ".npz":
+        arrays = _read_npz(path)
+        heights = arrays["heights"].astype(np.float64)
+        values = {"size_m": arrays["size_m"].ravel().tolist()} if "size_m" in arrays else {}
+    elif path.suffix.lower() == ".png":
         heights = _read_png(path)
-        beside = path.with_suffix(".json")
-        inside = {name: value for name, value in read_json(beside).items() if name in given} if beside.exists() else {}
-        if scale_m is None and "scale_m" not in inside:
+        values = read_json(beside) if beside.exists() else {}
+        if scale_m is None and "scale_m" not in values:
             raise ValueError(
-                f"{path}: how many metres is a gray level? give --scale, or scale_m in {beside.name} beside it"
+                f"{path}: expected metres a gray level: give --scale, or scale_m in {beside.name} beside it"
             )
     else:
         raise ValueError(f"a heightmap must be an .npz or a .png file, got {path}: save it as one of these")
-    known = inside | {name: value for name, value in given.items() if value is not None}
-    size = _checked_size(path, known.get("size_m"))
-    scale, offset = (_checked_number(path, name, known.get(name, at)) for name, at in (("scale_m", 1), ("offset_m", 0)))
+    given = {"size_m": size_m, "scale_m": scale_m, "offset_m": offset_m}
+    values = {name: given[name] if given[name] is not None else values.get(name) for name in given}
+    meaning = _meaning_of(path, {name: value for name, value in values.items() if value is not None})
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is named below
-        heights = heights * scale + offset
-    if ground is not None and not np.allclose(size, _WHOLE, rtol=0.0, atol=1e-6):
+        heights = heights * meaning.scale_m + meaning.offset_m
+    _check_heights(path, heights)
+    return Heightmap(heights=heights, size_m=meaning.size_m, ground=_ground_in(path, arrays, meaning.size_m))
+
+
+def _meaning_of(path: Path, values: dict[str, Any]) -> _Meaning:
+    if "size_m" not in values:
         raise ValueError(
-            f"{path}: a map with friction or softness must be {_WHOLE[0]:g} m x {_WHOLE[1]:g} m, got {size[0]:g} m x "
-            f"{size[1]:g} m: they are of patches of a whole terrain"
+            f"{path}: expected its size: give --size X Y in metres, or size_m in the .npz or in a .json beside a .png"
         )
-    return Heightmap(heights=_checked(path, heights), size_m=size, ground=ground)
-
-
-def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, Any]]:
     try:
-        found = sorted(array_names(path))
-        wanted = [name for name in ("heights", "size_m", *_GROUND) if name in found]
-        arrays = read_arrays(path, wanted, max_bytes=_MAX_BYTES)
+        return from_builtins(_Meaning, values, str(path))
+    except ValueError as error:
+        raise ValueError(f"{error}: sizes are {MIN_SIDE_M:g} to {MAX_SIDE_M:g} m, a crossing is 16 m x 8 m") from None
+
+
+def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a map, by name."""
+    try:
+        names = [name for name in array_names(path) if name in ("size_m", *_GROUND)]
+        arrays = read_arrays(path, ["heights", *names], max_bytes=_MAX_BYTES)
+        check_shapes(arrays, {"heights": ("nrow", "ncol")})
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
-        raise ValueError(f"{path} must be an .npz file of arrays, but it is damaged or another file: {error}") from None
-    if "heights" not in arrays:
-        raise ValueError(f"{path} must hold an array 'heights', got {', '.join(found) or 'nothing'}: name it so")
-    heights = arrays["heights"]
-    if heights.ndim != 2 or heights.dtype.kind != "f":
-        raise ValueError(
-            f"{path}: heights must be floats [m] of shape (nrow, ncol), got {heights.dtype} of shape {heights.shape}"
-        )
-    inside: dict[str, Any] = {"size_m": arrays["size_m"].ravel().tolist()} if "size_m" in arrays else {}
-    inside["ground"] = _ground_in(path, arrays)
-    with np.errstate(invalid="ignore"):  # what is not finite is named later
-        return heights.astype(np.float64), inside
-
-
-def _ground_in(path: Path, arrays: dict[str, NDArray[Any]]) -> GroundMaps | None:
-    there = [arrays[name] for name in _GROUND if name in arrays]
-    if not there:
-        return None
-    try:
-        plain = GroundMaps.plain(1, there[0].shape)
-        maps = (np.asarray(arrays.get(name, getattr(plain, name)[0]), dtype=np.float32)[None] for name in _GROUND)
-        friction, time_constant_s = maps
-        return GroundMaps(friction=friction, time_constant_s=time_constant_s)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{path} must be an .npz file with an array 'heights', got: {error}") from None
+    if arrays["heights"].dtype.kind != "f":
+        raise ValueError(f"{path}: heights must be floats [m], got {arrays['heights'].dtype}")
+    return arrays
 
 
 def _read_png(path: Path) -> NDArray[np.float64]:
@@ -144,42 +144,37 @@ def _read_png(path: Path) -> NDArray[np.float64]:
             mode, size = image.mode, image.size
             gray = np.asarray(image) if mode in _GRAY_MODES and max(size) <= _MAX_NODES else None
     except Exception as error:  # a damaged image can fail with anything
-        raise ValueError(f"{path} must be a PNG image, but it is damaged or another file: {error}") from None
-    if max(size) > _MAX_NODES:
-        raise ValueError(f"{path}: an image may have at most {_MAX_NODES} pixels a side, got {size[0]} x {size[1]}")
+        raise ValueError(f"{path} must be a PNG image, got: {error}") from None
     if gray is None:
-        raise ValueError(f"{path} must be a grayscale image of 8 or 16 bits, got mode '{mode}': convert it first")
+        raise ValueError(
+            f"{path} must be a grayscale image of 8 or 16 bits of at most {_MAX_NODES} a side, got mode '{mode}' "
+            f"and {size[0]} x {size[1]}: convert it first"
+        )
     return gray[::-1].astype(np.float64)
 
 
-def _checked_size(path: Path, size: Any) -> tuple[float, float]:
-    if size is None:
+def _ground_in(path: Path, arrays: dict[str, NDArray[Any]], size_m: tuple[float, float]) -> GroundMaps | None:
+    """Friction and softness of a map of the size of a terrain."""
+    maps = {name: arrays[name] for name in _GROUND if name in arrays}
+    if not maps:
+        return None
+    if not np.allclose(size_m, _WHOLE, rtol=0.0, atol=1e-6):
         raise ValueError(
-            f"{path}: how large is it? give --size X Y in metres, or size_m in the .npz or in a .json beside a .png"
+            f"{path}: with friction or softness it must be {_WHOLE[0]:g} m x {_WHOLE[1]:g} m, got {size_m}"
         )
-    sides = list(size) if isinstance(size, list | tuple) else [size]
-    if len(sides) != 2 or not all(_is_number(side) and MIN_SIDE_M <= side <= MAX_SIDE_M for side in sides):
-        raise ValueError(
-            f"{path}: size_m must be two lengths of {MIN_SIDE_M:g} to {MAX_SIDE_M:g} m, along x and along y, got "
-            f"{size}: a crossing is 16 m x 8 m"
+    try:
+        plain = GroundMaps.plain(1)
+        friction, time_constant_s = (
+            np.asarray(maps[name], dtype=np.float32)[None] if name in maps else getattr(plain, name) for name in _GROUND
         )
-    return float(sides[0]), float(sides[1])
+        return GroundMaps(friction=friction, time_constant_s=time_constant_s)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= sys.float_info.max  # False of NaN
-
-
-def _checked_number(path: Path, name: str, value: Any) -> float:
-    if not _is_number(value) or (name == "scale_m" and value == 0):
-        raise ValueError(f"{path}: {name} must be a finite number of metres, a scale not 0, got {value}")
-    return float(value)
-
-
-def _checked(path: Path, heights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _check_heights(path: Path, heights: NDArray[np.float64]) -> None:
     if min(heights.shape) < 2 or max(heights.shape) > _MAX_NODES:
-        shape = " x ".join(map(str, heights.shape))
-        raise ValueError(f"{path}: a heightmap needs 2 to {_MAX_NODES} nodes a side, got {shape} (rows x columns)")
+        raise ValueError(f"{path}: a heightmap needs 2 to {_MAX_NODES} nodes a side, got {heights.shape}")
     if not np.isfinite(heights).all():
         count = np.count_nonzero(~np.isfinite(heights))
         raise ValueError(f"{path}: {count} of {heights.size} heights are NaN or infinite: fill them first")
@@ -189,7 +184,6 @@ def _checked(path: Path, heights: NDArray[np.float64]) -> NDArray[np.float64]:
             f"{path}: heights must lie in +-{MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: are they metres (--scale), "
             "and is the ground about 0 (--offset)?"
         )
-    return heights
 
 
 def as_terrain(heightmap: Heightmap) -> NDArray[np.float32]:
@@ -218,12 +212,11 @@ def _weights(count: int, size: float, num_nodes: int) -> NDArray[np.float64]:
 def fitted(heightmap: Heightmap) -> str:
     """What becomes of a map on the terrain, in words."""
     rows, columns = heightmap.heights.shape
-    said = f"{columns} x {rows} nodes over {heightmap.size_m[0]:g} x {heightmap.size_m[1]:g} m"
-    said += f", heights {heightmap.heights.min():.2f} to {heightmap.heights.max():.2f} m"
-    sides = zip("xy", heightmap.size_m, _WHOLE, strict=True)
-    for axis, side, whole in sides:
+    (size_x, size_y), low, high = heightmap.size_m, heightmap.heights.min(), heightmap.heights.max()
+    words = f"{columns} x {rows} nodes over {size_x:g} x {size_y:g} m, heights {low:.2f} to {high:.2f} m"
+    for axis, side, whole in zip("xy", heightmap.size_m, _WHOLE, strict=True):
         if side > whole + 1e-6:
-            said += f", cut to its middle {whole:g} m along {axis}"
+            words += f", cut to its middle {whole:g} m along {axis}"
         elif side < whole - 1e-6:
-            said += f", continued by the height of its edge to {whole:g} m along {axis}"
-    return said if heightmap.ground is None else f"{said}, with friction or softness of its own"
+            words += f", continued by the height of its edge to {whole:g} m along {axis}"
+    return words if heightmap.ground is None else f"{words}, with friction or softness of its own"

@@ -1,16 +1,15 @@
 """A height map as a picture."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
 from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES, GroundMaps, patches_at
 from sim.terrain import NUM_COLS, NUM_ROWS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 LENGTH, WIDTH = 16.0, 8.0
 """Of a terrain [m]."""
@@ -51,7 +50,7 @@ def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> 
 
 
 def draw_heights(
-    axes: "Axes",
+    axes: Axes,
     heights: NDArray[np.float32],
     limits: tuple[float, float] | None = None,
     ground: GroundMaps | None = None,
@@ -64,8 +63,6 @@ def draw_heights(
         limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
         ground: Its friction and softness, which tint it.
     """
-    from matplotlib.colors import LinearSegmentedColormap
-
     low, high = limits or (float(heights.min()), float(heights.max()))
     greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
     image = axes.imshow(

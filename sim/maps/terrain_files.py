@@ -22,6 +22,7 @@ from PIL import Image
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
 from sim.ground import GroundMaps
+from sim.simulation import GROUND_FRICTION
 from sim.terrain import SPACING
 
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
@@ -115,8 +116,6 @@ def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:
     The geom stands turned by a quarter; x, y and z of the world are the terrain's. Its friction is below every robot's
     own: of two MuJoCo takes the larger.
     """
-    from sim.simulation import GROUND_FRICTION  # who only draws terrains has no simulation to wait for
-
     field = as_hfield(heights)
     root = ET.Element("mujoco", model=name)
     rows, columns = map(str, field.data.shape)
@@ -190,13 +189,6 @@ def write_terrain(
         about: Further keys of the JSON.
         genes: The terrain's genes, shape (num_genes,), for the npz.
         ground: Its friction and softness, for the npz.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: If a format is unknown.
-        OSError: If a file cannot be written.
     """
     check_formats(formats)
     scale, offset = gray_scale(heights)
@@ -218,11 +210,7 @@ def write_terrain(
 
 
 def check_formats(formats: Sequence[str]) -> None:
-    """That all formats are known and there is one.
-
-    Raises:
-        ValueError: If not.
-    """
+    """Raises ValueError unless all formats are known and there is one."""
     unknown = [ending for ending in formats if ending not in FORMATS]
     if unknown or not formats:
         raise ValueError(f"formats must be some of {', '.join(FORMATS)}, got {', '.join(unknown) or 'none'}")
