@@ -96,6 +96,9 @@ class Archive(Who, OnGround, Where):
         else:
             run = find_search(self.resume, robot=self.robot, policy=self.policy, space=self.space)
             robot, policy, cfg = run.robot, run.policy, run.cfg
+            space = None if self.space is None else load_space(self.space)
+            if space is not None and (space.sha256 is None or space.sha256 != cfg.space_sha256):
+                cfg = replace(cfg, space=space.name, space_sha256=space.sha256)
         fitness = cfg.fitness.of_penalties(self.fitness.penalties or cfg.fitness.penalties)
         cfg = replace(
             cfg,

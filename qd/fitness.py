@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.descriptors import Cells, terrain_ratios
-from sim.files.settings import check, setting
+from sim.files.settings import check
 from sim.rates import MAX_INVALID_SHARE, counted_episodes
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ class FitnessCfg:
     """Names of the penalties, in the order of the ratios."""
     scales: tuple[float, ...]
     """Scale of each penalty: raw sums are divided by it."""
-    alpha: float = setting(1.0)
+    alpha: float = 1.0
     """Weight of the standard deviations."""
-    lam: float = setting(2.0)
+    lam: float = 2.0
     """Weight of u, the share of episodes without a base collision; u is 0 if none collided."""
 
     def __post_init__(self) -> None:

@@ -7,12 +7,14 @@ import json
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg
 from sim.files.records import robot_identity
-from sim.files.settings import check, from_builtins, setting
+from sim.files.settings import NonNegativeInt, PositiveInt, Share, check, from_builtins
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, label_suffix, spec_of
 from sim.robots.robot import RobotCfg
 
@@ -20,8 +22,10 @@ Settings = dict[str, Any]
 """The settings that make a run what it is, as JSON values."""
 
 METHODS = ("cma_mae", "cma_me", "map_elites", "surrogate", "hard_random", "uniform_random")
-_SHARE = {"least": 0.0, "most": 1.0}
-_STEPS = {"least": 1e-6, "most": 1e3}  # what evolution strategies can reckon with; genes are float32 in [-1, 1]
+Step = Annotated[float, Meta(ge=1e-6, le=1e3)]
+"""A first step size that evolution strategies can reckon with; genes are float32 in [-1, 1]."""
+Sigma = Annotated[float, Meta(ge=0, le=1e3)]
+"""A standard deviation of changes of genes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,35 +38,35 @@ class SchedulerCfg:
     `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `hard_random`, the paper's, every height at
     its limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn,
     and where there are fewer emitters, the first methods count. docs/comparison.md compares them."""
-    emitters: int = setting(10, least=1)
+    emitters: PositiveInt = 10
     """Emitters that ask, each with an evolution strategy or a stream of its own."""
-    batch_size: int = setting(20, least=2)
+    batch_size: Annotated[int, Meta(ge=2)] = 20
     """Terrains an emitter asks for in an iteration."""
-    groups: int = setting(1, least=1, most=32)
+    groups: Annotated[int, Meta(ge=1, le=32)] = 1
     """Groups of emitters that ask and are told in turn, in a fixed order, at most one an emitter: robots have the
     terrains of the others to cross while the last robots of a group's terrains still walk."""
-    learning_rate: float = setting(0.09, least=0.0, most=1.0)
+    learning_rate: Share = 0.09
     """Step of a cell's acceptance threshold toward the fitness found there; 1 is elitist, 0 pure optimisation."""
-    sigma0: float | None = setting(None, **_STEPS)
+    sigma0: Step | None = None
     """First step size of an evolution strategy; genes live in [-1, 1]. The terrain space's own if None."""
-    restart_rule: int = setting(50, least=1)
+    restart_rule: PositiveInt = 50
     """Iterations after which an evolution strategy restarts at an elite."""
-    iso_sigma: float = setting(0.02, least=0.0, most=_STEPS["most"])
+    iso_sigma: Sigma = 0.02
     """Iso+line: standard deviation of each gene's own change (published: .01 of the genes' range)."""
-    line_sigma: float = setting(0.2, least=0.0, most=_STEPS["most"])
+    line_sigma: Sigma = 0.2
     """Iso+line: standard deviation of the step along the line to another elite, in its length (published: .2)."""
-    crossover_share: float = setting(0.3, **_SHARE)
+    crossover_share: Share = 0.3
     """Surrogate: share of the varied elites that take each of their parts, such as bumps, from a further elite with a
     chance of a half; of no effect where a space has no parts."""
-    candidates: int = setting(20, least=1, most=10_000)
+    candidates: Annotated[int, Meta(ge=1, le=10_000)] = 20
     """Surrogate: terrains that the networks judge in each generation for one that robots cross."""
-    generations: int = setting(10, least=1, most=1_000)
+    generations: Annotated[int, Meta(ge=1, le=1_000)] = 10
     """Surrogate: generations that the networks judge before robots cross the best."""
-    explore_share: float = setting(0.25, **_SHARE)
+    explore_share: Share = 0.25
     """Surrogate: share of its terrains that are elites varied once, whatever the networks say."""
-    disagree_share: float = setting(0.1, **_SHARE)
+    disagree_share: Share = 0.1
     """Surrogate: share of its terrains that the networks disagree most about."""
-    training_steps: int = setting(100, least=1, most=100_000)
+    training_steps: Annotated[int, Meta(ge=1, le=100_000)] = 100
     """Surrogate: steps of training an iteration, each on 64 terrains a network."""
 
     def __post_init__(self) -> None:
@@ -112,18 +116,18 @@ class SearchCfg:
     """Terrain space, as :func:`sim.space.load_space` takes it."""
     space_sha256: str | None = None
     """Hash of its code if it is a user's own."""
-    seed: int = setting(0, least=0)
-    iterations: int = setting(least=1)
+    seed: NonNegativeInt = 0
+    iterations: PositiveInt
     """Iterations to reach; may be raised later."""
-    replicas: int = setting(least=1)
+    replicas: PositiveInt
     """Episodes a terrain."""
-    intervals: int = setting(10, least=1)
+    intervals: PositiveInt = 10
     """Intervals of each ratio."""
     collision_bit: bool
     """Whether base collision is a descriptor of its own."""
     fitness: FitnessCfg
     scheduler: SchedulerCfg
-    reevaluate_every: int = setting(50, least=0)
+    reevaluate_every: NonNegativeInt = 50
     """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
 
     def __post_init__(self) -> None:

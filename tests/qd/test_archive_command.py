@@ -134,6 +134,7 @@ def test_a_run_goes_on_as_it_is_or_not_at_all(capsys):
         (["--fitness.penalties", "vel_x", "vel_y"], "penalties"),
         (["--iterations", "0"], "iterations"),
         (["--robot", "cassie"], "cassie"),
+        (["--space", "course"], "course"),
         (["--run-dir", "b"], "--run-dir"),
     ):
         assert name in fails(capsys, "--device", "cpu", "--resume", "a", *flags), flags

@@ -72,7 +72,7 @@ def test_the_run_names_its_ground_and_goes_on_with_it(searched, capsys):
     assert len(read_archive(searched)) > 0 and read_archive(searched).iterations == 2
     capsys.readouterr()
     assert search(*more, "--ground", "friction") == 2
-    assert f'space ("{SPACE}" there, "super_gaussian+friction" wanted)' in capsys.readouterr().err
+    assert "--ground" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
