@@ -13,20 +13,24 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
-from qd.workers.shards import MIN_ROWS, checked_count, merged, taken
+from qd.workers.shards import merged, taken
+from sim.device import resolve_device as resolve_warp_device
 from sim.files.records import provenance
+from sim.policy.loaders import load_policy
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from sim.rollout import CrossingCfg, Rollout, RolloutResult
+from sim.simulation import SolverCfg, resolved
+from sim.spaces.registry import load_space
 
-if TYPE_CHECKING:
-    from sim.robots.robot import RobotCfg
-    from sim.rollout import RolloutResult
-
+_MIN_ROWS = 4  # fewest robots of a simulation: one more process costs more than fewer of them gain
 _MOST_ENVS = {"cuda": 32_768, "cpu": 32}  # of a worker, when there is work for more
 _RUNNING_SHARE = 0.7  # of the episodes under way in several lots: the others wait for the last of their lot
 _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
@@ -65,7 +69,7 @@ def parse_workers(text: str | None) -> Workers:
 class EvaluatorCfg:
     """What an evaluator crosses, with what, and where."""
 
-    robot: "RobotCfg | str"
+    robot: RobotCfg | str
     """The robot, or the name of a shipped one."""
     policy: str
     """Controller, as :func:`sim.policy.loaders.load_policy` takes it."""
@@ -87,7 +91,7 @@ class EvaluatorCfg:
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
-    """Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it."""
+    """Terrain space of the genes, as :func:`sim.space.load_space` takes it."""
     resolved: bool = False
     """Whether contact is resolved (:func:`sim.simulation.resolved`), which takes five times as long."""
 
@@ -96,10 +100,10 @@ class EvaluatorCfg:
         """How many work at once: one on a GPU without Ray; on the CPU no more than there is work for."""
         on_ray, count = parse_workers(self.workers)
         if on_ray:
-            return count or _ray_module("ray_cluster").num_devices(self.device)
+            return count or _ray_workers().num_devices(self.device)
         if self.device.startswith("cuda"):
             return 1
-        by_rows = (self.num_envs or self.num_terrains * self.num_replicas) // MIN_ROWS
+        by_rows = (self.num_envs or self.num_terrains * self.num_replicas) // _MIN_ROWS
         return max(1, min(count or available_cores(), self.num_terrains, by_rows))
 
     @property
@@ -110,29 +114,25 @@ class EvaluatorCfg:
             episodes = self.num_terrains * self.num_replicas
             wanted = episodes if self.lots == 1 else int(_RUNNING_SHARE * episodes)
             wanted = min(wanted, _MOST_ENVS[self.device.partition(":")[0]] * self.num_workers)
-        return max(MIN_ROWS, -(-wanted // self.num_workers))
+        return max(_MIN_ROWS, -(-wanted // self.num_workers))
 
     @property
     def terrains_of_worker(self) -> int:
         """Terrains that a process has under way at most, or as many as give 4 robots an episode."""
-        return max(-(-self.num_terrains // self.num_workers), -(-MIN_ROWS // self.num_replicas))
+        return max(-(-self.num_terrains // self.num_workers), -(-_MIN_ROWS // self.num_replicas))
 
 
-@dataclass(frozen=True, kw_only=True)
-class WorkerStatus:
+class WorkerStatus(NamedTuple):
     """How Ray workers fare."""
 
     workers: int
-    """Workers that are there."""
-    episodes_per_s: tuple[float, ...]
-    """Of each that has crossed terrains, the last time."""
+    """Workers that are ready."""
     retries: int
     """How often terrains had to be crossed again by another worker."""
 
     def __str__(self) -> str:
-        rates = " + ".join(f"{rate:.1f}" for rate in self.episodes_per_s)
         again = f", {self.retries} crossed again" if self.retries else ""
-        return f"{self.workers} worker{'s' * (self.workers != 1)} ({rates} episodes/s{again})"
+        return f"{self.workers} worker{'s' * (self.workers != 1)}{again}"
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Evaluate(Protocol):
 
     def __call__(
         self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
-    ) -> "RolloutResult":
+    ) -> RolloutResult:
         """Cross each terrain once a replica.
 
         Args:
@@ -175,14 +175,9 @@ class Evaluate(Protocol):
         ...
 
 
-@runtime_checkable
-class _HasStatus(Protocol):
-    def status(self) -> WorkerStatus: ...
-
-
 def worker_status(evaluate: Evaluate) -> WorkerStatus | None:
     """How the Ray workers of an evaluator fare; None if it has none."""
-    return evaluate.status() if isinstance(evaluate, _HasStatus) else None
+    return evaluate.status() if isinstance(evaluate, Pipeline) else None
 
 
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = 0) -> NDArray[np.uint32]:
@@ -219,43 +214,33 @@ def resolve_device(name: str | None, workers: str | None = None) -> str:
     """
     on_ray, count = parse_workers(workers)
     if on_ray:
-        return _ray_module("ray_cluster").cluster_device(name, count)
-    from sim.device import resolve_device as resolve
-
-    device = resolve(name)
-    if device.startswith("cuda") and (count or 1) > 1:
-        raise ValueError(f"{count} workers need the CPU, got device {device}: give --device cpu, or --workers ray:N")
-    return device
-
-
-def origin_of(device: str, seed: int, workers: str | None) -> dict[str, Any]:
-    """Provenance of what workers evaluate on a device."""
-    origin = provenance(device, seed)
-    on_ray = parse_workers(workers).on_ray
-    return {**origin, "device": _ray_module("ray_cluster").name_of_device(device)} if on_ray else origin
+        return _ray_workers().cluster_device(name, count)
+    warp_device = resolve_warp_device(name)
+    if warp_device.startswith("cuda") and (count or 1) > 1:
+        raise ValueError(
+            f"{count} workers need the CPU, got device {warp_device}: give --device cpu, or --workers ray:N"
+        )
+    return warp_device
 
 
-def check_policy(policy: str, robot: "RobotCfg | str", device: str) -> None:
+def origin_of(device: str, seed: int, workers: str | None = None) -> dict[str, Any]:
+    """Provenance of what is crossed on a device, or on the devices of a cluster."""
+    return provenance(device, seed) | ({"device": device} if parse_workers(workers).on_ray else {})
+
+
+def check_policy(policy: str, robot: RobotCfg | str, device: str) -> None:
     """Loads a controller and tries it on the robot, so that a bad one is found before any long work.
 
     Raises:
         ValueError: If it cannot be loaded or does not fit the robot.
     """
-    from sim.policy.loaders import load_policy
-    from sim.robots.find import get_robot
-
-    # A cluster's GPUs need not be this machine's; for the CPU no simulation need be loaded.
+    # A cluster's GPUs need not be this machine's.
     here = device if device == "cpu" else resolve_device(None)
     load_policy(policy, get_robot(robot), device if here.startswith("cuda") else "cpu")
 
 
 def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     """The simulation of an evaluator, for a share of its terrains."""
-    from sim.robots.find import get_robot
-    from sim.rollout import CrossingCfg, Rollout
-    from sim.simulation import SolverCfg, resolved
-    from sim.spaces.registry import load_space
-
     robot = get_robot(cfg.robot)
     robot, solver = resolved(robot) if cfg.resolved else (robot, SolverCfg())
     return Rollout(
@@ -271,14 +256,14 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
     )
 
 
-def _ray_module(name: str) -> Any:
-    """A module of this folder that imports Ray, which takes seconds and need not be installed.
+def _ray_workers() -> Any:
+    """The module of Ray workers: Ray takes seconds to import and need not be installed.
 
     Raises:
         ValueError: If Ray is not installed.
     """
     try:
-        return importlib.import_module(f"qd.workers.{name}")
+        return importlib.import_module("qd.workers.ray_workers")
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
@@ -307,7 +292,7 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
         OSError: If there is no Ray cluster at RAY_ADDRESS.
     """
     if parse_workers(cfg.workers).on_ray:
-        with _ray_module("ray_workers").open_ray_workers(cfg, build) as workers:
+        with _ray_workers().open_ray_workers(cfg, build) as workers:
             yield workers
         return
     if cfg.device.startswith("cuda"):
@@ -344,16 +329,20 @@ class Pipeline(ABC):
         """Lets a lot of terrains be crossed; waits for nothing."""
 
     @abstractmethod
-    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Waits for the lot that was put in first; ``progress`` is told the share of it that is done."""
 
     @abstractmethod
     def clear(self) -> None:
         """Has nothing under way afterwards: what an evaluation that was stopped has left is of no later one."""
 
+    def status(self) -> WorkerStatus | None:
+        """How Ray workers fare; None without them."""
+        return None
+
     def __call__(
         self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
-    ) -> "RolloutResult":
+    ) -> RolloutResult:
         """Crosses each terrain once a replica; nothing else may be under way."""
         count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
@@ -361,7 +350,7 @@ class Pipeline(ABC):
 
     def in_lots(
         self, terrains: NDArray, seeds: NDArray, size: int, progress: Callable[[float], None] | None = None
-    ) -> "Iterator[tuple[slice, RolloutResult]]":
+    ) -> Iterator[tuple[slice, RolloutResult]]:
         """Crosses each terrain once a replica, in lots; nothing else may be under way.
 
         Args:
@@ -373,7 +362,9 @@ class Pipeline(ABC):
         Yields:
             Which terrains a lot has, and its result. Those behind are under way meanwhile as far as there is room.
         """
-        count = checked_count(terrains, seeds)
+        count = len(terrains)
+        if seeds.shape != (count,) or count == 0:
+            raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
         behind, num_taken = deque(lots), 0
 
@@ -403,7 +394,7 @@ class _Here(Pipeline):
         """Hands a lot to the simulation."""
         self._crosser.put(terrains, seeds)
 
-    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Waits for the simulation."""
         return self._crosser.take(progress)
 
@@ -433,7 +424,7 @@ class _Processes(Pipeline):
         self._first = (self._first + rest) % len(self._processes)
         self._lots.append(parts)
 
-    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Puts the parts of a lot together."""
         parts = self._lots[0]
         shares = dict.fromkeys(parts, 0.0)
@@ -469,7 +460,7 @@ class _AllAtOnce(Pipeline):
         """Keeps a lot until one is waited for."""
         self._lots.append((terrains, seeds))
 
-    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Crosses all lots there are, unless the first of them is crossed already."""
         if not self._results:
             terrains, seeds = (np.concatenate(arrays) for arrays in zip(*self._lots, strict=True))

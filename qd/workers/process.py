@@ -2,21 +2,18 @@
 
 import contextlib
 import multiprocessing
-import os
 import queue
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol
 
 from numpy.typing import NDArray
 
 from sim.files.command import UserError, told
-
-if TYPE_CHECKING:
-    from sim.rollout import RolloutResult
+from sim.rollout import RolloutResult
 
 
 class EvaluatorError(UserError):
@@ -28,7 +25,7 @@ class Crosser(Protocol):
 
     def evaluate(
         self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None
-    ) -> "RolloutResult":
+    ) -> RolloutResult:
         """Cross each terrain."""
         ...
 
@@ -40,7 +37,7 @@ class Crosser(Protocol):
         """Let terrains be crossed behind those under way."""
         ...
 
-    def take(self, progress: Callable[[float], None] | None = None) -> "RolloutResult":
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Wait for the terrains that were put in first; ``progress`` may put in more."""
         ...
 
@@ -113,7 +110,6 @@ class WorkerProcess:
 
 def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[[Any, int], Crosser]) -> None:
     """A worker's life: build, then evaluate until the other end closes."""
-    os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported: one core a worker
     inbox: queue.SimpleQueue[tuple[NDArray, NDArray] | None] = queue.SimpleQueue()
     under_way = 0
 

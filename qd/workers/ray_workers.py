@@ -1,461 +1,293 @@
-"""Evaluation by Ray workers, each an actor with one device.
+"""Evaluation by Ray workers, each an actor with one device of a cluster, or of this machine.
 
-Workers are handed whole terrains. An episode depends on its terrain, seed and replica alone, so any worker may cross
-any terrains, and again after another worker failed at them. Ray restarts a worker that died, where the cluster has
-place; what is done here is what Ray cannot know: that a result cannot be true, and that another worker is free.
+Ray places the workers and notices when one dies. What is done here is what Ray cannot know: that a result cannot be
+true, and that other workers are free while one is gone.
 """
 
+import logging
 import os
 import socket
 import sys
 import tempfile
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import ray
 from numpy.typing import NDArray
-from ray.exceptions import RayActorError, RayError, RayTaskError
+from ray.exceptions import RayError, RayTaskError
 from tqdm import tqdm
 
-from qd.workers.evaluator import WorkerStatus, parse_workers
+from qd.workers.evaluator import EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
 from qd.workers.process import Crosser, EvaluatorError
-from qd.workers.ray_cluster import connect, num_devices, resources
-from qd.workers.shards import MIN_ROWS, checked_count, flaw_of, merged, taken
+from qd.workers.shards import flaw_of, merged, taken
 from sim.files.command import debugging
 from sim.files.records import code_fingerprint
+from sim.ground import joined_name, split_name
 from sim.policy.spec import ControllerSpec
-
-if TYPE_CHECKING:
-    from qd.workers.evaluator import EvaluatorCfg
-    from sim.rollout import RolloutResult
+from sim.robots.find import get_robot
+from sim.robots.own import PackedRobot, pack_robot
+from sim.rollout import RolloutResult
+from sim.spaces.registry import is_own
 
 _ROOMS = ("kernels", "sim", "qd")
-_WATCH = "watch"
+_CONNECT_LIMIT_S = 10.0
 _POLL_S = 0.25
 _GROW_EVERY_S = 2.0
-_GATHER_S = 60.0  # how long the others are waited for where one worker is there
-_PATIENCE_S = 300.0  # how long the evaluation waits when no worker is there
-_HANG_S = 1800.0  # a busy worker without progress for so long is restarted; building and compiling take minutes
+_PATIENCE_S = 600.0  # how long the evaluation waits while no worker is ready; building and compiling take minutes
 _MOST_TRIES = 5  # of which three may be bad luck
 
 
 @dataclass(frozen=True, kw_only=True)
-class Controller:
-    """A controller, or other code, with the content of its files, which other machines need not have."""
+class PackedCode:
+    """A controller or a terrain space with the content of its files, which other machines need not have."""
 
     spec: ControllerSpec
     files: tuple[tuple[str, bytes], ...]
     """Name and content of each file; none of ``module:callable``."""
 
     @classmethod
-    def of(cls, policy: str) -> "Controller":
-        """Reads the files that ``policy`` names."""
-        spec = ControllerSpec.parse(policy)
+    def of(cls, name: str) -> "PackedCode":
+        """Reads the files that a controller's name holds."""
+        spec = ControllerSpec.parse(name)
         return cls(spec=spec, files=tuple((file.name, file.read_bytes()) for file in spec.files if file.is_file()))
 
-    def unpacked(self, folder: str) -> str:
-        """Writes the files into ``folder``; returns a policy as :func:`sim.policy.loaders.load_policy` takes it."""
+    def unpacked(self, folder: Path) -> str:
+        """Writes the files into a new folder; returns the name that stands for them there."""
+        folder.mkdir()
         for name, content in self.files:
-            (Path(folder) / name).write_bytes(content)
-        return str(self.spec.in_folder(Path(folder)) if self.files else self.spec)
-
-
-def _packed_robot(robot: Any) -> Any:
-    if isinstance(robot, str):
-        return robot
-    from sim.robots.own import pack_robot  # with the physics, which only workers need otherwise
-
-    return pack_robot(robot)
-
-
-def _packed_space(space: str) -> Controller | str:
-    from sim.ground import split_name
-    from sim.spaces.registry import is_own
-
-    return Controller.of(split_name(space)[0]) if is_own(space) else space
+            (folder / name).write_bytes(content)
+        return str(self.spec.in_folder(folder) if self.files else self.spec)
 
 
 _ray: Any = ray  # its annotations leave out what it documents
 
 
-@_ray.remote(concurrency_groups={_WATCH: 1}, max_restarts=-1)
+@_ray.remote
 class RayWorker:
-    """One device's simulation, built when first needed, and again when the number of terrains changes.
+    """One device's simulation.
 
     Args:
         cfg: Settings of the evaluator; the device is the one that Ray gave to this process.
         controller: Its controller.
-        robot: Its robot, as :func:`sim.robots.own.pack_robot` packs it.
-        space: Its terrain space: a name, or code with its file.
+        robot: Its robot, or the name of one.
+        space: Code of its terrain space, if it is a user's own.
         build: Makes the simulation of ``cfg`` for a number of terrains.
     """
 
     def __init__(
         self,
-        cfg: Any,
-        controller: Controller,
-        robot: Any,
-        space: Controller | str,
-        build: Callable[[Any, int], Crosser],
+        cfg: EvaluatorCfg,
+        controller: PackedCode,
+        robot: PackedRobot | str,
+        space: PackedCode | None,
+        build: Callable[[EvaluatorCfg, int], Crosser],
     ) -> None:
         self._cfg, self._controller, self._robot, self._space, self._build = cfg, controller, robot, space, build
-        self._crosser: Crosser | None = None
-        self._num_terrains = 0
-        self._share = 0.0
-        self._life = uuid.uuid4().hex
 
-    def introduce(self) -> tuple[str, str, str]:
-        """Where this process is, a name of this life between restarts, and the fingerprint of the code."""
-        return f"process {os.getpid()} on {socket.gethostname()}", self._life, code_fingerprint(_ROOMS)
-
-    def prepare(self, num_terrains: int) -> None:
+    def prepare(self, num_terrains: int, code: str) -> None:
         """Builds the simulation.
 
         Raises:
-            ValueError: If it cannot be built as asked for.
+            ValueError: If it cannot be built as asked for, or this machine has other code.
         """
-        if num_terrains == self._num_terrains:
-            return
-        self._crosser, self._num_terrains = None, 0  # frees its memory before the next one is built
+        if code_fingerprint(_ROOMS) != code:
+            raise ValueError(f"{socket.gethostname()} has other code or packages: use the same commit everywhere")
         # The process may be killed at any time, so the folder must not live as long as it does.
-        with tempfile.TemporaryDirectory(prefix="faultline-") as folder:
-            robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(Path(folder) / "robot")
-            space = self._space if isinstance(self._space, str) else self._unpacked(self._space, folder)
-            cfg = replace(self._cfg, policy=self._controller.unpacked(folder), robot=robot, space=space)
+        with tempfile.TemporaryDirectory(prefix="faultline-") as name:
+            folder, cfg = Path(name), self._cfg
+            robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(folder / "robot")
+            if self._space is not None:
+                own = self._space.unpacked(folder / "space")
+                cfg = replace(cfg, space=joined_name(own, split_name(cfg.space)[1]))
+            cfg = replace(cfg, policy=self._controller.unpacked(folder / "controller"), robot=robot)
             self._crosser = self._build(cfg, num_terrains)
-        self._num_terrains = num_terrains
 
-    def _unpacked(self, space: Controller, folder: str) -> str:
-        from sim.ground import joined_name, split_name
-
-        return joined_name(space.unpacked(tempfile.mkdtemp(dir=folder)), split_name(self._cfg.space)[1])
-
-    def cross(self, terrains: NDArray, seeds: NDArray, num_terrains: int) -> tuple["RolloutResult", float]:
-        """Crosses up to ``num_terrains`` terrains.
-
-        Returns:
-            The result, and the seconds it took without building.
-        """
-        self.prepare(num_terrains)
-        assert self._crosser is not None
-        began = time.perf_counter()
-        try:
-            result = self._crosser.evaluate(terrains, seeds, progress=self._note)
-            return result, time.perf_counter() - began
-        finally:
-            self._share = 0.0
-
-    @_ray.method(concurrency_group=_WATCH)
-    def share(self) -> float:
-        """Share of the present terrains that is done."""
-        return self._share
-
-    def _note(self, share: float) -> None:
-        self._share = share
+    def cross(self, terrains: NDArray, seeds: NDArray) -> RolloutResult:
+        """Crosses terrains, at most as many as it was prepared for."""
+        return self._crosser.evaluate(terrains, seeds)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Shard:
     """Terrains that one worker crosses."""
 
-    part: slice
+    terrains: NDArray
+    seeds: NDArray
     tries: int = 0
-    result: Any = None
-
-    def __str__(self) -> str:
-        return f"terrains {self.part.start} to {self.part.stop - 1}"
+    result: RolloutResult | None = None
 
 
-@dataclass
-class _Worker:
-    """A worker as seen from here: coming, idle, or busy with a task."""
+class RayWorkers(Pipeline):
+    """Evaluates terrains on Ray workers, one for each device that the cluster has or as many as asked for.
 
-    number: int
-    actor: Any
-    coming: Any = None
-    """The introduction to come of a worker that starts; None once it is there."""
-    where: str = "starting"
-    life: str = ""
-    task: Any = None
-    """The result to come of the shard that it crosses; None without one."""
-    shard: _Shard | None = None
-    share: float = 0.0
-    """Share of the shard that is done."""
-    moved_at: float = 0.0
-    """When the share last changed, by the monotonic clock [s]."""
-    question: Any = None
-    """The share to come that it was asked for."""
-    episodes_per_s: float = 0.0
-    """In its last shard; 0 before."""
-
-    def __str__(self) -> str:
-        return f"worker {self.number} ({self.where})"
-
-    def wait_for(self) -> None:
-        """Takes its task away; the worker is there again when it introduces itself, in whichever process."""
-        self.task = self.shard = self.question = None
-        self.share = 0.0
-        self.coming = self.actor.introduce.options(max_task_retries=-1).remote()
-
-    def restart(self) -> None:
-        """Ends its process, whatever that does; Ray starts another."""
-        with suppress(RayError):
-            ray.kill(self.actor, no_restart=False)
-        self.wait_for()
-
-
-class RayWorkers:
-    """Evaluates any number of terrains (:class:`qd.workers.evaluator.Evaluate`) on Ray workers.
+    A worker that fails in any way is replaced, and its terrains are crossed again by another.
 
     Args:
         cfg: What is crossed, with what; ``num_terrains`` at once over all workers.
         build: Makes a worker's simulation.
     """
 
-    def __init__(self, cfg: "EvaluatorCfg", build: Callable[[Any, int], Crosser]) -> None:
+    def __init__(self, cfg: EvaluatorCfg, build: Callable[[EvaluatorCfg, int], Crosser]) -> None:
+        super().__init__(cfg.num_terrains)
         gpus = int(cfg.device.startswith("cuda"))
         self._cfg, self._count = cfg, parse_workers(cfg.workers).count
-        self._options = {"num_gpus": gpus, "num_cpus": 1 - gpus}
+        self._resources = {"num_gpus": gpus, "num_cpus": 1 - gpus}
         # Controller, robot and space travel once a machine, however many workers it has.
-        packed = Controller.of(cfg.policy), _packed_robot(cfg.robot), _packed_space(cfg.space)
-        files = tuple(map(ray.put, packed))
-        self._arguments = replace(cfg, device="cuda:0" if gpus else "cpu", robot=""), *files, build
+        space = PackedCode.of(split_name(cfg.space)[0]) if is_own(cfg.space) else None
+        packed = [ray.put(value) for value in (PackedCode.of(cfg.policy), pack_robot(get_robot(cfg.robot)), space)]
+        self._arguments = replace(cfg, device="cuda:0" if gpus else "cpu", robot=""), *packed, build
         self._code = code_fingerprint(_ROOMS)
-        self._workers: list[_Worker] = []
-        self._started = self._retries = 0
-        self._grown_at = -np.inf
+        self._workers: set[Any] = set()
+        self._idle: deque[Any] = deque()
+        self._tasks: dict[Any, tuple[Any, _Shard | None]] = {}  # the worker of each, and what it crosses if prepared
+        self._lots: deque[list[_Shard]] = deque()
+        self._waiting: deque[_Shard] = deque()
+        self._retries = self._failed_starts = 0
+        self._grown_at, self._seen_at = -_GROW_EVERY_S, time.monotonic()  # when the cluster and a worker were looked at
+        self._taken_at = time.perf_counter()
 
     def open(self) -> None:
-        """Starts the workers, and lets the first one compile the kernels, which the others then find compiled.
+        """Starts the workers and waits for the first.
 
         Raises:
             ValueError: If the simulation cannot be built as asked for.
-            EvaluatorError: If no worker comes, or none that can be used.
+            EvaluatorError: If no worker comes.
         """
-        began = time.monotonic()
-        while len(self._ready) < max(1, len(self._workers)):
-            self._start_missing()
-            self._wait()
-            if time.monotonic() - began > (_GATHER_S if self._ready else _PATIENCE_S):
-                break
-        if not self._ready:
-            raise self._nobody_came()
-        first = self._ready[0]
-        try:
-            ray.get(first.actor.prepare.options(max_task_retries=_MOST_TRIES - 1).remote(self._shard_size()))
-        except RayError as error:
-            raise _as_raised(error, f"{first} cannot build its simulation: {reason_of(error)}") from None
+        while not self._idle:
+            self._turn()
 
     def close(self) -> None:
         """Ends the workers, whatever they do."""
         for worker in self._workers:
             with suppress(RayError):  # the whole cluster may be gone
-                ray.kill(worker.actor)
+                ray.kill(worker)
 
     def status(self) -> WorkerStatus:
         """How the workers fare."""
-        rates = tuple(worker.episodes_per_s for worker in self._ready if worker.episodes_per_s)
-        return WorkerStatus(workers=len(self._ready), episodes_per_s=rates, retries=self._retries)
+        preparing = sum(shard is None for _, shard in self._tasks.values())
+        return WorkerStatus(workers=len(self._workers) - preparing, retries=self._retries)
 
-    def __call__(
-        self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
-    ) -> "RolloutResult":
-        """Crosses each terrain once a replica.
+    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+        """Deals a lot out in shards of as many terrains as a worker has room for."""
+        size = self._cfg.terrains_of_worker
+        lot = [_Shard(terrains[k : k + size], seeds[k : k + size]) for k in range(0, len(terrains), size)]
+        if not self._lots:
+            self._taken_at = time.perf_counter()
+        self._lots.append(lot)
+        self._waiting.extend(lot)
+        self._deal()
+
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
+        """Waits for the lot that was put in first.
 
         Raises:
-            ValueError: If the arguments do not fit, or a shard is refused five times.
-            EvaluatorError: If a shard fails five times, or no worker is left and none comes.
+            ValueError: If a worker refused its terrains five times.
+            EvaluatorError: If terrains failed five times, or no worker is left and none comes.
         """
-        count, size, began = checked_count(terrains, seeds), self._shard_size(), time.monotonic()
-        shards = [_Shard(slice(first, min(first + size, count))) for first in range(0, count, size)]
-        try:
-            self._cross_all(shards, size, terrains, seeds, progress or (lambda share: None))
-        except BaseException:  # Ctrl-C too: what is under way belongs to no later call
-            for worker in self._busy:
-                worker.restart()
-            raise
-        whole = merged([shard.result for shard in shards], join=0)
-        return replace(whole, wall_s=time.monotonic() - began)
+        lot, self._seen_at = self._lots[0], time.monotonic()
+        while (done := sum(shard.result is not None for shard in lot)) < len(lot):
+            self._turn()
+            if progress is not None:
+                progress(done / len(lot))
+        if progress is not None:
+            progress(1.0)
+        self._lots.popleft()
+        now = time.perf_counter()
+        wall_s, self._taken_at = now - self._taken_at, now
+        return replace(merged([shard.result for shard in lot if shard.result is not None], join=0), wall_s=wall_s)
 
-    def _cross_all(
-        self, shards: list[_Shard], size: int, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None]
-    ) -> None:
-        waiting, shown, busy_at = deque(shards), 0.0, time.monotonic()
-        while any(shard.result is None for shard in shards):
-            self._start_missing()
-            for worker in self._ready:
-                if waiting and worker.task is None:
-                    shard = worker.shard = waiting.popleft()
-                    worker.share, worker.moved_at, worker.question = 0.0, time.monotonic(), None
-                    worker.task = worker.actor.cross.remote(terrains[shard.part], seeds[shard.part], size)
-            if self._busy:
-                busy_at = time.monotonic()
-            elif time.monotonic() - busy_at > _PATIENCE_S:
-                raise self._nobody_came()
-            self._wait()
-            waiting.extendleft(shard for worker in self._busy if (shard := self._failed_shard(worker)))
-            done = sum(shard.result is not None for shard in shards) + sum(map(_share_of, self._ready))
-            shown = max(shown, min(1.0, done / len(shards)))
-            progress(shown)
+    def clear(self) -> None:
+        """Forgets all lots; what workers still cross of them is of no later one."""
+        self._lots.clear()
+        self._waiting.clear()
 
-    @property
-    def _wanted(self) -> int:
-        """Workers wanted: as many as asked for, or as the cluster has devices now."""
-        return self._count or max(1, num_devices(self._cfg.device))
-
-    @property
-    def _ready(self) -> list[_Worker]:
-        return [worker for worker in self._workers if worker.coming is None]
-
-    @property
-    def _busy(self) -> list[_Worker]:
-        return [worker for worker in self._ready if worker.task is not None]
-
-    def _shard_size(self) -> int:
-        """Terrains of a shard: an equal part of those that are crossed at once."""
-        return max(-(-self._cfg.num_terrains // self._wanted), -(-MIN_ROWS // self._cfg.num_replicas))
+    def _turn(self) -> None:
+        """Waits for some task to end, but not for long, and gives idle workers the next."""
+        self._start_missing()
+        if not self._tasks:
+            time.sleep(_POLL_S)
+        for task in ray.wait([*self._tasks], timeout=_POLL_S)[0] if self._tasks else []:
+            self._finish(task, *self._tasks.pop(task))
+        if self.status().workers:
+            self._seen_at = time.monotonic()
+        elif time.monotonic() - self._seen_at > _PATIENCE_S:
+            raise EvaluatorError(f"no worker came within {_PATIENCE_S:g} s; the cluster has {_resources()}")
+        self._deal()
 
     def _start_missing(self) -> None:
-        """Starts workers for the devices that have none; one whose worker could not be used gets no other."""
+        """Starts workers for the devices that have none."""
         if time.monotonic() - self._grown_at < _GROW_EVERY_S:
             return
         self._grown_at = time.monotonic()
-        for _ in range(self._wanted - self._started):
-            self._started += 1
-            actor: Any = RayWorker
-            worker = _Worker(number=self._started, actor=actor.options(**self._options).remote(*self._arguments))
-            worker.wait_for()
-            self._workers.append(worker)
+        actor: Any = RayWorker
+        for _ in range((self._count or max(1, num_devices(self._cfg.device))) - len(self._workers)):
+            worker = actor.options(**self._resources).remote(*self._arguments)
+            self._workers.add(worker)
+            self._tasks[worker.prepare.remote(self._cfg.terrains_of_worker, self._code)] = worker, None
 
-    def _wait(self) -> None:
-        """Waits until a task is done or a worker is there, but not for long."""
-        references = {worker.task if worker.coming is None else worker.coming: worker for worker in self._workers}
-        references.pop(None, None)
-        if not references:
-            time.sleep(_POLL_S)
-            return
-        for reference in ray.wait([*references], timeout=_POLL_S)[0]:
-            if references[reference].coming is not None:
-                self._welcome(references[reference])
+    def _deal(self) -> None:
+        while self._waiting and self._idle:
+            worker, shard = self._idle.popleft(), self._waiting.popleft()
+            self._tasks[worker.cross.remote(shard.terrains, shard.seeds)] = worker, shard
 
-    def _welcome(self, worker: _Worker) -> None:
+    def _finish(self, task: Any, worker: Any, shard: _Shard | None) -> None:
+        """Takes a task's result; replaces the worker if it failed."""
+        result: Any = None
+        error, flaw = None, None
         try:
-            where, life, code = ray.get(worker.coming)
-        except RayError as error:
-            self._dismiss(worker, f"did not start: {reason_of(error)}")
-            return
-        if life == worker.life:  # still the process that is being ended
-            worker.wait_for()
-            return
-        worker.coming, worker.where, worker.life = None, where, life
-        if code != self._code:
-            self._dismiss(
-                worker, "has other code or packages than this machine: use the same commit and `make setup` everywhere"
-            )
-
-    def _dismiss(self, worker: _Worker, reason: str) -> None:
-        """Goes on without a worker that cannot be used.
-
-        Raises:
-            EvaluatorError: If it was the last.
-        """
-        self._workers.remove(worker)
-        with suppress(RayError):
-            ray.kill(worker.actor)
-        if not self._workers:
-            raise EvaluatorError(f"no worker can be used: {worker} {reason}")
-        _tell(f"{worker} {reason}; the others go on without it")
-
-    def _failed_shard(self, worker: _Worker) -> _Shard | None:
-        """Takes a worker's result if it is there; returns the shard if it failed or hangs and must be crossed again.
-
-        Raises:
-            ValueError: If the shard was refused five times.
-            EvaluatorError: If it failed five times.
-        """
-        shard, replicas, error = worker.shard, self._cfg.num_replicas, None
-        assert shard is not None
-        there = bool(ray.wait([worker.task], timeout=0)[0])
-        if not there and time.monotonic() - worker.moved_at < _HANG_S:
-            return None
-        trouble = f"made no progress for {_HANG_S:g} s"
-        try:
-            if there:
-                result, seconds = ray.get(worker.task)
-                count = shard.part.stop - shard.part.start
-                flaw = flaw_of(result, count, replicas)
-                if flaw is None:
-                    shard.result = taken(result, count)
-                    worker.task, worker.share = None, 0.0
-                    worker.episodes_per_s = count * replicas / seconds
-                    return None
-                trouble = f"answered with nonsense: {flaw}"
+            result = ray.get(task)
+            if shard is not None:
+                flaw = flaw_of(result, len(shard.terrains), self._cfg.num_replicas)
         except RayError as raised:
-            error, trouble = raised, f"failed: {reason_of(raised)}"
-        who = str(worker)
-        if isinstance(error, RayActorError):
-            worker.wait_for()  # Ray is restarting it
-        else:
-            worker.restart()
-        self._retries += 1
+            error, flaw = raised, _reason_of(raised)
+        if flaw is None:
+            self._idle.append(worker)
+            if shard is not None:
+                shard.result = taken(result, len(shard.terrains))
+            return
+        with suppress(RayError):
+            ray.kill(worker)
+        self._workers.remove(worker)
+        self._grown_at = -_GROW_EVERY_S  # another is started at once
+        if shard is None:
+            self._failed_starts += 1
+            if _is_refusal(error) or self._failed_starts >= _MOST_TRIES:
+                raise _as_raised(error, f"a worker cannot build its simulation: {flaw}")
+            return
         shard.tries += 1
+        self._retries += 1
+        what = f"{len(shard.terrains)} terrains"
         if shard.tries >= _MOST_TRIES:
-            raise _as_raised(error, f"{shard} failed {_MOST_TRIES} times; the last time {who} {trouble}")
-        _tell(f"{who} {trouble}; {shard} are crossed again by another")
-        return shard
-
-    def _nobody_came(self) -> EvaluatorError:
-        return EvaluatorError(f"no worker came within {_PATIENCE_S:g} s; the cluster has {resources()}")
+            raise _as_raised(error, f"{what} failed {_MOST_TRIES} times; the last time: {flaw}")
+        if any(shard in lot for lot in self._lots):  # not forgotten meanwhile
+            tqdm.write(f"a worker failed ({flaw}); its {what} are crossed again by another", file=sys.stderr)
+            self._waiting.appendleft(shard)
 
 
-def _share_of(worker: _Worker) -> float:
-    """Share of its shard that a worker has done when it last said so; asks it again without waiting.
-
-    The question also shows that an idle worker died; the task of a busy one fails, and says why.
-    """
-    if worker.question is None:
-        worker.question = worker.actor.share.remote()
-    elif ray.wait([worker.question], timeout=0)[0]:
-        question, worker.question = worker.question, None
-        try:
-            share: Any = ray.get(question)
-            if share != worker.share:
-                worker.share, worker.moved_at = share, time.monotonic()
-        except RayError:
-            if worker.task is None:
-                worker.wait_for()
-    return worker.share
+def _is_refusal(error: BaseException | None) -> bool:
+    """Whether a worker raised a ValueError, which the user can mend."""
+    return isinstance(error, RayTaskError) and isinstance(error.cause, ValueError)
 
 
 def _as_raised(error: BaseException | None, message: str) -> Exception:
-    """A ValueError if a worker raised one, since the user can mend it; else the evaluation's own error."""
-    refused = isinstance(error, RayTaskError) and isinstance(error.cause, ValueError)
-    return ValueError(message) if refused else EvaluatorError(message)
+    return ValueError(message) if _is_refusal(error) else EvaluatorError(message)
 
 
-def reason_of(error: BaseException) -> str:
+def _reason_of(error: BaseException) -> str:
     """Why a worker failed, in one line: the exception that it raised, or how it died; its traceback for debugging."""
     if isinstance(error, RayTaskError):
         text = f"{type(error.cause).__name__}: {' '.join(str(error.cause).split())}"
         return f"{text}\n{error}" if debugging() else text  # Ray keeps the worker's traceback in the error's text
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__
-
-
-def _tell(message: str) -> None:
-    """Prints a line that leaves progress bars whole."""
-    tqdm.write(message, file=sys.stderr)
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 @contextmanager
-def open_ray_workers(cfg: "EvaluatorCfg", build: Callable[[Any, int], Crosser]) -> Iterator[RayWorkers]:
+def open_ray_workers(cfg: EvaluatorCfg, build: Callable[[EvaluatorCfg, int], Crosser]) -> Iterator[RayWorkers]:
     """Starts the workers and ends them; arguments and errors as of :func:`qd.workers.evaluator.open_evaluator`."""
     connect(parse_workers(cfg.workers).count)
     workers = RayWorkers(cfg, build)
@@ -463,6 +295,64 @@ def open_ray_workers(cfg: "EvaluatorCfg", build: Callable[[Any, int], Crosser]) 
         workers.open()
         yield workers
     except RayError as error:
-        raise EvaluatorError(f"the Ray cluster failed: {reason_of(error)}") from error
+        raise EvaluatorError(f"the Ray cluster failed: {_reason_of(error)}") from error
     finally:
         workers.close()
+
+
+def connect(count: int | None) -> None:
+    """Joins the cluster that RAY_ADDRESS names, or starts Ray on this machine for ``count`` workers or one a device.
+
+    Raises:
+        OSError: If there is no cluster at RAY_ADDRESS.
+    """
+    if ray.is_initialized():
+        return
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's behaviour to come; it warns otherwise
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    address = os.environ.get("RAY_ADDRESS")
+    if address is None:
+        cores = max(available_cores(), count or 1)
+        ray.init(address="local", num_cpus=cores, include_dashboard=False, object_store_memory=256 << 20, **quiet)
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        if host and port.isdecimal():  # Ray itself would try for minutes where nothing listens
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_LIMIT_S).close()
+        ray.init(address=address, **quiet)
+    except Exception as error:  # of many types: no such host, another version of Ray, a token that is missing
+        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        raise OSError(
+            f"no Ray cluster at RAY_ADDRESS={address}: {reason}: start one with `ray start --head`, or unset "
+            "RAY_ADDRESS to use this machine alone"
+        ) from None
+
+
+def cluster_device(name: str | None, count: int | None) -> str:
+    """Device of the workers, ``cuda`` or ``cpu``; for None CUDA where the cluster has it.
+
+    Raises:
+        ValueError: If the device is absent, one GPU among several is named, or this machine has fewer GPUs than wanted.
+        OSError: If there is no cluster at RAY_ADDRESS.
+    """
+    if name not in (None, "cpu", "cuda"):
+        raise ValueError(f"with workers on Ray the device must be cpu or cuda, got {name}")
+    connect(count)
+    gpus = num_devices("cuda")
+    if name == "cuda" and not gpus:
+        raise ValueError(f"device cuda: the cluster has no GPU: {_resources()}; give --device cpu, or add a node")
+    device = name or ("cuda" if gpus else "cpu")
+    most = num_devices(device)
+    if count is not None and count > most and not os.environ.get("RAY_ADDRESS"):
+        raise ValueError(f"workers must be at most ray:{most}, one for each GPU of this machine, got ray:{count}")
+    return device
+
+
+def num_devices(device: str) -> int:
+    """GPUs or CPU cores that the cluster has now."""
+    return int(ray.cluster_resources().get("GPU" if device.startswith("cuda") else "CPU", 0))
+
+
+def _resources() -> str:
+    return ", ".join(f"{value:g} {name}" for name, value in ray.cluster_resources().items() if name in ("CPU", "GPU"))

@@ -1,6 +1,7 @@
 """Evaluates over the stand-in on the cluster at RAY_ADDRESS, once a line of its input says so; a program of its own."""
 
 import sys
+import time
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def main() -> None:
                 if evaluate.status().workers == int(line):
                     break
                 result = evaluate(GENES, SEEDS)
-                evaluate._wait()
+                time.sleep(0.1)
             print("found", evaluate.status().workers, repr(float(result.penalties.sum())), flush=True)
 
 

@@ -10,13 +10,12 @@ import pytest
 
 from qd.workers import evaluator
 from qd.workers.evaluator import (
+    Compute,
     EvaluatorCfg,
     EvaluatorError,
-    Workers,
     open_evaluator,
     parse_workers,
     pipeline_of,
-    resolve_device,
 )
 from qd.workers.process import _serve
 from qd.workers.shards import merged
@@ -62,34 +61,54 @@ def same(a, b) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("text", "workers"),
+    ("text", "on_ray", "count"), [(None, False, None), ("4", False, 4), ("ray", True, None), ("ray:16", True, 16)]
+)
+def test_workers_as_the_command_line_names_them(text, on_ray, count):
+    assert parse_workers(text) == (on_ray, count)
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "1.5", "auto", "ray:0", "ray:", "ray4", "4 ", "9999999"])
+def test_workers_that_are_no_number_and_not_on_ray(text):
+    with pytest.raises(ValueError, match="workers"):
+        parse_workers(text)
+
+
+@pytest.mark.parametrize(
+    ("num_terrains", "num_replicas", "workers", "processes", "terrains"),
     [
-        (None, Workers(on_ray=False, count=None)),
-        ("4", Workers(on_ray=False, count=4)),
-        ("ray", Workers(on_ray=True, count=None)),
-        ("ray:16", Workers(on_ray=True, count=16)),
+        (8, 4, "2", 2, 4),
+        (6, 4, "4", 4, 2),
+        (3, 4, "8", 3, 1),  # no more processes than terrains
+        (8, 1, "8", 2, 4),  # no fewer than 4 robots each
+        (1, 1, "8", 1, 4),
+        (9, 4, None, 3, 3),  # one a core
     ],
 )
-def test_workers_as_the_command_line_names_them(text, workers):
-    assert parse_workers(text) == workers
+def test_sizes(monkeypatch, num_terrains, num_replicas, workers, processes, terrains):
+    monkeypatch.setattr(evaluator, "available_cores", lambda: 3)
+    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, num_replicas=num_replicas, workers=workers)
+    assert (cfg.num_workers, cfg.terrains_of_worker) == (processes, terrains)
 
 
-@pytest.mark.parametrize("text", ["", "0", "-1", "1.5", "auto", "ray:0", "ray:", "ray4", "4 ", "ray:-1", "9999999"])
-def test_workers_that_are_no_number_and_not_on_ray(text):
-    with pytest.raises(ValueError, match=f"number of processes from 1 on, ray, or ray:N, got '{text}'"):
-        resolve_device("cpu", text)
+def test_a_device_that_cannot_have_such_workers(monkeypatch):
+    monkeypatch.setattr(evaluator, "resolve_warp_device", lambda name: name or "cuda:0")
+    assert Compute.resolve() == Compute("cuda:0")
+    assert Compute.resolve("cpu", "2", 64) == Compute("cpu", "2", 64)
+    for arguments, name in ((("cuda", "2"), "workers"), (("cpu", "two"), "workers"), (("cpu", None, 0), "num_envs")):
+        with pytest.raises(ValueError, match=name):
+            Compute.resolve(*arguments)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("num_processes", [1, 2, 4])
-def test_how_terrains_are_spread_changes_nothing(num_processes):
-    cfg = dataclasses.replace(CFG, workers=str(num_processes))
-    assert cfg.num_workers == num_processes
-    with open_evaluator(cfg, build=Crosser) as evaluate:
-        for count in (1, 6, 15):
-            result = evaluate(GENES[:count], SEEDS[:count])
-            assert result.penalties.shape == (count, 4, 6)
-            assert same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
+@pytest.mark.parametrize(("device", "workers"), [("cpu", "1"), ("cpu", "2"), ("cuda:0", None)])
+def test_how_terrains_are_spread_changes_nothing(device, workers):
+    for num_terrains in (1, 6):
+        cfg = dataclasses.replace(CFG, device=device, workers=workers, num_terrains=num_terrains)
+        with open_evaluator(cfg, build=Crosser) as evaluate:
+            for count in (1, 6, 15):
+                seen = []
+                result = evaluate(GENES[:count], SEEDS[:count], seen.append)
+                assert same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
+                assert seen == sorted(seen) and seen[-1] == 1.0
 
 
 def test_shards_run_at_the_same_time_and_turns_one_after_the_other():
@@ -98,15 +117,6 @@ def test_shards_run_at_the_same_time_and_turns_one_after_the_other():
         # Twelve, of which six fit, go in lots of three, as parts of two and one, one and two, ... in turn: the second
         # parts begin at 102, 104, 108 and 110.
         assert evaluate(GENES[:12], SEEDS[:12]).physics_steps == 102 + 104 + 108 + 110
-
-
-def test_progress_rises_to_one():
-    seen = []
-    with open_evaluator(dataclasses.replace(CFG, workers="2"), build=Crosser) as evaluate:
-        evaluate(GENES, SEEDS, seen.append)
-    assert seen == sorted(seen)
-    assert seen[-1] == 1.0
-    assert len(seen) >= 9  # three turns of at least a result and a half-way mark
 
 
 def test_lots_come_one_by_one_while_the_next_is_under_way():
@@ -149,15 +159,6 @@ def test_lots_of_one_terrain_are_dealt_round():
     assert same(merged(results, join=1), stand_in.evaluate(GENES[:6], SEEDS[:6], 4))
 
 
-@pytest.mark.parametrize(
-    ("num_terrains", "num_replicas", "workers", "expected"),
-    [(6, 4, "4", 2), (6, 4, "1", 6), (1, 1, "8", 4)],  # no fewer than 4 robots
-)
-def test_terrains_of_a_process(num_terrains, num_replicas, workers, expected):
-    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, num_replicas=num_replicas, workers=workers)
-    assert cfg.terrains_of_worker == expected
-
-
 @pytest.mark.parametrize("device", ["cpu", "cuda:0"])
 def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(device):
     def stop(share: float) -> None:
@@ -168,12 +169,6 @@ def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(device):
         with pytest.raises(KeyboardInterrupt):
             evaluate(GENES, SEEDS, stop)  # of lots of three, two are in
         assert same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
-
-
-@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
-def test_one_terrain_at_once(device):
-    with open_evaluator(dataclasses.replace(CFG, device=device, num_terrains=1), build=Crosser) as evaluate:
-        assert same(evaluate(GENES[:3], SEEDS[:3]), stand_in.evaluate(GENES[:3], SEEDS[:3], 4))
 
 
 def test_an_evaluator_of_one_evaluation_at_a_time_crosses_all_lots_together():
@@ -200,45 +195,17 @@ def test_an_evaluator_of_one_evaluation_at_a_time_crosses_all_lots_together():
     assert whole.wall_s == pytest.approx(20.0)
 
 
-def test_on_cuda_everything_stays_in_this_process():
-    cfg = dataclasses.replace(CFG, device="cuda:0", policy=str(os.getpid()))
-    seen = []
-    with open_evaluator(cfg, build=Crosser) as evaluate:
-        assert same(evaluate(GENES, SEEDS, seen.append), stand_in.evaluate(GENES, SEEDS, 4))
-    assert seen == sorted(seen)
-
-
 @pytest.mark.parametrize(
-    ("num_terrains", "num_replicas", "workers", "expected"),
+    ("policy", "error", "reason"),
     [
-        (8, 4, "2", 2),
-        (3, 4, "8", 3),  # no more than terrains
-        (8, 1, "8", 2),  # no fewer than 4 rows each
-        (1, 1, "8", 1),
+        ("refuse to build", ValueError, "policy 'x' does not fit"),
+        ("fail", EvaluatorError, "RuntimeError: the solver is broken"),
+        ("die", EvaluatorError, "SIGKILL"),
     ],
 )
-def test_number_of_processes(num_terrains, num_replicas, workers, expected):
-    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, num_replicas=num_replicas, workers=workers)
-    assert cfg.num_workers == expected
-
-
-def test_one_a_core_by_default(monkeypatch):
-    monkeypatch.setattr(evaluator, "available_cores", lambda: 3)
-    assert dataclasses.replace(CFG, workers=None).num_workers == 3
-
-
-def test_a_refusal_arrives_as_it_was_said():
-    cfg = dataclasses.replace(CFG, policy="refuse to build")
-    with pytest.raises(ValueError, match="policy 'x' does not fit"), open_evaluator(cfg, build=Crosser):
-        pass
-
-
-def test_a_failure_in_a_worker_names_its_reason():
-    cfg = dataclasses.replace(CFG, policy="fail")
-    with (
-        open_evaluator(cfg, build=Crosser) as evaluate,
-        pytest.raises(EvaluatorError, match="RuntimeError: the solver is broken"),
-    ):
+def test_why_a_worker_ended_is_known(policy, error, reason):
+    cfg = dataclasses.replace(CFG, policy=policy, workers="2")
+    with pytest.raises(error, match=reason), open_evaluator(cfg, build=Crosser) as evaluate:
         evaluate(GENES, SEEDS)
 
 
@@ -264,26 +231,6 @@ def test_large_height_maps_go_in_while_results_come_out():
             evaluate.put(lot, SEEDS[:2])
         for lot in maps:
             np.testing.assert_array_equal(evaluate.take().penalties, lot)
-
-
-@pytest.mark.parametrize(("policy", "error"), [("refuse to build", ValueError), ("fail", EvaluatorError)])
-def test_for_debugging_an_error_of_a_worker_brings_its_traceback(monkeypatch, policy, error):
-    monkeypatch.setenv("FAULTLINE_DEBUG", "1")
-    cfg = dataclasses.replace(CFG, policy=policy)
-    with (
-        pytest.raises(error, match=r"(?s)Traceback .*test_evaluator\.py\", line \d+"),
-        open_evaluator(cfg, build=Crosser) as evaluate,
-    ):
-        evaluate(GENES, SEEDS)
-
-
-def test_a_dead_worker_is_noticed():
-    cfg = dataclasses.replace(CFG, policy="die", workers="2")
-    with (
-        open_evaluator(cfg, build=Crosser) as evaluate,
-        pytest.raises(EvaluatorError, match=r"a worker process died \(signal SIGKILL\)"),
-    ):
-        evaluate(GENES, SEEDS)
 
 
 def test_leaving_ends_workers_in_the_midst_of_work():
@@ -316,8 +263,7 @@ def test_seeds_must_be_one_a_terrain():
         evaluate(GENES, SEEDS[:3])
 
 
-def test_a_worker_whose_parent_was_killed_with_unread_messages_leaves_quietly(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # put back after the worker's function has set it
+def test_a_worker_whose_parent_was_killed_with_unread_messages_leaves_quietly():
     ours, theirs = multiprocessing.Pipe()
 
     def die() -> None:
