@@ -1,4 +1,4 @@
-"""Folders for runs that are begun by the hundred."""
+"""A folder for runs that are begun by the hundred."""
 
 import tempfile
 from collections.abc import Iterator
@@ -6,14 +6,12 @@ from pathlib import Path
 
 import pytest
 
-_MEMORY = Path("/dev/shm")
-
 
 @pytest.fixture
 def folder(tmp_path) -> Iterator[Path]:
     """An empty folder in memory where the system has one: every write waits for the disk, and here there are many."""
-    if not _MEMORY.is_dir():
+    if not Path("/dev/shm").is_dir():
         yield tmp_path
         return
-    with tempfile.TemporaryDirectory(dir=_MEMORY, prefix="faultline-") as path:
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="faultline-") as path:
         yield Path(path)

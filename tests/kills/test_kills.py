@@ -1,47 +1,66 @@
-"""Searches killed at random moments by the system: nothing saved is lost, and all come to the same bits."""
+"""A kill, and a full disk, at the steps that a run takes on the disk: nothing saved is lost, and it ends alike."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from tests.kills import searches
-from tests.kills.campaign import RealSearch, kill_and_resume
-from tests.kills.children import Child, run_child
+from tests.kills import runs
+from tests.kills.faults import fill, run_child
 
-KILLS = 100
-ITERATIONS = 28
-LONGEST_S = 0.3
+ITERATIONS = 2
+KINDS = {
+    "search": (runs.search, runs.search_outcome, runs.saved_iterations, "checkpoint.bin"),
+    "training": (runs.train, runs.train_outcome, runs.saved_updates, "checkpoint.pt"),
+}
 
 
-@pytest.mark.parametrize("number_of_kills", [3, pytest.param(KILLS, marks=pytest.mark.kills)])
-def test_kills_at_random_moments(folder, number_of_kills):
-    def start(path: Path, number: int) -> Child:
-        log = folder / "log"
-        log.unlink(missing_ok=True)
-        return Child(log, searches.search, path, iterations=ITERATIONS)
-
-    code, output = run_child(folder / "log", searches.search, folder / "whole", iterations=ITERATIONS)
+def undisturbed(folder: Path, kind: str) -> list[str]:
+    """Names and files of all steps of a run that ends, which is left in ``whole``."""
+    code, output = run_child(folder / "log", KINDS[kind][0], folder / "whole", iterations=ITERATIONS, log=folder / "s")
     assert code == 0, output
-    whole = searches.outcome(folder / "whole")
-    kills = kill_and_resume(start, folder, lambda: whole, kills=number_of_kills, longest_s=LONGEST_S, seed=20251121)
-    assert len(kills) == number_of_kills
-    # Had all moments come before the first save or after the last, nothing would have been tested.
-    between = [kill for kill in kills if 0 < kill.saved < ITERATIONS]
-    assert number_of_kills < KILLS or len(between) > KILLS / 4, kills
+    return (folder / "s").read_text().splitlines()
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes left behind in /proc")
+@pytest.mark.parametrize(
+    ("kind", "every"),
+    [("search", 12), *(pytest.param(kind, 1, marks=pytest.mark.kills) for kind in KINDS)],
+)
+def test_a_run_killed_at_a_step_loses_nothing_and_ends_alike(folder, kind, every):
+    run, outcome, saved, checkpoint = KINDS[kind]
+    steps = undisturbed(folder, kind)
+    whole = outcome(folder / "whole")
+    assert sum(step.startswith("replace") and step.endswith(f"/{checkpoint}") for step in steps) >= ITERATIONS
+
+    def kill_at(at: int) -> None:
+        path, log = folder / f"run-{at}", folder / f"log-{at}"
+        assert run_child(log, run, path, iterations=ITERATIONS, at=at)[0] == -9, f"not killed at {at}, {steps[at]}"
+        replaced = sum(step.startswith("replace") and step.endswith(f"/{checkpoint}") for step in steps[:at])
+        assert saved(path) == min(replaced, ITERATIONS), f"killed before step {at}, {steps[at]}"
+        code, output = run_child(log, run, path, iterations=ITERATIONS)
+        assert code == 0 and "Traceback" not in output, f"killed before step {at}, {steps[at]}:\n{output}"
+        assert outcome(path) == whole, f"killed before step {at}, {steps[at]}"
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(kill_at, range(0, len(steps), every)))
+
+
 @pytest.mark.kills
-def test_kills_of_the_real_search_and_its_workers(tmp_path):
-    fast = {"NUMBA_DISABLE_JIT": "1"}  # spares compiling
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_disk_that_fills_up_is_said_in_a_line_and_the_run_goes_on_once_there_is_space(folder, kind):
+    run, outcome, *_ = KINDS[kind]
+    steps = undisturbed(folder, kind)
+    whole = outcome(folder / "whole")
 
-    def start(path: Path, number: int) -> RealSearch:
-        return RealSearch(path, iterations=2, workers=2, whole_group=number % 3 == 2, **fast)
+    def fill_at(at: int) -> None:
+        path, log = folder / f"run-{at}", folder / f"log-{at}"
+        code, output = run_child(log, run, path, iterations=ITERATIONS, at=at, fault=fill)
+        assert code == 2 and "Traceback" not in output, f"no space at step {at}, {steps[at]}:\n{output}"
+        assert sum(line.startswith("error: ") for line in output.splitlines()) == 1, output
+        assert not list(path.rglob(".*.tmp")), "what could not be written takes space"
+        code, output = run_child(log, run, path, iterations=ITERATIONS)
+        assert code == 0, f"no space at step {at}, {steps[at]}, and then:\n{output}"
+        assert outcome(path) == whole, f"no space at step {at}, {steps[at]}"
 
-    def whole() -> tuple:
-        assert undisturbed.wait() == 0, undisturbed.output
-        return searches.outcome(tmp_path / "whole")
-
-    undisturbed = RealSearch(tmp_path / "whole", iterations=2, workers=1, **fast)  # on the other core meanwhile
-    kills = kill_and_resume(start, tmp_path, whole, kills=3, longest_s=11.0, seed=9)
-    assert len(kills) == 3
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(fill_at, [at for at, step in enumerate(steps) if not step.startswith("unlink")][::2]))

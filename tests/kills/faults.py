@@ -1,0 +1,133 @@
+"""What a program does to the files under a folder, step by step, and a fault at any of them.
+
+A step is what the system sees: a file opened for writing, a half of what is written, a flush to the disk, a rename, a
+new folder, a removal. A fault strikes before its step is done, so that all of them together leave every state of the
+disk that a kill can leave.
+"""
+
+import builtins
+import errno
+import io
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["tests.kills.runs"])
+_PATIENCE_S = 300.0
+
+
+def kill(name: str, path: str) -> None:
+    """Ends the process as the system does when it is out of memory or power."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fill(name: str, path: str) -> None:
+    """There is no space for what the step would write."""
+    if name != "unlink":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+
+
+class Steps:
+    """Watches a folder from its construction to the end of the process.
+
+    Args:
+        folder: What is watched.
+        log: File that gets a line a step; None for none.
+        fault: Called with name and path of a step, before it.
+        at: Number of the step at which ``fault`` strikes, and at every later one; None for never.
+    """
+
+    def __init__(
+        self, folder: Path, *, log: Path | None = None, fault: Callable[[str, str], None] = kill, at: int | None = None
+    ) -> None:
+        self._folder, self._log, self._fault, self._at, self._count = str(folder), log, fault, at, 0
+        self._open, self._os_open, self._fsync = io.open, os.open, os.fsync
+        io.open = builtins.open = self._watched_open
+        os.open, os.fsync = self._watched_os_open, self._watched_fsync
+        for name, place in (("replace", 1), ("unlink", 0), ("mkdir", 0)):
+            setattr(os, name, self._watched(name, getattr(os, name), place))
+
+    def take(self, name: str, path: str | bytes) -> None:
+        """Counts a step on a path of the folder and lets the fault strike where it is due."""
+        path = os.fsdecode(path)
+        if not path.startswith(self._folder):
+            return
+        number, self._count = self._count, self._count + 1
+        if self._log is not None:
+            handle = self._os_open(self._log, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
+            os.write(handle, f"{name} {path}\n".encode())
+            os.close(handle)
+        if self._at is not None and number >= self._at:
+            self._fault(name, path)
+
+    def _watched(self, name: str, function: Callable[..., Any], place: int) -> Callable[..., Any]:
+        def watched(*arguments: Any, **named: Any) -> Any:
+            self.take(name, os.fspath(arguments[place]))
+            return function(*arguments, **named)
+
+        return watched
+
+    def _watched_open(self, file: Any, mode: str = "r", *rest: Any, **named: Any) -> Any:
+        if isinstance(file, int) or not set(mode) & set("wxa+"):
+            return self._open(file, mode, *rest, **named)
+        self.take("open", os.fspath(file))
+        opened = self._open(file, mode, *rest, **named)
+        return _File(opened, file, self) if os.fsdecode(file).startswith(self._folder) else opened
+
+    def _watched_os_open(self, path: Any, flags: int, *rest: Any, **named: Any) -> int:
+        if flags & os.O_CREAT:
+            self.take("open", os.fspath(path))
+        return self._os_open(path, flags, *rest, **named)
+
+    def _watched_fsync(self, handle: int) -> None:
+        self.take("fsync", os.readlink(f"/proc/self/fd/{handle}"))
+        self._fsync(handle)
+
+
+class _File:
+    """A file being written, in two halves that reach the disk one after the other."""
+
+    def __init__(self, file: Any, path: Any, steps: Steps) -> None:
+        self._file, self._path, self._steps = file, path, steps
+
+    def write(self, data: Any) -> int:
+        half = len(data) // 2
+        for name, part in (("write", data[:half]), ("rest", data[half:])):
+            self._steps.take(name, self._path)
+            self._file.write(part)
+            self._file.flush()
+        return len(data)
+
+    def __enter__(self) -> "_File":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def run_child(log: Path, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> tuple[int, str]:
+    """Exit code and output of a function in a process of its own, forked from one that has everything imported."""
+    process = _CONTEXT.Process(target=_live, args=(log, function, arguments, named))
+    process.start()
+    if not connection.wait([process.sentinel], _PATIENCE_S):
+        process.kill()
+        raise AssertionError(f"a child hangs:\n{log.read_text()}")
+    process.join()
+    return process.exitcode or 0, log.read_text(errors="replace")
+
+
+def _live(log: Path, function: Callable[..., Any], arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+    handle = os.open(log, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(handle, stream.fileno())
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the fork server ignores it
+    sys.exit(function(*arguments, **named))

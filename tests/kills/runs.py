@@ -1,0 +1,120 @@
+"""A search and a training of a fraction of a second, by their own commands, and what each comes to.
+
+The fork server imports this module once: what every child needs is imported and compiled here. It must stay without
+threads and hold no simulation that a child would not have made alike.
+"""
+
+import gc
+import json
+import os
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+import torch
+import tqdm
+
+import faultline
+from qd import search as searching
+from qd.archive import ARCHIVE_FILE
+from qd.run.checkpoint import load_checkpoint
+from qd.run.directory import CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE
+from qd.scheduler import Scheduler
+from sim.robots.find import get_robot
+from tests.kills.faults import Steps
+from tests.qd.searches import TIMES, crossing_by
+from tests.qd.stand_in import open_stand_in
+from train.ppo import training
+from train.ppo.checkpoint import CHECKPOINT, read_checkpoint
+from train.task.cfg import CurriculumCfg, TaskCfg
+from train.task.task import CommandTask
+
+_SEARCH = (
+    "archive --device cpu --policy tests.sim.policies:stand --seed 5 --replicas 2 --method cma_mae+map_elites "
+    "--scheduler.emitters 2 --scheduler.batch-size 4 --scheduler.restart-rule 4 --fitness.intervals 3"
+)  # networks of a surrogate would learn longer than the stand-in takes; few cells make a small checkpoint
+_TRAIN = (
+    "train --device cpu --num-envs 6 --task.curriculum.num-columns 2 --task.curriculum.noise-columns 1 "
+    "--ppo.hidden-dims 16 8 --ppo.steps-per-env 4 --ppo.epochs 1 --ppo.mini-batches 2"
+)
+_OF_A_CLOCK = (*TIMES, "rollout_s", "physics_steps", "robot_steps", "idle_share")
+
+os.environ.setdefault("FAULTLINE_COMMIT", "under test")  # spares asking git
+tqdm.tqdm.monitor_interval = 0  # or the first bar starts a thread
+tqdm.tqdm.set_lock(threading.RLock())  # its own is one for all processes: a killed child would keep it
+torch.set_num_threads(1)
+_TASK = CommandTask(
+    get_robot("anymal"), TaskCfg(curriculum=CurriculumCfg(num_columns=2, noise_columns=1)),
+    num_envs=6, device="cpu", seed=0,
+)  # fmt: skip
+
+
+def search(path: Path, *, iterations: int, **watched: Any) -> int:
+    """Begins a search over the stand-in evaluator or goes on with it; returns the command's exit code.
+
+    Args:
+        path: The run directory.
+        iterations: Iterations in all.
+        watched: As of :class:`tests.kills.faults.Steps`; the folder is watched if there are some.
+    """
+    searching.write_figures = lambda folder, archive, metrics: []  # which would take a second
+    words = _SEARCH.split()
+    if (path / CONFIG_FILE).exists():
+        words = [*words[:5], "--resume", str(path)]
+    else:
+        words += ["--run-dir", str(path)]
+    if watched:
+        Steps(path, **watched)
+    with crossing_by(open_stand_in):
+        return faultline.main([*words, "--iterations", str(iterations)])
+
+
+def search_outcome(path: Path) -> tuple[Any, ...]:
+    """What a search comes to: the archive's bytes, its metrics without a clock's, and what it would ask next."""
+    state = load_checkpoint(path / CHECKPOINT_FILE)
+    rows = [json.loads(line) for line in (path / METRICS_FILE).read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+    rows = [{key: value for key, value in row.items() if key not in _OF_A_CLOCK} for row in rows]
+    return (path / ARCHIVE_FILE).read_bytes(), rows, Scheduler.from_state(state).ask().tobytes()
+
+
+def saved_iterations(path: Path) -> int:
+    """Iterations that the checkpoint of a search has; 0 without one."""
+    file = path / CHECKPOINT_FILE
+    return len(load_checkpoint(file)["metrics"]) if file.exists() else 0
+
+
+def train(path: Path, *, iterations: int, **watched: Any) -> int:
+    """Begins a training or goes on with it, saving every iteration; arguments and result as of :func:`search`."""
+    training.CommandTask = lambda *_, **__: _TASK
+    training.SAVE_EVERY_S = 0.0
+    if watched:
+        Steps(path, **watched)
+    return faultline.main([*_TRAIN.split(), "--run-dir", str(path), "--iterations", str(iterations)])
+
+
+def train_outcome(path: Path) -> tuple[Any, ...]:
+    """What a training comes to: all of its checkpoint but what a clock says, as plain values."""
+    content = read_checkpoint(path / CHECKPOINT)
+    return tuple((key, _plain(value)) for key, value in sorted(content.items()) if key != "progress")
+
+
+def saved_updates(path: Path) -> int:
+    """Iterations that the checkpoint of a training has; 0 without one."""
+    file = path / CHECKPOINT
+    return read_checkpoint(file)["iter"] if file.exists() else 0
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
+
+
+with tempfile.TemporaryDirectory() as _folder:
+    search(Path(_folder) / "run", iterations=2)  # compiles the evolution strategy
+gc.collect()
+gc.freeze()  # or a child's first collection copies every page
