@@ -13,8 +13,9 @@ from qd.archive import Archive
 from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
 from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, split_elites
 from qd.run.directory import RunDirectory, find_run
-from sim.policy.export import export_onnx
-from sim.policy.loaders import MlpPolicy, load_policy
+from sim.policy.loaders import load_policy
+from sim.policy.mlp import MlpPolicy
+from sim.policy.onnx import export_onnx
 from sim.policy.spec import SHIPPED, controller_hash, is_same
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace

@@ -4,7 +4,6 @@ import functools
 import inspect
 import multiprocessing
 import os
-import re
 import sys
 import warnings
 import zipfile
@@ -17,13 +16,12 @@ import warp as wp
 
 from sim.files.atomic import check_zip, read_json
 from sim.files.records import robot_digest
-from sim.policy.onnx_file import load_onnx
-from sim.policy.runner import action_problem, with_rows_of_zeros
-from sim.policy.spec import ControllerSpec, find_named, in_one_line, place_of_code
+from sim.policy.mlp import MlpPolicy
+from sim.policy.runner import action_problem
+from sim.policy.spec import ControllerSpec, find_named, in_one_line
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 
-_CALLED_WITH = {"factory": "robot, device", "adapter": "controller, robot"}
 _FORMATS = (
     "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), module:callable or "
     "file.py:callable (a function on device tensors, or a class or factory marked by `faultline_factory = True` that "
@@ -42,38 +40,6 @@ class Policy(Protocol):
     def __call__(self, observation: torch.Tensor, /) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size)."""
         ...
-
-
-class MlpPolicy(torch.nn.Module):
-    """Multilayer perceptron with ELU between its layers: rsl_rl's ``MLPModel`` without its distribution."""
-
-    def __init__(self, state: dict[str, torch.Tensor]) -> None:
-        """Build from rsl_rl's keys ``mlp.<k>.weight`` / ``.bias`` and, if any, ``obs_normalizer._mean`` / ``._std``."""
-        super().__init__()
-        indices = sorted(int(m.group(1)) for key in state if (m := re.fullmatch(r"mlp\.(\d+)\.weight", key)))
-        layers: list[torch.nn.Module] = []
-        for index in indices:
-            weight = state[f"mlp.{index}.weight"]
-            layer = torch.nn.Linear(weight.shape[1], weight.shape[0])
-            layer.weight.data.copy_(weight)
-            layer.bias.data.copy_(state[f"mlp.{index}.bias"])
-            layers += [layer, torch.nn.ELU()]
-        self.layers = torch.nn.Sequential(*layers[:-1])
-        self.mean = torch.nn.Buffer(state.get("obs_normalizer._mean", torch.zeros(1)).float())
-        self.std = torch.nn.Buffer(state.get("obs_normalizer._std", torch.ones(1)).float())
-        self.normalised = "obs_normalizer._mean" in state
-
-    @property
-    def sizes(self) -> tuple[int, int]:
-        """Observation and action size."""
-        linear = [layer for layer in self.layers if isinstance(layer, torch.nn.Linear)]
-        return linear[0].in_features, linear[-1].out_features
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Mean actions, shape (num_envs, num_joints)."""
-        if self.normalised:
-            observation = (observation - self.mean) / (self.std + 1e-2)
-        return self.layers(with_rows_of_zeros(observation))[: len(observation)]
 
 
 def prepare_torch(device: str) -> None:
@@ -114,7 +80,8 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
 
     Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
     checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
-    file made to harm can crash. A training record beside a file that names another robot is told.
+    file made to harm can crash. If the training record beside a
+    file names another robot, a warning says so.
 
     Args:
         spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or ``module:adapter@file``;
@@ -171,51 +138,36 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
         raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; expected {_FORMATS}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
-    kind, arguments = "factory", (robot, device)
-    if spec.file is not None:
-        kind, arguments = "adapter", (_load_file(Path(spec.file), robot, device, fits=False), robot)
-    elif not getattr(target, "faultline_factory", False):
-        _check_unmarked(target, spec)
+    if spec.file is None and not getattr(target, "faultline_factory", False):
+        _check_takes_observation(target, spec)
         return target
+    arguments = (
+        (robot, device) if spec.file is None else (_load_file(Path(spec.file), robot, device, fits=False), robot)
+    )
     try:
         policy = target(*arguments)
     except Exception as error:
-        raise ValueError(
-            f"policy '{spec}' is {_a(kind)} that failed, called with ({_CALLED_WITH[kind]}): "
-            f"{in_one_line(error, target)}; mend it first"
-        ) from error
+        called = "robot, device" if spec.file is None else "controller, robot"
+        raise ValueError(f"policy '{spec}' failed, called with ({called}): {in_one_line(error)}") from error
     if not callable(policy):
-        raise ValueError(f"policy '{spec}' is {_a(kind)} that must return a callable, got {type(policy).__name__}")
+        raise ValueError(f"policy '{spec}' must return a callable, got {type(policy).__name__}")
     return policy
 
 
-def _check_unmarked(target: Any, spec: ControllerSpec) -> None:
-    """Refuses what is no function of the observation: a class without the mark, or a function of something else.
-
-    Raises:
-        ValueError: If it is.
-    """
-    where = place_of_code(target)
-    if inspect.isclass(target):
-        raise ValueError(
-            f"policy '{spec}' is a class without the mark{where}: write `faultline_factory = True` into it, and it is "
-            "called with (robot, device) and makes the controller"
-        )
+def _check_takes_observation(target: Any, spec: ControllerSpec) -> None:
+    """Refuses what is no function of the observation: a class without the mark, or a function of something else."""
     try:
-        signature = inspect.signature(target)
-    except (TypeError, ValueError):  # not all that is written in C has one
+        if not inspect.isclass(target):
+            inspect.signature(target).bind(None)
+            return
+    except ValueError:  # not all that is written in C has a signature
         return
-    try:
-        signature.bind(None)
-    except TypeError as error:
-        raise ValueError(
-            f"policy '{spec}' must take one argument, the observation, got {spec.name}{signature}{where}: one that is "
-            "called with (robot, device) and makes a controller is marked by `faultline_factory = True`"
-        ) from error
-
-
-def _a(kind: str) -> str:
-    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
+    except TypeError:
+        pass
+    raise ValueError(
+        f"policy '{spec}' must be a function of the observation: a class or function that makes a controller of "
+        "(robot, device) is marked by `faultline_factory = True`"
+    )
 
 
 def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -> Policy:
@@ -231,12 +183,14 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
         raise ValueError(f"policy '{path}' is a Python file: name what to call in it, {path}:CALLABLE")
     expected = (robot.observation_size, robot.num_joints)
     if path.suffix.lower() == ".onnx":
+        from sim.policy.onnx import load_onnx  # onnxruntime takes long to load, and few controllers need it
+
         return load_onnx(path, expected if fits else None, device)
     try:
         if zipfile.is_zipfile(path):
             check_zip(path)
     except ValueError as error:
-        raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back; expected {_FORMATS}") from error
+        raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back") from error
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of TorchScript files, which are none of the matter here
@@ -245,9 +199,9 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
         return _load_script(path, device, error)
     state = content.get("actor_state_dict") if isinstance(content, dict) else None
     if not isinstance(state, dict) or "mlp.0.weight" not in state:
-        found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
+        got = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
         raise ValueError(
-            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', found {found}"
+            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', got {got}"
         )
     try:
         policy = MlpPolicy(state)
@@ -279,9 +233,9 @@ def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None
         with torch.inference_mode():
             action = policy(observation)
     except (Exception, SystemExit) as error:  # a controller can fail with anything
+        reason = in_one_line(error) if ControllerSpec.parse(spec).runs_code else reason_of(error)
         raise ValueError(
-            f"policy '{spec}' failed on observations of shape {tuple(observation.shape)}, which robot '{robot.name}' "
-            f"gives: {in_one_line(error) if ControllerSpec.parse(spec).runs_code else reason_of(error)}"
+            f"policy '{spec}' failed on observations of shape {tuple(observation.shape)} of '{robot.name}': {reason}"
         ) from error
     problem = action_problem(action, expected)
     if problem is not None:
@@ -291,6 +245,15 @@ def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None
         )
     if not torch.isfinite(action).all():
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
+
+
+def load_checkpoint(spec: str | Path, robot: RobotCfg) -> MlpPolicy:
+    """A robot's controller from an rsl_rl checkpoint, on the CPU, as ONNX can be written of it."""
+    prepare_torch("cpu")
+    policy = load_policy(spec, robot, "cpu")
+    if not isinstance(policy, MlpPolicy):
+        raise ValueError(f"policy '{spec}' must be an rsl_rl checkpoint (.pt), got {type(policy).__name__}")
+    return policy
 
 
 PolicySpec = str | Path | Callable[[torch.Tensor], torch.Tensor]

@@ -3,7 +3,6 @@
 import hashlib
 import importlib
 import importlib.util
-import inspect
 import re
 import sys
 import sysconfig
@@ -117,67 +116,33 @@ def controller_hash(policy: str | Path) -> str | None:
 def _origin_of(module: str) -> str:
     """File of a module; empty if there is no such module."""
     try:
-        found = importlib.util.find_spec(module)
+        spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):  # no package of that name
-        found = None
-    return "" if found is None or found.origin is None else found.origin
+        return ""
+    return "" if spec is None or spec.origin is None else spec.origin
 
 
 _ROOT = Path(__file__).resolve().parents[2]
-_NOT_THEIRS = (
+_NOT_THE_USERS = (
     *(_ROOT / room for room in ("kernels", "sim", "qd", "train")),
     *(Path(sysconfig.get_path(kind)) for kind in ("stdlib", "platstdlib", "purelib", "platlib")),
 )
 
 
-def in_one_line(error: BaseException, code: Any = None) -> str:
-    """Kind of an error, the first line of what it says, and the line of the user's code that it comes from.
-
-    Args:
-        error: What was raised.
-        code: The function or class that was called; it is named if the error came before its first line.
-    """
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    text = ": ".join([type(error).__name__, *lines[:1]])
-    if isinstance(error, SyntaxError):  # which says file and line itself
-        return f"{text}: `{error.text.strip()}`" if error.text else text
-    return f"{text}{_place_of(error) or place_of_code(code)}"
-
-
-def _place_of(error: BaseException) -> str:
-    """The innermost line of a traceback that is neither the project's nor an installed package's, in brackets."""
-    theirs = [
-        (frame.filename, frame.lineno)
+def in_one_line(error: BaseException) -> str:
+    """Kind of an error, the first line of what it says, and the innermost line of the user's own code."""
+    text = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
+    frames = [
+        frame
         for frame in traceback.extract_tb(error.__traceback__)
-        if not frame.filename.startswith("<") and not _is_installed(Path(frame.filename))
+        if not frame.filename.startswith("<")
+        and not any(Path(frame.filename).is_relative_to(folder) for folder in _NOT_THE_USERS)
     ]
-    return f" ({_short(theirs[-1][0])}, line {theirs[-1][1]})" if theirs else ""
-
-
-def _is_installed(file: Path) -> bool:
-    return any(file.is_relative_to(folder) for folder in _NOT_THEIRS)
-
-
-def _short(file: str) -> str:
-    """A path from the working directory, if it lies below."""
-    path = Path(file)
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
-
-
-def place_of_code(code: Any) -> str:
-    """File and line of a function or class, in brackets; empty if it has none."""
-    try:
-        return f" ({_short(inspect.getfile(code))}, line {inspect.getsourcelines(code)[1]})"
-    except (TypeError, OSError):
-        return ""
+    return f"{text} ({frames[-1].filename}, line {frames[-1].lineno})" if frames else text
 
 
 def run_file(path: Path) -> ModuleType:
-    """Runs a Python file as a module of its own, as it is now; its neighbours can be imported from it.
-
-    Raises:
-        ValueError: If there is no such file, or it fails.
-    """
+    """Runs a Python file as a module of its own, as it is now; its neighbours can be imported from it."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     path = path.resolve()
@@ -194,15 +159,8 @@ def run_file(path: Path) -> ModuleType:
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)  # no .pyc that an edit could outrun
     except (Exception, SystemExit) as error:  # a file can fail with anything
         del sys.modules[name]
-        raise ValueError(f"{path} fails: {in_one_line(error)}{_commas(error, path)}") from error
+        raise ValueError(f"{path} fails: {in_one_line(error)}") from error
     return module
-
-
-def _commas(error: BaseException, path: Path) -> str:
-    """Where a file that is no Python may have a comma in place of a decimal point."""
-    lines = path.read_text(errors="replace").splitlines() if isinstance(error, SyntaxError) else []
-    found = [str(number) for number, line in enumerate(lines, 1) if re.search(r"=\s*[-+]?\d+,\d", line)]
-    return f"; is the comma in line {', '.join(found)} a decimal point?" if found else ""
 
 
 def find_named(place: str, name: str) -> Any:
@@ -215,12 +173,12 @@ def find_named(place: str, name: str) -> Any:
     Raises:
         Exception: Anything, if it cannot be run or has no such name.
     """
-    found: Any = run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
+    target: Any = run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
     for part in name.split("."):
-        if not hasattr(found, part):
-            raise AttributeError(f"it has no '{name}', only {', '.join(k for k in vars(found) if k[0] != '_')}")
-        found = getattr(found, part)
-    return found
+        if not hasattr(target, part):
+            raise AttributeError(f"it has no '{name}', only {', '.join(k for k in vars(target) if k[0] != '_')}")
+        target = getattr(target, part)
+    return target
 
 
 MARK = "@"
@@ -234,22 +192,17 @@ def kind_of(name: str) -> str:
 
 def firsts(names: Iterable[str]) -> list[str]:
     """The first controller of each kind, in order."""
-    found: dict[str, str] = {}
+    first: dict[str, str] = {}
     for name in names:
-        found.setdefault(kind_of(name), name)
-    return list(found.values())
+        first.setdefault(kind_of(name), name)
+    return list(first.values())
 
 
 def about_controllers(controllers: Mapping[str, str], robot: RobotWithController) -> dict[str, dict[str, str | None]]:
-    """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own.
-
-    Args:
-        controllers: Policy of each by its name.
-        robot: The robot.
-    """
+    """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own."""
     return {
-        who: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
-        for who, policy in controllers.items()
+        name: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
+        for name, policy in controllers.items()
     }
 
 
@@ -261,12 +214,9 @@ def controllers_of(policies: Sequence[str], robot: RobotWithController, *, flag:
             by spaces.
         robot: The robot, whose controller is the shipped one.
         flag: The flag that names them, for errors.
-
-    Raises:
-        ValueError: If one has no name, or two have the same.
     """
     text = " ".join(policies).strip() or f"base={SHIPPED}"
-    found: dict[str, str] = {}
+    controllers: dict[str, str] = {}
     for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is
         name, _, policy = item.partition("=")
         if not re.fullmatch(r"[\w.+@-]+", name) or not policy:
@@ -274,30 +224,17 @@ def controllers_of(policies: Sequence[str], robot: RobotWithController, *, flag:
                 f"{flag} must be NAME=FILE each, the name of letters, digits and . _ + @ -, got '{item}': "
                 "write for example C-G=runs/tuned/policy.pt"
             )
-        if name in found:
+        if name in controllers:
             raise ValueError(f"{flag} must have different names, got '{name}' twice: rename one of them")
-        found[name] = spec_of(policy, robot)
-    return found
-
-
-def named_file(text: str) -> str:
-    """``NAME=FILE`` of a controller that is named so, or by its file alone, whose name it then has."""
-    if re.match(r"[\w.+@-]+=", text):
-        return text
-    return f"{Path(ControllerSpec.parse(text).label).stem}={text}"
+        controllers[name] = spec_of(policy, robot)
+    return controllers
 
 
 def certifier_hash(name: str, policy: str) -> str:
-    """SHA-256 of a certifier, which its certificates name.
-
-    Raises:
-        ValueError: If it has none.
-    """
+    """SHA-256 of a certifier, which its certificates name."""
     digest = controller_hash(policy)
     if digest is None:
-        raise ValueError(
-            f"certifier {name} must have a file, which its certificates name by hash, got {policy}: give a file"
-        )
+        raise ValueError(f"certifier {name} must have a file, by whose hash certificates name it, got {policy}")
     return digest
 
 

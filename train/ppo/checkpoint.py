@@ -9,7 +9,8 @@ from typing import Any
 import torch
 
 from sim.files.atomic import write_atomically
-from sim.policy.loaders import MlpPolicy, load_policy, read_weights, reason_of
+from sim.policy.loaders import load_policy, read_weights, reason_of
+from sim.policy.mlp import MlpPolicy
 from sim.robots.robot import RobotCfg
 
 FORMAT = "faultline training checkpoint 2"
