@@ -164,40 +164,23 @@ _ON_SURFACE = 1.0e-5
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeTables:
-    """The probes of one robot as tensors, grouped by radius: one radius, one size of window."""
+    """The P probes and S strips of one robot as tensors, probes also grouped by radius: one radius, one window."""
 
-    position: Tensor
-    """Centres in their body's frame [m], shape (P, 3)."""
-    body: Tensor
-    """Body of each probe, shape (P,)."""
-    radius: Tensor
-    """Radius of each probe [m], shape (P,)."""
-    groups: tuple[tuple[float, int, Tensor], ...]
-    """Radius [m], cells along a side of its window, and the probes of that radius."""
-    order: Tensor
-    """Where each probe stands in the groups' probes one after another, shape (P,)."""
-    strip_probes: Tensor
-    """Probes of each strip in order, the last one repeated, shape (S, longest)."""
-    strip_body: Tensor
-    """Body of each strip, shape (S,)."""
-    strip_radius: Tensor
-    """Radius of each strip's probes [m], shape (S,)."""
+    position: Tensor  # in the body's frame [m], (P, 3)
+    body: Tensor  # (P,)
+    radius: Tensor  # [m], (P,)
+    groups: tuple[tuple[float, int, Tensor], ...]  # radius, cells along a side of its window, and its probes
+    order: Tensor  # where each probe stands in the groups' probes one after another, (P,)
+    strip_probes: Tensor  # of each strip in order, the last one repeated, (S, longest)
+    strip_body: Tensor  # (S,)
+    strip_radius: Tensor  # [m], (S,)
 
 
 def make_tables(
     position: np.ndarray, strip_start: np.ndarray, strip_radius: np.ndarray, strip_body: np.ndarray, *, spacing: float,
     device: torch.device,
 ) -> ProbeTables:  # fmt: skip
-    """Tables of strips given as :class:`kernels.contact.Probes` gives them.
-
-    Args:
-        position: Probe centres in their body's frame [m], shape (P, 3).
-        strip_start: First probe of each strip, and P, shape (S + 1,).
-        strip_radius: Radius of each strip's probes [m], shape (S,).
-        strip_body: Body of each strip, shape (S,).
-        spacing: Distance of neighbouring nodes [m].
-        device: Where to put the tables.
-    """
+    """Tables of strips given as :class:`kernels.contact.Probes` gives them."""
     lengths = np.diff(strip_start)
     radius = np.repeat(strip_radius, lengths)
     probes = [np.flatnonzero(radius == value) for value in np.unique(radius)]
@@ -362,19 +345,11 @@ def choose_probes(distance: Tensor, tables: ProbeTables) -> Tensor:
 def collide(
     body_q: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
 ) -> tuple[Tensor, ...]:
-    """Contact records of every strip, dense: slots for the deepest, the first and the last probe that touch.
-
-    Args:
-        body_q: Poses (E, bodies, 7).
-        terrain_of_env: Terrain of each environment, shape (E,).
-        heights: Node heights [m], shape (T, rows, cols).
-        spacing: Distance of neighbouring nodes [m].
-        tables: The robot's probes.
+    """Contact records of every strip of robots with poses (E, bodies, 7), in slots for its deepest, first, last probe.
 
     Returns:
         Probe of each slot, -1 where there is no contact, (E, S, 3); surface points in the world, probe centres in the
-        body, normals in the world and offsets in the body, (E, S, 3, 3) each: what the kernel writes a record. Shapes
-        and radii follow from the strip.
+        body, normals in the world and offsets in the body, (E, S, 3, 3) each.
     """
     rotation = rotation_matrices(body_q[..., 3:])  # (E, bodies, 3, 3)
     centre, distance, normal = probe_contacts(body_q, rotation, terrain_of_env, heights, spacing, tables)
