@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 from qd.run.directory import RunDirectory
-from qd.run.settings import preset
 from qd.search import search
 from results.make.common import parse
 
@@ -19,9 +18,8 @@ ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Runs both searches and writes their mean STD with 95 % bootstrap intervals over elites."""
     script = parse(__doc__, argv, "ablation.json")
-    cfg = preset("small" if script.small else "wide", script.robot)
-    iterations, every = (1, 1) if script.small else (18, 6)
-    cfg = replace(cfg, seed=script.seed, iterations=iterations, reevaluate_every=every)
+    every = 1 if script.small else 6
+    cfg = script.search_cfg(18, seed=script.seed, reevaluate_every=every)
     rows = {}
     for name, alpha in ALPHAS.items():
         run = script.runs / "ablation" / name

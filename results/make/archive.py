@@ -6,13 +6,11 @@ Then it is judged: fresh episodes, contact resolved, a specialist trained on wha
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from qd.judge import judge
 from qd.run.directory import RunDirectory
-from qd.run.settings import preset
 from qd.search import search
 from results.make.common import Script, parse
 from train.cfg import FinetuneCfg, RunCfg
@@ -27,11 +25,9 @@ PUBLISHED = ("archive.npz", "archive.json", "config.json", "metrics.jsonl", "*.p
 def make_archive(script: Script, name: str) -> Path:
     """Searches and judges; returns the run."""
     method, seed = SEARCHES[name]
-    cfg = preset("small" if script.small else "wide", script.robot)
-    scheduler = cfg.scheduler if method is None else replace(cfg.scheduler, method=method)
-    cfg = replace(cfg, scheduler=scheduler, seed=seed + script.seed, iterations=1 if script.small else cfg.iterations)
+    changes = {} if method is None else {"method": method}
     run = script.runs / name
-    search(cfg, run, script.compute)
+    search(script.search_cfg(seed=script.seed + seed, **changes), run, script.compute)
     if not script.small:  # on a CPU judging and a training take hours
         judge_with_specialist(script, run)
     return run

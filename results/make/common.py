@@ -5,7 +5,7 @@ import json
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from qd.archive import Archive
 from qd.run.directory import read_archive_of
+from qd.run.settings import SearchCfg, preset
 from qd.workers.evaluator import Compute
 from sim.device import resolve_device
 from sim.files.atomic import write_atomically
@@ -55,6 +56,22 @@ class Script:
     def runs(self) -> Path:
         """Folder for runs that are not published."""
         return self.out.parent / "runs" if self.small else Path("runs/make") / self.robot.name
+
+    def search_cfg(self, iterations: int | None = None, **changes: Any) -> SearchCfg:
+        """Settings of a search of preset wide; in a trial of four terrains, which no specialist can be trained on.
+
+        Args:
+            iterations: The preset's if None.
+            changes: Of its settings or its scheduler's, by name, and ``policy`` and ``space``.
+        """
+        named = {name: changes.pop(name) for name in ("policy", "space") if name in changes}
+        cfg = preset("small" if self.small else "wide", self.robot, **named)
+        of_scheduler = {name: changes.pop(name) for name in list(changes) if hasattr(cfg.scheduler, name)}
+        if self.small:
+            iterations, of_scheduler = 1, {**of_scheduler, "emitters": 2, "batch_size": 2, "groups": 1}
+            changes["replicas"] = 1
+        scheduler = replace(cfg.scheduler, **of_scheduler)
+        return replace(cfg, scheduler=scheduler, iterations=iterations or cfg.iterations, **changes)
 
     def read_archive(self, name: str = "archive") -> Archive:
         """A published archive of archive.py; in a trial too."""

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from qd.run.settings import preset
 from qd.search import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse
@@ -31,9 +30,9 @@ def last_policy(rounds: Sequence[Mapping[str, Any]], run: Path) -> Path | None:
 
 def search_again(script: Script, name: str, policy: Path | None, seed: int) -> dict[str, Any]:
     """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None."""
-    cfg = preset("wide", script.robot, None if policy is None else str(policy))
     run = script.runs / "rounds" / f"{name}-{seed}"
-    search(replace(cfg, seed=seed, iterations=13), run, script.compute)
+    cfg = script.search_cfg(13, seed=seed, policy=None if policy is None else str(policy))
+    search(cfg, run, script.compute)
     counts = judge_with_specialist(script, run)
     return {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
 

@@ -5,14 +5,12 @@ that fail cross with contact resolved and are crossed by the robot's panel.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from qd.judge import judge
 from qd.run.directory import RunDirectory
-from qd.run.settings import preset
 from qd.search import search
 from results.make.common import SEEDS, Script, mean_over_seeds, parse
 
@@ -26,12 +24,10 @@ JUDGED = ("confirmed", "certified", "faults", "faults_panel", "fault_families")
 
 def follow_search(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     """The numbers of a run's archive.json after each step."""
-    cfg = preset("small" if script.small else "wide", script.robot)
-    cfg = replace(cfg, seed=seed, scheduler=replace(cfg.scheduler, method=method))
     steps, run = (1,) if script.small else STEPS, script.runs / "search" / f"{method}-{seed}"
     rows = []
     for iterations in steps:
-        search(replace(cfg, iterations=iterations), run, script.compute)
+        search(script.search_cfg(iterations, seed=seed, method=method), run, script.compute)
         is_last = iterations == steps[-1] and not script.small
         judge(run, stages=("fresh", "resolved", "others") if is_last else ("fresh",), compute=script.compute)
         rows.append(RunDirectory(run).read_summary())

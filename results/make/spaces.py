@@ -2,14 +2,12 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from qd.archive import Archive
 from qd.groups import elites_of, failure_modes
 from qd.judge import judge
 from qd.run.directory import RunDirectory
-from qd.run.settings import preset
 from qd.search import search
 from results.make.common import parse
 from sim.spaces.registry import get_space
@@ -42,10 +40,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     script = parse(__doc__, argv, "spaces.json")
     numbers = {}
     for name in SPACES:
-        cfg = preset("small" if script.small else "wide", script.robot, space=name)
-        cfg = replace(cfg, seed=script.seed, iterations=1 if script.small else 13)
         run = script.runs / "spaces" / name
-        search(cfg, run, script.compute)
+        search(script.search_cfg(13, seed=script.seed, space=name), run, script.compute)
         archive = judge(run, stages=("fresh",) if script.small else ("fresh", "resolved", "others"),
                         compute=script.compute)  # fmt: skip
         summary = RunDirectory(run).read_summary()

@@ -60,9 +60,7 @@ def rollout_of(script: Script, num_terrains: int, num_envs: int, replicas: int) 
 
 def time_iteration(script: Script) -> dict[str, Any]:
     """The paper's iteration beside bare physics on the same crossings."""
-    cfg = preset("small" if script.small else "paper", script.robot)
-    if script.small:
-        cfg = replace(cfg, replicas=1, scheduler=replace(cfg.scheduler, emitters=2, batch_size=2, groups=1))
+    cfg = script.search_cfg() if script.small else preset("paper", script.robot)
     metrics, terrains = time_search(script, "iteration", cfg, 1 if script.small else 10)
     rate = float(np.median([row["robot_steps"] / row["wall_s"] for row in metrics]))
     rollout = rollout_of(script, len(terrains), cfg.episodes_per_iteration, cfg.replicas)
@@ -86,8 +84,7 @@ def time_wide(script: Script) -> dict[str, Any]:
     """Iterations of preset wide by method, and what the paper's four million episodes take by them."""
     numbers = {}
     for method in WIDE:
-        cfg = preset("wide", script.robot)
-        cfg = replace(cfg, scheduler=replace(cfg.scheduler, method=method))
+        cfg = script.search_cfg(method=method)
         metrics, _ = time_search(script, f"wide-{method}", cfg, 6)
         seconds = float(np.median([row["wall_s"] for row in metrics]))
         numbers[method] = {
