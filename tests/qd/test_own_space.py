@@ -15,8 +15,7 @@ from qd.fresh import Reevaluate, reevaluate_run
 from qd.show.elites import find_archive
 from qd.show.export import Export, export
 from qd.show.recordings import on_elite
-from qd.show.report import command
-from qd.show.report.command import Report
+from qd.show.report import report
 from sim.bank import heights_of
 from sim.files.command import run_command
 from sim.maps.heightmap import read_heightmap
@@ -174,7 +173,9 @@ def test_a_recording_is_read_without_the_code(ridges, searched, tmp_path, monkey
 
 def test_a_page_about_it(ridges, searched, monkeypatch):
     monkeypatch.setattr("sim.files.figures._png_of", lambda figure: PICTURE)
-    monkeypatch.setattr(command, "check_policy", lambda policy, robot, device: None)
-    cfg = Report(run=searched, space=ridges, device="cpu", episodes=2, elites=1)
-    page = command.html_report(cfg, cross=stand_in_cross([])).read_text()
+    monkeypatch.setattr(report, "check_policy", lambda policy, robot, device: None)
+    out = report.write_report(
+        searched, space=ridges, device="cpu", episodes=2, num_elites=1, cross=stand_in_cross([])
+    )
+    page = out.read_text()
     assert re.search(r"ridges of 0\.\d\d m", page)

@@ -10,6 +10,7 @@ from qd.show.figures import label_of, look_of, mode_words
 from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, Cards, Folded, Picture, absent, counted, paragraph, percent, picture, table
+from qd.show.report.rendered import rendered
 from sim.files.command import plain_command
 from sim.files.intervals import wilson_interval
 
@@ -37,7 +38,7 @@ def failures(shown: Shown) -> list[Block]:
         cards.append((drawn, *_card_words(shown, number, more=number not in leaders), anchor_of(number)))
     text = (
         "The worst terrain of each failure mode, where the middle one of the robots that end as most do has ended; "
-        f"lines are the ways of all {shown.material.cfg.episodes}."
+        f"lines are the ways of all {shown.episodes}."
     )
     if reason:
         text = f"The worst terrain of each failure mode from above. Where robots end on them is not shown. {reason}"
@@ -46,8 +47,6 @@ def failures(shown: Shown) -> list[Block]:
 
 def _pictured(shown: Shown, number: int) -> tuple[Picture, str]:
     """A terrain with the robots on it if that can be had, else from above, and then why."""
-    from qd.show.report.rendered import rendered
-
     material, crossed = shown.material, shown.crossed.get(number)
     if crossed is not None and len(crossed.chosen):
         scales = dict(zip(material.archive.penalties, material.archive.scales, strict=True))
@@ -164,7 +163,7 @@ def detail_section(shown: Shown) -> list[Block]:
         return [absent(shown.not_crossed)]
     stubborn = sum(shown.crossed[number].rates[ARRIVED].hits == 0 for number in shown.worst)
     text = (
-        f"{choice_told(shown.elites, shown.worst, shown.steady)} Each was crossed {shown.material.cfg.episodes} times "
+        f"{choice_told(shown.elites, shown.worst, shown.steady)} Each was crossed {shown.episodes} times "
         "afresh for this page, by the episodes that `faultline replay --elite N` shows; on "
         f"{stubborn} of the first {len(shown.worst)} no robot reached the goal. Scaled penalties: 1 is what a common "
         "one comes to on hard-random terrain."

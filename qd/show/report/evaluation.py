@@ -1,14 +1,12 @@
-"""The page's chapters about an evaluation: the tables, and the same terrain before and after fine-tuning."""
+"""The page's chapter about an evaluation."""
 
 from pathlib import Path
 from typing import Any
 
 from qd.evaluate.labels import FATES, SETS
-from qd.show.crossed import ARRIVED, FAILED, Crossed
-from qd.show.crossing_figures import draw_maps
 from qd.show.report.material import Shown
-from qd.show.report.page import Block, Folded, Picture, absent, counted, heading, paragraph, percent, picture, table
-from qd.show.report.tables import CERTIFIED, GENERATED, MEASURES, Change, Changes, by_kind
+from qd.show.report.page import Block, Folded, Picture, absent, counted, paragraph, percent, table
+from qd.show.report.tables import CERTIFIED, GENERATED, MEASURES, by_kind
 from sim.files.command import plain_command
 from sim.files.records import without_machine
 
@@ -37,7 +35,6 @@ def tables_section(shown: Shown) -> list[Block]:
         *certified_table(kinds),
         Folded("Show the figure", drawn) if (drawn := _drawn(shown.material.tables_file.with_suffix(".png"))) else "",
         Folded("Show what became of terrains", changes) if (changes := changes_tables(tables)) else "",
-        *before_after(shown),
     ]
 
 
@@ -218,54 +215,3 @@ def changes_tables(tables: dict[str, Any]) -> list[Block]:
     )
     blocks: list[Block] = [paragraph(text), table(head, from_first)]
     return [*blocks, table(head, others, folded=f"Show {counted(len(others), 'other pair')}")] if others else blocks
-
-
-def before_after(shown: Shown) -> list[Block]:
-    """Two controllers' paths on the same terrains; nothing without tables."""
-    if shown.no_changes:
-        told = f"The same terrain before and after is left out. {shown.no_changes} New tables are made by"
-        return [absent(told, _command(shown))]
-    if shown.changes is None:
-        return []
-    introduced = paragraph(_introduced(shown, shown.changes))
-    blocks = [introduced, *(block for pair in shown.pairs.items() for block in _change(shown, *pair))]
-    return [Folded("Show the same terrain before and after", blocks, "before-after")]
-
-
-def _introduced(shown: Shown, changes: Changes) -> str:
-    """Who crosses what, and how to see it move."""
-    change, policies = changes.chosen[0], changes.policies
-    place = without_machine(str(changes.run))
-    files = " and ".join(f"{who} ({without_machine(policy)})" for who, policy in policies.items())
-    view = plain_command("view", robot=shown.material.robot.spec, run=changes.run, elite=change.number,
-                        policies=[f"{who}={policy}" for who, policy in policies.items()])  # fmt: skip
-    return (
-        f"{files} on elites held out of training, numbered as in {place}: the worst of those mended, of those "
-        f"newly broken and of those still failing, as far as there are such. `{view}` shows them walk."
-    )
-
-
-def _change(shown: Shown, change: Change, crossed: tuple[Crossed, Crossed]) -> list[Block]:
-    """One terrain under both controllers."""
-    names = (change.before, change.after)
-    far = ", among the third farthest from all that was trained on" if change.far else ""
-    told = "; with ".join(f"{who} {_ended(one)}" for who, one in zip(names, crossed, strict=True))
-    text = f"{change.kind.capitalize()} by the tables{far}. Crossed again from the same starts: with {told}."
-    rates = [one.rates[ARRIVED] for one in crossed]
-    maps = {f"{who}: {rate.hits} of {rate.count} reach the goal": one
-            for who, rate, one in zip(names, rates, crossed, strict=True)}  # fmt: skip
-    title = f"{shown.material.archive.robot}, elite {change.number}: {change.before} and {change.after}"
-    shows = f"Paths of {change.before} and of {change.after} on elite {change.number}"
-    drawn = picture(f"change-{change.number}", draw_maps(maps, title), shows)
-    by = "with" if change.kind == "still failing" else "by"
-    return [heading(f"Elite {change.number}: {change.kind} {by} {change.after}"), paragraph(text), drawn]
-
-
-def _ended(crossed: Crossed) -> str:
-    """How many reached the goal, and what the others ended in."""
-    arrived, at = crossed.rates[ARRIVED], crossed.failed_at
-    if at is None:
-        return f"{arrived} reach the goal"
-    others = [f"{label} {crossed.rates[label].hits}" for label in FAILED if crossed.rates[label].hits]
-    who = "the other one" if arrived.count - arrived.hits == 1 else "the middle one of the others"
-    return f"{arrived} reach the goal ({', '.join(others)}; {who} ends at x = {at:.1f} m)"

@@ -3,17 +3,15 @@
 Okabe and Ito's colours, apart for every kind of colour blindness; markers and hatches tell the same apart in grey.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from qd.groups import TOLERANCE, Elites, Modes
 from qd.show.figures import label_of, look_of
 from sim.files.figures import new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MODE_LOOKS = {
     "collision_rate": (("#d55e00", "X"), ("#e69f00", "D"), ("#cc79a7", "^")),
@@ -35,7 +33,7 @@ def mode_looks(modes: Modes) -> list[tuple[str, str]]:
     return chosen
 
 
-def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
+def draw_pairs(elites: Elites, modes: Modes) -> Figure:
     """Every two shares of the penalties against each other, a point an elite, by failure mode.
 
     Args:
@@ -69,7 +67,7 @@ def draw_pairs(elites: Elites, modes: Modes) -> "Figure":
     return figure
 
 
-def _scatter(axes: "Axes", elites: Elites, modes: Modes, x: int, y: int) -> None:
+def _scatter(axes: Axes, elites: Elites, modes: Modes, x: int, y: int) -> None:
     if len(crossed := np.flatnonzero(modes.labels == 0)):
         style = {"s": 8, "color": "0.75", "marker": ".", "linewidths": 0}
         axes.scatter(
@@ -81,7 +79,7 @@ def _scatter(axes: "Axes", elites: Elites, modes: Modes, x: int, y: int) -> None
         axes.scatter(elites.ratios[mode.members, x], elites.ratios[mode.members, y], label=label, **style)
 
 
-def draw_modes(elites: Elites, modes: Modes) -> "Figure":
+def draw_modes(elites: Elites, modes: Modes) -> Figure:
     """The failure modes: their mean shares, how their crossings end, and how well divisions separate.
 
     Args:
@@ -119,7 +117,7 @@ def draw_modes(elites: Elites, modes: Modes) -> "Figure":
     return figure
 
 
-def _draw_silhouettes(axes: "Axes", modes: Modes) -> None:
+def _draw_silhouettes(axes: Axes, modes: Modes) -> None:
     axes.set_xlabel("number of modes")
     axes.set_ylabel("mean silhouette")
     if not modes.silhouettes:

@@ -1,22 +1,20 @@
 """The page's chapter about minimal terrains."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from qd.run.minimal_file import NUMBERS_FILE
 from qd.show.minimal_figure import draw_minimal
+from qd.show.report.material import Shown
 from qd.show.report.page import Block, absent, counted, paragraph, percent, picture, table
 from sim.files.command import plain_command
-
-if TYPE_CHECKING:
-    from qd.show.report.material import Shown
 
 _ROWS = 5  # of a table that is not folded
 _PICTURED = 6  # terrains
 
 
-def minimal_section(shown: "Shown") -> list[Block]:
+def minimal_section(shown: Shown) -> list[Block]:
     """How little of a terrain it takes to fail, with pictures."""
     material = shown.material
     found, robot, run = material.minimal, material.robot.spec, material.run

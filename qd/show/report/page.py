@@ -5,14 +5,13 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
 
 from qd.run.progress import clock
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MAX_BYTES = 15_000_000
 """Most that a page may weigh."""
@@ -69,11 +68,6 @@ def paragraph(text: str, *, kind: str = "") -> str:
     """A paragraph, of a class of the style if one is named; what stands between backticks in it is a command."""
     words = re.sub(r"`([^`]*)`", r"<code>\1</code>", escape(text))
     return f'<p class="{kind}">{words}</p>' if kind else f"<p>{words}</p>"
-
-
-def heading(text: str, anchor: str = "") -> str:
-    """Of a part of a section, with what a link to it says after ``#``."""
-    return f'<h3 id="{escape(anchor)}">{escape(text)}</h3>' if anchor else f"<h3>{escape(text)}</h3>"
 
 
 def absent(text: str, command: str = "") -> str:
@@ -153,7 +147,7 @@ def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
     return text.encode("utf-8", errors="backslashreplace")  # a file's name may hold bytes that are no text
 
 
-def picture(name: str, figure: "Figure", shows: str) -> Picture:
+def picture(name: str, figure: Figure, shows: str) -> Picture:
     """A figure as a part of the page.
 
     Args:
@@ -196,7 +190,7 @@ def _pictures_in(block: Block) -> Iterator[Picture]:
         yield from (picture for part in block.blocks for picture in _pictures_in(part))
 
 
-def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section], *, remedy: str) -> Path:
+def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section]) -> Path:
     """Writes figures and page, the page last: it is whole or as it was.
 
     Args:
@@ -204,17 +198,13 @@ def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section], 
         title: Of the page.
         lead: What stands under it.
         sections: In order.
-        remedy: What makes a page smaller.
 
     Returns:
         The file.
-
-    Raises:
-        ValueError: If the page is too large.
     """
     page, pictures = render(title, lead, sections), pictures_of(sections)
     if len(page) > MAX_BYTES:
-        raise ValueError(f"the page would have {len(page):,} bytes, at most {MAX_BYTES:,} are allowed: {remedy}")
+        raise ValueError(f"the page must have at most {MAX_BYTES:,} bytes, got {len(page):,}: show fewer --elites")
     figures = out.with_name(f"{out.stem}-figures")
     figures.mkdir(exist_ok=True)
     for one in pictures:

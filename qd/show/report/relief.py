@@ -1,17 +1,18 @@
 """Small pictures of terrains from above, one for every elite of a page."""
 
 import io
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
+from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
+from sim.ground import GroundMaps
+from sim.maps.picture import tinted
+from sim.recording.scene import height_colors
+from sim.spaces.base import TerrainSpace
 from sim.terrain import SPACING
-
-if TYPE_CHECKING:
-    from sim.ground import GroundMaps
-    from sim.spaces.base import TerrainSpace
 
 _AT_ONCE = 50  # height maps that are made at once
 _FEW = 1_000  # terrains, up to which pictures are large
@@ -22,7 +23,7 @@ _MARK = 3  # half side of the marks of start and goal [nodes]
 _START, _GOAL = (240, 200, 60), (0, 158, 115)
 
 
-def reliefs_of(genes: NDArray[np.float32], space: "TerrainSpace") -> list[bytes]:
+def reliefs_of(genes: NDArray[np.float32], space: TerrainSpace) -> list[bytes]:
     """A picture of each terrain, as JPEG: blue below the start's level, brown above, slopes lit from one side.
 
     Slippery and soft patches are tinted.
@@ -31,8 +32,6 @@ def reliefs_of(genes: NDArray[np.float32], space: "TerrainSpace") -> list[bytes]
         genes: Shape (N, num_genes).
         space: What they mean.
     """
-    from sim.bank import terrains_of
-
     width = _WIDTHS[len(genes) > _FEW]
     lots = (genes[first : first + _AT_ONCE] for first in range(0, len(genes), _AT_ONCE))
     pictures = []
@@ -43,7 +42,7 @@ def reliefs_of(genes: NDArray[np.float32], space: "TerrainSpace") -> list[bytes]
     return pictures
 
 
-def relief(heights: NDArray[np.floating], width: int = _WIDTHS[0], ground: "GroundMaps | None" = None) -> bytes:
+def relief(heights: NDArray[np.floating], width: int = _WIDTHS[0], ground: GroundMaps | None = None) -> bytes:
     """A picture of a terrain, with the start yellow and the goal green.
 
     Args:
@@ -51,11 +50,6 @@ def relief(heights: NDArray[np.floating], width: int = _WIDTHS[0], ground: "Grou
         width: Of the picture [pixels].
         ground: Its friction and softness, which tint it.
     """
-    from PIL import Image
-
-    from sim.maps.picture import tinted
-    from sim.recording.scene import height_colors
-
     rise_y, rise_x = np.gradient(heights, SPACING)
     light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
     colors = height_colors(heights) if ground is None else tinted(height_colors(heights), ground)

@@ -4,17 +4,15 @@ By MuJoCo's renderer, on a GPU or in software (:mod:`sim.recording.renderer`).
 """
 
 import io
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageColor
 
 from qd.show.crossed import Crossed, ending_of
 from qd.show.shot import typical_episode
-
-if TYPE_CHECKING:
-    from sim.recording.renderer import Camera
-    from sim.robots.robot import RobotCfg
+from sim.recording.renderer import Camera, Renderer
+from sim.robots.robot import RobotCfg
 
 WIDTH, HEIGHT = 1040, 520
 """Of a picture [pixels]; a page shows it at half of that and more."""
@@ -28,7 +26,7 @@ _ELEVATION, _AZIMUTH = -34.0, 62.0
 _BEFORE = 0.9  # how far before the end the camera looks at [m]
 
 
-def rendered(crossed: Crossed, robot: "RobotCfg", scales: dict[str, float]) -> bytes:
+def rendered(crossed: Crossed, robot: RobotCfg, scales: dict[str, float]) -> bytes:
     """A picture of a terrain where robots end on it, as JPEG.
 
     The robot stands where the middle one of the episodes ended that end as most do, with ghosts of it on its way there.
@@ -41,10 +39,6 @@ def rendered(crossed: Crossed, robot: "RobotCfg", scales: dict[str, float]) -> b
     Raises:
         ValueError: If there is no OpenGL.
     """
-    from PIL import Image
-
-    from sim.recording.renderer import Renderer
-
     recording = crossed.recording
     episode = typical_episode(recording, scales)
     poses = recording.qpos(0, episode)
@@ -62,18 +56,14 @@ def rendered(crossed: Crossed, robot: "RobotCfg", scales: dict[str, float]) -> b
     return content.getvalue()
 
 
-def _camera(end: NDArray[np.float64], stands: float) -> "Camera":
+def _camera(end: NDArray[np.float64], stands: float) -> Camera:
     """Behind and beside where the robot ended, high enough to see over what stopped it."""
-    from sim.recording.renderer import Camera
-
     target = (float(end[0]) - _BEFORE, float(end[1]), float(end[2]) - 0.3 * stands)
     return Camera(target=target, distance=_DISTANCE * stands, azimuth=_AZIMUTH, elevation=_ELEVATION)
 
 
 def _ways(crossed: Crossed) -> list[tuple[NDArray[np.float64], tuple[float, float, float, float]]]:
     """The way of every base, in the colour of how it ended."""
-    from PIL import ImageColor
-
     found = []
     for k, outcome in enumerate(crossed.outcome.tolist()):
         path = crossed.path(k)

@@ -1,14 +1,17 @@
 """The page of a hardening: faults by round, rates by round, and what became of terrains."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from qd.evaluate.labels import SETS
 from qd.evaluate.tables import as_tables
 from qd.run.directory import ROUNDS_FILE
 from qd.show.report.evaluation import changes_tables, measure_table
+from qd.show.report.material import check_page
 from qd.show.report.page import (
     Block,
     Section,
@@ -22,42 +25,29 @@ from qd.show.report.page import (
     table,
 )
 from qd.show.report.tables import MEASURES, by_kind
-from sim.files.atomic import has_shape, prepare_output, read_json
+from sim.files.atomic import read_json
 from sim.files.command import plain_command
 from sim.files.figures import bar_lengths, new_figure
 from sim.files.records import without_machine
 from sim.robots.find import get_robot
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 _COUNTS = ("elites", "failing", "confirmed", "certified", "faults")
 _BARS = {"failing": ("#56b4e9", ""), "confirmed": ("#0072b2", "//"), "faults": ("#d55e00", "..")}
 _LINES = (("#0072b2", "o"), ("#d55e00", "X"), ("#009e73", "s"), ("#cc79a7", "^"), ("#e69f00", "D"), ("#56b4e9", "v"),
           ("#000000", "P"))  # fmt: skip
-_COUNT = int | None
-_ROW = {"controller": str, "search": str, "episodes": _COUNT, "panel": [str], **dict.fromkeys(_COUNTS, _COUNT)}
-_CHOICE = {"kept": bool, "why": str}
-_SHAPES = {"robot": str, "rounds": [_ROW], "comparisons": {...: _ROW}, "tables": dict, "sessions": list}
 
 
-def rounds_report(run: Path, robot: str | None, out: Path | None) -> Path:
+def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
     """Writes the page; returns its file.
 
     Args:
         run: Directory of the hardening.
         robot: The robot that the command line names.
         out: File to write; report.html in the directory.
-
-    Raises:
-        ValueError: If the file is damaged, of another robot or of no finished search yet, or OUT cannot be written.
     """
     content = _read(run, robot)
     out = out or run / "report.html"
-    if out.suffix != ".html":
-        raise ValueError(f"out must be a file named *.html, got {out}: name for example {out / 'report.html'}")
-    prepare_output(out)
+    check_page(out)
     sections = [
         Section("Faults by round", "faults", _faults(content)),
         Section("Rates by round", "rates", _rates(content)),
@@ -65,101 +55,67 @@ def rounds_report(run: Path, robot: str | None, out: Path | None) -> Path:
         Section("What became of terrains", "changes", _changes(content)),
         Section("Where this comes from", "origin", _origin(content, run)),
     ]
-    place = without_machine(str(run))
-    lead = f"Made from {place} by faultline: a search for what breaks a controller, a training on it, and again."
+    lead = f"Made from {without_machine(str(run))}: a search for what breaks a controller, a training on it, and again."
     title = f"{content['robot']} hardened: {counted(len(content['rounds']) - 1, 'round')} of search and training"
-    return publish_page(out, title, lead, sections, remedy=f"move files out of {run}")
+    return publish_page(out, title, lead, sections)
 
 
 def _read(run: Path, robot: str | None) -> dict[str, Any]:
     file = run / ROUNDS_FILE
     content = read_json(file)
     if not content.get("rounds"):
-        go_on = "let it go on with the command that began it"
-        raise ValueError(f"{file} must have a search that is over, got none: {go_on}")
-    shapes = _SHAPES | ({"choices": {...: _CHOICE}} if "choices" in content else {})
+        raise ValueError(f"{file} must have a search that is over, got none: let the hardening go on")
     try:
-        damaged = [key for key, shape in shapes.items() if not has_shape(content.get(key), shape)]
-        if damaged:
-            raise ValueError(f"its {damaged[0]} cannot be read")
         content["tables"] = as_tables({"robot": content["robot"], **content["tables"]})
-    except ValueError as error:
-        raise ValueError(f"{file} must be of `faultline harden`, but {error}: put a copy back") from None
+        if not all({"controller", "search", "panel", "faults"} <= set(row) for row in content["rounds"]):
+            raise ValueError("a round lacks a name")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} must be of `faultline harden`, got another or a damaged file: {error}") from None
     if robot is not None and get_robot(robot).name != content["robot"]:
         raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
     return content
-
-
-def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rounds, and after them what they are compared with."""
-    return [*content["rounds"], *content["comparisons"].values()]
 
 
 def _faults(content: dict[str, Any]) -> list[Block]:
     """What each search found."""
     first, last = content["rounds"][0], content["rounds"][-1]
     glance = [
-        (f"faults of {row['controller']}, in {row['episodes']:,} episodes of a search", _number(row["faults"]))
+        (f"faults of {row['controller']}, in {_number(row.get('episodes'))} episodes", _number(row["faults"]))
         for row in ([first] if first is last else [first, last])
     ]
     text = (
         f"Each search is against one controller. A terrain is failing if under half of the robots reach the goal in 40 "
-        "fresh episodes, confirmed if they do not with contact resolved either, and a fault if a controller of the "
-        f"panel ({', '.join(first['panel']) or 'nobody'}) crosses it. {_told(first, last)}"
+        "fresh episodes, confirmed if they do not with contact resolved either, and a fault if another controller "
+        f"({', '.join(first['panel']) or 'nobody'}) crosses it. Two searches of one controller may find numbers of "
+        "faults that differ several times over: read the counts beside the rates below."
     )
-    head = ["controller", "search", "episodes", *_COUNTS, "panel"]
+    head = ["controller", "search", "episodes", *_COUNTS, "others"]
     rows = [
-        [row["controller"], row["search"], *(_number(row[key]) for key in ("episodes", *_COUNTS)),
-         ", ".join(row["panel"])] for row in _rows(content)
+        [row["controller"], row["search"], *(_number(row.get(key)) for key in ("episodes", *_COUNTS)),
+         ", ".join(row["panel"])] for row in content["rounds"]
     ]  # fmt: skip
     shows = "Failing elites, those confirmed, and faults of the search against every controller"
-    compared = [paragraph(_compared(content))] if content["comparisons"] else []
-    return [at_a_glance(glance), paragraph(text), picture("faults", draw_faults(content), shows), *compared,
-            table(head, rows)]  # fmt: skip
+    return [at_a_glance(glance), paragraph(text), picture("faults", draw_faults(content), shows), table(head, rows)]
 
 
 def _number(count: int | None) -> str:
     return "-" if count is None else f"{count:,}"
 
 
-def _told(first: dict[str, Any], last: dict[str, Any]) -> str:
-    """What the rounds brought, in a sentence; empty where there is one search alone, or faults were not counted."""
-    if first is last or first["faults"] is None or last["faults"] is None:
-        return ""
-    share = f", {last['faults'] / first['faults']:.2f} times as many" if first["faults"] and last["faults"] else ""
-    same = "" if first["episodes"] == last["episodes"] else " The searches had different budgets."
-    return (
-        f"The search against {first['controller']} found {counted(first['faults'], 'fault')}, that against "
-        f"{last['controller']} {counted(last['faults'], 'fault')}{share}.{same} Two searches of one controller may "
-        "find numbers of faults that differ several times over: read the counts beside the rates below."
-    )
-
-
-def _compared(content: dict[str, Any]) -> str:
-    """What the rounds are compared with."""
-    words = {"hard_random": "hard-random terrains", "first_archive": "the first archive alone"}
-    told = [
-        f"{row['controller']} had as many trainings of the same length as {counted(row['rounds'], 'round')} on "
-        f"{words.get(kind, kind)}"
-        for kind, row in content["comparisons"].items()
-    ]
-    return f"For comparison, {'; '.join(told)}, and then one search against it."
-
-
-def draw_faults(content: dict[str, Any]) -> "Figure":
+def draw_faults(content: dict[str, Any]) -> Figure:
     """What the search against every controller found, as bars.
 
     Args:
         content: Of ``rounds.json``.
     """
-    rows = _rows(content)
+    rows = content["rounds"]
     figure = new_figure(max(6.0, 1.5 * len(rows) + 2.0), 4.0)
     axes = figure.subplots()
     places, width = np.arange(len(rows)), 0.26
     for shift, (name, (colour, hatch)) in enumerate(_BARS.items(), start=-1):
-        counts = [row[name] or 0 for row in rows]
+        counts = [row.get(name) or 0 for row in rows]
         bars = axes.bar(places + width * shift, counts, width, color=colour, hatch=hatch, edgecolor="white", label=name)
-        axes.bar_label(bars, [_number(row[name]) for row in rows], fontsize=8)
+        axes.bar_label(bars, [_number(row.get(name)) for row in rows], fontsize=8)
     axes.set_xticks(places, [row["controller"] for row in rows])
     axes.set_ylabel("terrains of the search's archive")
     axes.set_xlabel("controller that was searched")
@@ -184,26 +140,24 @@ def _rates(content: dict[str, Any]) -> list[Block]:
     return [paragraph(text), drawn, *(measure_table(tables, measure) for measure in MEASURES)]
 
 
-def draw_rates(content: dict[str, Any]) -> "Figure":
-    """Goal rate and success of every controller: a line a set over the rounds, points of what they are compared with.
+def draw_rates(content: dict[str, Any]) -> Figure:
+    """Goal rate and success of every controller: a line a set over the rounds.
 
     Args:
         content: Of ``rounds.json``.
     """
-    tables = content["tables"]
-    compared = [row["controller"] for row in content["comparisons"].values()]
     figure = new_figure(12.0, 4.6)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, measure in zip(panels, ("goal", "success"), strict=True):
-        _draw_lines(axes, tables, measure, [who not in compared for who in tables["controllers"]])
+        _draw_lines(axes, content["tables"], measure)
         axes.set_ylabel(f"{MEASURES[measure]} [%]")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
-def _draw_lines(axes: "Axes", tables: dict[str, Any], measure: str, joined: list[bool]) -> None:
-    """Each set's rates; controllers that are ``joined`` have a line through them."""
+def _draw_lines(axes: Axes, tables: dict[str, Any], measure: str) -> None:
+    """Each set's rates with their intervals."""
     controllers = list(tables["controllers"])
     count = len(tables[measure])
     for k, (name, row) in enumerate(tables[measure].items()):
@@ -214,9 +168,7 @@ def _draw_lines(axes: "Axes", tables: dict[str, Any], measure: str, joined: list
         values, lengths = 100.0 * rates, 100.0 * bar_lengths(rates, limits)
         places = np.array(there) + 0.06 * (k - (count - 1) / 2)
         label = SETS.get(name, f"{name}, held out")
-        axes.errorbar(places, values, lengths, color=colour, marker=marker, capsize=3, label=label, linestyle="")
-        rounds = [joined[place] for place in there]
-        axes.plot(places[rounds], values[rounds], color=colour, linewidth=1.2)
+        axes.errorbar(places, values, lengths, color=colour, marker=marker, capsize=3, label=label, linewidth=1.2)
     axes.set_xticks(range(len(controllers)), controllers, rotation=20 if len(controllers) > 5 else 0)
     axes.set_ylim(-3, 103)
     axes.grid(alpha=0.3)
@@ -246,15 +198,9 @@ def _changes(content: dict[str, Any]) -> list[Block]:
 
 def _origin(content: dict[str, Any], run: Path) -> list[Block]:
     """Where the numbers come from, and how to look closer."""
-    sessions = [
-        [f"{number}", *(str(one.get(key, "")) for key in ("command", "commit", "device", "date"))]
-        for number, one in enumerate(content["sessions"], start=1)
-    ]
-    closer = [plain_command("report", run=run / row["search"]) for row in _rows(content)]
+    closer = [plain_command("report", run=run / row["search"]) for row in content["rounds"]]
     return [
         paragraph(f"The numbers are those of {run / ROUNDS_FILE}. It was begun with:"),
         table(["", ""], origin_table(content), words=True),
-        paragraph(f"It was worked on in {counted(len(sessions), 'session')}:"),
-        table(["session", "command", "commit", "device", "date"], sessions, words=True),
         paragraph(f"Each search has a page of its own: {', '.join(f'`{command}`' for command in closer)}."),
     ]

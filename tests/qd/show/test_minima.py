@@ -15,7 +15,7 @@ from qd.show.view.command import View, show_of
 from qd.show.view.plots import MINIMAL, Choice
 from tests.builders import free_port
 from tests.qd.recordings import recording_of
-from tests.qd.show.report.test_report import make_run, minimal_of
+from tests.qd.show.report.pages import make_run, minimal_of
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,8 @@ from qd.groups import MAX_MODES, elites_of, failure_modes, find_modes, rank
 from qd.show.crossed import crossed_of, penalties_by_place
 from qd.show.report.elites import choice_told
 from qd.show.report.page import percent
+from sim.files.records import robot_digest
+from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.recordings import NAMES, recording_of
@@ -24,6 +26,7 @@ def grouped_archive(sizes=(6, 9, 5)):
     archive = small_archive(len(kinds))
     archive = dataclasses.replace(
         archive,
+        robot_sha256=robot_digest(get_robot("anymal")),
         ratios=np.column_stack([values[:, 0] + noise, values[:, 1] - noise]),
         goal_rate=values[:, 2],
         collision_rate=values[:, 3],

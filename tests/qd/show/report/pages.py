@@ -1,0 +1,99 @@
+"""Pages and runs for the tests of the report."""
+
+import dataclasses
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+
+from qd.archive import read_archive, write_archive
+from qd.minimal import Case, Minimal
+from qd.run.minimal_file import write_minimal
+from qd.run.settings import as_settings, preset
+from qd.show.report import report
+from sim.files.atomic import to_json
+from sim.robots.find import get_robot
+from tests.builders import fresh_values
+from tests.qd.recordings import stand_in_cross
+from tests.qd.show.report.test_numbers import grouped_archive
+from tests.qd.show.test_figures import rows
+
+DOT = bytes.fromhex("89504e470d0a1a0a")
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Text, resources, anchors and balance of a page."""
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__()
+        self.open, self.words, self.resources, self.links, self.ids = [], [], [], [], []
+        self.feed(content.decode())
+        self.close()
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+        self.resources += [given[name] for name in ("src", "srcset", "data", "action") if name in given]
+        self.links += [given["href"]] if "href" in given else []
+        self.ids += [given["id"]] if "id" in given else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.words.append(data)
+
+
+def make_run(root):
+    """A whole run of 20 elites with fresh values."""
+    archive, _ = grouped_archive()
+    archive = dataclasses.replace(archive, iterations=4)
+    archive = archive.corrected_by(fresh_values(archive))
+    folder = root / "run"
+    folder.mkdir()
+    write_archive(folder / "archive.npz", archive)
+    metrics = [{**row, "mean_duration_s": 15.0} for row in rows(4)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in metrics))
+    small = preset("small", get_robot("anymal"))
+    fitness = dataclasses.replace(small.fitness, penalties=archive.penalties, scales=archive.scales)
+    settings = as_settings(dataclasses.replace(small, fitness=fitness))
+    origin = {"command": "python <script>alert(1)</script>", "commit": "abc", "device": "CPU", "seed": 0,
+              "versions": {"numpy": "2"}, "date": "today"}  # fmt: skip
+    (folder / "config.json").write_bytes(to_json({"settings": settings, "iterations": 4, "sessions": [], **origin}))
+    return folder
+
+
+def reporter(run, patch):
+    """Makes a report in a folder without published tables; returns the page and what was crossed."""
+    patch.chdir(run.parent)
+    patch.setattr(report, "check_policy", lambda policy, robot, device: None)
+
+    def make(**changes):
+        crossed = []
+        asked = {"run": run, "device": "cpu", "episodes": 4, "num_elites": 1, **changes}
+        return report.write_report(**asked, cross=stand_in_cross(crossed)), crossed
+
+    return make
+
+
+def minimal_of(run, count=1):
+    """The first failing elites of a run, each with its first part alone as the minimal terrain."""
+    archive = read_archive(run)
+    numbers = np.flatnonzero(archive.failing)[:count].tolist()
+    cases = {n: Case(parts=(0, 1), how="greedy", scalable=True) for n in numbers}
+    never, much = np.array([0, 40, 0, 0]), np.array([20, 0, 0, 0])
+    one = Minimal(parts=(0,), counts=never, without={0: much}, scale=0.5, passing_scale=None, scales={}, subsets=1)
+    genes = dict(zip(numbers, archive.genes[numbers], strict=True))
+    write_minimal(run, archive, cases, dict.fromkeys(numbers, one), archive.rows(np.array(numbers)), genes)
+    entries = [
+        {"elite": n, "cell": int(archive.cell[n]), "iteration": int(archive.iteration[n]), "bumps": [0],
+         "words": ["bump of <0.24> m"], "of": 2, "goal_rate": 0.0, "goal_interval": [0.0, 0.088],
+         "cause": {"bump": 0, "kind": "rise"}, "margin_m": 0.12, "verdict": "failing"}
+        for n in numbers
+    ]  # fmt: skip
+    (run / "minimal.json").write_bytes(to_json({"elites": entries}))
+    return numbers, entries
