@@ -113,7 +113,7 @@ class SearchCfg:
     policy_sha256: str | None
     """Hash of the controller's files, None where there are none."""
     space: str = "super_gaussian"
-    """Terrain space, as :func:`sim.space.load_space` takes it."""
+    """Terrain space, as :func:`sim.spaces.registry.load_space` takes it."""
     space_sha256: str | None = None
     """Hash of its code if it is a user's own."""
     seed: NonNegativeInt = 0

@@ -9,11 +9,11 @@ import viser
 
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.address import ask_query, read_address
-from qd.show.view.command import Show
-from qd.show.view.errands import Errands
+from qd.show.view.common import Common
 from qd.show.view.recorder import Recorder, Report
 from qd.show.view.scene import first_view_of, shapes_of
-from qd.show.view.tab import Common, Tab
+from qd.show.view.show import Show
+from qd.show.view.tab import Tab
 from sim.robots.skeleton import Skeleton
 
 _FRAME_S = 0.04
@@ -36,15 +36,14 @@ class Page(viser.ViserServer):
 class App:
     """The page and its tabs."""
 
-    def __init__(self, show: Show, recordings: Recordings) -> None:
+    def __init__(self, show: Show, recordings: Recordings, *, host: str, port: int) -> None:
         """Open the page.
 
         Args:
             show: What to show.
-            recordings: Those that are kept.
-
-        Raises:
-            ValueError: If the robot's file cannot be shown.
+            recordings: Those that are stored.
+            host: Address to serve the page at.
+            port: Likewise.
         """
         self._recordings, self.tabs = recordings, dict[int, Tab]()
         self._asked: queue.SimpleQueue[tuple[Hashable, Asked]] = queue.SimpleQueue()
@@ -57,11 +56,10 @@ class App:
             recordings=recordings,
             record=lambda wanted, tab: self._recorder.record(wanted, tab=tab),
             record_ahead=lambda wanted, tab: self._recorder.record_ahead(wanted, tab=tab),
-            errands=Errands(),
             post=self.post,
         )
         self._recorder = Recorder(show.robot, lambda report: self.post(self.show_report, report))
-        self.page = Page(host=show.cfg.host, port=show.cfg.port, label="faultline", verbose=False)
+        self.page = Page(host=host, port=port, label="faultline", verbose=False)
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=False)
@@ -108,16 +106,15 @@ class App:
             tab.show_report(report)
 
     def close(self) -> None:
-        """End the recording processes, films that are made, and the page."""
+        """End the recording processes and the page."""
         self._recorder.stop()
-        self._common.errands.stop()
         self.page.stop()
 
     def run(self) -> None:
         """Serve until interrupted."""
         show = self._common.show
         for policy in list(show.controllers.values())[:1]:  # ready by the time that somebody has chosen an elite
-            self._recorder.warm(on_elite(show.found.archive, 0, policy=policy, replicas=show.cfg.replicas))
+            self._recorder.warm(on_elite(show.found.archive, 0, policy=policy, replicas=show.replicas))
         last = time.perf_counter()
         while True:
             self.do_asked(wait_s=_FRAME_S if self._playing else _IDLE_S)

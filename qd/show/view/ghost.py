@@ -1,19 +1,16 @@
 """The ghost: a second controller on the same terrain at the same time, such as the one that certifies a fault."""
 
 from html import escape
-from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from qd.show.crossed import ending_of
 from qd.show.recordings import Wanted, on_elite
+from qd.show.view.common import Common
 from qd.show.view.playing import Crossing, crossing_of
 from qd.show.view.recorder import Report
 from sim.recording.recorder import Recording
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from qd.show.view.tab import Common
 
 CERTIFYING, NOBODY = "who certifies it", "none"
 """Choices beside the names of controllers: of each elite the one that certifies it, if it is at hand; nobody."""
@@ -22,7 +19,7 @@ CERTIFYING, NOBODY = "who certifies it", "none"
 class Ghost:
     """Whose crossing is shown beside the chosen controller's, and what is recorded of it."""
 
-    def __init__(self, common: "Common", tab: int) -> None:
+    def __init__(self, common: Common, tab: int) -> None:
         """Who certifies the elite, if anybody does.
 
         Args:
@@ -44,7 +41,7 @@ class Ghost:
         """What can be chosen."""
         return (CERTIFYING, NOBODY, *self._common.show.controllers)
 
-    def load(self, elite: int, beside: str | None, minimal: "NDArray[np.float32] | None" = None) -> str:
+    def load(self, elite: int, beside: str | None, minimal: NDArray[np.float32] | None = None) -> str:
         """Take another elite or controller; what is not recorded is asked for.
 
         Args:
@@ -61,7 +58,7 @@ class Ghost:
         self.name = chosen if chosen in show.controllers and chosen != beside else None
         if self.name is not None:
             archive, policy = show.found.archive, show.controllers[self.name]
-            self._wanted = on_elite(archive, elite, policy=policy, replicas=show.cfg.replicas, minimal=minimal)
+            self._wanted = on_elite(archive, elite, policy=policy, replicas=show.replicas, minimal=minimal)
             self.recording = self._common.recordings.read(self._wanted)
         missing = self._wanted if self.recording is None else None
         if missing is not None or self._asked:
@@ -100,7 +97,7 @@ class Ghost:
             return ""
         who = f"Ghost, {escape(self.name)}:"
         if self.recording is None:
-            return f"{who} its {self._common.show.cfg.replicas} episodes are recorded …"
+            return f"{who} its {self._common.show.replicas} episodes are recorded …"
         ending = ending_of(self.recording.outcome[0, replica])
         ended = f'<span style="color:{ending.color}">{ending.words}</span>'
         return f"{who} {ended} after {float(self.recording.duration_s[0, replica]):.1f} s."

@@ -6,7 +6,7 @@ They hand on what a visitor does to the :class:`qd.show.view.tab.Tab`, by the vi
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import viser
@@ -16,9 +16,6 @@ from qd.groups import ORDERS
 from qd.show.view.legend import legend_html
 from qd.show.view.plots import FITNESS_WORDS, Axes, Choice, axes_svg
 from qd.show.view.scene import PHONE, first_view_of
-
-if TYPE_CHECKING:
-    from qd.show.view.tab import Tab
 
 PAGE = 8
 """Lines of the list at once."""
@@ -158,7 +155,7 @@ class Clock:
 class ArchivePanel:
     """The elites on parallel axes, their ranges, and the list of those in the ranges."""
 
-    def __init__(self, client: viser.ClientHandle, axes: Axes, selection: Selection, title: str, tab: "Tab") -> None:
+    def __init__(self, client: viser.ClientHandle, axes: Axes, selection: Selection, title: str, tab: Any) -> None:
         """Lay it out.
 
         Args:
@@ -166,7 +163,7 @@ class ArchivePanel:
             axes: The elites.
             selection: Those listed, and the one picked.
             title: What archive it is.
-            tab: Does what a visitor asks for.
+            tab: The :class:`qd.show.view.tab.Tab`, which does what a visitor asks for.
         """
         self._axes, self._selection, self._tab, self._gui = axes, selection, tab, client.gui
         self._panel = client.gui.add_panel()
@@ -270,13 +267,13 @@ class ArchivePanel:
 class CrossingPanel:
     """The picked elite, and the controls of its crossing."""
 
-    def __init__(self, client: viser.ClientHandle, controllers: Sequence[str], tab: "Tab") -> None:
+    def __init__(self, client: viser.ClientHandle, controllers: Sequence[str], tab: Any) -> None:
         """Lay it out.
 
         Args:
             client: The tab's browser.
             controllers: Their names.
-            tab: Does what a visitor asks for.
+            tab: The :class:`qd.show.view.tab.Tab`, which does what a visitor asks for.
         """
         gui, self._post = client.gui, tab.common.post
         is_phone = client.camera.image_width < PHONE  # where viser makes a sheet of it
@@ -309,10 +306,8 @@ class CrossingPanel:
         _on_visit(self._speed, lambda value: self._post(tab.set_speed, SPEEDS[value]))
         views = {"overview": (tab.overview,), "near": (tab.look, first_view_of)}
         _add_choices(gui, "View", views, lambda asked: self._post(*asked))
-        copies = {"copy link": (tab.taking.link,), "copy command": (tab.taking.command,)}
+        copies = {"copy link": (tab.copy_link,), "copy command": (tab.copy_command,)}
         _add_choices(gui, "Share", copies, lambda asked: self._post(*asked))
-        files = {"film this": (tab.taking.film,), "export this": (tab.taking.files,)}
-        _add_choices(gui, "Files", files, lambda asked: self._post(*asked))
         self._follow = self._add_switch(gui, "Follow", tab.set_follow, False)
         self._add_switch(gui, "Foot forces", tab.set_forces, True)
         self._add_switch(gui, "All paths", tab.scene.set_show_paths, True)
@@ -417,12 +412,12 @@ KEY_WORDS = (
 """Keys and what they do."""
 
 
-def add_keys(client: viser.ClientHandle, tab: "Tab") -> None:
+def add_keys(client: viser.ClientHandle, tab: Any) -> None:
     """Have keys do what the panels do; those of a text field stay with it.
 
     Args:
         client: The tab's browser.
-        tab: Does what a visitor asks for.
+        tab: The :class:`qd.show.view.tab.Tab`, which does what a visitor asks for.
     """
     asked: dict[str, tuple[Any, tuple[Callable[..., None], object] | tuple[Callable[..., None]]]] = {
         "Play or pause": ("space", (tab.play,)),

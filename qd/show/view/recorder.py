@@ -5,19 +5,16 @@ from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Any
+from multiprocessing.synchronize import Event
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.show.recordings import Simulation, Wanted
 from qd.workers.process import EvaluatorError, WorkerProcess
-
-if TYPE_CHECKING:
-    from multiprocessing.synchronize import Event
-
-    from sim.recording.recorder import Recording
-    from sim.robots.robot import RobotCfg
+from sim.recording.recorder import Recording
+from sim.robots.robot import RobotCfg
 
 MAX_PROCESSES = 3
 """Controllers whose simulation is kept ready, one process each."""
@@ -33,7 +30,7 @@ class Report:
     """In words, without who and what."""
     share: float = 0.0
     """Done so far."""
-    recording: "Recording | None" = None
+    recording: Recording | None = None
     """The result, once there is one."""
     failed: bool = False
     """Whether there will be none."""
@@ -46,7 +43,7 @@ class _DroppedError(Exception):
 class _Recording:
     """What a recording process has: the simulation of a controller, ready to cross."""
 
-    def __init__(self, robot: "RobotCfg", first: Wanted, drop: "Event") -> None:
+    def __init__(self, robot: RobotCfg, first: Wanted, drop: Event) -> None:
         self._simulation, self._first, self._drop = Simulation(robot, "cpu"), first, drop
         self._simulation.prepare(first)
         self._wanted: deque[Wanted] = deque()
@@ -55,7 +52,7 @@ class _Recording:
         """Keeps one terrain, to be crossed as the first one was."""
         self._wanted.append(replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0])))
 
-    def take(self, progress: Callable[[float], None]) -> "Recording | None":
+    def take(self, progress: Callable[[float], None]) -> Recording | None:
         """The recording of the terrain that was put in first, crossed now; None if it is dropped meanwhile."""
 
         def tell(share: float) -> None:
@@ -69,7 +66,7 @@ class _Recording:
             return None
 
 
-Cfg = tuple["RobotCfg", Wanted, "Event"]
+Cfg = tuple[RobotCfg, Wanted, Event]
 """Of a recording process: the robot, what it crosses at first, and what is set when its work is wanted no more."""
 
 
@@ -87,7 +84,7 @@ class Recorder:
     While nobody waits it records ahead what a tab may ask for next, and drops that when somebody asks for another one.
     """
 
-    def __init__(self, robot: "RobotCfg", report: Callable[[Report], None], *, build: Build = build_recording) -> None:
+    def __init__(self, robot: RobotCfg, report: Callable[[Report], None], *, build: Build = build_recording) -> None:
         """Start to wait for work.
 
         Args:

@@ -1,17 +1,17 @@
 """A browser tab: what it shows, and what happens when its visitor does something. No tab knows of another."""
 
 import time
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from html import escape
-from typing import TYPE_CHECKING
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from qd.show.crossed import crossed_of
-from qd.show.recordings import Recordings, Wanted, on_elite
-from qd.show.view.address import Address, keep_keys, show_query
-from qd.show.view.errands import Errands
+from qd.show.recordings import Wanted, on_elite
+from qd.show.view.address import Address, copy_link, copy_text, keep_keys, show_query
+from qd.show.view.common import Common
 from qd.show.view.ghost import CERTIFYING, Ghost
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection, add_keys
 from qd.show.view.playing import (
@@ -24,45 +24,21 @@ from qd.show.view.playing import (
     next_mark,
     paths_of,
 )
-from qd.show.view.plots import Axes, Curves
+from qd.show.view.plots import Curves
 from qd.show.view.pointing import let_point
 from qd.show.view.recorder import Report
-from qd.show.view.scene import Scene, Shapes, View, first_view_of, overview_of
-from qd.show.view.taking import Taking
+from qd.show.view.scene import Scene, View, first_view_of, overview_of
+from qd.show.view.show import SEARCHED
 from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
+from sim.files.command import command_line
 from sim.recording.recorder import Recording
-from sim.robots.skeleton import Skeleton
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from qd.show.view.command import Show
 
 _NUMBERS_S = 0.2
 """Real time from one update of curves and numbers to the next, while playing."""
 _ADDRESS_S = 1.0
 """Real time from one update of the address to the next; browsers take no more than some three a second."""
 _KEPT_KEYS = ("ArrowLeft", "ArrowRight")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Common:
-    """What all tabs share."""
-
-    show: "Show"
-    axes: Axes
-    skeleton: Skeleton
-    shapes: Shapes
-    recordings: Recordings
-    record: Callable[[Wanted | None, Hashable], None]
-    """Asks for crossings on behalf of a tab or of its ghost; of each the last ones count."""
-    record_ahead: Callable[[Sequence[Wanted], Hashable], None]
-    """Has crossings recorded while nobody waits for others; of a tab the last ones asked for count."""
-    errands: Errands
-    post: Callable[..., None]
-    """Has something done by the loop, with arguments; of what has equal ``only_last``, the last."""
 
 
 class Tab:
@@ -92,7 +68,6 @@ class Tab:
         self._curves: Curves | None = None
         self._query, self._told, self._addressed = "", 0.0, time.perf_counter()
         self.ghost = Ghost(common, client.client_id)
-        self.taking = Taking(self)
         self.scene = Scene(client, common.shapes, CrossingCfg())
         title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
         self._list = ArchivePanel(client, common.axes, self._selection, title, self)
@@ -103,7 +78,7 @@ class Tab:
         self._open(address, refused)
 
     def _open(self, address: Address, refused: list[str]) -> None:
-        show, episodes = self.common.show, self.common.show.cfg.replicas
+        show, episodes = self.common.show, self.common.show.replicas
         first = self._selection.picked if show.elite is None else show.elite
         elite = first if address.elite is None else address.elite
         if not 0 <= elite < len(self._archive):
@@ -117,7 +92,7 @@ class Tab:
             self.ghost.choice = address.ghost
         elif address.ghost is not None:
             refused.append(self._no_controller(address.ghost))
-        self._minimal = address.minimal or (address.elite is None and show.cfg.minimal is not None)
+        self._minimal = address.minimal or (address.elite is None and show.minimal)
         if address.minimal and (show.minima is None or elite not in show.minima.genes):
             refused.append(f"Elite {elite} has no minimal terrain here.")
         if address.episode is not None and not 1 <= address.episode <= episodes:
@@ -173,26 +148,30 @@ class Tab:
             self._query = query
             show_query(self.client, query)
 
-    @property
-    def elite(self) -> int:
-        """Number of the elite that is shown."""
-        return self._selection.picked
+    def copy_link(self) -> None:
+        """Have the browser copy the link to what the tab shows."""
+        self.show_address()
+        copy_link(self.client)
+        self.client.add_notification("Link copied", "It opens what this tab shows.", auto_close_seconds=3.0)
+
+    def copy_command(self) -> None:
+        """Have the browser copy the command that replays what the tab shows."""
+        show, name, number = self.common.show, self._controller, self._selection.picked
+        which = {"elite": number} if self.genes is None else {"minimal": number}
+        policy = None if name is None or name == SEARCHED else show.controllers[name]
+        space = show.found.space
+        text = command_line(
+            "replay", robot=show.robot.spec, run=show.found.run, space=space.name if space.sha256 else None, **which,
+            policy=policy, replicas=show.replicas,
+        )  # fmt: skip
+        copy_text(self.client, text)
+        self.client.add_notification("Command copied", text, auto_close_seconds=6.0)
 
     @property
-    def genes(self) -> "NDArray[np.float32] | None":
+    def genes(self) -> NDArray[np.float32] | None:
         """Of the minimal terrain that is shown; None of a whole elite."""
         minima = self.common.show.minima
-        return None if minima is None or not self._minimal else minima.genes.get(self.elite)
-
-    @property
-    def controller(self) -> str | None:
-        """Name of the controller whose crossing is shown; None without one."""
-        return self._controller
-
-    @property
-    def filmed(self) -> tuple[Recording, int] | None:
-        """The crossings that are shown, and which of them, counted from 0; None while there are none."""
-        return None if self._recording is None else (self._recording, self._replica)
+        return None if minima is None or not self._minimal else minima.genes.get(self._selection.picked)
 
     def choose_terrain(self, minimal: bool) -> None:
         """Show the elite's minimal terrain, or the whole one."""
@@ -279,8 +258,8 @@ class Tab:
 
     def choose_replica(self, replica: int) -> None:
         """Show another episode, counted from 0."""
-        if not 0 <= replica < self.common.show.cfg.replicas:
-            self.refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.cfg.replicas}.")
+        if not 0 <= replica < self.common.show.replicas:
+            self.refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.replicas}.")
             return
         self._replica, self._begin_s = replica, 0.0
         if self._recording is not None:
@@ -363,7 +342,7 @@ class Tab:
         show = self.common.show
         if self._controller is None:
             return None
-        policy, replicas = show.controllers[self._controller], show.cfg.replicas
+        policy, replicas = show.controllers[self._controller], show.replicas
         return on_elite(self._archive, self._selection.picked, policy=policy, replicas=replicas, minimal=self.genes)
 
     def _record_ahead(self) -> None:
@@ -371,7 +350,7 @@ class Tab:
         show, wanted = self.common.show, []
         if self._controller is not None and self._recording is not None:
             near = dict.fromkeys(self._selection.step(by) for by in (1, -1))
-            policy, replicas = show.controllers[self._controller], show.cfg.replicas
+            policy, replicas = show.controllers[self._controller], show.replicas
             there = [on_elite(self._archive, number, policy=policy, replicas=replicas) for number in near]
             wanted = [one for one in there if self.common.recordings.may_keep(one)]
         self.common.record_ahead(wanted, self.client.client_id)

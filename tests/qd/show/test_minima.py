@@ -11,9 +11,8 @@ from qd.archive import read_archive
 from qd.show.elites import find_archive
 from qd.show.export import Export, export
 from qd.show.replay import ReplayElite, describe, draw, replay
-from qd.show.view.command import View, show_of
 from qd.show.view.plots import MINIMAL, Choice
-from tests.builders import free_port
+from qd.show.view.show import find_show
 from tests.qd.recordings import recording_of
 from tests.qd.show.report.pages import make_run, minimal_of
 
@@ -85,10 +84,9 @@ def test_they_are_exported_beside_whole_elites(found, run, tmp_path):
         export(Export(run=run, minimal="all", out=tmp_path, formats=("npz",)))
 
 
-def test_the_viewer_lists_them(found, run, tmp_path):
+def test_the_viewer_lists_them(found, run):
     numbers = list(found.minima().genes)
-    view = View(run=run, minimal=str(numbers[1]), port=free_port(), policies=("base=shipped",), cache=tmp_path)
-    show = show_of(view)
+    show = find_show(run, minimal=str(numbers[1]), policies=("base=shipped",))
     assert show.elite == numbers[1] and show.minima is not None
     assert f"{MINIMAL} (2)" in show.axes.kinds()
     assert set(show.axes.listed(Choice(ranges={}, kind=MINIMAL)).tolist()) == set(numbers)

@@ -10,7 +10,8 @@ from qd.show.view.plots import axes_of
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import small_archive
 
-collect_ignore = [] if find_spec("viser") else ["test_app.py", "test_panels.py", "test_address.py", "test_browser.py"]
+_NEED_VISER = ("test_app.py", "test_panels.py", "test_address.py", "test_browser.py", "test_show.py")
+collect_ignore = [] if find_spec("viser") else list(_NEED_VISER)
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@ import dataclasses
 import re
 import signal
 import subprocess
-import sys
-import tempfile
 import time
 import urllib.request
 from pathlib import Path
@@ -16,15 +14,13 @@ from qd.archive import read_archive
 from qd.show.minima import MinimalFound
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
-from qd.show.view.command import View, show_of
-from qd.show.view.errands import Made
 from qd.show.view.recorder import Report
-from qd.show.view.scene import first_view_of
+from qd.show.view.show import find_show
 from qd.show.view.tab import Tab
 from sim.policy.spec import controller_hash
 from sim.recording.file import read_recording
 from tests.builders import free_port, judged_archive
-from tests.qd.show.view.visitor import HEIGHT, ROOT, WIDTH, Visitor, serve, view_command
+from tests.qd.show.view.visitor import ROOT, Visitor, serve, view_command
 
 PICK_LIMIT_S = 1.0
 """From a click to the terrain on its way to the browser; it takes 0.15 s."""
@@ -38,14 +34,14 @@ def run(published):
 @pytest.fixture(scope="module")
 def show(anymal, run):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return show_of(View(run=run, elite="0", port=free_port(), policies=policies))
+    return find_show(run, elite="0", policies=policies)
 
 
 class Shown:
     """A viewer with one tab, and what its visitor does; what it would record is kept in ``asked``."""
 
     def __init__(self, show, recordings, query=""):
-        self.app = App(show, recordings)
+        self.app = App(show, recordings, host="127.0.0.1", port=free_port())
         self.asked = []
         self.ahead = []
         self.app._recorder.record = lambda wanted, tab=0: self.asked.append(wanted)
@@ -137,14 +133,6 @@ def notes(shown, count, visitor=0):
     return found
 
 
-def see_note(shown, text, visitor=0):
-    """Waits for a note at the top of a page; others may have gone by then."""
-    until = time.perf_counter() + 10.0
-    while text not in (found := shown.visitors[visitor].notes):
-        assert time.perf_counter() < until, found
-        time.sleep(0.05)
-
-
 def test_the_worst_elite_is_there_with_its_crossing(tab):
     assert "Elite 0" in tab._panel._details.content
     assert status(tab).startswith("Episode 1: out of time after 20.0 s. All 20: 19 out of time, 1 base collision")
@@ -158,7 +146,7 @@ def test_a_folder_of_any_name_is_shown_as_text(show, run, tmp_path):
     folder = tmp_path / "a`<img src=x onerror=alert(1)>"
     folder.mkdir()
     (folder / "archive.npz").write_bytes((run / "archive.npz").read_bytes())
-    odd = show_of(dataclasses.replace(show.cfg, run=folder, port=free_port()))
+    odd = find_show(folder, elite="0", policies=("base=shipped",))
     shown = Shown(odd, Recordings(odd.robot, folder=tmp_path / "cache"))
     try:
         assert "a`&lt;img src=x onerror=alert(1)&gt;" in shown.tab._list._title.content
@@ -192,7 +180,7 @@ def test_a_link_opens_what_it_was_copied_from(shown):
         (shown.tab.choose_controller, "other"),
         (shown.tab.seek, 1.25),
         (shown.tab.set_follow, True),
-        (shown.tab.taking.link,),
+        (shown.tab.copy_link,),
     )
     query = shown.tab._query
     assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
@@ -216,12 +204,6 @@ def test_the_address_follows_the_camera(shown):
         assert time.perf_counter() < until, tab._query
         time.sleep(0.05)
         tab.show_address()
-
-
-def test_a_camera_in_the_address_is_left_where_it_is(shown):
-    tab = shown.come("?initialCameraPosition=1,2,3&initialCameraLookAt=4,5,0")
-    assert tab.client.camera.position.tolist() == [1.0, 2.0, 3.0]
-    assert shown.tab.client.camera.position.tolist() == list(first_view_of(WIDTH, HEIGHT)[0])
 
 
 def test_what_is_not_there_is_refused_in_words(shown):
@@ -278,14 +260,6 @@ def test_one_goes_from_mark_to_mark(shown):
     assert all(f"{mark.words}, {mark.time_s:.1f} s" in tab._panel._curves.content for mark in marks)
 
 
-def test_steps_stop_the_clock(shown):
-    tab = shown.tab
-    shown.do((tab.play,), (tab.go_on, 0.1))
-    assert not tab.playing and tab._panel._play.label == "Play"
-    shown.do((tab.seek, 5.0), (tab.go_on, -0.1))
-    assert tab._clock.time_s == pytest.approx(4.9)
-
-
 def test_episodes_are_chosen_by_their_outcome(shown):
     tab = shown.tab
     assert tab._panel._groups.options == (
@@ -298,33 +272,6 @@ def test_episodes_are_chosen_by_their_outcome(shown):
     assert status(tab).startswith("Episode 20: out of time")  # round again
     shown.do((tab.choose_replica, 16))  # by a key, not one of the group
     assert tab._panel._groups.value == "all 20 episodes" and tab._panel._episode.value == "17: base collision"
-
-
-def test_feet_have_names(shown):
-    tab = shown.tab
-    assert all(name in tab._panel._numbers.content for name in ("LF_FOOT", "RH_FOOT"))
-    assert not any(label.visible for label in tab.scene._names)
-    shown.do((tab.set_names, True))
-    assert all(label.visible for label in tab.scene._names)
-
-
-def test_penalties_are_called_alike_on_axes_curves_and_in_numbers(tab):
-    for shown in (tab._list._plot, tab._panel._curves, tab._panel._numbers):
-        assert "yaw-rate error" in shown.content and "yaw_rate" not in shown.content
-    assert "multiples of its scale" in tab._panel._numbers.content
-
-
-def test_opening_waits_for_no_simulation(run):
-    command = (
-        "import sys, pathlib; from qd.show.view.command import View, show_of;"
-        "show_of(View(run=pathlib.Path(sys.argv[1])));"
-        "import qd.show.view.app; print('newton' in sys.modules)"
-    )
-    archive = str(run)
-    done = subprocess.run(
-        [sys.executable, "-c", command, archive], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
-    assert done.stdout.split()[-1:] == ["False"], done.stderr
 
 
 def test_a_pick_shows_its_terrain_within_a_second(shown):
@@ -351,27 +298,6 @@ def test_the_list_follows_the_ranges(shown):
     assert tab._selection.picked == tab._selection.kept[tab._selection.kept.tolist().index(first) + 1]
 
 
-def test_the_first_of_the_list_is_shown_where_none_is_named(show, tmp_path):
-    shown = Shown(dataclasses.replace(show, elite=None), Recordings(show.robot, folder=tmp_path))
-    try:
-        ranking = shown.tab.common.axes.ranking
-        assert shown.tab._selection.picked == ranking.leaders()[0] == shown.tab._selection.listed[0]
-        assert shown.tab._list._lines[0].color == (213, 94, 0)
-    finally:
-        shown.close()
-
-
-def test_an_empty_list_says_so_and_leads_back(shown, run):
-    panel, archive = shown.tab._list, read_archive(run / "archive.npz")
-    faults = int((archive.confirmed & archive.certified).sum())
-    assert not panel._again.visible
-    shown.do((panel.choose, "kind", "faults"), (panel.brush, "goal_rate", 0.9, 1.0))
-    assert panel._count.content.startswith("**None of") and panel._again.visible
-    assert not any(line.visible for line in panel._lines) and panel._choosers["kind"][0].value == f"faults ({faults})"
-    shown.do((panel.change, shown.tab._selection.clear))
-    assert not panel._again.visible and panel._lines[0].visible and panel._choosers["kind"][0].value.startswith("all ")
-
-
 def test_playing_and_dragging_move_the_robot(shown):
     tab = shown.tab
     before = tab.scene._bodies[0].position.copy()
@@ -396,22 +322,6 @@ def test_playing_and_dragging_move_the_robot(shown):
     assert seen.any() and seen[pushing[frame]].all()
 
 
-def test_episodes_are_stepped_through(shown):
-    tab = shown.tab
-    shown.do((tab.seek, 5.0), (tab.choose_replica, 16))
-    assert status(tab).startswith("Episode 17: base collision")
-    assert tab._clock.time_s == 0.0 and tab._clock.duration_s < 20.0
-    shown.do((tab.step_replica, 1))
-    assert status(tab).startswith("Episode 18:")
-
-
-def test_another_controller_has_its_own_crossing(shown):
-    tab = shown.tab
-    shown.do((tab.choose_controller, "other"))  # it is the same file
-    assert status(tab).startswith("Episode 1: out of time")
-    assert shown.asked[-1] is None
-
-
 def rows_of(details):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in details.splitlines() if "|" in line]
 
@@ -424,25 +334,11 @@ def test_the_neighbours_in_the_list_are_recorded_ahead(shown):
     assert shown.ahead[-1] == []
 
 
-def test_what_is_shown_can_be_taken_along(shown):
-    tab = shown.tab
-    shown.do((tab.taking.command,))
+def test_the_command_that_replays_what_is_shown_is_copied(shown):
+    shown.do((shown.tab.copy_command,))
     (command,) = notes(shown, 1)
     assert "replay --robot anymal --run" in command and "--elite 0 " in command and command.endswith("--replicas 20")
     assert any(command.split("--robot")[1] in script for script in shown.visitors[0].scripts)
-    asked = []
-    tab.common.errands.run = lambda tab, words, made, done: asked.append((words, done)) or True
-    shown.do((tab.choose_replica, 16), (tab.taking.film,), (tab.taking.files,))
-    (film, filmed), (export, _) = asked
-    assert export(Path("there"))[-2:] == ["--out", "there/files"] and export(Path("x"))[0] == "export"
-    with tempfile.TemporaryDirectory() as folder:
-        words = film(Path(folder))
-        assert words[0] == "film" and words[words.index("--replica") + 1] == "16"
-        with np.load(words[words.index("--recording") + 1]) as taken:
-            assert taken["base_position"].shape == (1, 20, 1001, 3)
-    filmed(Made(b"", "no OpenGL"))
-    shown.app.do_asked(wait_s=0.2)
-    see_note(shown, "elite-0-episode-17.mp4 was not made: no OpenGL")
 
 
 def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
@@ -574,22 +470,4 @@ def test_the_command_serves_a_page_and_ends_on_ctrl_c(run, tmp_path):
     process.send_signal(signal.SIGINT)
     rest = process.communicate(timeout=180)[0]
     assert process.returncode == 0 and "Stopped." in rest and "Traceback" not in rest
-    assert any(f"{len(read_archive(run)):,} elites of anymal, ready after" in line for line in lines)
-
-
-def test_bad_input_is_one_line():
-    command = view_command("--run", "nowhere", "--port", str(free_port()))
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert ended.returncode == 2
-    assert [line for line in ended.stderr.splitlines() if "Warp" not in line] == [
-        "error: no archive at nowhere: give a run directory or the archive.npz of one"
-    ]
-
-
-def test_the_help_says_what_to_do():
-    ended = subprocess.run(
-        [sys.executable, "-m", "faultline", "view", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
-    assert ended.returncode == 0
-    for word in ("Ranges", "Elites", "ssh -L", "Ctrl-C", "--policies", "--host"):
-        assert word in ended.stdout
+    assert any(f"{len(read_archive(run)):,} elites of anymal." in line for line in lines)

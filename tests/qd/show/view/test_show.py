@@ -1,0 +1,108 @@
+"""What is found before a page opens: archive, controllers, port."""
+
+import json
+import shutil
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qd.archive import write_archive
+from qd.run.directory import RESULTS
+from qd.show.view.serve import check_port
+from qd.show.view.show import find_show
+from sim.files.records import robot_digest
+from sim.robots.find import get_robot
+from tests.builders import small_archive
+
+
+@pytest.fixture(scope="module")
+def run(published):
+    return published / "anymal" / "archive"
+
+
+@pytest.fixture
+def copied(tmp_path, run):
+    return Path(shutil.copytree(run, tmp_path / "run"))
+
+
+def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypatch, anymal, published):
+    (tmp_path / "results").symlink_to(published)
+    monkeypatch.chdir(tmp_path)
+    show = find_show()
+    assert show.found.run == RESULTS / "anymal" / "archive"
+    assert show.controllers["as searched"] == str(anymal.policy_file)
+
+
+def test_controllers_are_named_and_tried(tmp_path, anymal, run):
+    show = find_show(run, policies=(f"base=shipped tuned={anymal.policy_file}",))
+    assert list(show.controllers) == ["base", "tuned"]
+    with pytest.raises(ValueError, match="no such file"):
+        find_show(run, policies=("base=shipped", f"tuned={tmp_path / 'none.pt'}"))
+
+
+def test_terrains_are_shown_when_the_controller_of_the_search_is_lost(copied):
+    config = copied / "config.json"
+    config.write_text(config.read_text().replace('"policy": "shipped"', '"policy": "/gone/policy.pt"'))
+    show = find_show(copied)
+    assert show.controllers == {} and "/gone/policy.pt" in show.note
+
+
+def test_terrains_are_shown_when_the_controller_of_the_search_is_code(copied):
+    settings = json.loads((copied / "config.json").read_text())
+    settings["settings"] |= {"policy": "tests.sim.policies:stand", "policy_sha256": None}
+    (copied / "config.json").write_text(json.dumps(settings))
+    show = find_show(copied)
+    assert show.controllers == {} and "tests.sim.policies:stand is code" in show.note
+    named = find_show(copied, policies=("mine=tests.sim.policies:stand",))
+    assert named.controllers == {"mine": "tests.sim.policies:stand"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"robot": "spot"}, "spot"),
+        ({"run": Path("nowhere")}, "nowhere"),
+        ({"robot": "cassie"}, "anymal"),
+        ({"elite": "5000"}, "5000"),
+        ({"elite": "-1"}, "-1"),
+        ({"elite": "0 1"}, "0 1"),
+        ({"policies": ("shipped",)}, "policies"),
+    ],
+)
+def test_what_is_wrong_is_said_before_a_page_opens(changes, field, run):
+    with pytest.raises((ValueError, FileNotFoundError), match=field):
+        find_show(**{"run": run} | changes)
+
+
+def test_a_run_without_elites_is_refused(tmp_path):
+    archive = small_archive().rows(np.array([], dtype=int))
+    archive.robot_sha256 = robot_digest(get_robot("anymal"))
+    write_archive(tmp_path / "archive.npz", archive)
+    with pytest.raises(ValueError, match="no elites"):
+        find_show(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["archive.npz", "config.json"])
+def test_a_half_written_run_is_refused(copied, name):
+    file = copied / name
+    file.write_bytes(file.read_bytes()[:300])
+    with pytest.raises(ValueError, match=name):
+        find_show(copied)
+
+
+def test_a_port_in_use_is_refused_until_it_is_free():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=f"port {port}"):
+            check_port("127.0.0.1", port)
+    check_port("127.0.0.1", port)
+
+
+@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 0), ("256.1.1.1", 8080)])
+def test_what_cannot_be_listened_at_is_refused(host, port):
+    with pytest.raises(ValueError, match="port"):
+        check_port(host, port)
