@@ -72,9 +72,11 @@ def measure_dose(
             how="resolved" if resolved else "searched", cache=crossings_folder(robot), open_evaluator=open_evaluator,
         )  # fmt: skip
         rows = {
-            (name, who): [{**row, "resolved": resolved} for row in rows_of(name, dose, who, results[name][who])]
+            (name, controller): [
+                {**row, "resolved": resolved} for row in rows_of(name, dose, controller, results[name][controller])
+            ]
             for name, dose in doses.items()
-            for who in controllers
+            for controller in controllers
         }
         return {
             **origin_of(compute.device, seed, compute.workers),

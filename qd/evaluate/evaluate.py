@@ -31,7 +31,8 @@ from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_eval
 from sim.files.command import publish
 from sim.files.figures import as_png
 from sim.files.records import identity, robot_identity
-from sim.policy.spec import controller_hash, name_of, who_crossed
+from sim.policy.spec import controller_hash, name_of, spec_of, who_crossed
+from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import load_space
@@ -144,22 +145,22 @@ def cross_sets(
 
 def evaluate(
     controllers: Mapping[str, str],
-    sets: Mapping[str, TerrainSet],
+    sets: Mapping[str, TerrainSet] | None = None,
     *,
-    robot: RobotCfg,
-    compute: Compute,
+    robot: RobotCfg | str = "anymal",
+    compute: Compute | None = None,
     episodes: int = EPISODES,
     seed: int = 0,
     cache: Path | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
 ) -> Tables:
-    """The tables of controllers on sets of terrains (:func:`qd.evaluate.sets.make_sets`).
+    """The tables of controllers on sets of terrains.
 
     Args:
-        controllers: Policy of each by its name.
-        sets: Sets by name.
-        robot: The robot.
-        compute: Where terrains are crossed.
+        controllers: Policy of each by its name; ``shipped`` is the robot's own.
+        sets: Sets by name (:func:`qd.evaluate.sets.make_sets`); 24 hand-crafted and 24 hard-random terrains if None.
+        robot: The robot, or its name or settings file.
+        compute: Where terrains are crossed; by default on the CPU.
         episodes: On each terrain.
         seed: Of bootstraps.
         cache: Folder where crossings are stored and found again.
@@ -169,16 +170,22 @@ def evaluate(
         AllInvalidError: If no episode of a controller on a set is valid.
         EvaluatorError: If a worker is lost.
     """
+    robot, compute = get_robot(robot), compute or Compute()
+    sets = sets or make_sets((), _SMALL[0], seed)
+    controllers = {name: spec_of(policy, robot) for name, policy in controllers.items()}
     others = [policy for policy in controllers.values() if policy != str(robot.policy_file)]
     scales = robot.read_penalty_scales(others[0] if others else None)
     results = cross_sets(
         controllers, sets, robot=robot, compute=compute, episodes=episodes, reward=True, cache=cache,
         open_evaluator=open_evaluator,
     )  # fmt: skip
-    crossed = {name: {who: measure(result, scales) for who, result in row.items()} for name, row in results.items()}
+    crossed = {
+        name: {controller: measure(result, scales) for controller, result in row.items()}
+        for name, row in results.items()
+    }
     about = {
-        who: Controller(policy=name_of(policy, robot), sha256=controller_hash(policy))
-        for who, policy in controllers.items()
+        name: Controller(policy=name_of(policy, robot), sha256=controller_hash(policy))
+        for name, policy in controllers.items()
     }
     return make_tables(crossed, sets, robot, controllers=about, episodes=episodes, seed=seed)
 

@@ -124,7 +124,7 @@ def make_pack(
             controllers, {"pack": terrains}, robot=body, compute=compute, episodes=episodes,
             cache=crossings_folder(body), open_evaluator=open_evaluator,
         )["pack"]  # fmt: skip
-        rows = {who: rows_of(result) for who, result in crossed.items()}
+        rows = {controller: rows_of(result) for controller, result in crossed.items()}
         rates = np.array([[row["goal_rate"] for row in of_crosser] for of_crosser in rows.values()], np.float64).T
         abouts = [candidate.about for candidate in chosen]
         more = {"controllers": np.array([*rows]), "goal_rates": rates, "robot": np.array(body.name)}
@@ -134,20 +134,20 @@ def make_pack(
             "space": cfg.space,
             "space_sha256": cfg.space_sha256,
             "episodes": episodes,
-            "searched": next(who for who, crosser in controllers.items() if is_same(crosser, searched)),
+            "searched": next(controller for controller, crosser in controllers.items() if is_same(crosser, searched)),
             "iterations": archive.iterations,
             "panel": list(archive.faults.certifiers) if archive.faults else [],
             "candidates": len(candidates),
             "not_known_to_be_passable": not_passable,
             "controllers": about_controllers(controllers, body),
-            "rates": {who: over_all(of_crosser, abouts, seed) for who, of_crosser in rows.items()},
+            "rates": {controller: over_all(of_crosser, abouts, seed) for controller, of_crosser in rows.items()},
             "by": grouped(abouts, rows),
             "modes": [
                 {"mode": mode.number, "ending": mode.ending, "marked_by": mode.marked_by} for mode in modes.modes
             ],
             "terrains_sha256": write_terrains(out, heights, chosen, more),
             "terrains": [
-                about | {"rates": {who: of_crosser[place] for who, of_crosser in rows.items()}}
+                about | {"rates": {controller: of_crosser[place] for controller, of_crosser in rows.items()}}
                 for place, about in enumerate(abouts)
             ],
         }

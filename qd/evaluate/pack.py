@@ -99,13 +99,13 @@ def evaluate_pack(
     check_policy(policy, robot, compute.device)
     chosen = pack_set(pack.heights, min(count, len(pack)), seed)
     abouts = pack.terrains[: len(chosen)]
-    who = who_crossed(robot, policy)
+    controller = who_crossed(robot, policy)
 
     def measure() -> dict[str, Any]:
         result = cross_sets(
-            {who: policy}, {"pack": chosen}, robot=robot, compute=compute, episodes=episodes,
+            {controller: policy}, {"pack": chosen}, robot=robot, compute=compute, episodes=episodes,
             cache=crossings_folder(robot), open_evaluator=open_evaluator,
-        )["pack"][who]  # fmt: skip
+        )["pack"][controller]  # fmt: skip
         rows = rows_of(result)
         beside = {name: [about["rates"][name] for about in abouts] for name in pack.content["rates"]}
         about_pack = {name: pack.content[name] for name in ("robot", "robot_sha256", "terrains_sha256", "episodes")}
@@ -122,9 +122,9 @@ def evaluate_pack(
         }
 
     def draw(report: dict[str, Any]) -> bytes:
-        return draw_worst(report["terrains"], pack.heights, _TESTED, who)
+        return draw_worst(report["terrains"], pack.heights, _TESTED, controller)
 
-    return publish(out or RUNS / f"{who}-pack.json", measure, show_pack_test, draw=draw)
+    return publish(out or RUNS / f"{controller}-pack.json", measure, show_pack_test, draw=draw)
 
 
 def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
@@ -197,31 +197,34 @@ def _by(group: str, abouts: Sequence[dict[str, Any]], rows: Mapping[str, Sequenc
         members.setdefault(about[group], []).append(place)
     lines = []
     for value, places in sorted(members.items(), key=lambda pair: (-len(pair[1]), str(pair[0]))):
-        some = {who: [of_crosser[place] for place in places] for who, of_crosser in rows.items()}
+        some = {controller: [of_crosser[place] for place in places] for controller, of_crosser in rows.items()}
         rates = {
-            who: [row["goal_rate"] for row in chosen if row["goal_rate"] is not None] for who, chosen in some.items()
+            controller: [row["goal_rate"] for row in chosen if row["goal_rate"] is not None]
+            for controller, chosen in some.items()
         }
         lines.append(
             {
                 group: value,
                 "terrains": len(places),
-                "goal_rate": {who: float(np.mean(known)) if known else None for who, known in rates.items()},
-                "failing": {who: sum(map(fails, chosen)) for who, chosen in some.items()},
+                "goal_rate": {
+                    controller: float(np.mean(known)) if known else None for controller, known in rates.items()
+                },
+                "failing": {controller: sum(map(fails, chosen)) for controller, chosen in some.items()},
             }
         )
     return lines
 
 
-def draw_worst(terrains: Sequence[dict[str, Any]], heights: NDArray[np.float32], who: str, title: str) -> bytes:
+def draw_worst(terrains: Sequence[dict[str, Any]], heights: NDArray[np.float32], controller: str, title: str) -> bytes:
     """The terrains with the lowest goal rates of a controller."""
-    rates = {place: about["rates"][who]["goal_rate"] for place, about in enumerate(terrains)}
+    rates = {place: about["rates"][controller]["goal_rate"] for place, about in enumerate(terrains)}
     places = sorted((place for place, rate in rates.items() if rate is not None), key=rates.__getitem__)[:_DRAWN]
     captions = []
     for place in places:
         about = terrains[place]
         words = filter(None, [about["verdict"], about["cause"], f"{rates[place]:.0%} arrive"])
         captions.append(f"{place}: {about['name']}: {', '.join(words)}")
-    failing = sum(fails(about["rates"][who]) for about in terrains)
+    failing = sum(fails(about["rates"][controller]) for about in terrains)
     return as_png(draw_gallery(heights[places], captions, f"{title}: fails {failing} of {len(terrains)} terrains"))
 
 

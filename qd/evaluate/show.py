@@ -59,7 +59,10 @@ def show_tables(report: dict[str, Any]) -> None:
     if report.get("part") == "validation":
         print("\nValidation terrains, to choose settings by. Rates to report are of part test.")
     for name in report["goal"]:
-        rows = [(who, *_cells(report, name, who), _paper_cell(report, name, who)) for who in report["goal"][name]]
+        rows = [
+            (controller, *_cells(report, name, controller), _paper_cell(report, name, controller))
+            for controller in report["goal"][name]
+        ]
         title = f"{SETS.get(name, name)}: {report['terrains'][name]} terrains x {report['episodes']} episodes"
         show_table(title, ("", *(MEASURES[key] for key in _FORMS), "paper: success, reward"), rows)
     for name, about in report["certified"].items():
@@ -75,22 +78,29 @@ def show_tables(report: dict[str, Any]) -> None:
     if rows:
         show_table("terrains that some controller crossed once, or that none did", ("", "terrains", "share"), rows)
     _show_invalid(
-        {f"{who} on {name}": counts for name, row in report["outcomes"].items() for who, counts in row.items()}
+        {
+            f"{controller} on {name}": counts
+            for name, row in report["outcomes"].items()
+            for controller, counts in row.items()
+        }
     )
 
 
-def _cells(report: dict[str, Any], name: str, who: str) -> list[str]:
+def _cells(report: dict[str, Any], name: str, controller: str) -> list[str]:
     intervals = report["intervals"]
-    return [value_words(report[key][name][who], intervals[key][name][who], form) for key, form in _FORMS.items()]
+    return [
+        value_words(report[key][name][controller], intervals[key][name][controller], form)
+        for key, form in _FORMS.items()
+    ]
 
 
-def published_value(report: Mapping[str, Any], measure: str, name: str, who: str) -> float | None:
+def published_value(report: Mapping[str, Any], measure: str, name: str, controller: str) -> float | None:
     """The paper's number of a measure, a set and a controller's name; None where it has none."""
-    return (report["paper"] or {}).get(measure, {}).get(name, {}).get(who)
+    return (report["paper"] or {}).get(measure, {}).get(name, {}).get(controller)
 
 
-def _paper_cell(report: dict[str, Any], name: str, who: str) -> str:
-    success, reward = (published_value(report, key, name, who) for key in ("success", "reward"))
+def _paper_cell(report: dict[str, Any], name: str, controller: str) -> str:
+    success, reward = (published_value(report, key, name, controller) for key in ("success", "reward"))
     return "" if success is None else f"{success:.3f}, {reward:.1f}"
 
 
@@ -100,11 +110,11 @@ def _show_certified(report: dict[str, Any], name: str, about: dict[str, Any]) ->
     keys = ("certified_goal", "certified_success")
     rows = [
         (
-            who,
-            *(value_words(report[key][name][who], report["intervals"][key][name][who]) for key in keys),
-            _BIASED.get(about["chosen_by"].get(who, ""), ""),
+            controller,
+            *(value_words(report[key][name][controller], report["intervals"][key][name][controller]) for key in keys),
+            _BIASED.get(about["chosen_by"].get(controller, ""), ""),
         )
-        for who in report["goal"][name]
+        for controller in report["goal"][name]
     ]
     show_table(title, ("", MEASURES["goal"], MEASURES["success"], "biased"), rows if about["terrains"] else [])
 
@@ -123,9 +133,9 @@ def _show_over_seeds(summaries: dict[str, Any]) -> None:
 def _show_penalties(penalties: dict[str, Any]) -> None:
     names = list(next(iter(next(iter(penalties.values())).values())))
     rows = [
-        (f"{name}, {who}", *(value_words(values[key], None, ".2f") for key in names))
+        (f"{name}, {controller}", *(value_words(values[key], None, ".2f") for key in names))
         for name, row in penalties.items()
-        for who, values in row.items()
+        for controller, values in row.items()
     ]
     show_table("scaled penalties", ("", *names), rows)
 
@@ -171,11 +181,11 @@ def show_pack_test(report: dict[str, Any]) -> None:
 def _show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
     rows = [
         (
-            who,
+            controller,
             *(value_words(row[f"{key}_rate"], row[f"{key}_interval"]) for key in ("goal", "success", "fallen")),
             f"{row['failing']} of {row['terrains']}",
             f"{row['failing_families']} of {row['families']}",
         )
-        for who, row in rates.items()
+        for controller, row in rates.items()
     ]
     show_table(title, ("", *(MEASURES[key] for key in ("goal", "success", "fallen")), "fails", "families"), rows)

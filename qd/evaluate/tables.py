@@ -211,12 +211,18 @@ def make_tables(
         over_seeds=over_seeds({**means, **certified}, (*_MEASURES, *CERTIFIED)),
         intervals=intervals,
         terrains={name: len(terrains) for name, terrains in sets.items()},
-        outcomes={name: {who: measured.outcomes for who, measured in row.items()} for name, row in crossed.items()},
+        outcomes={
+            name: {controller: measured.outcomes for controller, measured in row.items()}
+            for name, row in crossed.items()
+        },
         invalid_terrains={
-            name: {who: int((~measured.valid).sum()) for who, measured in row.items()} for name, row in crossed.items()
+            name: {controller: int((~measured.valid).sum()) for controller, measured in row.items()}
+            for name, row in crossed.items()
         },
         differences={
-            name: differences({who: row[who] for who in firsts(row)}, sets[name].numbers, seed, families[name])
+            name: differences(
+                {controller: row[controller] for controller in firsts(row)}, sets[name].numbers, seed, families[name]
+            )
             for name, row in crossed.items()
         },
         traversable={
@@ -238,13 +244,16 @@ _MEASURES = tuple(MEASURES)
 def _of_measures(crossed: Crossed, statistic: Callable[[str, NDArray[np.float64]], Any]) -> dict[str, Any]:
     """Each measure, and ``penalties``: set -> controller -> a statistic of the set's name and the terrains' values."""
     tables: dict[str, Any] = {
-        key: {name: {who: statistic(name, row[who].values[key]) for who in row} for name, row in crossed.items()}
+        key: {
+            name: {controller: statistic(name, row[controller].values[key]) for controller in row}
+            for name, row in crossed.items()
+        }
         for key in MEASURES
     }
     tables["penalties"] = {
         name: {
-            who: {key: statistic(name, values) for key, values in measured.penalties.items()}
-            for who, measured in row.items()
+            controller: {key: statistic(name, values) for key, values in measured.penalties.items()}
+            for controller, measured in row.items()
         }
         for name, row in crossed.items()
     }
@@ -259,8 +268,8 @@ def _of_certified(
     return {
         key: {
             name: {
-                who: statistic(measured.values[measure][member], of_terrains(sets[name].families, member))
-                for who, measured in crossed[name].items()
+                controller: statistic(measured.values[measure][member], of_terrains(sets[name].families, member))
+                for controller, measured in crossed[name].items()
             }
             for name, member in members.items()
         }
@@ -269,7 +278,7 @@ def _of_certified(
 
 
 def _about_certified(sets: Mapping[str, TerrainSet], controllers: Mapping[str, Controller]) -> dict[str, Certified]:
-    about = {}
+    certified = {}
     for name, terrains in sets.items():
         certificates = terrains.certificates
         if certificates is not None:
@@ -277,13 +286,15 @@ def _about_certified(sets: Mapping[str, TerrainSet], controllers: Mapping[str, C
             by_hash = dict(zip(certificates.sha256, certificates.certifiers, strict=True))
             roles = {certificates.searched_sha256: "searched"}
             roles |= {sha256: "certifier" for sha256, certifier in by_hash.items() if counts[certifier]}
-            hashes = {who: controller["sha256"] for who, controller in controllers.items()}
-            about[name] = Certified(
+            hashes = {controller: about["sha256"] for controller, about in controllers.items()}
+            certified[name] = Certified(
                 terrains=int(certificates.certified.sum()),
                 certifiers=counts,
-                chosen_by={who: roles[sha] for who, sha in hashes.items() if sha is not None and sha in roles},
+                chosen_by={
+                    controller: roles[sha] for controller, sha in hashes.items() if sha is not None and sha in roles
+                },
             )
-    return about
+    return certified
 
 
 def split_by_goal(
@@ -404,7 +415,7 @@ def over_seeds(tables: Mapping[str, Values], measures: Iterable[str]) -> dict[st
     for measure in measures:
         for name, row in tables[measure].items():
             for kind in dict.fromkeys(map(kind_of, row)):
-                values = [value for who, value in row.items() if kind_of(who) == kind]
+                values = [value for controller, value in row.items() if kind_of(controller) == kind]
                 if len(values) > 1:
                     summary = _summary(values, is_rate=measure in RATES)
                     summaries.setdefault(measure, {}).setdefault(name, {})[kind] = summary
