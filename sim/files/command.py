@@ -6,24 +6,23 @@ module loads quickly; what takes seconds to import (torch, warp, newton, pyribs)
 
 import os
 import shlex
-import shutil
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, get_args, get_origin, get_type_hints, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
+
+import tyro
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.records import without_machine
 from sim.files.settings import PositiveInt, check
 
-_ALL = "all"
 _DEBUG = "FAULTLINE_DEBUG"
 
 
@@ -120,26 +119,13 @@ class _HasDefaults(Protocol):
 
 @contextmanager
 def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None]:
-    """Adds what is saved and how to go on to the error of work that stops or fails half way.
-
-    Args:
-        state: What is saved, after ``Stopped;``.
-        command: Says what to do next, once it is known.
-
-    Raises:
-        Interrupted: On Ctrl-C.
-        UserError: If a worker is lost.
-        OSError: If a file cannot be written.
-    """
+    """Adds what is saved (``state``) and how to go on to the error of work that stops or fails half way."""
     try:
         yield
     except KeyboardInterrupt:
         raise Interrupted(f"Stopped; {state}. {command()}") from None
     except (UserError, OSError) as error:
-        # Work within work has named how it goes on alone: the outer one's command does both.
-        inner = error.__cause__
-        named = type(inner) is type(error) and str(error).startswith(f"{inner}. ")
-        raise type(error)(f"{inner if named else error}. {command()}") from (inner if named else error)
+        raise type(error)(f"{error}. {command()}") from error
 
 
 def debugging() -> bool:
@@ -165,13 +151,10 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
         can mend (ValueError, OSError, FloatingPointError), after a UserError its own; 130 for Ctrl-C and SIGTERM.
         FAULTLINE_DEBUG=1 shows the traceback instead of the line.
     """
-    import tyro
-
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         defaults: Any = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
         flags: Any = cls  # a protocol is no type that tyro's annotations take
-        _refuse_bare_flags(cls, argv)
         command: _Command = tyro.cli(flags, prog=f"faultline {name}", args=list(argv), **defaults)
         check(command)
         status = command.execute()
@@ -197,22 +180,6 @@ def peek(argv: Sequence[str], flag: str) -> str | None:
     return value
 
 
-def _refuse_bare_flags(cls: type, argv: Sequence[str]) -> None:
-    """Refuses a flag of several values that has none, where that would be taken for one that was left out.
-
-    Raises:
-        ValueError: If there is one.
-    """
-    several = {
-        f"--{name.replace('_', '-')}"
-        for name, kind in get_type_hints(cls).items()
-        if any(get_origin(one) is tuple for one in (kind, *get_args(kind))) and not getattr(cls, name, None)
-    }
-    for word, following in pairwise([*argv, "--"]):
-        if word.replace("_", "-") in several and following.startswith("--"):
-            raise ValueError(f"{word} must have one or several values behind it, got none: give some, or leave it out")
-
-
 _COMPILER, _AGAIN_S = f"{os.sep}llvmlite{os.sep}", 0.1
 
 
@@ -229,47 +196,29 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 
 def command_line(name: str, **flags: object) -> str:
-    """A command that runs as it stands, typed in the present folder: ``faultline replay --run runs/x --elite 0``.
+    """A command as it is typed: ``faultline replay --run runs/x --elite 0``; flags as of :func:`command_words`."""
+    return shlex.join(["faultline", *command_words(name, **flags)])
+
+
+def command_words(name: str, **flags: object) -> list[str]:
+    """The words of a command after ``faultline``.
 
     Args:
         name: The word that calls it.
         flags: Values by field name; None, False and empty lists are left out, True is a bare flag.
     """
-    return shlex.join([*_program(), *command_words(name, **flags)])
-
-
-def plain_command(name: str, **flags: object) -> str:
-    """:func:`command_line` for a file that others read, without where things lie on this machine."""
-    return shlex.join(["faultline", *map(without_machine, command_words(name, **flags))])
-
-
-def command_words(name: str, **flags: object) -> list[str]:
-    """The words of :func:`command_line` after ``faultline``."""
-    return [name, *_words(flags)]
-
-
-def _words(flags: Mapping[str, object]) -> Iterator[str]:
+    words = [name]
     for field, value in flags.items():
         flag = f"--{field.replace('_', '-')}"
         if value is True:
-            yield flag
+            words.append(flag)
         elif isinstance(value, list | tuple):
-            yield from (flag, *map(str, value)) if value else ()
+            words += [flag, *map(str, value)] if value else []
         elif str(value).startswith("-"):  # would be taken for a flag
-            yield f"{flag}={value}"
+            words.append(f"{flag}={value}")
         elif value is not None and value is not False:
-            yield from (flag, str(value))
-
-
-def _program() -> list[str]:
-    """How ``faultline`` is called on this machine: as it was, beside the interpreter that runs, or as a module."""
-    called, beside = Path(sys.argv[0]), Path(sys.executable).with_name("faultline")
-    found = shutil.which("faultline")
-    if found is not None and found in (str(called), str(beside)):
-        return ["faultline"]
-    if called.name == "faultline":
-        return [str(called)]
-    return [os.path.relpath(beside)] if beside.exists() else [sys.executable, "-m", "faultline"]
+            words += [flag, str(value)]
+    return words
 
 
 def split_words(values: Sequence[str]) -> list[str]:
@@ -278,24 +227,19 @@ def split_words(values: Sequence[str]) -> list[str]:
 
 
 def chosen_elites(text: str, count: int, whose: object) -> list[int]:
-    """Numbers of elites, as a command line names them.
+    """Numbers of elites, as a command line names them: separated by spaces or commas, or ``all``.
 
     Args:
-        text: Numbers separated by spaces or commas, or ``all``.
+        text: The numbers.
         count: How many elites there are.
-        whose: Their run or pool, for the message.
-
-    Raises:
-        ValueError: If it is something else, or there is no such elite.
+        whose: Their run, for the message.
     """
-    words = split_words([text])
-    known = dict.fromkeys(map(str, range(count)))
-    if words == [_ALL]:
-        words = list(known)
+    known = [str(number) for number in range(count)]
+    words = known if split_words([text]) == ["all"] else split_words([text])
     unknown = [word for word in words if word not in known]
     if unknown or not words:
-        valid = f"expected {_ALL}, or numbers of 0 to {count - 1}" if count else "the archive is empty"
-        raise ValueError(f"{whose} has no elite {', '.join(unknown) or repr(text)}: {valid}")
+        expected = f"all, or numbers of 0 to {count - 1}" if count else "one that has elites"
+        raise ValueError(f"{whose} has no elite {', '.join(unknown) or repr(text)}: expected {expected}")
     return [int(word) for word in dict.fromkeys(words)]
 
 
@@ -309,13 +253,10 @@ def publish(
     """Measures, shows and writes a report, which is returned; where to write is tried before the work.
 
     Args:
-        out: File of the report; it is shown alone if left out.
+        out: File of the report, a ``.json`` if there is a figure; it is shown alone if left out.
         measure: Makes the report.
         show: Prints it.
         draw: Makes a PNG of it, which is written beside it, ``.png`` in place of ``.json``.
-
-    Raises:
-        ValueError: If a file cannot be written to, or ``out`` has another ending: the figure would take its place.
     """
     makers: dict[Path, Callable[[dict[str, Any]], bytes]] = {} if out is None else {out: to_json}
     if out is not None and draw is not None:
@@ -331,8 +272,3 @@ def publish(
         write_atomically(file, make(report))
         print(f"written to {file}{replaced}")
     return report
-
-
-def show_json(report: dict[str, Any]) -> None:
-    """Prints a report as its file has it."""
-    print(to_json(report).decode())

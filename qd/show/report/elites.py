@@ -11,8 +11,9 @@ from qd.show.report.figures import draw_modes
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, Cards, Folded, Picture, absent, counted, paragraph, percent, picture, table
 from qd.show.report.rendered import rendered
-from sim.files.command import plain_command
+from sim.files.command import command_line
 from sim.files.intervals import wilson_interval
+from sim.files.records import without_machine
 
 _MIN_PICTURED = 3  # terrains that the page begins with
 
@@ -297,7 +298,7 @@ def all_section(shown: Shown) -> list[Block]:
         keys.append([f"{value:.5g}" for value in values])
     numbers = elites.numbers[order].tolist()
     links = [anchor_of(number) if number in shown.crossed else "" for number in numbers]
-    again = plain_command("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N")
+    again = without_machine(command_line("replay", robot=shown.material.robot.spec, run=shown.material.run, elite="N"))
     folded = f"Show {counted(len(rows), 'elite')}"
     listed = table(head, rows, keys=keys, links=links, opens=_opened(shown, numbers), folded=folded)
     text = (

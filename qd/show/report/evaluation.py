@@ -7,7 +7,7 @@ from qd.evaluate.labels import FATES, SETS
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, Folded, Picture, absent, counted, paragraph, percent, table
 from qd.show.report.tables import CERTIFIED, GENERATED, MEASURES, by_kind
-from sim.files.command import plain_command
+from sim.files.command import command_line
 from sim.files.records import without_machine
 
 _TRAINED_ON = {
@@ -98,12 +98,14 @@ def fates(tables: dict[str, Any]) -> str:
 def _command(shown: Shown) -> str:
     """What makes the tables."""
     material = shown.material
-    return plain_command(
-        "evaluate",
-        robot=material.robot.spec,
-        policies=["base=shipped", "C-G=FILE"],
-        archive=material.run,
-        out=material.tables_file,
+    return without_machine(
+        command_line(
+            "evaluate",
+            robot=material.robot.spec,
+            policies=["base=shipped", "C-G=FILE"],
+            archive=material.run,
+            out=material.tables_file,
+        )
     )
 
 

@@ -8,7 +8,8 @@ from qd.run.minimal_file import NUMBERS_FILE
 from qd.show.minimal_figure import draw_minimal
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, absent, counted, paragraph, percent, picture, table
-from sim.files.command import plain_command
+from sim.files.command import command_line
+from sim.files.records import without_machine
 
 _ROWS = 5  # of a table that is not folded
 _PICTURED = 6  # terrains
@@ -21,8 +22,13 @@ def minimal_section(shown: Shown) -> list[Block]:
     if found is None:
         text = f"Left out: there is no {NUMBERS_FILE} of these elites. It is made by"
         if material.archive.fresh is None:
-            return [absent(f"{text} faultline minimise, after", plain_command("reevaluate", robot=robot, run=run))]
-        return [absent(text, plain_command("minimise", robot=robot, run=run))]
+            return [
+                absent(
+                    f"{text} faultline minimise, after",
+                    without_machine(command_line("reevaluate", robot=robot, run=run)),
+                )
+            ]
+        return [absent(text, without_machine(command_line("minimise", robot=robot, run=run)))]
     entries = found.numbers["elites"]
     shows = "How many parts failures take, by the kind of the cause, and minimal terrains from above"
     drawn = draw_minimal(material.archive.robot, found.numbers, found.genes, material.space, most=_PICTURED)

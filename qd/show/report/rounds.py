@@ -26,7 +26,7 @@ from qd.show.report.page import (
 )
 from qd.show.report.tables import MEASURES, by_kind
 from sim.files.atomic import read_json
-from sim.files.command import plain_command
+from sim.files.command import command_line
 from sim.files.figures import bar_lengths, new_figure
 from sim.files.records import without_machine
 from sim.robots.find import get_robot
@@ -198,7 +198,7 @@ def _changes(content: dict[str, Any]) -> list[Block]:
 
 def _origin(content: dict[str, Any], run: Path) -> list[Block]:
     """Where the numbers come from, and how to look closer."""
-    closer = [plain_command("report", run=run / row["search"]) for row in content["rounds"]]
+    closer = [without_machine(command_line("report", run=run / row["search"])) for row in content["rounds"]]
     return [
         paragraph(f"The numbers are those of {run / ROUNDS_FILE}. It was begun with:"),
         table(["", ""], origin_table(content), words=True),

@@ -28,7 +28,7 @@ from qd.show.report.page import (
     picture,
     table,
 )
-from sim.files.command import plain_command
+from sim.files.command import command_line
 from sim.files.intervals import bootstrap_interval
 from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec
@@ -95,7 +95,7 @@ def _no_faults(shown: Shown) -> Block:
     material = shown.material
     word = "certify" if material.archive.fresh is not None else "reevaluate"
     text = "Which of these are faults, terrains that another controller crosses, is not known yet. Next:"
-    return absent(text, plain_command(word, robot=material.robot.spec, run=material.run))
+    return absent(text, without_machine(command_line(word, robot=material.robot.spec, run=material.run)))
 
 
 def _faults_at_a_glance(archive: Archive) -> list[tuple[str, str]]:
@@ -149,7 +149,7 @@ def curves_section(shown: Shown) -> list[Block]:
     rows, archive = shown.material.metrics, shown.material.archive
     if not rows:
         left_out = "The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:"
-        return [absent(left_out, plain_command("archive", robot=shown.material.robot.spec))]
+        return [absent(left_out, without_machine(command_line("archive", robot=shown.material.robot.spec)))]
     first, last = rows[0], rows[-1]
     half = next(row["iteration"] for row in rows if row["elites"] >= last["elites"] / 2)
     text = (
@@ -211,7 +211,7 @@ def _pairs(shown: Shown) -> list[Block]:
     elites = shown.elites
     if len(elites) < 3:
         too_few = f"The projections are left out: they need 3 elites, and there are {len(elites)}."
-        longer = plain_command("archive", resume=shown.material.run, iterations="N")
+        longer = without_machine(command_line("archive", resume=shown.material.run, iterations="N"))
         return [absent(f"{too_few} A longer search finds more:", longer)]
     text = (
         f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode; grey ones do not fail."
@@ -242,7 +242,7 @@ def origin_section(shown: Shown) -> list[Block]:
     origin = shown.material.origin
     if not origin:
         lost = "The search is not on record: there is no config.json beside the archive. A search writes one:"
-        return [absent(lost, plain_command("archive", robot=shown.material.robot.spec))]
+        return [absent(lost, without_machine(command_line("archive", robot=shown.material.robot.spec)))]
     rows = origin_table(origin)
     again = shown.material.reproduced_by
     rows += [[f"fresh episodes: {name}", str(again[name])] for name in _AGAIN if name in again]
