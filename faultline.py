@@ -17,10 +17,8 @@ class Command(NamedTuple):
 COMMANDS: dict[str, dict[str, Command]] = {
     "Find what breaks a controller": {
         "archive": Command("qd.commands:Archive", "search the terrains on which a controller fails"),
-        "reevaluate": Command("qd.fresh:Reevaluate", "cross every elite of an archive again in fresh episodes"),
-        "confirm": Command("qd.run.judge:Confirm", "cross the failing elites again with contact resolved"),
-        "certify": Command("qd.run.judge:Certify", "which failing elites other controllers cross: faults"),
-        "minimise": Command("qd.run.minimise:Minimise", "which parts of a failing terrain it takes to fail"),
+        "judge": Command("qd.commands:Judge", "which elites of an archive are faults of its controller"),
+        "minimise": Command("qd.commands:Minimise", "which parts of a failing terrain it takes to fail"),
         "pack": Command("qd.commands:MakePack", "faults of a run as a pack to test any controller on"),
         "evaluate": Command("qd.commands:Evaluate", "rates of controllers, or the paper's tables"),
         "dose": Command("qd.commands:Dose", "which real obstacle at which size stops a controller"),
@@ -41,7 +39,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
     },
     "Bring a robot": {
         "stand": Command("sim.commands:Stand", "look at a robot: its joints and geoms, whether it stands"),
-        "calibrate": Command("qd.studies.calibrate:Calibrate", "measure the penalty scales of a robot"),
+        "calibrate": Command("qd.commands:Calibrate", "measure the penalty scales of a robot"),
     },
 }
 """What can be done, by what it is for."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from qd.run.settings import PRESETS, SchedulerCfg, preset_of
-from sim.files.command import OfRobot, OnGround, Where, Who, peek
+from sim.files.command import InSpace, OfRobot, OnGround, Where, Who, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
@@ -78,8 +78,8 @@ class Archive(Who, OnGround, Where):
 
     def execute(self) -> None:
         """Searches, and judges what was found."""
+        from qd.judge import find_search, judge
         from qd.run.directory import free_path
-        from qd.run.judge import find_search, judge
         from qd.run.settings import preset
         from qd.search import search
         from qd.workers.evaluator import Compute
@@ -117,6 +117,133 @@ class Archive(Who, OnGround, Where):
             print(f"Preset small judges nothing: `faultline judge --run {path}` says which elites are faults.")
         else:
             judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judge(Who, InSpace, Where):
+    """Say which elites of a run are faults of its controller.
+
+    fresh: every elite is crossed in 40 fresh episodes, since an elite is the best of many noisy evaluations. It fails
+    if under half of the robots reach the goal. resolved: those that fail are crossed in 20 episodes with contact
+    resolved, 1 ms steps and a contact time constant of 3 ms. An elite that fails there too is confirmed. others: other
+    controllers cross those that fail, at the search's settings and with contact resolved. An elite is certified if one
+    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. mujoco_c: up to
+    100 of those that fail are crossed in plain MuJoCo C. Crossings are kept, so the same command goes on after Ctrl-C.
+    """
+
+    run: Path | None = None
+    """Run directory; the newest of the robot under runs/."""
+    stages: tuple[Literal["fresh", "resolved", "others", "mujoco_c"], ...] = ("fresh", "resolved", "others")
+    """What to do, in this order."""
+    certifiers: tuple[str, ...] = ()
+    """The other controllers, each NAME=FILE; if left out, results/<robot>/panel/*.pt and RUN/certifiers/*.pt."""
+    seed: NonNegativeInt | None = None
+    """Seed of the fresh episodes; the search's if left out."""
+
+    def execute(self) -> None:
+        """Judges the run."""
+        from qd.judge import judge
+        from qd.run.directory import find_run
+        from qd.workers.evaluator import Compute
+        from sim.policy.spec import controllers_of
+        from sim.robots.find import get_robot
+
+        robot = get_robot(self.robot)
+        judge(
+            find_run(robot, self.run, published="never"),
+            compute=Compute.resolve(self.device, self.workers, self.num_envs),
+            stages=self.stages,
+            certifiers=controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
+            robot=self.robot,
+            policy=self.policy,
+            space=self.space,
+            seed=self.seed,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Minimise(Who, InSpace, Where):
+    """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
+
+    Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
+    the robots reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes
+    check it. Then its heights are scaled down together as long as it still fails. That is the margin. The cause is the
+    part without which most robots arrive. Results are in minimal.json, minimal.npz and minimal.png of the run; those of
+    several calls add up. Crossings are kept, so the same command goes on after Ctrl-C.
+    """
+
+    run: Path | None = None
+    """Run directory; the newest of the robot under runs/."""
+    elite: str | None = None
+    """Numbers of failing elites: one, several as in --elite "0 3", or all that fail. If left out, 200 on a GPU and 3 on
+    the CPU: faults first, then confirmed and certified ones, then others that fail."""
+    how: Literal["exhaustive", "greedy"] | None = None
+    """exhaustive: robots cross all subsets, from the smallest on, until one fails. greedy: parts are taken away one at
+    a time as long as the rest fails. Where many parts are needed, that takes far fewer crossings. If left out,
+    exhaustive on a GPU, and greedy on the CPU and for terrains of more than 10 parts."""
+    judge: bool = False
+    """Cross the minimal terrains with contact resolved and by other controllers too, as `faultline judge` does."""
+    certifiers: tuple[str, ...] = ()
+    """The other controllers, each NAME=FILE; if left out, those that `faultline judge` takes."""
+
+    def execute(self) -> None:
+        """Finds the minimal terrains, and prints them."""
+        from qd.minimise import minimise
+        from qd.run.directory import find_run
+        from qd.workers.evaluator import Compute
+        from sim.policy.spec import controllers_of
+        from sim.robots.find import get_robot
+
+        robot = get_robot(self.robot)
+        minimise(
+            find_run(robot, self.run, published="never"),
+            compute=Compute.resolve(self.device, self.workers, self.num_envs),
+            elite=self.elite,
+            how=self.how,
+            judged=self.judge or bool(self.certifiers),
+            certifiers=controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
+            robot=self.robot,
+            policy=self.policy,
+            space=self.space,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrate(Who, OnGround, Where):
+    """Measure the penalty scales of a robot with a controller, on hard-random terrains.
+
+    It writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped. Every
+    search reads them there. Crossings are kept, so the same command goes on after Ctrl-C.
+    """
+
+    terrains: PositiveInt = 1_000
+    """Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal."""
+    most_terrains: PositiveInt = 5_000
+    """Largest number of terrains. With fewer failing episodes even then, all episodes give the scales."""
+    space: str = "super_gaussian"
+    """Terrain space that they are drawn from: super_gaussian, course, or file.py:CLASS."""
+    seed: NonNegativeInt = 0
+    """Draws terrains and starts."""
+    out: Path | None = None
+    """Where to write; sim/robots/<robot>.scales.json, or <name>.scales.json beside a settings file."""
+
+    def execute(self) -> None:
+        """Measures the scales."""
+        from qd.calibrate import calibrate
+        from qd.workers.evaluator import Compute
+        from sim.robots.find import get_robot
+        from sim.spaces.registry import load_space
+
+        calibrate(
+            get_robot(self.robot),
+            self.policy,
+            compute=Compute.resolve(self.device, self.workers, self.num_envs),
+            terrains=self.terrains,
+            most_terrains=self.most_terrains,
+            space=load_space(self.space, self.ground),
+            seed=self.seed,
+            out=self.out,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,44 +1,40 @@
-"""Minimal terrains: the fewest parts of a failing terrain on which the controller still fails.
+"""Minimal terrains: the fewest parts of a failing terrain on which the controller still fails, and which is the cause.
 
-A terrain has parts, such as bumps. It is taken apart by crossing some of its parts alone, 20 episodes each. What is
-crossed next follows from what was crossed before and from nothing else, so a search for minimal terrains that was
-stopped goes on from the counts alone (:class:`Case`).
+A terrain has parts, such as bumps. Robots cross some of its parts alone, 20 episodes each; a subset fails if under half
+of them reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes check
+it. Then its heights are scaled down together as long as it still fails.
 """
 
 import math
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from qd.archive import OUTCOMES, Archive, goal_rates
-from qd.faults import EPISODES, outcome_counts
+from qd.archive import Archive, goal_rates
+from qd.causes import effects_of
+from qd.faults import EPISODES, FRESH_EPISODES, fresh_counts
 from qd.fitness import FAILING_GOAL_RATE
-from qd.fresh import FRESH_EPISODES, Open, elite_seeds
-from qd.run.progress import share_bar
-from qd.workers.evaluator import EvaluatorCfg, pipeline_of
-from qd.workers.invalid import invalid_reasons, invalid_words
-
-if TYPE_CHECKING:
-    from sim.spaces.base import TerrainSpace
-
-How = Literal["exhaustive", "greedy"]
-Parts = tuple[int, ...]
-"""Numbers of some parts of a terrain, rising."""
+from qd.judge import Search, elite_seeds, outcome_counts
+from qd.workers.cross import Crossings
+from sim.spaces.base import TerrainSpace
 
 SCALE_STEPS = 5
 """Halvings of the interval that holds the least scale which still fails: it is known to 1/32."""
 MOST_PARTS = 10
 """Parts of a terrain whose subsets, 1,024 at most, are all crossed if need be."""
+LEAST_EFFECT_M = 1e-4
+"""A part that changes no height by more is none [m]."""
 
 _ROW_EPISODES = 5  # of a row of genes; the episodes of a trial are spread over workers by rows
 _STREAM, _FRESH_STREAM = 11, 12
-_LOT = {"cuda": 3200, "cpu": EPISODES // _ROW_EPISODES}  # rows of a worker between two saves
+
+How = Literal["exhaustive", "greedy"]
+Parts = tuple[int, ...]
+"""Numbers of some parts of a terrain, rising."""
 
 
 class Trial(NamedTuple):
@@ -52,24 +48,14 @@ class Trial(NamedTuple):
     """Whether by 40 episodes, with other seeds than the 20 by which a subset is found."""
 
     @property
-    def episodes(self) -> int:
-        """How many episodes it takes."""
-        return FRESH_EPISODES if self.fresh else EPISODES
-
-
-def goal_rate(counts: NDArray[np.int64]) -> float:
-    """Share of the valid episodes that reached the goal, of counts of shape (4,); NaN if too many are invalid."""
-    return float(goal_rates(counts))
-
-
-def fails(counts: NDArray[np.int64]) -> bool:
-    """Whether episodes, shape (4,), say that the controller fails; too many invalid ones say nothing."""
-    return goal_rate(counts) < FAILING_GOAL_RATE
+    def rows(self) -> int:
+        """Rows of genes that its episodes take."""
+        return (FRESH_EPISODES if self.fresh else EPISODES) // _ROW_EPISODES
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A failing terrain that is taken apart."""
+    """A failing terrain that is taken apart; episodes are counted by :data:`qd.archive.OUTCOMES`, shape (4,)."""
 
     parts: Parts
     """Parts that shape its ground, in the order in which they are taken away."""
@@ -80,54 +66,25 @@ class Case:
     flat: Parts = ()
     """Parts that change no height, such as slippery patches. Where they alone are left, nothing is scaled."""
     counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)
-    """Episodes by :data:`qd.archive.OUTCOMES`, shape (4,), of what was crossed. The fresh episodes of all parts
-    together, which are those of the elite, are there from the beginning."""
+    """Episodes of what was crossed; those of all parts together, the elite's fresh ones, are there from the start."""
 
     @property
     def whole(self) -> Parts:
         """All its parts."""
         return tuple(sorted(self.parts))
 
-    def fails(self, parts: Parts) -> bool | None:
-        """Whether a subset fails: by its fresh episodes if it has them, else by its 20; None if it was not crossed."""
-        for trial in (Trial(parts, fresh=True), Trial(parts)):
-            if trial in self.counts:
-                return fails(self.counts[trial])
-        return None
+    def goal_rate(self, trial: Trial) -> float:
+        """Share of the valid episodes that reached the goal; NaN if too many are invalid."""
+        return float(goal_rates(self.counts[trial]))
 
-    def scales(self, parts: Parts) -> bool:
-        """Whether scaling changes what is left of its terrain."""
-        return self.scalable and not set(parts) <= set(self.flat)
+    def fails(self, trial: Trial) -> bool:
+        """Whether the controller fails it; too many invalid episodes say nothing."""
+        return self.goal_rate(trial) < FAILING_GOAL_RATE
 
-    def wanted(self) -> list[Trial]:
-        """What is to be crossed next; nothing when the minimal terrain and its least scale are known."""
-        wanted, minimum = _exhaustive(self) if self.how == "exhaustive" else _greedy(self)
-        return wanted if minimum is None else _scaling(self, minimum)[0]
-
-    def minimal(self) -> "Minimal | None":
-        """The minimal terrain; None as long as something is to be crossed."""
-        if self.wanted():
-            return None
-        _, parts = _exhaustive(self) if self.how == "exhaustive" else _greedy(self)
-        assert parts is not None
-        _, scale, passing = _scaling(self, parts)
-        removed = {part: tuple(other for other in parts if other != part) for part in parts}
-        return Minimal(
-            parts=parts,
-            counts=self.counts[Trial(parts, fresh=True)],
-            without={part: self._best_known(rest) for part, rest in removed.items()},
-            scale=scale if self.scales(parts) else None,
-            passing_scale=passing,
-            scales={
-                trial.scale: counts
-                for trial, counts in self.counts.items()
-                if trial.scale != 1.0 and trial.parts == parts
-            },
-            subsets=len({trial.parts for trial in self.counts if trial.scale == 1.0 and trial.parts != self.whole}),
-        )
-
-    def _best_known(self, parts: Parts) -> NDArray[np.int64]:
-        return self.counts.get(Trial(parts, fresh=True), self.counts[Trial(parts)])
+    def known_best(self, parts: Parts) -> Trial:
+        """The fresh episodes of some parts if they were crossed, else the 20."""
+        fresh = Trial(parts, fresh=True)
+        return fresh if fresh in self.counts else Trial(parts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,168 +112,162 @@ class Minimal:
         Args:
             rank: Of parts without which equally many do, the one of the largest number here is meant.
         """
-        rates = {part: goal_rate(counts) for part, counts in self.without.items()}
+        rates = {part: float(goal_rates(counts)) for part, counts in self.without.items()}
         return max(rates, key=lambda part: (np.nan_to_num(rates[part], nan=-1.0), rank[part]), default=None)
 
 
-def _exhaustive(case: Case) -> tuple[list[Trial], Parts | None]:
-    """What to cross next, or the smallest subset that fails: fewest parts, then lowest goal rate."""
-    whole = case.whole
-    for size in range(len(whole)):
-        trials = [Trial(parts) for parts in combinations(whole, size)]
-        missing = [trial for trial in trials if trial not in case.counts]
-        if missing:
-            return missing, None
-        candidates = [trial for trial in trials if fails(case.counts[trial])]
-        for trial in sorted(candidates, key=lambda trial: (goal_rate(case.counts[trial]), trial.parts)):
-            again = trial._replace(fresh=True)
-            if again not in case.counts:
-                return [again], None
-            if fails(case.counts[again]):
-                return [], trial.parts
-    return [], whole
+Steps = Generator[list[Trial], None, Any]
+"""Yields trials to be crossed, whose episodes are in the counts of the case when it goes on."""
 
 
-def _greedy(case: Case) -> tuple[list[Trial], Parts | None]:
-    """What to cross next, or a subset that fails, of which no part can be taken away."""
-    kept, place, in_need = case.whole, 0, 0
-    while in_need < len(kept):  # each part is needed since one was taken away the last time
-        part, place = case.parts[place % len(case.parts)], place + 1
-        if part not in kept:
-            continue
-        rest = tuple(other for other in kept if other != part)
-        rest_fails = case.fails(rest)
-        if rest_fails is None:
-            return [Trial(rest)], None
-        kept, in_need = (rest, 0) if rest_fails else (kept, in_need + 1)
-    again = Trial(kept, fresh=True)
-    return ([], kept) if again in case.counts else ([again], None)
+def find_minimal(case: Case) -> Steps:
+    """Finds the minimal terrain of a case; the generator returns a :class:`Minimal`."""
+    parts = yield from _exhaustive(case) if case.how == "exhaustive" else _greedy(case)
+    scalable = case.scalable and not set(parts) <= set(case.flat)
+    scale, passing = (yield from _scaled(case, parts)) if scalable else (None, None)
+    others = {part: tuple(other for other in parts if other != part) for part in parts}
+    trials = [trial for trial in case.counts if trial.scale != 1.0 and trial.parts == parts]
+    return Minimal(
+        parts=parts,
+        counts=case.counts[Trial(parts, fresh=True)],
+        without={part: case.counts[case.known_best(rest)] for part, rest in others.items()},
+        scale=scale,
+        passing_scale=passing,
+        scales={trial.scale: case.counts[trial] for trial in trials},
+        subsets=len({trial.parts for trial in case.counts if trial.scale == 1.0 and trial.parts != case.whole}),
+    )
 
 
-def _scaling(case: Case, parts: Parts) -> tuple[list[Trial], float, float | None]:
-    """What to cross next, the least scale that is known to fail, and the largest below it that is known not to."""
+def _missing(case: Case, *trials: Trial) -> Steps:
+    missing = [trial for trial in trials if trial not in case.counts]
+    if missing:
+        yield missing
+
+
+def _exhaustive(case: Case) -> Steps:
+    """The smallest subset that fails: fewest parts, then lowest goal rate."""
+    for size in range(len(case.whole)):
+        trials = [Trial(parts) for parts in combinations(case.whole, size)]
+        yield from _missing(case, *trials)
+        failing = [trial for trial in trials if case.fails(trial)]
+        for trial in sorted(failing, key=lambda trial: (case.goal_rate(trial), trial.parts)):
+            fresh = trial._replace(fresh=True)
+            yield from _missing(case, fresh)
+            if case.fails(fresh):
+                return trial.parts
+    return case.whole
+
+
+def _greedy(case: Case) -> Steps:
+    """A subset that fails, of which no part can be taken away."""
+    while True:
+        parts, place, needed = case.whole, 0, 0
+        while needed < len(parts):  # each part is needed since one was taken away the last time
+            part, place = case.parts[place % len(case.parts)], place + 1
+            if part not in parts:
+                continue
+            rest = tuple(other for other in parts if other != part)
+            yield from _missing(case, case.known_best(rest))
+            parts, needed = (rest, 0) if case.fails(case.known_best(rest)) else (parts, needed + 1)
+        fresh = Trial(parts, fresh=True)
+        yield from _missing(case, fresh)
+        if case.fails(fresh) or parts == case.whole:
+            return parts
+
+
+def _scaled(case: Case, parts: Parts) -> Steps:
+    """The least scale that is known to fail, and the largest below it that is known not to, None if none is."""
     passing, failing = 0.0, 1.0
-    for _ in range(SCALE_STEPS if case.scales(parts) else 0):
+    for _ in range(SCALE_STEPS):
         trial = Trial(parts, scale=(passing + failing) / 2)
-        if trial not in case.counts:
-            return [trial], failing, passing or None
-        if fails(case.counts[trial]):
-            failing = trial.scale
-        else:
-            passing = trial.scale
-    return [], failing, passing or None
+        yield from _missing(case, trial)
+        passing, failing = (passing, trial.scale) if case.fails(trial) else (trial.scale, failing)
+    return failing, passing or None
 
 
-def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:
-    """The fresh episodes of an elite by :data:`qd.archive.OUTCOMES`, shape (4,)."""
-    fresh = archive.fresh
-    assert fresh is not None
-    valid = int(fresh.episodes[number] - fresh.invalid_episodes[number])
-    goal, collided = (round(float(rate[number]) * valid) for rate in (fresh.goal_rate, fresh.collision_rate))
-    counts = {"goal": goal, "base_collision": collided, "other": valid - goal - collided}
-    return np.array([counts.get(name, int(fresh.invalid_episodes[number])) for name in OUTCOMES])
-
-
-def genes_of(archive: Archive, number: int, case: Case, trial: Trial, space: "TerrainSpace") -> NDArray[np.float32]:
-    """Genes of what is left of an elite's terrain, shape (num_genes,)."""
-    count = len(space.parts(archive.genes[number]))
-    genes = space.without(archive.genes[number][None], [part for part in range(count) if part not in trial.parts])
-    scaled = space.scaled(genes, trial.scale) if trial.scale != 1.0 else genes
-    assert scaled is not None and set(trial.parts) <= set(case.parts)
+def genes_of(genes: NDArray[np.float32], trial: Trial, space: TerrainSpace) -> NDArray[np.float32]:
+    """Genes of what is left of a terrain, shape (num_genes,)."""
+    gone = [part for part in range(len(space.parts(genes))) if part not in trial.parts]
+    left = space.without(genes[None], gone)
+    scaled = space.scaled(left, trial.scale) if trial.scale != 1.0 else left
+    assert scaled is not None
     return scaled[0]
 
 
-def minimise(
-    archive: Archive,
-    cases: Mapping[int, Case],
-    space: "TerrainSpace",
-    *,
-    evaluator: EvaluatorCfg,
-    open_evaluator: Open,
-    seed: int,
-    save: Callable[[], object],
-) -> None:
-    """Crosses what is wanted of some cases, all of them together, until nothing is.
+def case_of(
+    archive: Archive, number: int, space: TerrainSpace, half_width: float, how: How | None, *, on_gpu: bool
+) -> Case:
+    """An elite that is to be taken apart.
+
+    Args:
+        archive: With fresh values.
+        number: Of the elite, which fails.
+        space: Of the genes.
+        half_width: Half the width of the robot's stance [m].
+        how: As of :class:`Case`; what suits the device if None.
+        on_gpu: Whether robots cross on a GPU.
+    """
+    genes = archive.genes[number]
+    count = len(space.parts(genes))
+    if not count:
+        raise ValueError(f"space must have parts(genes) and without(genes, parts), got {space.name} without parts")
+    effects = effects_of(genes, range(count), space)
+    parts = np.flatnonzero(effects.changes(LEAST_EFFECT_M)).tolist()
+    if how == "exhaustive" and len(parts) > MOST_PARTS:
+        raise ValueError(f"how must be greedy with over {MOST_PARTS} parts, got {len(parts)} of elite {number}")
+    return Case(
+        parts=tuple(sorted(parts, key=lambda part: (*effects.way(part, half_width), part))),
+        how=how or ("exhaustive" if on_gpu and len(parts) <= MOST_PARTS else "greedy"),
+        scalable=space.scaled(genes[None], 0.5) is not None,
+        flat=tuple(part for part in parts if np.abs(effects.heights[part]).max() <= LEAST_EFFECT_M),
+        counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
+    )
+
+
+def take_apart(
+    archive: Archive, cases: Mapping[int, Case], space: TerrainSpace, search: Search, crossings: Crossings
+) -> dict[int, Minimal]:
+    """Finds the minimal terrains of some elites, all of them together.
 
     All subsets of an elite are crossed from the same starts; the fresh episodes have others. Starts follow from the
-    seed and from what names the elite.
+    search's seed and from what names the elite.
 
     Args:
         archive: The elites.
         cases: By number of the elite; their counts grow.
         space: Of the genes.
-        evaluator: Controller, robot and device; how many terrains at once follows from the device.
-        open_evaluator: Opens what crosses terrains.
-        seed: The search's.
-        save: Called after each lot.
+        search: Its controller crosses them.
+        crossings: What crosses terrains.
+
+    Returns:
+        By number of the elite, rising.
     """
-    wanted = _wanted(cases)
-    if not wanted:
-        return
-    rows = sum(trial.episodes for _, trial in wanted) // _ROW_EPISODES
-    if any(case.how == "exhaustive" for case in cases.values()):  # later sizes have more subsets
-        subsets = sum(math.comb(len(case.parts), len(case.parts) // 2) for case in cases.values())
-        rows = max(rows, subsets * EPISODES // _ROW_EPISODES)
-    cfg = replace(evaluator, num_terrains=rows, num_replicas=_ROW_EPISODES, lots=1)
-    lot = min(rows, _LOT[cfg.device.partition(":")[0]] * cfg.num_workers)
-    cfg = replace(cfg, num_terrains=min(rows, 2 * lot))
-    seeds = _Seeds(archive, seed)
-    with open_evaluator(cfg) as evaluate:
-        pipeline = pipeline_of(evaluate)
-        while wanted:
-            own = [_rows_of(archive, number, cases[number], trial, space) for number, trial in wanted]
-            starts = np.concatenate([seeds.of(number, trial) for number, trial in wanted])
-            whose = np.repeat(np.arange(len(wanted)), [len(genes) for genes in own])
-            counts, reasons = np.zeros((len(wanted), len(OUTCOMES)), np.int64), dict[str, int]()
-            with share_bar(_words(wanted, cases)) as progress:
-                for part, result in pipeline.in_lots(np.concatenate(own), starts, lot, progress):
-                    np.add.at(counts, whose[part], outcome_counts(result))
-                    for reason, count in invalid_reasons(result).items():
-                        reasons[reason] = reasons.get(reason, 0) + count
-                    for (number, trial), crossed in zip(wanted, counts, strict=True):
-                        if crossed.sum() == trial.episodes:
-                            cases[number].counts[trial] = crossed.copy()
-                    save()
-            told = invalid_words(dict(sorted(reasons.items(), key=lambda one: -one[1])), int(counts.sum()))
-            if told is not None:
-                tqdm.write(told, file=sys.stderr)
-            wanted = _wanted(cases)
-
-
-def _wanted(cases: Mapping[int, Case]) -> list[tuple[int, Trial]]:
-    return [(number, trial) for number, case in sorted(cases.items()) for trial in case.wanted()]
-
-
-def _rows_of(archive: Archive, number: int, case: Case, trial: Trial, space: "TerrainSpace") -> NDArray[np.float32]:
-    """Genes of a trial, a row for every few of its episodes."""
-    return np.repeat(genes_of(archive, number, case, trial, space)[None], trial.episodes // _ROW_EPISODES, axis=0)
-
-
-class _Seeds:
-    """Seeds of the rows of trials, which follow from the elite alone."""
-
-    def __init__(self, archive: Archive, seed: int) -> None:
-        self._seeds = {
-            fresh: elite_seeds(archive, seed, episodes // _ROW_EPISODES, stream=stream).reshape(len(archive), -1)
-            for fresh, episodes, stream in ((False, EPISODES, _STREAM), (True, FRESH_EPISODES, _FRESH_STREAM))
-        }
-
-    def of(self, number: int, trial: Trial) -> NDArray[np.uint32]:
-        return self._seeds[trial.fresh][number]
-
-
-def _words(wanted: list[tuple[int, Trial]], cases: Mapping[int, Case]) -> str:
-    """What is crossed, for a bar."""
-    done = len(cases) - len({number for number, _ in wanted})
-    what = sorted(set(_kinds(wanted)))
-    return f"{done} of {len(cases)} elites done; crossing {len(wanted)} of {', '.join(what)}"
-
-
-def _kinds(wanted: list[tuple[int, Trial]]) -> Iterator[str]:
-    for _, trial in wanted:
-        if trial.fresh:
-            yield "40 fresh episodes"
-        elif trial.scale != 1.0:
-            yield "scaled heights"
-        else:
-            yield f"{len(trial.parts)} part{'s' * (len(trial.parts) != 1)}"
+    seeds = {
+        fresh: elite_seeds(archive, search.cfg.seed, Trial((), fresh=fresh).rows, stream=stream).reshape(
+            len(archive), -1
+        )
+        for fresh, stream in ((False, _STREAM), (True, _FRESH_STREAM))
+    }
+    subsets = [math.comb(len(case.parts), len(case.parts) // 2) for case in cases.values() if case.how == "exhaustive"]
+    most_rows = max(len(cases) * Trial((), fresh=True).rows, sum(subsets) * Trial(()).rows)
+    steps = {number: find_minimal(case) for number, case in sorted(cases.items())}
+    minima = dict[int, Minimal]()
+    while True:
+        wanted = list[tuple[int, Trial]]()
+        for number, step in list(steps.items()):
+            try:
+                wanted += [(number, trial) for trial in next(step)]
+            except StopIteration as end:
+                minima[number] = end.value
+                del steps[number]
+        if not wanted:
+            return dict(sorted(minima.items()))
+        rows = [np.repeat(genes_of(archive.genes[n], trial, space)[None], trial.rows, axis=0) for n, trial in wanted]
+        result = crossings.cross(
+            search.policy, np.concatenate(rows), np.concatenate([seeds[trial.fresh][n] for n, trial in wanted]),
+            replicas=_ROW_EPISODES, space=search.space, at_most=most_rows, invalid_ok=True,
+            label=f"{len(minima)} of {len(cases)} elites done",
+        )  # fmt: skip
+        ends = np.cumsum([trial.rows for _, trial in wanted])
+        for (number, trial), counts in zip(wanted, np.split(outcome_counts(result), ends[:-1]), strict=True):
+            cases[number].counts[trial] = counts.sum(axis=0)

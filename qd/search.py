@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
+from qd.faults import fresh_numbers
 from qd.fitness import Evaluation, concatenated, evaluation_of
-from qd.fresh import drawn_elites, numbers_of, reevaluate
+from qd.judge import drawn_elites, fresh_values
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.run.progress import ProgressBar, clock, plan
 from qd.run.settings import SearchCfg
@@ -192,8 +193,8 @@ def metrics_row(
 def _sample_elites(cfg: SearchCfg, archive: Archive, evaluate: Evaluate) -> dict[str, Any]:
     """How reliable some elites of this iteration are, in fresh episodes (the paper's mean STD over iterations)."""
     sample = drawn_elites(archive, MOST_DRAWN, cfg.seed)
-    fresh = reevaluate([sample], evaluate, cfg.fitness, num_replicas=cfg.replicas, seeds=[cfg.seed])[0]
-    return numbers_of(fresh, cfg.cells, sampled=True)
+    fresh = fresh_values(sample, evaluate, cfg.fitness, num_replicas=cfg.replicas, seed=cfg.seed)
+    return fresh_numbers(sample, fresh, sampled=True)
 
 
 def _evaluator_cfg(cfg: SearchCfg, robot: RobotCfg, policy: str, compute: Compute) -> EvaluatorCfg:

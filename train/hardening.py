@@ -6,7 +6,7 @@ were kept: that is written there, and decided again from the crossings if it is 
 """
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -15,13 +15,12 @@ from typing import Any
 from qd.archive import Archive, read_archive
 from qd.evaluate.evaluate import EPISODES, sizes_for
 from qd.evaluate.sets import paper_terrains
-from qd.faults import is_judged
-from qd.fresh import Open, Reevaluate, reevaluate_run
+from qd.judge import Stage as Judging
+from qd.judge import judge, panel_of
 from qd.run.directory import ROUNDS_FILE, RunDirectory, claimed
-from qd.run.judge import Certify, Confirm, certify_run, confirm_run, panel_of
 from qd.run.settings import SearchCfg, differences, preset
 from qd.search import search
-from qd.workers.evaluator import Compute, check_policy, open_evaluator, resolve_device
+from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, resolve_device
 from sim.files.atomic import is_leftover, read_json
 from sim.files.command import Interrupted, command_line, naming_what_is_next
 from sim.files.records import identity
@@ -117,7 +116,7 @@ class Hardening:
     """What makes it what it is, as JSON values."""
     compared: dict[str, int]
     """What the rounds are compared with, and of how many trainings each comparison is."""
-    open_evaluator: Open
+    open_evaluator: OpenEvaluator
 
     @property
     def stages(self) -> list[Stage]:
@@ -182,7 +181,7 @@ class Hardening:
             ValueError: If nobody is left.
         """
         if not self.flags.by:
-            return panel_of(self.robot, lambda file: is_same(file, policy))
+            return {name: file for name, file in panel_of(self.robot).items() if not is_same(file, policy)}
         named = controllers_of(self.flags.by, self.robot, flag="by")
         found = {name: file for name, file in named.items() if not is_same(file, policy)}
         if not found:
@@ -193,12 +192,12 @@ class Hardening:
         """Whether the search against a controller is over, its fresh episodes included."""
         run = RunDirectory(stage.search)
         archive = judged_archive(run)
-        whole = run.read_summary().get("reproduced_by")  # a kill may come between the archive and its numbers
+        whole = run.read_summary().get("judged_by")  # a kill may come between the archive and its numbers
         return archive is not None and archive.iterations >= self.search_iterations and bool(whole)
 
     def is_judged(self, stage: Stage) -> bool:
         """Whether its faults are counted too."""
-        return self.is_searched(stage) and is_judged(read_archive(stage.search), self.certifiers(stage.policy))
+        return self.is_searched(stage) and "others" in RunDirectory(stage.search).read_summary()["judged_by"]
 
     def is_tuned(self, tune: Tune) -> bool:
         """Whether a training is over."""
@@ -221,7 +220,7 @@ class Hardening:
         return command_line("harden", **{**kept, "run_dir": self.path})
 
 
-def hardening_of(flags: Harden, *, open_evaluator: Open = open_evaluator) -> Hardening:
+def hardening_of(flags: Harden, *, open_evaluator: OpenEvaluator = open_evaluator) -> Hardening:
     """What a command line asks for, checked.
 
     Raises:
@@ -360,7 +359,7 @@ def _refuse_changed(job: Hardening, stage: Stage) -> None:
         )
 
 
-def harden(flags: Harden, *, open_evaluator: Open = open_evaluator) -> int:
+def harden(flags: Harden, *, open_evaluator: OpenEvaluator = open_evaluator) -> int:
     """Runs what is left of a hardening; returns the exit status 0, also where the time is up.
 
     Args:
@@ -457,8 +456,7 @@ def _search(job: Hardening, stage: Stage) -> None:
     )
     compute = Compute(job.device, job.flags.workers, job.flags.num_envs)
     search(cfg, stage.search, compute, robot=job.robot, policy=stage.policy, open_evaluator=job.open_evaluator)
-    again = Reevaluate(**_where(job), run=stage.search, policy=_named(job, stage))
-    reevaluate_run(again, open_evaluator=job.open_evaluator)
+    _judge(job, stage, ("fresh",))
 
 
 def judged_archive(run: RunDirectory) -> Archive | None:
@@ -477,12 +475,13 @@ def search_cfg(flags: Harden, robot: RobotCfg, policy: str | None, space: Terrai
     return replace(cfg, replicas=flags.replicas or cfg.replicas, scheduler=replace(cfg.scheduler, **sizes))
 
 
-def _judge(job: Hardening, stage: Stage) -> None:
+def _judge(job: Hardening, stage: Stage, stages: Sequence[Judging] = ("resolved", "others")) -> None:
     """Counts the faults of a controller among the elites of its search."""
-    who = tuple(f"{name}={file}" for name, file in job.certifiers(stage.policy).items())
-    confirm = Confirm(**_where(job), run=stage.search, policy=_named(job, stage))
-    confirm_run(confirm, open_evaluator=job.open_evaluator)
-    certify_run(Certify(**_where(job), run=stage.search, by=who), open_evaluator=job.open_evaluator)
+    judge(
+        stage.search, compute=Compute(job.device, job.flags.workers, job.flags.num_envs), stages=stages,
+        certifiers=job.certifiers(stage.policy), robot=job.robot.spec, policy=_named(job, stage), space=job.flags.space,
+        open_evaluator=job.open_evaluator,
+    )  # fmt: skip
 
 
 def _where(job: Hardening) -> dict[str, Any]:

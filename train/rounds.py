@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from qd.archive import read_archive
 from qd.evaluate.evaluate import evaluate
 from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets
-from qd.faults import fault_numbers
+from qd.faults import count_faults, fault_numbers
 from qd.run.directory import ROUNDS_FILE, RunDirectory, read_archive_of
 from qd.workers.evaluator import origin_of
 from sim.files.atomic import has_shape, read_json, to_json, write_atomically
@@ -98,7 +98,9 @@ def record(job: "Hardening") -> None:
 def _row(job: "Hardening", stage: "Stage") -> dict[str, Any]:
     """What the search against a controller found."""
     # The faults by the archive: a kill may come between it and its numbers.
-    known = RunDirectory(stage.search).read_summary() | fault_numbers(read_archive(stage.search))
+    archive = read_archive(stage.search)
+    known = RunDirectory(stage.search).read_summary() | fault_numbers(archive)
+    known |= {"panel": known["certifiers"], "faults": count_faults(archive)}
     counts = {name: known.get(name) for name in _COUNTS}
     who = {name: value for name, value in identity(job.robot, stage.policy).items() if name.startswith("policy")}
     return {

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, FaultCounts, read_archive
+from qd.archive import Archive, FaultCounts
 from qd.evaluate.evaluate import cross_sets, crossings_folder
 from qd.evaluate.pack import (
     HEIGHT_UNIT_M,
@@ -29,13 +29,12 @@ from qd.evaluate.pack import (
     rows_of,
 )
 from qd.evaluate.show import show_pack
-from qd.faults import EPISODES, judgement, rate_of
+from qd.faults import EPISODES, fresh_counts, judgement, rate_of
 from qd.fitness import FAILING_GOAL_RATE
 from qd.groups import Modes, elites_of, families_of, find_modes, verdict_of
-from qd.minimal import fresh_counts
-from qd.run.directory import RESULTS, RUNS, RunDirectory
-from qd.run.minimise import minimal_of_run
-from qd.run.settings import as_settings, own_policy
+from qd.judge import find_search
+from qd.minimise import read_minimal
+from qd.run.directory import RESULTS, RUNS
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
 from sim.bank import heights_of
 from sim.files.atomic import prepare_output, write_atomically
@@ -43,9 +42,8 @@ from sim.files.command import publish
 from sim.files.npz import npz_bytes
 from sim.files.records import identity
 from sim.policy.spec import about_controllers, is_same
-from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
-from sim.spaces.registry import get_space, load_space
+from sim.spaces.registry import get_space
 
 NEAR_GOAL_RATE = 0.75
 """Goal rate of the searched controller from which on a terrain is no near-fault."""
@@ -94,20 +92,16 @@ def make_pack(
     Returns:
         The content of ``pack.json``.
     """
-    cfg = RunDirectory(run).read_cfg()
-    if space is not None:
-        load_space(space)  # one of a user's own, which the run's name then finds
+    search = find_search(run, robot=robot, policy=policy, space=space)
+    cfg, body, searched, archive = search.cfg, search.robot, search.policy, search.read_archive()
     drawn_in = get_space(cfg.space, cfg.space_sha256)
-    body = robot_of(as_settings(cfg), robot, run)
-    searched = policy or own_policy(run, cfg, body)
     controllers = {**(controllers or _published_controllers(body))}
     if not any(is_same(searched, crosser) for crosser in controllers.values()):
         controllers = {"searched": searched, **controllers}
     for crosser in controllers.values():
         check_policy(crosser, body, compute.device)
-    archive = read_archive(run)
     _check_judged(archive, run)
-    candidates, modes, not_passable = candidates_of(archive, run, body)
+    candidates, modes, not_passable = candidates_of(archive, run)
     chosen = choose(candidates, size)
     if not chosen:
         raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
@@ -181,13 +175,12 @@ def _check_judged(archive: Archive, run: Path) -> None:
         )
 
 
-def candidates_of(archive: Archive, run: Path, robot: RobotCfg) -> tuple[list[Candidate], Modes, int]:
+def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], Modes, int]:
     """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
 
     Args:
         archive: With fresh values and fault counts.
         run: Its directory, where minimal terrains are read.
-        robot: Its robot.
 
     Returns:
         The terrains, the failure modes of the elites among them, and how many failing elites and minimal terrains are
@@ -203,20 +196,20 @@ def candidates_of(archive: Archive, run: Path, robot: RobotCfg) -> tuple[list[Ca
         number: {"mode": mode, "family": family}
         for number, mode, family in zip(near.tolist(), modes.labels.tolist(), families.tolist(), strict=True)
     }
-    numbers, judged = minimal_of_run(run, archive, robot)
-    entries = {entry["elite"]: entry for entry in numbers["elites"]}
+    minima = read_minimal(run, archive)
+    entries = {} if minima is None else {entry["elite"]: entry for entry in minima.numbers["elites"]}
     candidates, not_passable = [], 0
     for number in near.tolist():
         if passable[number]:
             about = _about_elite(archive, number, entries.get(number))
             candidates.append(Candidate(archive.genes[number], about | kin[number]))
         not_passable += not passable[number]
-    for place, entry in enumerate(numbers["elites"]):
-        if len(entry["bumps"]) == entry["of"]:
-            continue  # the elite itself
-        if judged.certified[place]:
-            candidates.append(Candidate(judged.genes[place], _about_minimal(entry) | kin[entry["elite"]]))
-        not_passable += not judged.certified[place]
+    for number, entry in entries.items():
+        if minima is None or not archive.failing[number] or len(entry["bumps"]) == entry["of"]:
+            continue  # with all its parts it is the elite itself
+        if entry["certificates"]:
+            candidates.append(Candidate(minima.genes[number], _about_minimal(entry) | kin[number]))
+        not_passable += not entry["certificates"]
     return candidates, modes, int(not_passable)
 
 

@@ -12,7 +12,7 @@ from sim.files.command import chosen_elites, command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, label_suffix, spec_of
 
 if TYPE_CHECKING:
-    from qd.show.minima import MinimalFound
+    from qd.minimise import MinimalFound
     from sim.robots.robot import RobotCfg
     from sim.spaces.base import TerrainSpace
 
@@ -113,12 +113,12 @@ class Found:
             FileNotFoundError: If there are none.
             ValueError: If their file is damaged.
         """
-        from qd.show.minima import read_minimal_numbers
+        from qd.minimise import read_minimal
 
-        found = read_minimal_numbers(self.folder, self.archive)
+        found = read_minimal(self.folder, self.archive)
         if found is None:
-            word = "reevaluate" if self.archive.fresh is None else "minimise"
-            first = " first, then `faultline minimise`" if word == "reevaluate" else ""
+            word = "judge" if self.archive.fresh is None else "minimise"
+            first = " first, then `faultline minimise`" if word == "judge" else ""
             again = command_line(word, robot=self.robot.spec, run=self.run)
             raise FileNotFoundError(f"{self.run} has no minimal terrains of its elites: `{again}`{first} makes them")
         return found

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from qd.archive import Archive
-from qd.faults import fault_numbers
-from qd.fresh import FRESH_EPISODES, numbers_of
+from qd.faults import FRESH_EPISODES, fault_numbers, fresh_numbers
 from qd.groups import Mode
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, bar_lengths, new_figure
@@ -246,7 +245,8 @@ def draw_spread(archive: Archive) -> "Figure":
 
 
 _CORRECTED = (
-    "reevaluated", "corrected_qd_score", "corrected_coverage", "corrected_elites", "corrected_mean_fitness",
+    "elites_same_cell", "elites_reproduced", "reevaluated", "corrected_qd_score", "corrected_coverage",
+    "corrected_elites", "mean_fitness_corrected",
     "mean_std", "mean_std_interval",
 )  # fmt: skip
 
@@ -265,7 +265,7 @@ def summary(
     Returns:
         As JSON values; what fresh episodes say is None if nobody looked.
     """
-    corrected = {} if archive.fresh is None else numbers_of(archive.fresh, archive.cells)
+    corrected = {} if archive.fresh is None else fresh_numbers(archive, archive.fresh)
     with_collision = int(archive.collided.sum())
     return {
         **origin,
@@ -276,7 +276,6 @@ def summary(
         "terrains_evaluated": sum(row["terrains"] for row in metrics),
         "episodes": sum(row["episodes"] for row in metrics),
         "elites": len(archive),
-        "elites_reproduced": corrected.get("reproduced"),
         "reachable_cells": archive.cells.num_cells,
         "reachable_coverage": archive.reachable_coverage,
         "qd_score": archive.qd_score,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from qd.show.minima import MinimalFound
+    from qd.minimise import MinimalFound
     from sim.recording.recorder import Recording
 
 
@@ -37,8 +37,6 @@ class ReplayElite(Who, OnDevice, Which):
     """Episodes to run."""
     seed: int = 0
     """Seed of the fresh episodes."""
-    certificate: str | None = None
-    """Name of a certifier: show its crossing of the elite that `faultline certify --record` kept, and cross nothing."""
     out: Path | None = None
     """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published; with
     another controller or certifier elite-<number>-<its name>.png. Of a minimal terrain minimal-<number>..."""
@@ -78,31 +76,29 @@ def replay(cfg: ReplayElite) -> Replay:
     """Crosses an elite's terrain again, or reads the recording of that.
 
     Raises:
-        FileNotFoundError: If there is no archive, or no crossing of the certificate.
+        FileNotFoundError: If there is no archive.
         ValueError: If there is no such elite, or robot, device or controller are not as they must be.
     """
     found = find_archive(cfg.robot, cfg.run, cfg.policy, space=cfg.space)
     archive, robot = found.archive, found.robot
-    if cfg.minimal is not None and cfg.certificate:
-        raise ValueError("certificates are of whole elites, got --certificate beside --minimal: leave one of them out")
     minima = None if cfg.minimal is None else found.minima()
     elite = found.one(cfg.elite) if minima is None else _one_of(minima, str(cfg.minimal), found)
     _, fitness = found.as_searched()
-    policy = None if cfg.certificate else found.policy(cfg.policy)
-    suffix = f"-{cfg.certificate}" if policy is None else found.suffix(policy)
+    policy = found.policy(cfg.policy)
+    suffix = found.suffix(policy)
     name = "elite" if minima is None else "minimal"
     out = cfg.out or folder_for(found.run, robot.name) / f"{name}-{elite}{suffix}.png"
     if out.suffix != ".png":
         raise ValueError(f"out must be a file named *.png, got {out}: name for example {out / 'elite.png'}")
     genes = None if minima is None else minima.genes[elite]
-    recording = _kept(cfg, found, elite) if policy is None else _crossed(cfg, found, elite, policy, out, genes)
+    recording = _crossed(cfg, found, elite, policy, out, genes)
     return Replay(
         found=found,
         out=out,
         elite=elite,
         recording=recording,
         fresh=evaluation_of(recording.result(), archive.cells, fitness),
-        controller=str(recording.origin["policy"] if policy is None else policy) if suffix else "",
+        controller=policy if suffix else "",
         minimal="" if minima is None else minima.words(elite),
     )
 
@@ -113,13 +109,6 @@ def _one_of(minima: "MinimalFound", text: str, found: Found) -> int:
         known = ", ".join(map(str, minima.genes))
         raise ValueError(f"--minimal must name one elite here, got '{text}': give one of {known}")
     return numbers[0]
-
-
-def _kept(cfg: ReplayElite, found: Found, elite: int) -> "Recording":
-    """The crossing that a certificate is of."""
-    from qd.show.evidence import read_evidence
-
-    return read_evidence(found.run, found.archive, elite, str(cfg.certificate))
 
 
 def _crossed(

@@ -13,7 +13,7 @@ import pytest
 from qd import search as searching
 from qd.archive import Archive
 from qd.fitness import FitnessCfg
-from qd.fresh import Reevaluate, reevaluate_run
+from qd.judge import judge
 from qd.run.settings import SchedulerCfg, SearchCfg
 from qd.search import search
 from qd.show import figures
@@ -66,7 +66,7 @@ def found_and_fresh(folder: Path) -> Path:
         without_figures(patch)
         run(folder / "found", iterations=6)
         shutil.copytree(folder / "found", folder / "fresh")
-        reevaluate_run(Reevaluate(run=folder / "fresh", device="cpu", workers="1"), open_evaluator=open_stand_in)
+        judge(folder / "fresh", compute=ALONE, stages=("fresh",), open_evaluator=open_stand_in)
     return folder
 
 

@@ -209,7 +209,3 @@ def test_fault_counts_go_with_their_elites():
     turned = archive.rows(np.array([4, 0, 2]))
     assert turned.confirmed.tolist() == [False, True, False]
     assert turned.certified.tolist() == [False, True, True]
-    bare = dataclasses.replace(archive, faults=None).rows(np.array([3, 1, 4, 0, 2]))
-    assert np.array_equal(bare.with_faults_of(archive).confirmed, [False, True, False, True, False])
-    others = dataclasses.replace(bare, iteration=bare.iteration + 1)
-    assert others.with_faults_of(archive).faults is None

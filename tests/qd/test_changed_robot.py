@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.commands import Archive, Evaluate
-from qd.fresh import Reevaluate, reevaluate_run
+from qd.commands import Archive, Evaluate, Judge
+from qd.judge import judge
 from qd.run.settings import SchedulerCfg
 from qd.show.elites import find_archive
 from qd.show.export import Export
@@ -20,6 +20,7 @@ from qd.show.recordings import Recordings, on_elite
 from qd.show.replay import ReplayElite
 from qd.show.report.command import Report
 from qd.show.view.command import View
+from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.files.records import identity, robot_digest
 from sim.recording.file import write_recording
@@ -95,7 +96,7 @@ def refused(capsys, command, *argv: str) -> str:
 
 READERS = {
     "archive --resume": (Archive, ("--resume", "runs/dog", "--device", "cpu", "--policy")),
-    "reevaluate": (Reevaluate, ("--run", "runs/dog", "--device", "cpu", "--policy")),
+    "judge": (Judge, ("--run", "runs/dog", "--device", "cpu", "--policy")),
     "replay": (ReplayElite, ("--run", "runs/dog", "--device", "cpu", "--policy")),
     "film": (Film, ("--run", "runs/dog", "--device", "cpu", "--policy")),
     "report": (Report, ("--run", "runs/dog", "--device", "cpu", "--policy")),
@@ -172,13 +173,8 @@ def test_a_controller_that_changed_is_another_and_writes_other_files(dog, capsys
     # Named, it is another controller than was searched, whatever its name.
     found = find_archive(str(dog), Path("runs/dog"))
     assert found.suffix(found.policy(trot(dog))) == "-dog_trot.py-Trot"
-    before = hashes(Path("runs/dog"))
-    args = Reevaluate(robot=str(dog), run=Path("runs/dog"), policy=trot(dog), device="cpu")
-    reevaluate_run(args, open_evaluator=open_dog)
-    assert "With another controller than was searched" in capsys.readouterr().out
-    after = hashes(Path("runs/dog"))
-    assert before.items() <= after.items()
-    assert set(after) - set(before) == {f"runs/dog/archive-dog_trot.py-Trot.{kind}" for kind in ("npz", "json")}
+    with pytest.raises(ValueError, match="must be the controller that was searched"):
+        judge(Path("runs/dog"), robot=str(dog), policy=trot(dog), compute=Compute(), open_evaluator=open_dog)
     code.write_text(code.read_text().replace("0.3", "0.35"))
     assert found.suffix(trot(dog)) == ""
 
@@ -189,7 +185,7 @@ def test_a_lost_or_changed_file_of_the_search_is_refused_unless_named(dog, capsy
     found = find_archive(str(dog), Path("runs/file"))
     assert found.policy(None) == str(policy)
     save_checkpoint(policy, rsl_rl_actor(12 + 24 + 15, 8, normalised=True).state_dict())
-    for command in (ReplayElite, Reevaluate):
+    for command in (ReplayElite, Judge):
         line = refused(capsys, command, "--robot", str(dog), "--run", "runs/file", "--device", "cpu")
         assert f"the controller in {policy}, which is another one now" in line and "--policy" in line
     assert found.suffix(found.policy(str(policy))) == "-mine"

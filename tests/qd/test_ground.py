@@ -10,7 +10,7 @@ import pytest
 
 from qd.archive import read_archive, write_archive
 from qd.causes import effects_of
-from qd.run.minimise import Minimise, minimise_run
+from qd.minimise import minimise
 from qd.show.crossed import crossed_of
 from qd.show.crossing_figures import draw_paths
 from qd.show.elites import find_archive
@@ -19,6 +19,7 @@ from qd.show.recordings import Recordings, on_elite, on_heights
 from qd.show.replay import ReplayElite, draw, replay
 from qd.show.report.relief import reliefs_of
 from qd.show.view.meshes import terrain_mesh
+from qd.workers.evaluator import Compute
 from sim.bank import terrains_of
 from sim.ground import GroundMaps
 from sim.maps.heightmap import read_heightmap
@@ -118,8 +119,10 @@ def minimised(searched):
     fresh = replace(fresh_values(archive), goal_rate=np.zeros(len(archive)))
     write_archive(searched / "archive.npz", archive.corrected_by(fresh))
     number = int(np.flatnonzero((read_archive(searched).genes == archive.genes[0]).all(axis=1))[0])
-    args = Minimise(run=searched, elite=str(number), device="cpu", workers="1", how="greedy")
-    return searched, number, minimise_run(args, open_evaluator=nobody_crosses_ice)
+    found = minimise(
+        searched, compute=Compute(workers="1"), elite=str(number), how="greedy", open_evaluator=nobody_crosses_ice
+    )
+    return searched, number, found.numbers
 
 
 def test_a_minimal_terrain_may_be_a_patch(minimised, tmp_path):

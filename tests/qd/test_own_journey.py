@@ -17,8 +17,9 @@ import pytest
 import faultline
 from qd.archive import read_archive
 from qd.commands import Archive
-from qd.fresh import Reevaluate, reevaluate_run
+from qd.judge import judge
 from qd.show.replay import ReplayElite, replay
+from qd.workers.evaluator import Compute
 from tests.builders import hashes
 from tests.sim.dogs import KINDS, write_dog
 
@@ -274,7 +275,7 @@ def test_a_run_that_is_handed_over_runs_nothing_of_its_own(searched, tmp_path, h
         lambda: replay(ReplayElite(robot=robot[1], run=tmp_path, device="cpu")),
         lambda: archive_command(tmp_path),
         lambda: archive_command(tmp_path, robot=robot[1]),
-        lambda: reevaluate_run(Reevaluate(run=tmp_path, device="cpu")),
+        lambda: judge(tmp_path, compute=Compute()),
     ):
         with pytest.raises(ValueError, match=r"not shipped|which is code|is of .*evil"):
             command()

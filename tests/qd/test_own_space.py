@@ -5,17 +5,19 @@ import re
 import signal
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qd.archive import read_archive
 from qd.commands import Archive
-from qd.fresh import Reevaluate, reevaluate_run
+from qd.judge import judge
 from qd.show.elites import find_archive
 from qd.show.export import Export, export
 from qd.show.recordings import on_elite
 from qd.show.report import report
+from qd.workers.evaluator import Compute
 from sim.bank import heights_of
 from sim.files.command import run_command
 from sim.maps.heightmap import read_heightmap
@@ -130,7 +132,12 @@ def test_a_run_goes_on_with_no_other_space(ridges, searched, capsys, monkeypatch
 
 
 @pytest.mark.parametrize(
-    "look", [lambda: export(Export()), lambda: find_archive(None, None), lambda: reevaluate_run(Reevaluate())]
+    "look",
+    [
+        lambda: export(Export()),
+        lambda: find_archive(None, None),
+        lambda: judge(Path("runs/anymal-1"), compute=Compute()),
+    ],
 )
 def test_a_run_alone_runs_nothing(searched, monkeypatch, look):
     searched.rename(searched.parent / "moved")
@@ -142,7 +149,9 @@ def test_a_run_alone_runs_nothing(searched, monkeypatch, look):
 
 
 def test_fresh_episodes(ridges, searched):
-    archive = reevaluate_run(Reevaluate(run=searched, space=ridges, device="cpu"), open_evaluator=open_rasterising)
+    archive = judge(
+        searched, space=ridges, compute=Compute(workers="1"), stages=("fresh",), open_evaluator=open_rasterising
+    )
     assert archive.fresh is not None and (archive.fresh.episodes == 40).all()
     assert read_archive(searched).space_sha256 == controller_hash(ridges)
 

@@ -9,12 +9,12 @@ from typing import Any
 from qd.archive import ARCHIVE_FILE, Archive
 from qd.evaluate.tables import read_tables
 from qd.groups import Elites, Modes, Ranking
+from qd.minimise import MinimalFound, read_minimal
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
 from qd.show.elites import Found, find_archive
 from qd.show.figures import summary
-from qd.show.minima import MinimalFound, read_minimal_numbers
 from qd.show.report.relief import reliefs_of
 from sim.files.atomic import prepare_output
 from sim.policy.spec import ControllerSpec, spec_of
@@ -134,7 +134,7 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
     folder = RunDirectory(found.folder)
     search = folder.read_cfg() if (folder.path / CONFIG_FILE).exists() else None
     numbers = folder.read_summary()
-    again = numbers.get("reproduced_by")
+    again = numbers.get("judged_by", {}).get("fresh")
     config = {} if search is None else folder.read_config()
     tables_file = RESULTS / found.robot.name / "tables.json"
     suffix = "" if policy is None else found.suffix(spec_of(policy, found.robot))
@@ -150,7 +150,7 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
         origin={key: config[key] for key in _ORIGIN if key in config},
         reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
-        minimal=read_minimal_numbers(found.folder, archive),
+        minimal=read_minimal(found.folder, archive),
         tables={**read_tables(tables_file, found.robot)} if tables_file.exists() else None,
         tables_file=tables_file,
     )

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from qd.run.minimal_file import NUMBERS_FILE
+from qd.minimise import NUMBERS_FILE
 from qd.show.minimal_figure import draw_minimal
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, absent, counted, paragraph, percent, picture, table
@@ -25,7 +25,7 @@ def minimal_section(shown: Shown) -> list[Block]:
             return [
                 absent(
                     f"{text} faultline minimise, after",
-                    without_machine(command_line("reevaluate", robot=robot, run=run)),
+                    without_machine(command_line("judge", robot=robot, run=run)),
                 )
             ]
         return [absent(text, without_machine(command_line("minimise", robot=robot, run=run)))]

@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 
 from qd.archive import Archive
-from qd.faults import any_of, fault_numbers, fault_words
+from qd.faults import FRESH_EPISODES, any_of, count_faults, fault_words
 from qd.fitness import FAILING_GOAL_RATE
-from qd.fresh import FRESH_EPISODES
 from qd.groups import Elites
 from qd.run.progress import clock
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
@@ -41,9 +40,9 @@ def lead_words(shown: Shown) -> str:
     """What the page leads with: faults where they are known, how many terrains fail, and in which ways."""
     elites, archive = shown.elites, shown.material.archive
     failing = int(elites.failing.sum())
-    faults, count = archive.faults, fault_numbers(archive)["faults"]
+    faults, count = archive.faults, count_faults(archive)
     told = ""
-    if faults is not None and count is not None:
+    if faults is not None and faults.certifiers and count is not None:
         what = "fault: a terrain" if count == 1 else "faults: terrains"
         told = f"{count:,} {what} that {any_of(faults.certifiers)} crosses and this controller does not. "
     told += f"The controller fails on {failing:,} of {counted(len(elites), 'elite')}"
@@ -93,15 +92,14 @@ def outcome_section(shown: Shown) -> list[Block]:
 def _no_faults(shown: Shown) -> Block:
     """That nobody knows yet which of what fails are faults, and the command that says it."""
     material = shown.material
-    word = "certify" if material.archive.fresh is not None else "reevaluate"
     text = "Which of these are faults, terrains that another controller crosses, is not known yet. Next:"
-    return absent(text, without_machine(command_line(word, robot=material.robot.spec, run=material.run)))
+    return absent(text, without_machine(command_line("judge", robot=material.robot.spec, run=material.run)))
 
 
 def _faults_at_a_glance(archive: Archive) -> list[tuple[str, str]]:
     """The number of faults, where other controllers crossed what fails."""
-    faults, count = archive.faults, fault_numbers(archive)["faults"]
-    if faults is None or count is None:
+    faults, count = archive.faults, count_faults(archive)
+    if faults is None or not faults.certifiers or count is None:
         return []
     return [(f"faults: elites that {any_of(faults.certifiers)} crosses and this controller does not", f"{count:,}")]
 

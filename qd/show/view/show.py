@@ -6,9 +6,9 @@ from functools import cached_property
 from pathlib import Path
 
 from qd.archive import goal_rates
-from qd.run.judge import panel_files
+from qd.judge import panel_of
+from qd.minimise import MinimalFound, read_minimal
 from qd.show.elites import Found, find_archive
-from qd.show.minima import MinimalFound, read_minimal_numbers
 from qd.show.view.plots import Axes, axes_of
 from qd.workers.evaluator import check_policy
 from sim.policy.spec import ControllerSpec, controller_hash, controllers_of
@@ -91,7 +91,7 @@ def find_show(
     if not len(found.archive):
         raise ValueError(f"{found.run} has no elites yet: {found.go_on}, or give another --run")
     number = found.one(elite) if elite else None
-    minima = read_minimal_numbers(found.folder, found.archive) if minimal is None else found.minima()
+    minima = read_minimal(found.folder, found.archive) if minimal is None else found.minima()
     if minima is not None and minimal is not None:
         number = minima.chosen(minimal, found.run)[0]
     controllers, note = _controllers_of(policies, found)
@@ -116,14 +116,14 @@ def _controllers_of(policies: Sequence[str], found: Found) -> tuple[dict[str, st
         check_policy(policy, found.robot, "cpu")
     except ValueError as error:
         return {}, f"{error}; name a controller with --policies to see crossings"
-    return {SEARCHED: policy, **_panel_of(found, policy)}, ""
+    return {SEARCHED: policy, **_panel_of(found)}, ""
 
 
-def _panel_of(found: Found, searched: str) -> dict[str, str]:
+def _panel_of(found: Found) -> dict[str, str]:
     """The robot's panel as far as it crossed the archive, by the names it has there."""
     faults = found.archive.faults
     if faults is None:
         return {}
     names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
-    files = panel_files(found.robot, lambda file: controller_hash(file) == controller_hash(searched))
-    return {names[digest]: file for file in files.values() if (digest := str(controller_hash(file))) in names}
+    files = panel_of(found.robot).values()
+    return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}

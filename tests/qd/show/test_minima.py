@@ -68,8 +68,6 @@ def test_one_is_replayed(found, run, tmp_path, monkeypatch):
     assert f"minimal terrain of elite {first}" in draw(done).axes[0].get_title()
     with pytest.raises(ValueError, match="--minimal must name one elite here"):
         replay(ReplayElite(run=run, minimal="all"))
-    with pytest.raises(ValueError, match="certificates are of whole elites"):
-        replay(ReplayElite(run=run, minimal=str(first), certificate="C-G"))
 
 
 def test_they_are_exported_beside_whole_elites(found, run, tmp_path):

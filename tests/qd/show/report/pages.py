@@ -7,8 +7,6 @@ from html.parser import HTMLParser
 import numpy as np
 
 from qd.archive import read_archive, write_archive
-from qd.minimal import Case, Minimal
-from qd.run.minimal_file import write_minimal
 from qd.run.settings import as_settings, preset
 from qd.show.report import report
 from sim.files.atomic import to_json
@@ -84,11 +82,7 @@ def minimal_of(run, count=1):
     """The first failing elites of a run, each with its first part alone as the minimal terrain."""
     archive = read_archive(run)
     numbers = np.flatnonzero(archive.failing)[:count].tolist()
-    cases = {n: Case(parts=(0, 1), how="greedy", scalable=True) for n in numbers}
-    never, much = np.array([0, 40, 0, 0]), np.array([20, 0, 0, 0])
-    one = Minimal(parts=(0,), counts=never, without={0: much}, scale=0.5, passing_scale=None, scales={}, subsets=1)
-    genes = dict(zip(numbers, archive.genes[numbers], strict=True))
-    write_minimal(run, archive, cases, dict.fromkeys(numbers, one), archive.rows(np.array(numbers)), genes)
+    np.savez(run / "minimal.npz", elite=np.array(numbers), genes=archive.genes[numbers])
     entries = [
         {"elite": n, "cell": int(archive.cell[n]), "iteration": int(archive.iteration[n]), "bumps": [0],
          "words": ["bump of <0.24> m"], "of": 2, "goal_rate": 0.0, "goal_interval": [0.0, 0.088],

@@ -11,7 +11,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.archive import read_archive
-from qd.show.minima import MinimalFound
+from qd.minimise import MinimalFound
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
 from qd.show.view.recorder import Report

@@ -1,0 +1,151 @@
+"""Penalty scales: what each raw penalty comes to where a crossing fails, so that the six can be added and compared.
+
+The scale of a penalty is its mean over those episodes on hard-random terrains that did not reach the goal: one typical
+failure costs about 1 of each kind. Scales are measured once with the shipped controller, before any search, and never
+tuned on an archive.
+"""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.run.directory import RUNS
+from qd.workers.cross import Crossings
+from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.shards import merged
+from sim.crossing import CrossingCfg
+from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.records import identity
+from sim.robots.robot import RobotCfg
+from sim.rollout import RolloutResult
+from sim.spaces.base import TerrainSpace
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+
+_LOOK = 16  # terrains that are crossed before all others, since a penalty that never occurs shows early
+_ENOUGH = 200  # failing episodes that scales are means over; with fewer, even of the most terrains, all episodes are
+_FEW = 30  # of those episodes, how many at least a penalty should occur in
+
+
+def calibrate(
+    robot: RobotCfg,
+    policy: str | None = None,
+    *,
+    compute: Compute,
+    terrains: int = 1_000,
+    most_terrains: int = 5_000,
+    replicas: int = 20,
+    space: TerrainSpace = SUPER_GAUSSIAN,
+    seed: int = 0,
+    out: Path | None = None,
+    cache: Path | None = RUNS / "crossings",
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> dict[str, Any]:
+    """Measures the penalty scales of a robot with a controller and writes them where a search reads them.
+
+    Args:
+        robot: The robot.
+        policy: Its controller; the robot's own if None.
+        compute: Where terrains are crossed.
+        terrains: Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal.
+        most_terrains: Largest number of terrains. With fewer failing episodes even then, all episodes give the scales.
+        replicas: Episodes a terrain.
+        space: What the terrains are drawn from.
+        seed: Draws terrains and starts.
+        out: File to write; the robot's own if None.
+        cache: Folder where crossings are kept.
+        open_evaluator: Opens what crosses terrains.
+
+    Returns:
+        The content of the file.
+
+    Raises:
+        ValueError: If a value cannot be used; if a penalty never occurred, once the scales of the others are written.
+        AllInvalidError: If no episode is valid.
+        EvaluatorError: If a worker is lost; what was crossed is kept.
+    """
+    if policy is not None and out is None and robot.settings_file is None:
+        raise ValueError("out must name a file for the scales of another controller than the shipped one, got none")
+    for name, value in {"terrains": terrains, "most_terrains": most_terrains, "replicas": replicas}.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    policy, out, most = policy or str(robot.policy_file), out or robot.scales_file, max(terrains, most_terrains)
+    prepare_output(out)
+    check_policy(policy, robot, compute.device)
+    # Both are drawn row by row: of 5,000 the first 1,000 are those that 1,000 would be.
+    genes = space.hard_random(most, seed)
+    seeds = np.random.SeedSequence(seed).generate_state(most, np.uint32)
+    results: list[RolloutResult] = []
+    with Crossings(robot, compute, cache=cache, open_evaluator=open_evaluator) as crossings:
+        done, count = 0, min(_LOOK, terrains)
+        while count > done:
+            rows = slice(done, count)
+            results.append(
+                crossings.cross(
+                    policy, genes[rows], seeds[rows], replicas=replicas, space=space.name, at_most=terrains,
+                    label=f"hard-random terrains {done + 1:,} to {count:,}",
+                )
+            )  # fmt: skip
+            result, done = merged(results, join=1), count
+            if done < terrains:
+                _print_absent(result)
+                count = terrains
+            elif _failing(result).sum() < _ENOUGH:
+                print(f"{_failing(result).sum()} of {result.invalid.size} episodes did not reach the goal.", flush=True)
+                count = min(done + terrains, most)
+    origin = {**origin_of(compute.device, seed, compute.workers), **identity(robot, policy), "space": space.name}
+    report = {**origin, "crossing": asdict(CrossingCfg()), **measured(result)}
+    _print_scales(report)
+    write_atomically(out, to_json(report))
+    print(f"Written to {out}.")
+    if absent := [name for name in robot.penalties if name not in report["scales"]]:
+        raise ValueError(
+            f"penalties must occur in the episodes that scales are means over, got 0 of {', '.join(absent)}: leave "
+            f"them out of the robot's penalties, for which the scales in {out} fit, or calibrate on more terrains"
+        )
+    return report
+
+
+def _failing(result: RolloutResult) -> NDArray[np.bool_]:
+    """Episodes that are valid and did not reach the goal, shape (T, R)."""
+    return ~result.invalid & ~result.reached_goal
+
+
+def measured(result: RolloutResult) -> dict[str, Any]:
+    """The scales and what they are means over, as JSON values; a penalty that never occurs has no scale."""
+    failing, valid = _failing(result), ~result.invalid
+    by_failing = int(failing.sum()) >= _ENOUGH
+    rows = np.asarray(result.penalties, np.float64)[failing if by_failing else valid]
+    means = dict(zip(result.penalty_names, rows.mean(axis=0).tolist(), strict=True))
+    shares = (rows > 0.0).mean(axis=0).tolist()
+    return {
+        "terrains": len(valid),
+        "episodes": int(valid.size),
+        "invalid_episodes": int(valid.size - valid.sum()),
+        "failing_episodes": int(failing.sum()),
+        "scaled_by": "failing" if by_failing else "all",
+        "scales": {name: mean for name, mean in means.items() if mean},
+        "share_of_episodes_with": dict(zip(result.penalty_names, shares, strict=True)),
+    }
+
+
+def _print_absent(result: RolloutResult) -> None:
+    valid = ~result.invalid
+    sums = np.asarray(result.penalties)[valid].sum(axis=0).tolist()
+    absent = [name for name, value in zip(result.penalty_names, sums, strict=True) if not value]
+    if absent:
+        print(f"In the first {valid.sum()} episodes {', '.join(absent)} never occurred.", flush=True)
+
+
+def _print_scales(report: dict[str, Any]) -> None:
+    failing, count = report["failing_episodes"], report["episodes"] - report["invalid_episodes"]
+    if report["scaled_by"] == "failing":
+        count = failing
+        print(f"Means over the {count} episodes on {report['terrains']} terrains that did not reach the goal:")
+    else:
+        print(f"Means over all {count} valid episodes, as only {failing} did not reach the goal, under {_ENOUGH}:")
+    for name, scale in report["scales"].items():
+        hits = round(report["share_of_episodes_with"][name] * count)
+        print(f"  {name:<14}{scale:12.4f}{f'  (in {hits} episodes alone)' if hits < _FEW else ''}")

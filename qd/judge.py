@@ -1,0 +1,426 @@
+"""Judging: which elites of a search are faults of its controller.
+
+An elite is the best of many noisy evaluations and flatters itself; 40 fresh episodes do not. Those that fail by them
+are crossed with contact resolved, and by other controllers (:mod:`qd.faults` says what follows). Which episodes those
+are follows from the run's seed and from what names an elite, its cell and the iteration that found it. Crossings are
+kept in the run, so that a judging that was stopped finds them when it is run again.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.archive import (
+    ARCHIVE_FILE,
+    OUTCOMES,
+    Archive,
+    FaultCounts,
+    FreshValues,
+    goal_rates,
+    read_archive,
+    write_archive,
+)
+from qd.evaluate.marks import marks_of, recorded_marks
+from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fault_words, fresh_numbers
+from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
+from qd.groups import families_of
+from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed
+from qd.run.settings import SearchCfg, as_settings, is_searched, own_policy
+from qd.show import figures
+from qd.workers.cross import Crossings, How
+from qd.workers.evaluator import Compute, Evaluate, OpenEvaluator, check_policy, open_evaluator, origin_of
+from sim.files.atomic import read_json, to_json, write_atomically
+from sim.files.intervals import wilson_interval
+from sim.files.records import identity
+from sim.policy.spec import ControllerSpec, certifier_hash, spec_of
+from sim.robots.find import robot_of
+from sim.robots.robot import RobotCfg
+from sim.rollout import RolloutResult
+from sim.spaces.registry import get_space, load_space
+
+Stage = Literal["fresh", "resolved", "others", "mujoco_c"]
+STAGES: tuple[Stage, ...] = ("fresh", "resolved", "others")
+"""Fresh episodes of all elites; of those that fail, crossings with contact resolved, and by other controllers."""
+CROSSINGS_FOLDER = "crossings"
+"""Folder of a run that keeps what was crossed to judge it."""
+CERTIFIERS_FOLDER = "certifiers"
+"""Folder of a run that holds its own certifiers, such as its specialist, ``<name>.pt``."""
+PANEL_FOLDER = "panel"
+"""Folder of a robot's results that holds its fixed certifiers, ``<name>.pt``."""
+
+_BIT_EPISODES = 20  # the collision bit is "any collision", which more episodes than the search's would bias
+_MOST_IN_MUJOCO_C = 100  # failing elites
+_FRESH_STREAM, _DRAW_STREAM = 1, 3
+_CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM, _MUJOCO_C_STREAM = 5, 6, 7, 8
+
+
+def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
+    """Seeds of episodes on elites, which follow from what names an elite: its cell and the iteration that found it.
+
+    Args:
+        archive: The N elites.
+        seed: The search's.
+        times: Seeds an elite.
+        stream: Sets apart what must not share its episodes.
+
+    Returns:
+        Those of an elite in succession, shape (N * times,).
+    """
+    names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
+    rows = [np.random.SeedSequence([seed, *name], spawn_key=(stream,)).generate_state(times) for name in names]
+    return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
+
+
+def drawn_elites(archive: Archive, most: int, seed: int) -> Archive:
+    """An archive of some elites, drawn at random without replacement; all of them where there are no more than wanted.
+
+    Args:
+        archive: The elites.
+        most: How many to draw.
+        seed: The search's seed; the iterations done are drawn with too.
+    """
+    if len(archive) <= most:
+        return archive
+    rng = np.random.default_rng(np.random.SeedSequence([seed, archive.iterations], spawn_key=(_DRAW_STREAM,)))
+    return archive.rows(np.sort(rng.choice(len(archive), most, replace=False)))
+
+
+def fresh_values(
+    archive: Archive, evaluate: Evaluate, fitness: FitnessCfg, *, num_replicas: int, seed: int
+) -> FreshValues:
+    """Evaluates every elite again with 40 fresh episodes.
+
+    Args:
+        archive: The elites.
+        evaluate: Crosses terrains.
+        fitness: Weights of the fitness, with the archive's penalties.
+        num_replicas: Episodes a terrain that ``evaluate`` gives; terrains are crossed as often as makes 40.
+        seed: The search's seed; the episodes are drawn apart from the search's own.
+    """
+    if not len(archive):
+        empty = {name: getattr(archive, name) for name in Evaluation.__dataclass_fields__}
+        return FreshValues(
+            **empty, collision_low=archive.fitness, collision_high=archive.fitness, reproduced=np.zeros(0, bool)
+        )
+    times = -(-FRESH_EPISODES // num_replicas)
+    seeds = elite_seeds(archive, seed, times, stream=_FRESH_STREAM)
+    result = evaluate(archive.genes.repeat(times, axis=0), seeds)
+    if result.invalid.shape[1] != num_replicas:
+        raise ValueError(f"evaluate must give {num_replicas} episodes, got {result.invalid.shape[1]}")
+    return _compared(archive, _grouped(result, times), fitness)
+
+
+def _grouped(result: RolloutResult, times: int) -> RolloutResult:
+    """A result whose terrains come ``times`` times in succession as one of 40 episodes a terrain."""
+    arrays = {name: value for name, value in vars(result).items() if isinstance(value, np.ndarray)}
+    grouped = {name: v.reshape(-1, times * v.shape[1], *v.shape[2:])[:, :FRESH_EPISODES] for name, v in arrays.items()}
+    return replace(result, **grouped)
+
+
+def _compared(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -> FreshValues:
+    cells = archive.cells
+    fresh = evaluation_of(result, cells, fitness)
+    collided = (result.base_collision & ~result.invalid)[:, :_BIT_EPISODES].any(axis=1)
+    cell = cells.cell_of(fresh.ratios, collided)
+    counted = np.where(fresh.valid, fresh.episodes - fresh.invalid_episodes, 0)  # an invalid terrain says nothing
+    hits = np.rint(fresh.collision_rate * counted).astype(int)
+    limits = np.array([wilson_interval(*row) for row in zip(hits.tolist(), counted.tolist(), strict=True)])
+    return FreshValues(
+        **{**vars(fresh), "cell": cell},
+        collision_low=limits[:, 0],
+        collision_high=limits[:, 1],
+        reproduced=fresh.valid & cells.are_neighbours(archive.cell, cell),
+    )
+
+
+def outcome_counts(result: RolloutResult) -> NDArray[np.int64]:
+    """Episodes of each terrain by :data:`qd.archive.OUTCOMES`, shape (num_terrains, 4)."""
+    counts = {name: flags.sum(axis=1) for name, flags in (
+        ("goal", result.reached_goal), ("base_collision", result.base_collision), ("invalid", result.invalid),
+    )}  # fmt: skip
+    counts["other"] = result.invalid.shape[1] - sum(counts.values())
+    return np.stack([counts[name] for name in OUTCOMES], axis=1).astype(np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """A search whose elites are judged."""
+
+    run: Path
+    """Its directory."""
+    cfg: SearchCfg
+    robot: RobotCfg
+    policy: str
+    """The controller that was searched, as :func:`sim.policy.loaders.load_policy` takes it."""
+    space: str
+    """Terrain space, as :func:`sim.spaces.registry.load_space` takes it."""
+
+    def read_archive(self) -> Archive:
+        """Its archive, which must be of the settings beside it."""
+        archive, fitness = read_archive(self.run), self.cfg.fitness
+        if (archive.robot, archive.penalties, archive.scales) != (self.cfg.robot, fitness.penalties, fitness.scales):
+            raise ValueError(
+                f"{self.run / ARCHIVE_FILE} must have robot, penalties and scales of {CONFIG_FILE} beside it, got "
+                f"{archive.robot}, {archive.penalties} and {archive.scales}: put back the one that is not this run's"
+            )
+        return archive
+
+
+def find_search(run: Path, *, robot: str | None = None, policy: str | None = None, space: str | None = None) -> Search:
+    """The search of a run, with its robot, controller and terrain space as they are now.
+
+    Args:
+        run: Its directory.
+        robot: The robot, if its settings file must be named.
+        policy: The controller, if it has moved or is code.
+        space: The terrain space, if it is code.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+    """
+    cfg = RunDirectory(run).read_cfg()
+    if space is not None:
+        load_space(space)  # one of a user's own, which the run's name then finds
+    body = robot_of(as_settings(cfg), robot, run)
+    controller = own_policy(run, cfg, body) if policy is None else spec_of(policy, body)
+    if not is_searched(cfg, controller, body):
+        raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}: leave it out")
+    where = get_space(cfg.space, cfg.space_sha256).name  # where its code is now
+    return Search(run=run, cfg=cfg, robot=body, policy=controller, space=where)
+
+
+def panel_of(robot: RobotCfg) -> dict[str, str]:
+    """The robot's fixed certifiers by name."""
+    return {file.stem: str(file) for file in sorted((RESULTS / robot.name / PANEL_FOLDER).glob("*.pt"))}
+
+
+def certifiers_of(search: Search) -> dict[str, str]:
+    """Certifiers of a search by name: the robot's panel and the run's own, without the controller that was searched."""
+    files = {file.stem: str(file) for file in sorted((search.run / CERTIFIERS_FOLDER).glob("*.pt"))}
+    certifiers = panel_of(search.robot) | files
+    return {name: file for name, file in certifiers.items() if not is_searched(search.cfg, file, search.robot)}
+
+
+def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str) -> None:
+    """Tries each certifier on the robot; refuses the searched controller, which cannot certify itself."""
+    for name, policy in certifiers.items():
+        certifier_hash(name, policy)
+        if is_searched(search.cfg, policy, search.robot):
+            raise ValueError(f"certifier {name} must be another controller than the searched one, got {policy}")
+        try:
+            check_policy(policy, search.robot, device)
+        except ValueError as error:
+            raise ValueError(f"certifier {name} does not fit {search.robot.name}: {error}") from error
+
+
+def confirm(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
+    """The archive after its controller has crossed some elites with contact resolved.
+
+    Args:
+        archive: With fresh values.
+        rows: Numbers of the elites.
+        search: The search that found them.
+        crossings: What crosses terrains.
+    """
+    faults = archive.faults or FaultCounts.none_of(len(archive))
+    counts = _cross(archive, rows, search, crossings, search.policy, "resolved", _CONFIRM_STREAM, "contact resolved")
+    return replace(archive, faults=replace(faults, resolved_outcomes=_put(faults.resolved_outcomes, rows, counts)))
+
+
+def confirm_in_mujoco_c(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
+    """The archive after its controller has crossed up to 100 of some elites in MuJoCo C; the seed draws them.
+
+    The episodes begin as those of :func:`confirm` do, which has the arguments.
+    """
+    faults = archive.faults or FaultCounts.none_of(len(archive))
+    order = elite_seeds(archive, search.cfg.seed, stream=_MUJOCO_C_STREAM)[rows]
+    drawn = np.sort(rows[np.argsort(order, kind="stable")][:_MOST_IN_MUJOCO_C])
+    counts = _cross(archive, drawn, search, crossings, search.policy, "mujoco_c", _CONFIRM_STREAM, "MuJoCo C")
+    return replace(archive, faults=replace(faults, mujoco_c_outcomes=_put(faults.mujoco_c_outcomes, drawn, counts)))
+
+
+def certify(
+    archive: Archive, rows: NDArray[np.int64], certifiers: Mapping[str, str], search: Search, crossings: Crossings
+) -> Archive:
+    """The archive after other controllers have crossed some elites, at the search's settings and with contact resolved.
+
+    A terrain that a controller crosses less than half of the time at the search's settings is not crossed with contact
+    resolved, since it cannot get a certificate. Counts of a certifier that is not asked stay, those of another
+    controller of the same name go.
+
+    Args:
+        archive: With fresh values.
+        rows: Numbers of the elites.
+        certifiers: Controllers by name.
+        search: The search that found the elites.
+        crossings: What crosses terrains.
+    """
+    faults = archive.faults or FaultCounts.none_of(len(archive))
+    kinds = (faults.certifier_outcomes, faults.certifier_resolved_outcomes)
+    columns = {
+        name: (digest, *(counts[:, place] for counts in kinds))
+        for place, (name, digest) in enumerate(zip(faults.certifiers, faults.certifier_sha256, strict=True))
+    }
+    for name, policy in certifiers.items():
+        digest, nothing = certifier_hash(name, policy), np.zeros_like(faults.resolved_outcomes)
+        before = columns.get(name, ("", nothing, nothing))
+        _, searched, resolved = before if before[0] == digest else ("", nothing, nothing)
+        counts = _cross(archive, rows, search, crossings, policy, "searched", _CERTIFY_STREAM, name)
+        worth = rows[goal_rates(counts) >= FAILING_GOAL_RATE]
+        finer = _cross(
+            archive, worth, search, crossings, policy, "resolved", _CERTIFY_RESOLVED_STREAM, f"{name}, contact resolved"
+        )
+        columns[name] = (digest, _put(searched, rows, counts), _put(_put(resolved, rows, 0), worth, finer))
+    if not columns:
+        return replace(archive, faults=faults)
+    hashes, searched_all, resolved_all = zip(*columns.values(), strict=True)
+    faults = replace(
+        faults,
+        certifiers=tuple(columns),
+        certifier_sha256=hashes,
+        certifier_outcomes=np.stack(searched_all, axis=1),
+        certifier_resolved_outcomes=np.stack(resolved_all, axis=1),
+    )
+    return replace(archive, faults=faults)
+
+
+def _cross(
+    archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings, policy: str, how: How, stream: int,
+    label: str,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Outcomes of 20 episodes on some elites, shape (len(rows), 4)."""
+    seeds = elite_seeds(archive, search.cfg.seed, stream=stream)[rows]
+    result = crossings.cross(
+        policy, archive.genes[rows], seeds, replicas=EPISODES, space=search.space, how=how, label=label, invalid_ok=True
+    )
+    return outcome_counts(result)
+
+
+def _put(counts: NDArray[np.int64], rows: NDArray[np.int64], values: NDArray[np.int64] | int) -> NDArray[np.int64]:
+    """Counts with other values in some rows."""
+    counts = counts.copy()
+    counts[rows] = values
+    return counts
+
+
+def seen_by(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[str, str]) -> NDArray[np.bool_] | None:
+    """Whether each certifier of an archive has trained on kin of each elite, shape (N, C).
+
+    Args:
+        archive: With fault counts.
+        families: Family of each elite, shape (N,).
+        certifiers: Controllers by name.
+
+    Returns:
+        None if the training record of one of them is not at hand.
+    """
+    assert archive.faults is not None
+    marks, columns = np.array(marks_of(archive.genes)), []
+    for name in archive.faults.certifiers:
+        policy = certifiers.get(name)
+        trained_on = set() if policy is None else recorded_marks(policy)
+        if policy is None or not (trained_on or _has_record(policy)):
+            return None
+        columns.append(np.isin(families, families[np.isin(marks, [*trained_on])]))
+    return np.stack(columns, axis=1) if columns else None
+
+
+def _has_record(policy: str) -> bool:
+    return any(file.with_suffix(".train.json").is_file() for file in ControllerSpec.parse(policy).files)
+
+
+def judge(
+    run: Path,
+    *,
+    compute: Compute,
+    stages: Sequence[Stage] = STAGES,
+    certifiers: Mapping[str, str] | None = None,
+    robot: str | None = None,
+    policy: str | None = None,
+    space: str | None = None,
+    seed: int | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> Archive:
+    """Judges the elites of a search, and writes the run's archive, numbers and figures after each stage.
+
+    Args:
+        run: Its directory.
+        compute: Where terrains are crossed.
+        stages: What to do, in this order.
+        certifiers: Other controllers by name; those of :func:`certifiers_of` if None.
+        robot: The robot, if its settings file must be named.
+        policy: The controller that was searched, if it has moved or is code.
+        space: The terrain space, if it is code.
+        seed: Seed of the fresh episodes; the search's if None.
+        open_evaluator: Opens what crosses terrains.
+
+    Returns:
+        The judged archive.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+        EvaluatorError: If a worker is lost; what was crossed is kept.
+    """
+    search = find_search(run, robot=robot, policy=policy, space=space)
+    if seed is not None and seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
+    check_policy(search.policy, search.robot, compute.device)
+    certifiers = certifiers_of(search) if certifiers is None else certifiers
+    if "others" in stages:
+        check_certifiers(certifiers, search, compute.device)
+    with claimed(run), Crossings(
+        search.robot, compute, cache=run / CROSSINGS_FOLDER, open_evaluator=open_evaluator
+    ) as crossings:  # fmt: skip
+        archive = search.read_archive()
+        if archive.fresh is None and "fresh" not in stages:
+            raise ValueError(f"{run} must have fresh episodes of its elites, got none: begin with the stage fresh")
+        families = None
+        for stage in stages:
+            failing = np.flatnonzero(archive.failing)
+            if stage == "fresh":
+                archive = _evaluated_again(archive, search, crossings, search.cfg.seed if seed is None else seed)
+            elif stage == "resolved":
+                archive = confirm(archive, failing, search, crossings)
+            elif stage == "mujoco_c":
+                archive = confirm_in_mujoco_c(archive, failing, search, crossings)
+            else:
+                archive = certify(archive, failing, certifiers, search, crossings)
+            if families is None or stage == "fresh":
+                families = families_of(archive.genes, get_space(search.cfg.space, search.cfg.space_sha256))
+            by = origin_of(compute.device, search.cfg.seed if seed is None else seed, compute.workers)
+            _write(archive, families, search, certifiers, {stage: {**by, **identity(search.robot, search.policy)}})
+    for line in fault_words(archive):
+        print(line)
+    return archive
+
+
+def _evaluated_again(archive: Archive, search: Search, crossings: Crossings, seed: int) -> Archive:
+    """The archive with what 40 fresh episodes of each elite say."""
+
+    def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> RolloutResult:
+        return crossings.cross(
+            search.policy, terrains, seeds, replicas=FRESH_EPISODES, space=search.space, label="fresh episodes"
+        )
+
+    fresh = fresh_values(archive, evaluate, search.cfg.fitness, num_replicas=FRESH_EPISODES, seed=seed)
+    return archive.corrected_by(fresh)
+
+
+def _write(
+    archive: Archive, families: NDArray[np.int64], search: Search, certifiers: Mapping[str, str], by: dict[str, Any]
+) -> None:
+    """Writes archive, numbers and figures of a run."""
+    run, file = RunDirectory(search.run), search.run / SUMMARY_FILE
+    assert archive.fresh is not None
+    seen = None if archive.faults is None else seen_by(archive, families, certifiers)
+    numbers = read_json(file) if file.exists() else {}
+    numbers |= fresh_numbers(archive, archive.fresh) | fault_numbers(archive, families, seen)
+    numbers["judged_by"] = numbers.get("judged_by", {}) | by
+    write_archive(search.run / ARCHIVE_FILE, archive)
+    write_atomically(file, to_json(numbers))
+    if (search.run / METRICS_FILE).exists():
+        figures.write_figures(search.run, archive, run.read_metrics())

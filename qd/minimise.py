@@ -1,0 +1,282 @@
+"""Minimal terrains of a run: found, judged like elites, written, read and said."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.archive import OUTCOMES, Archive, goal_rates
+from qd.causes import effects_of
+from qd.faults import judgement, rate_of
+from qd.groups import VERDICTS, verdict_of, verdicts_of
+from qd.judge import (
+    CROSSINGS_FOLDER,
+    certifiers_of,
+    certify,
+    check_certifiers,
+    confirm,
+    find_search,
+)
+from qd.minimal import Case, How, Minimal, Trial, case_of, genes_of, take_apart
+from qd.run.directory import claimed
+from qd.show.figures import save_figure
+from qd.show.minimal_figure import draw_minimal
+from qd.workers.cross import Crossings
+from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from sim.bank import heights_of
+from sim.files.atomic import read_json, to_json, write_atomically
+from sim.files.command import chosen_elites, split_words
+from sim.files.intervals import value_words
+from sim.files.npz import npz_bytes, read_arrays
+from sim.files.records import identity
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import get_space
+
+MINIMAL_FILE = "minimal.npz"
+NUMBERS_FILE = "minimal.json"
+FIGURE_FILE = "minimal.png"
+
+_MOST_ELITES = {"cuda": 200, "cpu": 3}  # that are taken where none are named
+_ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "goal_interval", "cause", "margin_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MinimalFound:
+    """Minimal terrains of elites that are in an archive."""
+
+    numbers: dict[str, Any]
+    """As ``minimal.json`` has them."""
+    genes: dict[int, NDArray[np.float32]]
+    """By number of the elite, each of shape (num_genes,)."""
+
+    def chosen(self, text: str, whose: object) -> list[int]:
+        """Numbers of elites that have a minimal terrain, as a command line names them: some, or ``all``.
+
+        Args:
+            text: Numbers apart by spaces or commas, or ``all``.
+            whose: Their run, for the message.
+        """
+        known = list(map(str, self.genes))
+        words = split_words([text])
+        words = known if words == ["all"] else words
+        unknown = [word for word in words if word not in known]
+        if unknown or not words:
+            named = ", ".join(unknown) or repr(text)
+            raise ValueError(f"{whose} has no minimal terrain of elite {named}: expected all, or {', '.join(known)}")
+        return [int(word) for word in dict.fromkeys(words)]
+
+    def entry(self, number: int) -> dict[str, Any]:
+        """What ``minimal.json`` says of the minimal terrain of an elite."""
+        return next(entry for entry in self.numbers["elites"] if entry["elite"] == number)
+
+    def words(self, number: int) -> str:
+        """What is known of the minimal terrain of an elite, in a sentence."""
+        entry = self.entry(number)
+        rate = value_words(entry["goal_rate"], entry["goal_interval"], ".0%")
+        words = f"{len(entry['bumps'])} of {entry['of']} parts; goal reached {rate} when they were found"
+        if entry["cause"]:
+            words += f"; the cause is a {entry['cause']['kind']}"
+        return words + (f"; margin {100 * entry['margin_m']:.1f} cm" if entry["margin_m"] is not None else "")
+
+
+def minimise(
+    run: Path,
+    *,
+    compute: Compute,
+    elite: str | None = None,
+    how: How | None = None,
+    judged: bool = False,
+    certifiers: Mapping[str, str] | None = None,
+    robot: str | None = None,
+    policy: str | None = None,
+    space: str | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> MinimalFound | None:
+    """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
+
+    Args:
+        run: Its directory, judged at least by fresh episodes.
+        compute: Where terrains are crossed.
+        elite: Numbers of failing elites apart by spaces or commas, or ``all``; by default 200 on a GPU, 3 on the CPU,
+            faults first, then certified, confirmed and other failing ones.
+        how: How they are taken apart; what suits the device if None.
+        judged: Whether the minimal terrains are crossed with contact resolved and by certifiers too.
+        certifiers: Other controllers by name; those of :func:`qd.judge.certifiers_of` if None.
+        robot: The robot, if its settings file must be named.
+        policy: The controller that was searched, if it has moved or is code.
+        space: The terrain space, if it is code.
+        open_evaluator: Opens what crosses terrains.
+
+    Returns:
+        What the run has now; None without a failing elite.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+        EvaluatorError: If a worker is lost; what was crossed is kept.
+    """
+    search = find_search(run, robot=robot, policy=policy, space=space)
+    check_policy(search.policy, search.robot, compute.device)
+    certifiers = certifiers_of(search) if certifiers is None else certifiers
+    if judged:
+        check_certifiers(certifiers, search, compute.device)
+    terrain_space, half_width = get_space(search.cfg.space, search.cfg.space_sha256), search.robot.footprint[1]
+    kind = compute.device.partition(":")[0]
+    with claimed(run), Crossings(
+        search.robot, compute, cache=run / CROSSINGS_FOLDER, open_evaluator=open_evaluator
+    ) as crossings:  # fmt: skip
+        archive = search.read_archive()
+        numbers = _failing(archive, elite, run, _MOST_ELITES[kind])
+        cases = {
+            number: case_of(archive, number, terrain_space, half_width, how, on_gpu=kind == "cuda")
+            for number in numbers
+        }
+        minima = take_apart(archive, cases, terrain_space, search, crossings)
+        elites = as_elites(archive, minima, terrain_space)
+        if judged:
+            rows = np.arange(len(elites))
+            elites = certify(confirm(elites, rows, search, crossings), rows, certifiers, search, crossings)
+        before = read_minimal(run, archive)
+        entries = {} if before is None else {entry["elite"]: entry for entry in before.numbers["elites"]}
+        genes = {} if before is None else dict(before.genes)
+        for place, (number, minimal) in enumerate(minima.items()):
+            entry = _entry(archive, number, cases[number], minimal, terrain_space, half_width)
+            entries[number] = entry | {"verdict": verdict_of(elites, place), **judgement(elites, place)}
+            genes[number] = elites.genes[place]
+        if not entries:
+            return None
+        ordered = [entries[number] for number in sorted(entries)]
+        origin = origin_of(compute.device, search.cfg.seed, compute.workers) | identity(search.robot, search.policy)
+        space_named = {"space": search.cfg.space, "space_sha256": search.cfg.space_sha256}
+        content = {**origin, **space_named, **_totals(ordered), "elites": ordered}
+        arrays = {name: np.array(value) for name, value in space_named.items() if value is not None}
+        arrays |= {"elite": np.array(sorted(genes)), "genes": np.array([genes[number] for number in sorted(genes)])}
+        write_atomically(run / MINIMAL_FILE, npz_bytes(arrays))
+        write_atomically(run / NUMBERS_FILE, to_json(content))
+        save_figure(run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, terrain_space))
+    return MinimalFound(numbers=content, genes=genes)
+
+
+def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[int]:
+    """Numbers of the failing elites that are named, or of some: faults first."""
+    if archive.fresh is None:
+        raise ValueError(f"{run} must have fresh episodes of its elites, got none: let `faultline judge` cross them")
+    failing, verdicts = np.flatnonzero(archive.failing).tolist(), verdicts_of(archive)
+    if elite is None:
+        order = [VERDICTS.index(name) for name in ("fault", "confirmed", "certified", "failing")]
+        return sorted(sorted(failing, key=lambda number: (order.index(verdicts[number]), number))[:most])
+    if elite.strip() == "all":
+        return failing
+    numbers = chosen_elites(elite, len(archive), run)
+    if crossed := [number for number in numbers if number not in failing]:
+        raise ValueError(f"elite must name failing elites of {run}, got {', '.join(map(str, crossed))}, not failing")
+    return numbers
+
+
+def as_elites(archive: Archive, minima: Mapping[int, Minimal], space: TerrainSpace) -> Archive:
+    """Minimal terrains as elites whose fresh episodes are their own; of the rest only the names hold.
+
+    Args:
+        archive: The elites that they are of.
+        minima: By number of the elite, rising.
+        space: Of the genes.
+    """
+    rows = archive.rows(np.array([*minima], np.int64))
+    assert rows.fresh is not None
+    counts = np.array([minimal.counts for minimal in minima.values()], np.int64).reshape(-1, len(OUTCOMES))
+    genes = [genes_of(archive.genes[number], Trial(minimal.parts), space) for number, minimal in minima.items()]
+    fresh = replace(
+        rows.fresh,
+        goal_rate=goal_rates(counts),
+        episodes=counts.sum(axis=1),
+        invalid_episodes=counts[:, OUTCOMES.index("invalid")],
+    )
+    return replace(rows, genes=np.array(genes, np.float32).reshape(rows.genes.shape), fresh=fresh, faults=None)
+
+
+def _entry(archive: Archive, number: int, case: Case, minimal: Minimal, space: TerrainSpace, half_width: float) -> dict:
+    """A minimal terrain as ``minimal.json`` has it, without what others make of it."""
+    words = space.parts(archive.genes[number])
+    scales = (1.0, minimal.scale or 1.0)
+    genes = [genes_of(archive.genes[number], Trial(minimal.parts, scale), space) for scale in scales]
+    effects = effects_of(genes[0], minimal.parts, space)
+    shapes = {part: effects.shape(place, half_width) for place, part in enumerate(minimal.parts)}
+    cause = minimal.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
+    whole, scaled = heights_of(np.array(genes), space)
+    without = {str(part): rate_of(counts) for part, counts in minimal.without.items()}
+    return {
+        "elite": number,
+        "cell": int(archive.cell[number]),
+        "iteration": int(archive.iteration[number]),
+        "bumps": list(minimal.parts),
+        "words": [words[part] for part in minimal.parts],
+        "of": len(case.parts),
+        "how": case.how,
+        "subsets_crossed": minimal.subsets,
+        **rate_of(minimal.counts),
+        "without": {part: rate["goal_rate"] for part, rate in without.items()},
+        "without_intervals": {part: rate["goal_interval"] for part, rate in without.items()},
+        "cause": None if cause is None else {"bump": cause, **asdict(shapes[cause])},
+        "scale": minimal.scale,
+        "passing_scale": minimal.passing_scale,
+        "height_m": round(float(np.abs(whole).max()), 4),
+        "margin_m": None if minimal.scale is None else round(float(np.abs(whole - scaled).max()), 4),
+        "scales": [{"scale": scale, **rate_of(counts)} for scale, counts in sorted(minimal.scales.items())],
+    }
+
+
+def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """How many minimal terrains there are of each kind."""
+    sizes = [len(entry["bumps"]) for entry in entries]
+    margins = [entry["margin_m"] for entry in entries if entry["margin_m"] is not None]
+    causes = Counter(entry["cause"]["kind"] for entry in entries if entry["cause"])
+    verdicts = Counter(entry["verdict"] for entry in entries)
+    judged = any(entry["resolved"] for entry in entries)
+    names = {one["controller"] for entry in entries for one in entry["certificates"]}
+    return {
+        "minimal": len(entries),
+        "bumps_histogram": {str(size): count for size, count in sorted(Counter(sizes).items())},
+        "bumps_median": float(np.median(sizes)) if sizes else None,
+        "margin_m_median": float(np.median(margins)) if margins else None,
+        "causes": dict(sorted(causes.items(), key=lambda pair: (-pair[1], pair[0]))),
+        "confirmed": verdicts["confirmed"] + verdicts["fault"] if judged else None,
+        "certified": verdicts["certified"] + verdicts["fault"] if judged else None,
+        "faults": verdicts["fault"] if judged else None,
+        "certifiers": sorted(names),
+    }
+
+
+def read_minimal(folder: Path, archive: Archive) -> MinimalFound | None:
+    """The minimal terrains of a run; None where nobody looked for them, or of none of the archive's elites.
+
+    Args:
+        folder: Of the run.
+        archive: Its archive; what is of other elites is left out.
+    """
+    file = folder / NUMBERS_FILE
+    if not file.exists():
+        return None
+    try:
+        numbers, arrays = read_json(file), read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
+        entries, genes = numbers["elites"], arrays["genes"]
+        if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or len(entries) != len(genes):
+            raise ValueError(f"{NUMBERS_FILE} and {MINIMAL_FILE} are not of one another")
+        if not all(set(_ENTRY) <= set(entry) for entry in entries) or genes.shape[1:] != archive.genes.shape[1:]:
+            raise ValueError(f"expected {', '.join(_ENTRY)} of each, and genes of shape {archive.genes.shape[1:]}")
+    except Exception as error:  # a damaged zip archive can fail with anything
+        raise ValueError(f"{folder} must have minimal terrains of its archive: {error}: make them again") from None
+    rows = [row for row, entry in enumerate(entries) if _is_in(archive, entry)]
+    if not rows:
+        return None
+    kept = [entries[row] for row in rows]
+    return MinimalFound(numbers=numbers | {"elites": kept}, genes={entries[row]["elite"]: genes[row] for row in rows})
+
+
+def _is_in(archive: Archive, entry: dict[str, Any]) -> bool:
+    """Whether an elite is still the one of that number; a search that went on may have found others."""
+    number = entry["elite"]
+    exists = 0 <= number < len(archive)
+    return exists and (archive.cell[number], archive.iteration[number]) == (entry["cell"], entry["iteration"])

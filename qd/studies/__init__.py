@@ -1,1 +1,0 @@
-"""Studies: several searches beside each other, and what they say of a setting."""
