@@ -75,7 +75,7 @@ def test_an_empty_archive_has_scores_too():
 
 
 def test_missing_archive(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no archive at .*archive\.npz: give a run directory"):
+    with pytest.raises(FileNotFoundError, match=r"archive\.npz"):
         read_archive(tmp_path)
 
 
@@ -83,14 +83,13 @@ def test_damage_is_reported_not_raised_raw(tmp_path):
     file = tmp_path / "archive.npz"
     write_archive(file, small_archive(50))
     whole = file.read_bytes()
-    rng = np.random.default_rng(0)
-    for size in rng.integers(0, len(whole), 30):
+    for size in np.random.default_rng(0).integers(0, len(whole), 30):
         file.write_bytes(whole[:size])
-        with pytest.raises(ValueError, match="damaged or another file"):
+        with pytest.raises(ValueError, match=r"archive\.npz"):
             read_archive(file)
     for foreign in (b"", b"hello", b"PK\x03\x04", np.zeros(3).tobytes()):
         file.write_bytes(foreign)
-        with pytest.raises(ValueError, match="damaged or another file"):
+        with pytest.raises(ValueError, match=r"archive\.npz"):
             read_archive(file)
 
 
@@ -99,9 +98,8 @@ def test_flipped_bytes_never_raise_anything_but_a_value_error(tmp_path, fresh):
     file, archive = tmp_path / "archive.npz", small_archive(5)
     write_archive(file, dataclasses.replace(archive, fresh=fresh_values(archive) if fresh else None))
     whole = file.read_bytes()
-    rng = np.random.default_rng(1)
     refused = 0
-    for position in rng.integers(0, len(whole), 200):
+    for position in np.random.default_rng(1).integers(0, len(whole), 200):
         file.write_bytes(whole[:position] + bytes([whole[position] ^ 0xFF]) + whole[position + 1 :])
         try:
             read_archive(file)
@@ -110,37 +108,51 @@ def test_flipped_bytes_never_raise_anything_but_a_value_error(tmp_path, fresh):
     assert refused > 100  # the rest hit fields of the zip format that nobody reads
 
 
-def test_another_npz_is_refused(tmp_path):
-    np.savez(tmp_path / "archive.npz", genes=np.zeros((3, 64)))
-    with pytest.raises(ValueError, match="damaged or another file"):
-        read_archive(tmp_path)
-    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), genes=np.zeros((3, 32), np.float32)))
-    with pytest.raises(ValueError, match=r"genes must have shape \(3, 64\), got \(3, 32\)"):
-        read_archive(tmp_path)
-    np.savez(tmp_path / "archive.npz", allow_pickle=True, genes=np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match="damaged or another file"):
+def changed_file(folder, archive, **changes):
+    """The file of an archive with other arrays, or without those that are None."""
+    write_archive(folder / "archive.npz", archive)
+    with np.load(folder / "archive.npz") as stored:
+        arrays = {name: changes.get(name, stored[name]) for name in stored}
+    np.savez(folder / "archive.npz", **{name: array for name, array in arrays.items() if array is not None})
+
+
+NAMES = ["genes", "cell", "robot_sha256", "penalties", "fresh_cell", "fresh_reproduced", "certifiers"]
+NAMES += ["resolved_outcomes", "certifier_resolved_outcomes"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_file_that_lacks_an_array_is_refused_by_its_name(tmp_path, name):
+    changed_file(tmp_path, judged_archive(), **{name: None})
+    with pytest.raises(ValueError, match=name):
         read_archive(tmp_path)
 
 
-def test_fresh_values_are_all_there_or_none_and_such_as_episodes_give(tmp_path):
-    file, archive = tmp_path / "archive.npz", small_archive()
-    fresh = fresh_values(archive)
-    write_archive(file, dataclasses.replace(archive, fresh=fresh))
-    with np.load(file) as data:
-        arrays = dict(data)
-    for name in FRESH:
-        np.savez(file, **{key: value for key, value in arrays.items() if key != f"fresh_{name}"})
-        with pytest.raises(ValueError, match=f"damaged or another file.*fresh_{name}"):
-            read_archive(file)
-    for changes, message in (
-        ({"reproduced": np.ones(3)}, "fresh_reproduced must be of kind 'b'"),
-        ({"ratios": np.ones((3, 5))}, r"fresh_ratios must have shape \(3, 2\), got \(3, 5\)"),
-        ({"fitness": np.array([1.0, np.nan, 0.0])}, "must hold finite numbers"),
-        ({"cell": np.array([0, 1, 10])}, "cell must lie in 0 to 9"),  # two ratios have 10 reachable cells
-    ):
-        write_archive(file, dataclasses.replace(archive, fresh=dataclasses.replace(fresh, **changes)))
-        with pytest.raises(ValueError, match=message):
-            read_archive(file)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("genes", np.zeros((4, 64), np.float32)),
+        ("ratios", np.ones((5, 3))),
+        ("fresh_ratios", np.ones((5, 3))),
+        ("fresh_cell", np.zeros((5, 1), int)),
+        ("resolved_outcomes", np.zeros((5, 3), int)),
+        ("certifier_outcomes", np.zeros((5, 1, 4), int)),
+        ("certifier_sha256", np.array(["a"])),
+        ("scales", np.ones(3)),
+        ("robot", np.array(["anymal"])),
+        ("fitness", np.array(list("abcde"))),
+        ("penalties", np.ones(2)),
+    ],
+)
+def test_arrays_of_another_shape_or_kind_are_refused_by_name(tmp_path, name, value):
+    changed_file(tmp_path, judged_archive(), **{name: value})
+    with pytest.raises(ValueError, match=name):
+        read_archive(tmp_path)
+
+
+def test_nothing_in_a_file_runs(tmp_path):
+    changed_file(tmp_path, small_archive(), genes=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match=r"archive\.npz"):
+        read_archive(tmp_path)
 
 
 def test_confirmed_and_certified_by_hand():
@@ -162,50 +174,29 @@ def test_goal_rates_by_hand():
     np.testing.assert_array_equal(goal_rates(counts), [np.nan, 0.45, 0.6, np.nan, np.nan])
 
 
-@pytest.mark.parametrize("judged", [judged_archive(), "nobody"])
-def test_faults_come_back_with_what_follows_from_them(tmp_path, judged):
-    if judged == "nobody":
-        archive = dataclasses.replace(small_archive(), fresh=fresh_values(small_archive()))
-        judged = dataclasses.replace(archive, faults=FaultCounts.none_of(3))
-    write_archive(tmp_path / "archive.npz", judged)
-    back = read_archive(tmp_path)
+@pytest.mark.parametrize("judged", [True, False])
+def test_fault_counts_come_back(tmp_path, judged):
+    archive = judged_archive()
+    archive = archive if judged else dataclasses.replace(archive, faults=FaultCounts.none_of(5))
+    write_archive(tmp_path / "archive.npz", archive)
+    stored = read_archive(tmp_path).faults
     for name in COUNTS:
-        assert np.array_equal(getattr(back.faults, name), getattr(judged.faults, name)), name
-    assert back.faults.certifiers == judged.faults.certifiers
-    assert back.faults.certifier_sha256 == judged.faults.certifier_sha256
+        assert np.array_equal(getattr(stored, name), getattr(archive.faults, name)), name
+    assert (stored.certifiers, stored.certifier_sha256) == (archive.faults.certifiers, archive.faults.certifier_sha256)
     with np.load(tmp_path / "archive.npz") as arrays:
-        assert arrays["confirmed"].tolist() == judged.confirmed.tolist()
-        assert arrays["certified"].tolist() == judged.certified.tolist()
-        assert arrays["certifier_goal_rate"].shape == (len(judged), len(judged.faults.certifiers))
-        if len(judged) == 5:
-            # Wilson of 9 of 20: (.45 + .0960) / 1.1921 = .4581 +- 1.96 sqrt(.45 .55 / 20 + .0024) / 1.1921 = .1998
-            assert arrays["resolved_goal_interval"][0] == pytest.approx([0.2582, 0.6579], abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("confirmed", np.zeros(5, bool), "confirmed must follow from the outcomes"),
-        ("resolved_goal_rate", np.ones(5), "resolved_goal_rate must follow from the outcomes"),
-        ("resolved_outcomes", np.full((5, 4), -1), "resolved_outcomes must be counts"),
-        ("certifiers", np.array(["C-G"]), "every certifier a hash"),
-        ("fresh_fitness", None, "fresh_fitness"),
-        ("mujoco_c_outcomes", None, "mujoco_c_outcomes"),
-    ],
-)
-def test_faults_that_cannot_be_are_damage(tmp_path, name, value, message):
-    write_archive(tmp_path / "archive.npz", judged_archive())
-    with np.load(tmp_path / "archive.npz") as arrays:
-        content = {key: arrays[key] for key in arrays if key != name or value is not None}
-    if value is not None:
-        content[name] = value
-    np.savez(tmp_path / "archive.npz", **content)
-    with pytest.raises(ValueError, match=message):
-        read_archive(tmp_path)
+        assert arrays["confirmed"].tolist() == archive.confirmed.tolist()
+        assert arrays["certified"].tolist() == archive.certified.tolist()
 
 
 def test_fault_counts_go_with_their_elites():
-    archive = judged_archive()
-    turned = archive.rows(np.array([4, 0, 2]))
+    turned = judged_archive().rows(np.array([4, 0, 2]))
     assert turned.confirmed.tolist() == [False, True, False]
     assert turned.certified.tolist() == [False, True, True]
+
+
+def test_elites_are_the_same_in_any_order():
+    archive = judged_archive()
+    bare = dataclasses.replace(archive, fresh=None, faults=None).rows(np.array([3, 1, 4, 0, 2]))
+    assert bare.has_elites_of(archive)
+    assert not dataclasses.replace(bare, iteration=bare.iteration + 1).has_elites_of(archive)
+    assert not bare.rows(np.arange(4)).has_elites_of(archive)
