@@ -209,15 +209,15 @@ class Archive(Evaluation):
         """Whether the elites and all that was found of them are another's too, in whatever order."""
         if len(self) != len(other):
             return False
-        own, others = np.argsort(self.cell), np.argsort(other.cell)
-        return all(np.array_equal(getattr(self, name)[own], getattr(other, name)[others]) for name in PER_ELITE)
+        order, other_order = np.argsort(self.cell), np.argsort(other.cell)
+        return all(np.array_equal(getattr(self, name)[order], getattr(other, name)[other_order]) for name in PER_ELITE)
 
     def rows(self, chosen: NDArray[np.int64]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
         fresh = None if self.fresh is None else self.fresh.rows(chosen)
         faults = None if self.faults is None else self.faults.rows(chosen)
-        own = {name: getattr(self, name)[chosen] for name in PER_ELITE}
-        return replace(self, fresh=fresh, faults=faults, **own)
+        elites = {name: getattr(self, name)[chosen] for name in PER_ELITE}
+        return replace(self, fresh=fresh, faults=faults, **elites)
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with what fresh episodes say, by descending corrected fitness, the invalid elites last."""

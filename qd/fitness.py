@@ -96,7 +96,7 @@ class Evaluation:
 def concatenated(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Evaluations of terrains one after the other."""
     names = [field.name for field in fields(Evaluation)]
-    return Evaluation(**{name: np.concatenate([getattr(one, name) for one in evaluations]) for name in names})
+    return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})
 
 
 def paper_fitness(
@@ -167,8 +167,8 @@ def _scaled_penalties(result: "RolloutResult", cfg: FitnessCfg) -> NDArray[np.fl
 
 def _mean(values: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Mean over the valid episodes of values of shape (T, R, P); zeros where there are none."""
-    kept = np.where(valid[:, :, None], values, 0.0)
-    return kept.sum(axis=1) / np.maximum(valid.sum(axis=1), 1)[:, None]
+    counted = np.where(valid[:, :, None], values, 0.0)
+    return counted.sum(axis=1) / np.maximum(valid.sum(axis=1), 1)[:, None]
 
 
 def _rate(flags: NDArray[np.bool_], valid: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -59,7 +59,7 @@ class Networks(nn.ModuleList):
             return self.together(maps)
         # One by one, since groups are slow on the CPU.
         members = (slice(member, member + 1) for member in range(MEMBERS))
-        return torch.cat([self._through(maps[:, own].flatten(1, 2), own) for own in members], dim=1)
+        return torch.cat([self._through(maps[:, member].flatten(1, 2), member) for member in members], dim=1)
 
     def together(self, maps: Tensor) -> Tensor:
         """As :meth:`forward`, with all networks in one convolution."""
@@ -144,14 +144,14 @@ class Training:
         on_cuda = device.startswith("cuda")
         self._networks, self._loss, self._device = networks, loss, device
         weights = list(networks.parameters())
-        for one in weights:
-            one.grad = None
+        for tensor in weights:
+            tensor.grad = None
         self._optimiser = torch.optim.AdamW(
             weights, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, capturable=on_cuda, fused=on_cuda or None
         )
-        for one, remembered in zip(weights, moments or [{} for _ in weights], strict=True):
+        for tensor, remembered in zip(weights, moments or [{} for _ in weights], strict=True):
             if remembered:  # Adam begins anew where there is nothing
-                self._optimiser.state[one] = {name: remembered[name].to(device) for name in _MOMENTS}
+                self._optimiser.state[tensor] = {name: remembered[name].to(device) for name in _MOMENTS}
         self._batch: tuple[Tensor, Tensor, Tensor] | None = None  # maps, targets, which maps are mirrored
         self._stream = torch.cuda.Stream(device) if on_cuda else None
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -162,7 +162,8 @@ class Training:
         """What Adam remembers of each tensor of weights."""
         state = self._optimiser.state
         return [
-            {name: state[one][name] for name in _MOMENTS} if one in state else {} for one in self._networks.parameters()
+            {name: state[tensor][name] for name in _MOMENTS} if tensor in state else {}
+            for tensor in self._networks.parameters()
         ]
 
     def run(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:

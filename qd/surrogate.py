@@ -89,8 +89,6 @@ class Surrogate:
         stream: Seed of first weights, draws and proposals.
     """
 
-    space_sha256: str | None = None
-
     def __init__(self, cfg: SchedulerCfg, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
         self.cfg, self.cells, self.device = cfg, cells, "cpu"
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
@@ -147,30 +145,27 @@ class Surrogate:
             self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
-        kept = _in_units(genes)
+        units = _in_units(genes)
         if self._maps is not None:
-            self._maps = torch.cat([self._maps, self._mapped(kept)])[-MOST:]
-        self._genes = np.concatenate([self._genes, kept])[-MOST:]
+            self._maps = torch.cat([self._maps, self._map_units(units)])[-MOST:]
+        self._genes = np.concatenate([self._genes, units])[-MOST:]
         self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-MOST:]
         numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed].astype(np.float32)
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
 
-    def _mapped(self, genes: NDArray[np.int16]) -> Tensor:
-        """Heights over their scale and ground, in half precision since there are many, shape (N, num_maps, *SHAPE).
+    def _map_units(self, units: NDArray[np.int16]) -> Tensor:
+        """Maps of genes as they are remembered, in half precision since there are many, shape (N, num_maps, *SHAPE)."""
+        parts = torch.from_numpy(units).to(self.device).split(_AT_ONCE["cpu"])
+        return torch.cat([self._map_genes(part / _GENE_UNITS).half() for part in parts])
 
-        Args:
-            genes: As they are remembered.
-        """
-        parts = torch.from_numpy(genes).to(self.device).split(_AT_ONCE["cpu"])
-        return torch.cat([self._some_mapped(part / _GENE_UNITS).half() for part in parts])
-
-    def _some_mapped(self, genes: Tensor) -> Tensor:
+    def _map_genes(self, genes: Tensor) -> Tensor:
+        """Heights over their scale, and ground."""
         heights = corridor_heights(genes, self.space) / _HEIGHT_SCALE
         return torch.cat([heights[:, None], corridor_ground(genes, self.space)], dim=1)
 
     def _train(self, steps: int) -> None:
         if self._maps is None:
-            self._maps = self._mapped(self._genes)
+            self._maps = self._map_units(self._genes)
         targets = self._scaled(torch.from_numpy(self._targets).to(self.device).float())
         shape = steps, BATCH, MEMBERS
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
@@ -187,12 +182,13 @@ class Surrogate:
         first, last = self.cells.num_ratios, self.cells.num_ratios + self._regressed
         return columns[..., :first], columns[..., first:last], columns[..., last:]
 
-    def _loss(self, found: Tensor, wanted: Tensor) -> Tensor:
-        """Of shape (batch, MEMBERS, columns) both: the sum over the networks, none of which learns from another."""
-        (ratios, numbers, rates), (own_ratios, own_numbers, own_rates) = self._split(found), self._split(wanted)
-        loss = -_RATIO_WEIGHT * (own_ratios * ratios.log_softmax(-1)).sum(-1)
-        loss = loss + ((numbers - own_numbers) ** 2).mean(-1)
-        loss = loss + nn.functional.binary_cross_entropy_with_logits(rates, own_rates, reduction="none").mean(-1)
+    def _loss(self, outputs: Tensor, targets: Tensor) -> Tensor:
+        """Sum over the networks, none of which learns from another; both of shape (batch, MEMBERS, columns)."""
+        ratios, numbers, rates = self._split(outputs)
+        true_ratios, true_numbers, true_rates = self._split(targets)
+        loss = -_RATIO_WEIGHT * (true_ratios * ratios.log_softmax(-1)).sum(-1)
+        loss = loss + ((numbers - true_numbers) ** 2).mean(-1)
+        loss = loss + nn.functional.binary_cross_entropy_with_logits(rates, true_rates, reduction="none").mean(-1)
         return loss.mean(0).sum()
 
     @torch.inference_mode()
@@ -203,7 +199,7 @@ class Surrogate:
             genes: In [-1, 1], on the surrogate's device, shape (N, num_genes).
         """
         parts = genes.split(_AT_ONCE[genes.device.type])
-        columns = torch.cat([self._networks.judge(self._some_mapped(part)) for part in parts])
+        columns = torch.cat([self._networks.judge(self._map_genes(part)) for part in parts])
         ratios, numbers, rates = self._split(columns.transpose(0, 1))
         middle, spread = torch.from_numpy(self._scale).to(self.device)
         return Prediction(ratios.softmax(-1), numbers.clamp(-10.0, 10.0) * spread + middle, rates)
@@ -232,31 +228,31 @@ class Surrogate:
         if not len(elites):
             return self.space.hard_random(count, self._rng)
         draw = torch.Generator(self.device).manual_seed(int(self._rng.integers(2**62)))
-        there = torch.from_numpy(np.ascontiguousarray(elites, np.float32)).to(self.device)
+        parents = torch.from_numpy(np.ascontiguousarray(elites, np.float32)).to(self.device)
         if len(self) < FEWEST:
-            return self._varied(there, count, draw).cpu().numpy()
-        explored = self._varied(there, round(self.cfg.explore_share * count), draw)
+            return self._vary(parents, count, draw).cpu().numpy()
+        explored = self._vary(parents, round(self.cfg.explore_share * count), draw)
         best = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
         np.maximum.at(best, cell, fitness.astype(np.float32))
         expected = torch.cat([torch.from_numpy(under_way).to(self.device), explored])
-        known = self._with_expected(torch.from_numpy(best).to(self.device), expected)
-        searched = self._searched(count - len(explored), there, known, count, draw)
+        best_expected = self._add_expected(torch.from_numpy(best).to(self.device), expected)
+        searched = self._search(count - len(explored), parents, best_expected, count, draw)
         return torch.cat([explored, searched]).cpu().numpy()
 
-    def _with_expected(self, best: Tensor, expected: Tensor) -> Tensor:
+    def _add_expected(self, best: Tensor, expected: Tensor) -> Tensor:
         """Fitness in each cell once robots have crossed what they are to cross already, shape (num_cells,)."""
         if not len(expected):
             return best
-        found = self.predict(expected)
-        cells = self._expected_cells(found)
+        prediction = self.predict(expected)
+        cells = self._expected_cells(prediction)
         inside = cells >= 0
-        return best.scatter_reduce(0, cells[inside], found.fitness.mean(0)[inside], "amax")
+        return best.scatter_reduce(0, cells[inside], prediction.fitness.mean(0)[inside], "amax")
 
-    def _searched(self, wanted: int, elites: Tensor, best: Tensor, count: int, draw: torch.Generator) -> Tensor:
+    def _search(self, num_proposals: int, elites: Tensor, best: Tensor, count: int, draw: torch.Generator) -> Tensor:
         """The inner loop: what adds most to the predicted archive, and what the networks disagree about.
 
         Args:
-            wanted: Terrains to return.
+            num_proposals: Terrains to return.
             elites: Genes of the elites, where it begins.
             best: Fitness in each cell, expected or found, shape (num_cells,).
             count: Terrains of which these are a part.
@@ -266,29 +262,32 @@ class Surrogate:
         genes = elites.new_empty(self.cfg.generations * each, elites.shape[1])
         gain, spread = elites.new_empty(2, len(genes))
         cells = torch.empty(len(genes), dtype=torch.int64, device=genes.device)
-        kept = cells[:0]
+        survivors = cells[:0]
         for first in range(0, len(genes), each):
-            own = slice(first, first + each)
-            genes[own] = self._varied(torch.cat([elites, genes[kept]]), each, draw)
-            found = self.predict(genes[own])
-            gain[own], spread[own] = self._gain(found, best), found.ratios.std(0, correction=0).sum(1)
-            cells[own] = self._expected_cells(found)
-            rows = torch.cat([kept, torch.arange(first, first + each, device=genes.device)])
-            kept = rows[_best_of_each(cells[rows], gain[rows], self.cells.num_cells)]
-        chosen = kept[: wanted - min(wanted, round(self.cfg.disagree_share * count))]
+            children = slice(first, first + each)
+            genes[children] = self._vary(torch.cat([elites, genes[survivors]]), each, draw)
+            prediction = self.predict(genes[children])
+            gain[children], spread[children] = (
+                self._gain(prediction, best),
+                prediction.ratios.std(0, correction=0).sum(1),
+            )
+            cells[children] = self._expected_cells(prediction)
+            rows = torch.cat([survivors, torch.arange(first, first + each, device=genes.device)])
+            survivors = rows[_best_of_each(cells[rows], gain[rows], self.cells.num_cells)]
+        chosen = survivors[: num_proposals - min(num_proposals, round(self.cfg.disagree_share * count))]
         spread[chosen] = -torch.inf
-        disputed = spread.argsort(descending=True, stable=True)[: wanted - len(chosen)]
+        disputed = spread.argsort(descending=True, stable=True)[: num_proposals - len(chosen)]
         return genes[torch.cat([chosen, disputed])]
 
-    def _gain(self, found: Prediction, best: Tensor) -> Tensor:
+    def _gain(self, prediction: Prediction, best: Tensor) -> Tensor:
         """QD score that terrains would add, the mean over the networks, shape (N,)."""
-        cells = self._cells(found.ratios, found.collided)
-        gains = (found.fitness - best[cells]).clamp_min(0.0)
+        cells = self._cells(prediction.ratios, prediction.collided)
+        gains = (prediction.fitness - best[cells]).clamp_min(0.0)
         return torch.where(cells >= 0, gains, 0.0).mean(0)
 
-    def _expected_cells(self, found: Prediction) -> Tensor:
+    def _expected_cells(self, prediction: Prediction) -> Tensor:
         """Cell of each terrain by the networks' mean, and by most of them whether robots collide, shape (N,)."""
-        return self._cells(found.ratios.mean(0), found.collided.float().mean(0) >= 0.5)
+        return self._cells(prediction.ratios.mean(0), prediction.collided.float().mean(0) >= 0.5)
 
     def _cells(self, ratios: Tensor, collided: Tensor) -> Tensor:
         """Cell of each row of ratios, as :meth:`Cells.cell_of` has it; -1 of one on the edge of what can be reached."""
@@ -304,7 +303,7 @@ class Surrogate:
             cells = cells + len(self._codes) * collided
         return torch.where(reached, cells, -1)
 
-    def _varied(self, pool: Tensor, count: int, draw: torch.Generator) -> Tensor:
+    def _vary(self, pool: Tensor, count: int, draw: torch.Generator) -> Tensor:
         return varied(pool, count, self.cfg, self.space.genes_per_part, draw)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -319,7 +318,7 @@ class Surrogate:
             "genes": self._genes,
             "targets": self._targets,
             "scale": self._scale,
-            "learned": [{name: value.cpu().numpy() for name, value in one.items()} for one in learned],
+            "learned": [{name: value.cpu().numpy() for name, value in tensors.items()} for tensors in learned],
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -330,13 +329,15 @@ class Surrogate:
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets, self._scale = (state[k] for k in ("rng", "genes", "targets", "scale"))
         self._make_networks()
-        learned = [{name: torch.from_numpy(value).clone() for name, value in one.items()} for one in state["learned"]]
-        values, weights = [one.pop("weights") for one in learned], list(self._networks.parameters())
-        if [value.shape for value in values] != [own.shape for own in weights]:
-            raise ValueError("its surrogate has networks of another shape, of another version")
-        for own, value in zip(weights, values, strict=True):
-            own.data.copy_(value)
-        self._training = Training(self._networks, self._loss, self.device, learned)
+        moments = [
+            {name: torch.from_numpy(array).clone() for name, array in arrays.items()} for arrays in state["learned"]
+        ]
+        stored, weights = [tensors.pop("weights") for tensors in moments], list(self._networks.parameters())
+        if [tensor.shape for tensor in stored] != [tensor.shape for tensor in weights]:
+            raise ValueError("its surrogate has networks of another shape")
+        for tensor, value in zip(weights, stored, strict=True):
+            tensor.data.copy_(value)
+        self._training = Training(self._networks, self._loss, self.device, moments)
 
 
 def _in_units(genes: NDArray[np.float32]) -> NDArray[np.int16]:

@@ -23,11 +23,11 @@ def varied(pool: Tensor, count: int, cfg: SchedulerCfg, genes_per_part: int | No
     """
     on = {"generator": draw, "device": pool.device}
     elites, others, further = pool[torch.randint(len(pool), (3, count), **on)]
-    own = cfg.iso_sigma * torch.randn(elites.shape, **on)
+    noise = cfg.iso_sigma * torch.randn(elites.shape, **on)
     along = cfg.line_sigma * torch.randn((count, 1), **on)
-    children = elites + own + along * (others - elites)
+    children = elites + noise + along * (others - elites)
     if cfg.crossover_share and genes_per_part:
         crossed = torch.rand((count, 1), **on) < cfg.crossover_share
-        taken = (torch.rand((count, pool.shape[1] // genes_per_part), **on) < 0.5) & crossed
-        children = torch.where(taken.repeat_interleave(genes_per_part, dim=1), further, children)
+        swapped = (torch.rand((count, pool.shape[1] // genes_per_part), **on) < 0.5) & crossed
+        children = torch.where(swapped.repeat_interleave(genes_per_part, dim=1), further, children)
     return children.clamp(-1.0, 1.0)

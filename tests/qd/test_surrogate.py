@@ -54,7 +54,7 @@ def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
 
 
 def mapped(search: Surrogate, genes) -> torch.Tensor:
-    return search._some_mapped(torch.from_numpy(genes))
+    return search._map_genes(torch.from_numpy(genes))
 
 
 def make_surrogate(cfg: SchedulerCfg = CFG, seed: int = 0) -> Surrogate:
@@ -200,25 +200,13 @@ def test_it_learns_and_proposes_on_every_device(device, name, tmp_path, monkeypa
     search.compute_on(device)
     elites = space.hard_random(80, 0)
     told = crossed(elites, 0, space)
-    search.learn(elites, told, told.fitness)
+    search.learn(elites, told)
     genes = search.propose(16, elites, told.cell, told.fitness, elites[:4])
     assert genes.shape == (16, space.num_genes) and genes.dtype == np.float32 and np.abs(genes).max() <= 1.0
     assert len(np.unique(genes, axis=0)) == 16
     here = pickle.loads(pickle.dumps(search))  # on the CPU
     apart = np.abs(predicted(search, genes)["ratios"] - predicted(here, genes)["ratios"]).max(axis=(0, 2))
     assert np.median(apart) < 0.005  # devices may round an element of a course to another node
-
-
-def test_one_that_was_saved_when_there_were_more_settings_is_read():
-    search, state = make_surrogate(), make_surrogate().__getstate__()
-    search.__setstate__({**state, "cfg": {**state["cfg"], "mirror_share": 0.0, "shares": "fixed"}})
-    assert search.cfg == CFG
-
-
-def test_genes_that_were_saved_as_floats_are_the_same_terrains(learned):
-    state, search = learned.__getstate__(), make_surrogate()
-    search.__setstate__({**state, "genes": (state["genes"] / 32767).astype(np.float32)})
-    assert search._genes.dtype == np.int16 and np.array_equal(search._genes, learned._genes)
 
 
 def test_networks_of_another_shape_are_refused_when_loaded():
@@ -252,7 +240,7 @@ def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
     # By hand for the first: each network's fitness less that of the cell where it puts the terrain.
     own = [max(0.0, f - best[cells_of(r[None])[0]]) for f, r in zip(fitness[:, 0], found.ratios[:, 0], strict=True)]
     assert gain[0] == pytest.approx(np.mean(own), rel=1e-4)
-    chance = learned._varied(torch.from_numpy(elites), 60, torch.Generator().manual_seed(0))
+    chance = learned._vary(torch.from_numpy(elites), 60, torch.Generator().manual_seed(0))
     assert gain.mean() > learned._gain(learned.predict(chance), torch.from_numpy(best)).mean()
 
 
@@ -285,7 +273,7 @@ def test_before_it_knows_enough_it_draws_and_varies():
     first = search.propose(8, none, np.zeros(0, int), np.zeros(0), none)
     assert (np.abs(first[:, 7::8]) == 1.0).all()  # hard-random
     told = crossed(first, 0)
-    search.learn(first, told, told.fitness)
+    search.learn(first, told)
     later = search.propose(8, first[:1], told.cell[:1], told.fitness[:1], none)
     assert 0.0 < np.abs(later - first[0]).max() < 0.2  # one elite, varied by .02
 
@@ -310,7 +298,7 @@ def test_the_newest_are_kept(monkeypatch):
         search.learn(genes, told)
     assert len(search) == 70
     np.testing.assert_allclose(search._genes[-40:] / 32767, genes, atol=2e-5)
-    assert torch.equal(search._maps[-40:], search._mapped(search._genes[-40:]))
+    assert torch.equal(search._maps[-40:], search._map_units(search._genes[-40:]))
 
 
 @pytest.mark.slow
