@@ -11,7 +11,6 @@ import warp as wp
 from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
-from kernels.ground import PATCHES
 from sim.bank import TerrainBank
 from sim.rollout import Rollout
 from sim.simulation import Simulation
@@ -111,7 +110,7 @@ def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint3
     """
     sim, robot = rollout.sim, rollout.robot
     segments = record_segments(rollout, terrains, seeds)
-    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, ground_shape=PATCHES)
+    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_ground=True)
     bank.set_heights(sim.bank.heights.numpy())
     motion = Motion(sim, segments)
     with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
