@@ -11,7 +11,19 @@ from results.make import common, docs, tables
 from sim.files.records import sources_sha256
 
 MAKE = Path(common.__file__).parent
-SCRIPTS = ("base", "penalty_ratios", "agreement", "distances", "dose", "train_speed", "solver_options")
+FILES = {
+    **{
+        name: f"{name}.json"
+        for name in (
+            "base", "penalty_ratios", "agreement", "distances", "dose", "train_speed", "solver_options", "tables",
+            "ablation", "speed", "scale", "search", "spaces",
+        )
+    },
+    "archive": "archive/archive.json",
+    "minimal": "archive/minimal.json",
+    "pack": "pack/pack.json",
+}  # fmt: skip
+"""What each script writes."""
 
 
 def run_small(name, out, device):
@@ -21,9 +33,9 @@ def run_small(name, out, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("name", FILES)
 def test_a_trial_writes_its_file(name, tmp_path, device):
-    report = run_small(name, tmp_path / f"{name}.json", device)
+    report = run_small(name, tmp_path / "anymal" / FILES[name], device)
     assert {"command", "commit", "sources_sha256", "dirty", "device", "versions", "seed", "date"} <= report.keys()
     assert report["robot"] == "anymal" and report["sources_sha256"] == sources_sha256()
 
