@@ -196,37 +196,26 @@ def make_tables(
         episodes: On each terrain.
         seed: Of bootstraps.
     """
-    families = {name: terrains.families for name, terrains in sets.items()}
-    means = _of_measures(crossed, lambda _, values: mean_of(values))
-    certified = _of_certified(crossed, sets, lambda values, _: mean_of(values))
-    intervals = _of_measures(crossed, lambda name, values: interval_of(values, seed, families[name]))
-    intervals |= _of_certified(crossed, sets, lambda values, kin: interval_of(values, seed, kin))
+    means = _statistics(crossed, sets, lambda values, _: mean_of(values))
     return Tables(
         robot=robot.name,
         episodes=episodes,
         controllers=controllers,
         **means,
-        **certified,
         certified=_about_certified(sets, controllers),
-        over_seeds=over_seeds({**means, **certified}, (*_MEASURES, *CERTIFIED)),
-        intervals=intervals,
+        over_seeds=over_seeds(means, (*MEASURES, *CERTIFIED)),
+        intervals=_statistics(crossed, sets, lambda values, families: interval_of(values, seed, families)),
         terrains={name: len(terrains) for name, terrains in sets.items()},
-        outcomes={
-            name: {controller: measured.outcomes for controller, measured in row.items()}
-            for name, row in crossed.items()
-        },
-        invalid_terrains={
-            name: {controller: int((~measured.valid).sum()) for controller, measured in row.items()}
-            for name, row in crossed.items()
-        },
+        outcomes=_each(crossed, lambda measured: measured.outcomes),
+        invalid_terrains=_each(crossed, lambda measured: int((~measured.valid).sum())),
         differences={
             name: differences(
-                {controller: row[controller] for controller in firsts(row)}, sets[name].numbers, seed, families[name]
+                {first: row[first] for first in firsts(row)}, sets[name].numbers, seed, sets[name].families
             )
             for name, row in crossed.items()
         },
         traversable={
-            name: split_by_goal(row, sets[name].numbers, seed, families[name])
+            name: split_by_goal(row, sets[name].numbers, seed, sets[name].families)
             for name, row in crossed.items()
             if name in FROM_ARCHIVE
         },
@@ -238,43 +227,31 @@ def make_tables(
     )
 
 
-_MEASURES = tuple(MEASURES)
+def _each(crossed: Crossed, of: Callable[[Measured], Any]) -> dict[str, dict[str, Any]]:
+    return {name: {controller: of(measured) for controller, measured in row.items()} for name, row in crossed.items()}
 
 
-def _of_measures(crossed: Crossed, statistic: Callable[[str, NDArray[np.float64]], Any]) -> dict[str, Any]:
-    """Each measure, and ``penalties``: set -> controller -> a statistic of the set's name and the terrains' values."""
-    tables: dict[str, Any] = {
-        key: {
-            name: {controller: statistic(name, row[controller].values[key]) for controller in row}
-            for name, row in crossed.items()
-        }
-        for key in MEASURES
-    }
-    tables["penalties"] = {
-        name: {
-            controller: {key: statistic(name, values) for key, values in measured.penalties.items()}
-            for controller, measured in row.items()
-        }
-        for name, row in crossed.items()
-    }
-    return tables
-
-
-def _of_certified(
+def _statistics(
     crossed: Crossed, sets: Mapping[str, TerrainSet], statistic: Callable[[NDArray[np.float64], Families], Any]
 ) -> dict[str, Any]:
-    """Each of :data:`CERTIFIED`: set -> controller -> a statistic of certified terrains and their families."""
-    members = {name: chosen.certificates.certified for name, chosen in sets.items() if chosen.certificates is not None}
-    return {
-        key: {
-            name: {
-                controller: statistic(measured.values[measure][member], of_terrains(sets[name].families, member))
-                for controller, measured in crossed[name].items()
-            }
-            for name, member in members.items()
+    """Each measure and ``penalties``: set -> controller -> a statistic of the terrains' values and families."""
+    tables: dict[str, Any] = {key: {} for key in (*MEASURES, "penalties", *CERTIFIED)}
+    for name, row in crossed.items():
+        families, certificates = sets[name].families, sets[name].certificates
+        for key in MEASURES:
+            tables[key][name] = {controller: statistic(row[controller].values[key], families) for controller in row}
+        tables["penalties"][name] = {
+            controller: {key: statistic(values, families) for key, values in measured.penalties.items()}
+            for controller, measured in row.items()
         }
-        for key, measure in CERTIFIED.items()
-    }
+        if certificates is not None:
+            member = certificates.certified
+            kin = of_terrains(families, member)
+            for key, measure in CERTIFIED.items():
+                tables[key][name] = {
+                    controller: statistic(row[controller].values[measure][member], kin) for controller in row
+                }
+    return tables
 
 
 def _about_certified(sets: Mapping[str, TerrainSet], controllers: Mapping[str, Controller]) -> dict[str, Certified]:
