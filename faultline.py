@@ -34,7 +34,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
     "Train": {
         "train": Command("train.commands:Train", "train a base controller from scratch"),
         "finetune": Command("train.commands:Finetune", "train a controller further on terrains that broke it"),
-        "harden": Command("train.harden:Harden", "rounds of search and training, until little breaks it"),
+        "harden": Command("train.commands:Harden", "rounds of search and training, until little breaks it"),
         "export-policy": Command("sim.commands:ExportPolicy", "a controller as one ONNX file"),
     },
     "Bring a robot": {

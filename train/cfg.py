@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
-from sim.files.settings import NonNegativeInt, PositiveFloat, check
+from msgspec import Meta
+
+from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, check
 from sim.robots.robot import RobotCfg
 from sim.robots.training import Draw
 from train.ppo.cfg import PpoCfg, ppo_problems
@@ -168,6 +170,60 @@ class FinetuneCfg(TrainCfg):
             raise ValueError(f"mix {self.mix} takes no terrains from an archive, got --archive: leave it out")
         if self.mix == "generated" and self.ground is not None:
             raise ValueError("mix generated takes the ground of its archives, got --ground: leave it out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundSearchCfg:
+    """Each search of a hardening; what is left out or 0 is the preset's."""
+
+    preset: str | None = None
+    """Size of an iteration: wide (the default on a GPU), paper, or small (the default on the CPU)."""
+    episodes: NonNegativeInt = 0
+    """Budget in episodes, rounded up to whole iterations; 0: 400,000 on CUDA (5 minutes on one H200), 2,560 on the CPU.
+    With fewer, less is found: compare numbers of faults only between searches of the same budget."""
+    emitters: NonNegativeInt = 0
+    batch_size: NonNegativeInt = 0
+    """Terrains that an emitter asks for in an iteration."""
+    replicas: NonNegativeInt = 0
+    """Episodes a terrain."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundEvaluationCfg:
+    """The evaluation and the validation of every controller of a hardening."""
+
+    terrains: PositiveInt | None = None
+    """A set; on CUDA 300 (Cassie: 180), on the CPU 24."""
+    episodes: PositiveInt | None = None
+    """On each terrain; on CUDA 20, on the CPU 4."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HardenCfg:
+    """A hardening. With the robot and the files it names, it says all that the result depends on."""
+
+    policy: str | None = None
+    """Controller to begin with: an rsl_rl checkpoint with layers of any size; the robot's own."""
+    rounds: PositiveInt = 3
+    """Rounds of training; there is one search more. A larger number later continues a finished run."""
+    seed: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
+    """Seed of everything drawn in searches and trainings."""
+    space: str | None = None
+    """Terrain space: super_gaussian, course, or one of your own, file.py:CLASS; super_gaussian if left out."""
+    ground: tuple[str, ...] | None = None
+    """What the ground differs in from patch to patch of 2 m: friction, softness, or both."""
+    specialists: bool = False
+    """Train a specialist for each search too, whose certificates count beside those of the panel."""
+    search: RoundSearchCfg = field(default_factory=RoundSearchCfg)
+    tune: FinetuneCfg = field(default_factory=FinetuneCfg)
+    """Each training, but for controller, seed, archives and space, which are the round's. On CUDA it has 8192 robots
+    and 2000 terrains at a time (Cassie: the paper's sizes)."""
+    evaluation: RoundEvaluationCfg = field(default_factory=RoundEvaluationCfg)
+
+    @classmethod
+    def of(cls, robot: RobotCfg) -> Self:
+        """The settings of a robot."""
+        return cls(tune=FinetuneCfg.of(robot))
 
 
 def _with_sizes(cfg: _Cfg, sizes: Sizes) -> _Cfg:

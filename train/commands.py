@@ -7,11 +7,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from sim.files.command import peek
+from sim.files.command import Where, peek
 from sim.files.settings import from_builtins
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from train.cfg import FinetuneCfg, RunCfg, TrainCfg
+from train.cfg import FinetuneCfg, HardenCfg, RunCfg, TrainCfg
 
 _Cfg = TypeVar("_Cfg")
 
@@ -87,6 +87,37 @@ class Finetune(_OfTraining, FinetuneCfg):
         if given or self.mix != "generated":
             raise ValueError(f"--specialist takes archive and places of its run, got {', '.join(given) or self.mix}")
         train_specialist(robot, self.specialist, cfg, run)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Harden(HardenCfg, Where):
+    """Search for what breaks a controller, train it on all that was found, and search again, for some rounds.
+
+    Each search counts the faults: terrains that another controller crosses and this one does not. Each training is on
+    hand-crafted terrains and on the archives of all searches so far, and its controller is kept if validation terrains
+    speak for it. The last step is a search against the last controller. RUN_DIR/rounds.json has the numbers, and
+    `faultline report --run RUN_DIR` makes a page of them. After Ctrl-C or a kill the same command goes on.
+    """
+
+    robot: str = "anymal"
+    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
+    run_dir: Path | None = None
+    """Where to work, and to go on; runs/<robot>-harden-<seed>."""
+
+    @classmethod
+    def defaults(cls, argv: Sequence[str]) -> Self:
+        """The settings of the robot that a command line names."""
+        robot = get_robot(peek(argv, "--robot") or "anymal")
+        return cls(robot=robot.spec, **_values(HardenCfg.of(robot)))
+
+    def execute(self) -> None:
+        """Hardens."""
+        from qd.workers.evaluator import Compute
+        from train.harden import harden
+
+        robot, compute = get_robot(self.robot), Compute.resolve(self.device, self.workers, self.num_envs)
+        run_dir = self.run_dir or Path("runs") / f"{robot.name}-harden-{self.seed}"
+        harden(robot, _part(HardenCfg, self), run_dir, compute)
 
 
 def _peek(argv: Sequence[str]) -> tuple[RobotCfg, Path | None]:

@@ -1,88 +1,320 @@
-"""Harden a controller: rounds of search and training, until a search no longer finds what breaks it."""
+"""Harden a controller: rounds of search and training, until a search no longer finds what breaks it.
 
-from dataclasses import dataclass
+Every step is a run of its own under the directory of the hardening: search-0, tune-1, search-1 and so on. Searches and
+trainings go on from their checkpoints, and what else was crossed is found again, so a hardening that was stopped is
+begun again and does what is left.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from statistics import fmean
+from typing import Any
 
-from sim.files.command import OfRobot, OnGround, Where
-from sim.files.settings import setting
-from sim.robots.training import Draw
+import numpy as np
 
-Comparison = Literal["hard_random", "first_archive"]
-"""What else the trainings of a hardening could be spent on."""
+from qd.archive import read_archive
+from qd.evaluate.evaluate import EPISODES, cross_sets, evaluate, sizes_for
+from qd.evaluate.measures import terrain_rates
+from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, paper_terrains, read_elites
+from qd.evaluate.show import show_table
+from qd.judge import judge
+from qd.run.directory import ROUNDS_FILE, RunDirectory, claimed
+from qd.run.settings import SearchCfg, differences, preset
+from qd.search import search
+from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
+from sim.files.command import Interrupted
+from sim.files.intervals import value_words
+from sim.files.records import identity
+from sim.files.settings import check
+from sim.policy.spec import controller_hash
+from sim.robots.robot import RobotCfg
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import is_own, load_space
+from train.cfg import LARGE, FinetuneCfg, HardenCfg, RunCfg
+from train.finetune import finetune, train_specialist
+from train.ppo.checkpoint import CHECKPOINT, read_start
+from train.ppo.training import POLICY
+
+MOST_LOST = 0.01
+"""How much of its goal rate on hand-crafted and on hard-random terrains a controller may lose against the base."""
+FIXED_SETS = ("hand_crafted", "hard_random")
+"""Sets that every controller is evaluated on, beside the archives."""
+_GPU_EPISODES = 400_000
+_SEEDS = 100  # of searches and trainings, apart between hardenings of one seed and the next
+_COUNTS = (
+    "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "families", "failing",
+    "confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families", "certifiers",
+)  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class Harden(OfRobot, OnGround, Where):
-    """Search for what breaks a controller, train it on all that was found, and search again, for some rounds.
+def harden(
+    robot: RobotCfg,
+    cfg: HardenCfg,
+    run_dir: Path,
+    compute: Compute,
+    *,
+    certifiers: Mapping[str, str] | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> dict[str, Any]:
+    """Searches for what breaks a controller, trains it on all that was found, and searches again, for some rounds.
 
-    Each search counts the faults: terrains that a controller of the panel crosses and this one does not. Each training
-    is on hand-crafted terrains and on the archives of all searches so far, and its controller is kept if validation
-    terrains speak for it. Every controller is evaluated on
-    hand-crafted and hard-random terrains and on the held-out elites of every archive. The last step is a search against
-    the last controller. Every step is a run of its own under RUN_DIR: search-0, tune-1, search-1 and so on.
-    RUN_DIR/rounds.json has the numbers, and `faultline report --run RUN_DIR` makes a page of them. After Ctrl-C or a
-    kill the same command goes on.
+    Each training is on hand-crafted terrains and on the archives of all searches so far. Its controller is kept if
+    validation terrains speak for it; else the next round goes on with the controller before. Every controller is
+    evaluated on hand-crafted and hard-random terrains and on elites of every archive that no training draws.
+
+    Args:
+        robot: The robot.
+        cfg: Rounds, budgets and seed.
+        run_dir: Where to work; what is done there already is not done again.
+        compute: Where terrains are crossed and robots are trained.
+        certifiers: Controllers by name that judge the searches; those of :func:`qd.judge.judge` if None.
+        open_evaluator: Opens simulations.
+
+    Returns:
+        The content of ``rounds.json``, which is written after each round: the counts of all searches, which trainings
+        were kept and why, and the tables of all controllers.
+
+    Raises:
+        ValueError: If a setting cannot be used, or the directory holds something else; raised before any long work.
+        Interrupted: On Ctrl-C.
+        FloatingPointError: If a training leaves the finite numbers; its last checkpoint is kept.
+        EvaluatorError: If a worker is lost.
     """
+    hardening = _begin(robot, cfg, run_dir, compute, certifiers, open_evaluator)
+    try:
+        with claimed(run_dir):
+            for number in range(cfg.rounds + 1):
+                if number:
+                    hardening.train(number)
+                hardening.search(number)
+                hardening.evaluate()
+    except KeyboardInterrupt:
+        raise Interrupted(f"Stopped; what is done is kept, and the same command goes on in {run_dir}.") from None
+    _show(hardening.content)
+    return hardening.content
 
-    policy: Path | None = None
-    """Controller to begin with: an rsl_rl checkpoint with layers of any size; the shipped one."""
-    rounds: int = setting(3, least=1)
-    """Rounds of training. There is one search more than rounds. A larger number later continues a finished run."""
-    run_dir: Path | None = None
-    """Where to work, and to go on; runs/<robot>-harden-<seed>."""
-    seed: int = setting(0, least=0, most=10_000_000)
-    """Seed of everything drawn in searches and trainings."""
-    search_episodes: int | None = setting(None, least=1)
-    """Budget of each search in episodes, rounded up to whole iterations; 400,000 on CUDA (5 minutes on one H200), 2,560
-    on the CPU. With fewer, less is found: compare numbers of faults only between searches of the same budget."""
-    tune_iterations: int | None = setting(None, least=1)
-    """Budget of each round's training in iterations. As of `faultline finetune`, 1,200 on CUDA (Cassie: 3,000). On the
-    CPU 100, enough to see that it runs."""
-    max_seconds: float | None = setting(None, above=0.0)
-    """Stop after so many seconds, as by Ctrl-C. A search loses its present iteration. A training finishes it."""
-    tune_num_envs: int | None = setting(None, least=1)
-    """Robots of each training: 8,192 on CUDA, more than `faultline finetune` has (Cassie: the paper's 600), 24 on the
-    CPU."""
-    tune_terrains: int | None = setting(None, least=1)
-    """Terrains of each training at a time: 2,000 on CUDA (Cassie: the paper's 100), 12 on the CPU."""
-    keep: Literal["best", "last"] = "best"
-    """Which controller to go on with after a training. best: the new one only if it reaches the goal no less often on
-    validation terrains, and on hand-crafted and hard-random ones at most a point less than the base; else the one
-    before. last: always the new one."""
-    preset: str | None = None
-    """Size of a search's iteration: wide (the default on a GPU), paper, or small (the default on the CPU)."""
-    emitters: int | None = setting(None, least=1)
-    """Emitters of a search; the preset's."""
-    batch_size: int | None = setting(None, least=2)
-    """Terrains that an emitter asks for in an iteration; the preset's."""
-    replicas: int | None = setting(None, least=1)
-    """Episodes a terrain in a search; the preset's."""
-    draw: Draw | None = None
-    """How a training draws elites at each exchange, as of `faultline finetune`."""
-    by: tuple[str, ...] = ()
-    """Certifiers as NAME=FILE; the robot's panel if left out, results/<robot>/panel/*.pt. The controller that is
-    searched never certifies itself."""
-    terrains: int | None = setting(None, least=1)
-    """Terrains a set of evaluation and validation; 300 on CUDA (Cassie: 180), 24 on the CPU."""
-    episodes: int | None = setting(None, least=1)
-    """Episodes a terrain of evaluation and validation; 20 on CUDA, 4 on the CPU."""
-    space: str | None = None
-    """Terrain space: super_gaussian, course, or one of your own, file.py:CLASS; super_gaussian if left out."""
-    against: tuple[Comparison, ...] = ()
-    """What to compare the rounds with, after them. hard_random: as many trainings of the same length on hard-random
-    terrains. first_archive: the same on the first archive alone, of which the first training is that of the first
-    round. A search against the outcome follows."""
 
-    def execute(self) -> int:
-        """Runs what is left; returns the exit status 0, also where the time is up.
+def _begin(
+    robot: RobotCfg,
+    cfg: HardenCfg,
+    run_dir: Path,
+    compute: Compute,
+    certifiers: Mapping[str, str] | None,
+    open_evaluator: OpenEvaluator,
+) -> "_Hardening":
+    """A hardening whose settings and directory are checked."""
+    check(cfg)
+    base = cfg.policy or str(robot.policy_file)
+    read_start(Path(base), robot)
+    check_policy(base, robot, compute.device)
+    large = {} if robot.name == "cassie" else LARGE
+    tune = cfg.tune.sized(robot, compute.device, **large)
+    tune.check(robot)
+    full = (paper_terrains(robot.name), EPISODES)
+    terrains, episodes = sizes_for(compute, cfg.evaluation.terrains, cfg.evaluation.episodes, full=full, small=(24, 4))
+    settings = {
+        **asdict(replace(cfg, tune=tune)), "evaluation": {"terrains": terrains, "episodes": episodes},
+        **identity(robot, base),
+    }  # fmt: skip
+    del settings["rounds"]
+    settings = json.loads(to_json(settings))  # as they are read again
+    content = {**origin_of(compute.device, cfg.seed, compute.workers), "robot": robot.name, "settings": settings}
+    if (run_dir / ROUNDS_FILE).exists():
+        content = read_json(run_dir / ROUNDS_FILE)
+        if different := differences(content.get("settings", {}), settings):
+            raise ValueError(f"{run_dir} holds a hardening of other settings: {', '.join(different)}: give those")
+        done = len(content.get("rounds", [])) - 1
+        if cfg.rounds < done:
+            raise ValueError(f"rounds must be at least {done}, which {run_dir} has done, got {cfg.rounds}")
+    elif run_dir.is_dir() and not all(map(is_leftover, run_dir.iterdir())):
+        raise ValueError(f"{run_dir} must be empty or hold a hardening, got neither: give another directory")
+    hardening = _Hardening(
+        robot=robot, cfg=cfg, tune=tune, path=run_dir, compute=compute, terrains=terrains, episodes=episodes,
+        space=load_space(cfg.space, cfg.ground), certifiers=certifiers, open_evaluator=open_evaluator,
+        stored=content, policies={"base": base}, start=cfg.policy,
+    )  # fmt: skip
+    hardening.search_cfg(0, cfg.policy)  # refuses what no search can be
+    return hardening
 
-        Raises:
-            ValueError: If a flag's value cannot be used; raised before any long work.
-            FloatingPointError: If a training leaves the finite numbers; its last checkpoint is kept.
-            Interrupted: On Ctrl-C; what is finished is kept.
-            EvaluatorError: If a worker is lost; what is finished is kept.
+
+@dataclass(kw_only=True)
+class _Hardening:
+    """A hardening at work."""
+
+    robot: RobotCfg
+    cfg: HardenCfg
+    tune: FinetuneCfg
+    """Settings that all trainings share, with their sizes."""
+    path: Path
+    compute: Compute
+    space: TerrainSpace
+    terrains: int
+    """A set of evaluation and validation."""
+    episodes: int
+    """On each of them."""
+    certifiers: Mapping[str, str] | None
+    open_evaluator: OpenEvaluator
+    stored: dict[str, Any]
+    """What an earlier session wrote, or nothing but settings."""
+    policies: dict[str, str]
+    """Controller after each round so far, by its name."""
+    start: str | None
+    """What the next training begins with: the base, or the checkpoint of the last training kept, with its critic."""
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    choices: dict[str, dict[str, Any]] = field(default_factory=dict)
+    content: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def _named_space(self) -> str | None:
+        """What calls have to name for a space that is code."""
+        return self.space.name if is_own(self.space.name) else None
+
+    def _seed(self, number: int) -> int:
+        """Seed of a round.
+
+        Searches of one seed begin with the same terrains, of which some are held out. From 100 on seeds are apart from
+        those of searches of seed 0, 1 and so on, on whose elites controllers are tested.
         """
-        from train.hardening import harden
+        return _SEEDS * (self.cfg.seed + 1) + number
 
-        return harden(self)
+    def _searches(self) -> list[Path]:
+        """Searches so far with enough elites to train on some and hold out others; the first must have."""
+        runs = [self.path / row["search"] for row in self.rows]
+        counts = [len(read_archive(run)) for run in runs]
+        if counts[0] < MIN_ELITES:
+            raise ValueError(
+                f"{runs[0]} must have found at least {MIN_ELITES} elites to train on, got {counts[0]}: give more "
+                "--search.episodes and another directory"
+            )
+        return [run for run, count in zip(runs, counts, strict=True) if count >= MIN_ELITES]
+
+    def train(self, number: int) -> None:
+        """Trains on the archives of all searches so far, and goes on with the new controller if it is better."""
+        run, searches = self.path / f"tune-{number}", self._searches()
+        print(f"\n=== round-{number}: training, in {run}", flush=True)
+        base = self.policies["base"]
+        # Noise of the actions grows in a training: each begins with that of the base.
+        recipe = replace(self.tune.recipe, noise_of=base if self.start != self.cfg.policy else None)
+        cfg = replace(
+            self.tune, seed=self._seed(number), policy=self.start, archive=tuple(map(str, searches)),
+            space=self._named_space, recipe=recipe,
+        )  # fmt: skip
+        finetune(self.robot, cfg, run, RunCfg(device=self.compute.device))
+        before, after = list(self.policies.values())[-1], str(run / POLICY)
+        choice = self._choose({"base": base, "before": before, "after": after}, searches, run.name)
+        self.choices[run.name] = choice
+        print(f"{run.name} is {'kept' if choice['kept'] else 'not kept'}: {choice['why']}", flush=True)
+        if choice["kept"]:
+            self.start = str(run / CHECKPOINT)
+        self.policies[f"round-{number}"] = after if choice["kept"] else before
+
+    def _choose(self, controllers: Mapping[str, str], searches: Sequence[Path], name: str) -> dict[str, Any]:
+        """Whether to keep a training, by goal rates on validation terrains; of the same controllers as stored."""
+        sha256 = [controller_hash(policy) for policy in controllers.values()]
+        stored = self.stored.get("choices", {}).get(name)
+        if stored is not None and stored["sha256"] == sha256:
+            return stored
+        sets = dict(make_sets(FIXED_SETS, self.terrains, 0, space=self.space, part="validation"))
+        sets |= {run.name: self._held_out(run, "validation") for run in searches}
+        results = cross_sets(
+            controllers, sets, robot=self.robot, compute=self.compute, episodes=self.episodes, reward=True,
+            cache=self.path / "crossings", open_evaluator=self.open_evaluator,
+        )  # fmt: skip
+        goal: dict[str, dict[str, float]] = {}
+        for when in controllers:
+            rates = {name: terrain_rates(results[name][when])["goal"] for name in sets}
+            # Elites of all archives are one set, since a small archive has few for validation.
+            elites = np.concatenate([rates.pop(run.name) for run in searches])
+            goal[when] = {name: float(np.nanmean(values)) for name, values in (rates | {"elites": elites}).items()}
+        return {**verdict(goal["base"], goal["before"], goal["after"]), "goal": goal, "sha256": sha256}
+
+    def _held_out(self, run: Path, part: Part = "test") -> TerrainSet:
+        """Elites of a search that no training draws."""
+        archive = read_elites(run, self.robot, self._named_space)
+        return replace(generated_set(archive, self.terrains, 0, part), name=run.name)
+
+    def search(self, number: int) -> None:
+        """Searches for what breaks the controller of a round, and counts its faults."""
+        run, name = self.path / f"search-{number}", list(self.policies)[-1]
+        print(f"\n=== {name}: search, in {run}", flush=True)
+        policy = self.policies[name]
+        cfg = self.search_cfg(number, self.cfg.policy if policy == self.policies["base"] else policy)
+        search(cfg, run, self.compute, robot=self.robot, open_evaluator=self.open_evaluator)
+        settings: dict[str, Any] = {
+            "compute": self.compute, "robot": self.robot.spec, "space": self._named_space,
+            "open_evaluator": self.open_evaluator,
+        }  # fmt: skip
+        if self.cfg.specialists and judge(run, stages=("fresh",), **settings).failing.any():
+            specialist = replace(FinetuneCfg.specialist(self.robot), space=self._named_space)
+            train_specialist(self.robot, run, specialist, RunCfg(device=self.compute.device))
+        judge(run, certifiers=self.certifiers, **settings)
+        counts = RunDirectory(run).read_summary()
+        about = {key: value for key, value in identity(self.robot, policy).items() if key.startswith("policy")}
+        tuned = f"tune-{number}" if number else None
+        row = {"controller": name, **about, "tuned": tuned, "kept": tuned and self.choices[tuned]["kept"]}
+        self.rows.append({**row, "search": run.name, **{key: counts.get(key) for key in _COUNTS}})
+
+    def search_cfg(self, number: int, policy: str | None) -> SearchCfg:
+        """The search of a round against a controller, the robot's own if None."""
+        on_cuda, size = self.compute.device.startswith("cuda"), self.cfg.search
+        named = size.preset or ("wide" if on_cuda else "small")
+        cfg = preset(named, self.robot, policy, space=self.space.name, space_sha256=self.space.sha256)
+        scheduler = replace(
+            cfg.scheduler, emitters=size.emitters or cfg.scheduler.emitters,
+            batch_size=size.batch_size or cfg.scheduler.batch_size,
+        )  # fmt: skip
+        cfg = replace(cfg, seed=self._seed(number), replicas=size.replicas or cfg.replicas, scheduler=scheduler)
+        usual = _GPU_EPISODES if on_cuda else cfg.iterations * cfg.episodes_per_iteration
+        return replace(cfg, iterations=-(-(size.episodes or usual) // cfg.episodes_per_iteration))
+
+    def evaluate(self) -> None:
+        """Evaluates all controllers so far, and writes ``rounds.json``."""
+        sets = dict(make_sets(FIXED_SETS, self.terrains, 0, space=self.space))
+        sets |= {run.name: self._held_out(run) for run in self._searches()}
+        tables = evaluate(
+            self.policies, sets, robot=self.robot, compute=self.compute, episodes=self.episodes,
+            cache=self.path / "crossings", open_evaluator=self.open_evaluator,
+        )  # fmt: skip
+        rows = [
+            *self.rows,
+            *self.stored.get("rounds", [])[len(self.rows) :],
+        ]
+        self.content = {**self.stored, "rounds": rows, "choices": {**self.stored.get("choices", {}), **self.choices}}
+        if len(rows) == len(self.rows):
+            self.content["tables"] = dict(tables)
+        write_atomically(self.path / ROUNDS_FILE, to_json(self.content))
+
+
+def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, float]) -> dict[str, Any]:
+    """Whether to go on with a controller, by goal rates on validation terrains.
+
+    Two trainings of one recipe differ by several points, and one may end worse than it began.
+
+    Args:
+        base: Rate by set of the controller that a hardening begins with.
+        before: Of the one before the training.
+        after: Of the one after it.
+
+    Returns:
+        ``kept``, ``score`` of both, which is the mean over the sets, and ``why``, in words.
+    """
+    scores = {"before": fmean(before.values()), "after": fmean(after.values())}
+    why = f"its goal rate on validation is {scores['after']:.3f}, before {scores['before']:.3f}"
+    lost = {name: base[name] - after[name] for name in FIXED_SETS if base[name] - after[name] > MOST_LOST + 1e-9}
+    why += "".join(f"; on {name} it is {points:.3f} below the base's" for name, points in lost.items())
+    return {"kept": not lost and scores["after"] >= scores["before"], "why": why, "score": scores}
+
+
+def _show(content: Mapping[str, Any]) -> None:
+    """Prints the rounds."""
+    goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
+    counts = ("elites", "failing", "confirmed", "faults", "faults_panel")
+    rows = [
+        [row["controller"], *("-" if row[name] is None else f"{row[name]:,}" for name in counts),
+         *(value_words(goal[name].get(row["controller"]), limits[name].get(row["controller"])) for name in FIXED_SETS)]
+        for row in content["rounds"]
+    ]  # fmt: skip
+    show_table("Rounds", ["controller", *counts, *(f"goal on {name}" for name in FIXED_SETS)], rows)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from threading import Event
 from typing import Any, Literal
 
 import torch
@@ -42,24 +43,21 @@ Kind = Literal["train", "finetune"]
 """What a training is, by the command that makes it."""
 
 
-class StopRequest:
-    """Set by Ctrl-C or SIGTERM: the iteration at hand is finished, then everything is saved. A second one kills."""
+@contextmanager
+def stop_request() -> Iterator[Event]:
+    """An event that Ctrl-C or SIGTERM sets: the iteration at hand is finished and all is saved. A second one kills."""
+    stop = Event()
 
-    def __init__(self) -> None:
-        """Not asked yet; listens inside a ``with`` block."""
-        self.requested = False
-
-    def __enter__(self) -> "StopRequest":
-        self._before = {kind: signal.signal(kind, self._handle) for kind in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for kind, handler in self._before.items():
-            signal.signal(kind, handler)
-
-    def _handle(self, kind: int, _frame: object) -> None:
-        self.requested = True
+    def ask(kind: int, _frame: object) -> None:
+        stop.set()
         signal.signal(kind, signal.SIG_DFL)
+
+    before = {kind: signal.signal(kind, ask) for kind in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
 
 
 def device_of(name: str | None) -> str:
@@ -242,7 +240,7 @@ class Training:
         """
         if self.learner.ranks.is_first:
             write_atomically(self._run_dir / CONFIG, to_json(self._settings))
-        with StopRequest() as stop:
+        with stop_request() as stop:
             try:
                 self._iterate(stop, deadline_s)
             except FloatingPointError as error:
@@ -251,13 +249,13 @@ class Training:
                 ) from error
             self._finish(export)
         done = f"{self.learner.iteration} of {self._cfg.iterations} iterations"
-        if stop.requested:
+        if stop.is_set():
             raise Interrupted(f"Stopped after {done}; the same command goes on in {self._run_dir}.")
         if self.learner.iteration < self._cfg.iterations and self.learner.ranks.is_first:
             print(f"The time is up after {done}; the same command goes on in {self._run_dir}.")
         return self._run_dir / POLICY
 
-    def _iterate(self, stop: StopRequest, deadline_s: float) -> None:
+    def _iterate(self, stop: Event, deadline_s: float) -> None:
         learner = self.learner
         last_save = time.monotonic()
         if learner.iteration - learner.averaged < self.averaged_from:  # it was shorter: its last actors are others
@@ -265,7 +263,7 @@ class Training:
 
         def wants_more() -> bool:
             in_time = time.monotonic() + self.progress.slowest_s < deadline_s - _RESERVE_S
-            return learner.iteration < self._cfg.iterations and not stop.requested and in_time
+            return learner.iteration < self._cfg.iterations and not stop.is_set() and in_time
 
         while learner.ranks.all_want(wants_more(), learner.env.device):
             self.before_iteration()

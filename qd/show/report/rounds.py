@@ -67,12 +67,14 @@ def _read(run: Path, robot: str | None) -> dict[str, Any]:
         raise ValueError(f"{file} must have a search that is over, got none: let the hardening go on")
     try:
         content["tables"] = as_tables({"robot": content["robot"], **content["tables"]})
-        if not all({"controller", "search", "panel", "faults"} <= set(row) for row in content["rounds"]):
+        if not all({"controller", "search", "certifiers", "faults"} <= set(row) for row in content["rounds"]):
             raise ValueError("a round lacks a name")
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{file} must be of `faultline harden`, got another or a damaged file: {error}") from None
     if robot is not None and get_robot(robot).name != content["robot"]:
         raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
+    for row in content["rounds"]:  # without a specialist the faults are those that the panel shows
+        row["faults"] = row.get("faults_panel") if row["faults"] is None else row["faults"]
     return content
 
 
@@ -86,13 +88,13 @@ def _faults(content: dict[str, Any]) -> list[Block]:
     text = (
         f"Each search is against one controller. A terrain is failing if under half of the robots reach the goal in 40 "
         "fresh episodes, confirmed if they do not with contact resolved either, and a fault if another controller "
-        f"({', '.join(first['panel']) or 'nobody'}) crosses it. Two searches of one controller may find numbers of "
-        "faults that differ several times over: read the counts beside the rates below."
+        f"({', '.join(first['certifiers']) or 'nobody'}) crosses it. Two searches of one controller may find numbers "
+        "of faults that differ several times over: read the counts beside the rates below."
     )
     head = ["controller", "search", "episodes", *_COUNTS, "others"]
     rows = [
         [row["controller"], row["search"], *(_number(row.get(key)) for key in ("episodes", *_COUNTS)),
-         ", ".join(row["panel"])] for row in content["rounds"]
+         ", ".join(row["certifiers"])] for row in content["rounds"]
     ]  # fmt: skip
     shows = "Failing elites, those confirmed, and faults of the search against every controller"
     return [at_a_glance(glance), paragraph(text), picture("faults", draw_faults(content), shows), table(head, rows)]

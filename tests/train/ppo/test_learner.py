@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from train.ppo.cfg import PpoCfg
-from train.ppo.checkpoint import FORMAT, read_checkpoint, write_checkpoint
+from train.ppo.checkpoint import read_checkpoint, write_checkpoint
 from train.ppo.learner import Learner, Ranks
 from train.task.vec_env import CommandVecEnv
 
@@ -57,8 +57,8 @@ def test_resumed_training_is_repeatable(learner, tmp_path):
     saved_state = {key: value.clone() for key, value in state_of(learner).items()}
     rate, counter = learner.alg.learning_rate, int(learner.env.task.counter)
     ends = []
-    for _ in range(2):
-        again = Learner(learner.env, CFG, seed=99)
+    for seed in (98, 99):  # what is drawn follows from the checkpoint
+        again = Learner(learner.env, CFG, seed=seed)
         again.env.task.restart_all(torch.zeros(6))
         content = read_checkpoint(tmp_path / "c.pt")
         assert content["progress"] == {"note": [1, None, "x"]}
@@ -157,9 +157,10 @@ def test_other_files_are_no_checkpoints(learner, tmp_path):
     (tmp_path / "truncated.pt").write_bytes(whole.read_bytes()[:5000])
     (tmp_path / "text.pt").write_text("hello")
     torch.save({"actor_state_dict": {}}, tmp_path / "foreign.pt")
-    torch.save({"format": FORMAT, **content, "counter": "many"}, tmp_path / "counter.pt")
+    torch.save({**content, "counter": "many"}, tmp_path / "counter.pt")
+    torch.save({**content, "format": "another"}, tmp_path / "another.pt")
     torch.save(learner.alg.optimizer, tmp_path / "code.pt")  # a pickled object, not data
-    for name in ("absent", "truncated", "text", "code", "foreign", "counter"):
+    for name in ("absent", "truncated", "text", "code", "foreign", "counter", "another"):
         with pytest.raises(ValueError, match=f"{name}.pt") as error:
             read_checkpoint(tmp_path / f"{name}.pt")
         assert "\n" not in str(error.value)

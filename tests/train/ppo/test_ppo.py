@@ -137,34 +137,18 @@ def test_the_value_moves_no_further_than_the_clip_in_an_update(algorithm: type[P
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("field", "value"),
     [
-        ({"steps_per_env": 0}, "ppo.steps_per_env must be at least 1, got 0"),
-        ({"epochs": 0}, "ppo.epochs must be at least 1, got 0"),
-        ({"mini_batches": 0}, "ppo.mini_batches must be at least 1, got 0"),
-        ({"mini_batches": 49}, "at most half of the 6 x 16 transitions of an iteration, got 49"),
-        ({"learning_rate": 0.0}, "ppo.learning_rate must be above 0, got 0.0"),
-        ({"learning_rate": float("nan")}, "ppo.learning_rate must be"),
-        ({"gamma": 2.0}, "ppo.gamma must be at least 0 and at most 1, got 2.0"),
-        ({"lam": -0.1}, "ppo.lam must be at least 0 and at most 1, got -0.1"),
-        ({"clip": 0.0}, "ppo.clip must be above 0, got 0.0"),
-        ({"desired_kl": 0.0}, "ppo.desired_kl must be above 0, got 0.0"),
-        ({"entropy": -1.0}, "ppo.entropy must be at least 0, got -1.0"),
-        ({"hidden_dims": (8, 0)}, "ppo.hidden_dims must be at least 1, got (8, 0)"),
-        ({"hidden_dims": ()}, "ppo.hidden_dims must name at least one layer"),
-        ({"init_noise_std": -1.0}, "ppo.init_noise_std must be above 0, got -1.0"),
+        ("steps_per_env", 0), ("epochs", 0), ("mini_batches", 0), ("mini_batches", 49), ("learning_rate", 0.0),
+        ("learning_rate", float("nan")), ("gamma", 2.0), ("lam", -0.1), ("clip", 0.0), ("desired_kl", 0.0),
+        ("entropy", -1.0), ("hidden_dims", (8, 0)), ("hidden_dims", ()), ("init_noise_std", -1.0),
     ],
-)
-def test_settings_that_nothing_is_learned_with_are_named(changes: dict[str, Any], message: str) -> None:
-    (found,) = ppo_problems(PpoCfg(**changes), NUM_ENVS)
-    assert message in found
-
-
-def test_the_default_settings_can_be_learned_with() -> None:
-    assert ppo_problems(PpoCfg(), NUM_ENVS) == []
+)  # fmt: skip
+def test_settings_that_nothing_is_learned_with_are_named(field: str, value: Any) -> None:
+    (line,) = ppo_problems(PpoCfg(**{field: value}), NUM_ENVS)
+    assert f"ppo.{field}" in line
 
 
 def test_an_iteration_has_at_least_two_transitions() -> None:
-    assert ppo_problems(PpoCfg(steps_per_env=2, mini_batches=1), 1) == []
-    (found,) = ppo_problems(PpoCfg(steps_per_env=1, mini_batches=1), 1)
-    assert "at least 2 transitions, got 1" in found
+    assert ppo_problems(PpoCfg(), NUM_ENVS) == ppo_problems(PpoCfg(steps_per_env=2, mini_batches=1), 1) == []
+    assert len(ppo_problems(PpoCfg(steps_per_env=1, mini_batches=1), 1)) == 1

