@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from qd.archive import Archive
 from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
 from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, split_elites
+from qd.faults import SPECIALIST as CERTIFIER
+from qd.judge import CERTIFIERS_FOLDER
 from qd.run.directory import RunDirectory, find_run
 from sim.policy.loaders import load_policy
 from sim.policy.mlp import MlpPolicy
@@ -37,8 +39,6 @@ from train.ppo.training import (
 )
 from train.task.mix import Mix
 
-CERTIFIERS = "certifiers"
-"""Folder of a run with controllers that may certify its faults."""
 _CRITIC_ITERATIONS = 50
 
 
@@ -114,7 +114,7 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
         raise ValueError(f"the controller of {run} must be the one that was searched, got {policy or SHIPPED}, another "
                          "now: name it by --policy")  # fmt: skip
     cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, device_of(options.device), **SPECIALIST)
-    specialist = run / CERTIFIERS / "specialist.pt"
+    specialist = run / CERTIFIERS_FOLDER / f"{CERTIFIER}.pt"
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
     return specialist
 
