@@ -2,33 +2,42 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qd.minimal import SCALE_STEPS, Case, Trial, fresh_counts, minimise
-from qd.workers.evaluator import EvaluatorCfg
+from qd.judge import Search
+from qd.minimal import SCALE_STEPS, Case, Trial, find_minimal, take_apart
+from qd.workers.cross import Crossings
+from qd.workers.evaluator import Compute
+from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
+from tests.qd.searches import CFG
 from tests.qd.stand_in import make_result
 
 PASSES, FAILS, INVALID = np.array([20, 0, 0, 0]), np.array([0, 20, 0, 0]), np.array([0, 9, 0, 11])
-EVALUATOR = EvaluatorCfg(robot="anymal", policy="p", num_terrains=9, num_replicas=4, device="cpu", workers="2", lots=3)
+ROBOT = get_robot("anymal")
 
 
 def case(how="exhaustive", parts=range(8), scalable=True):
     whole = tuple(parts)
-    return Case(parts=whole, how=how, scalable=scalable, counts={Trial(whole, fresh=True): 2 * FAILS})
+    return Case(parts=whole, how=how, scalable=scalable, counts={Trial(tuple(sorted(whole)), fresh=True): 2 * FAILS})
 
 
-def solve(own, rule, crossed=None):
-    """The minimal terrain where ``rule(trial)`` says how many of 20 robots arrive."""
-    while wanted := own.wanted():
+def solve(case, rule, crossed=None):
+    """The minimal terrain where ``rule(trial)`` says how many of 20 robots arrive; notes what is crossed, in steps."""
+    steps = find_minimal(case)
+    while True:
+        try:
+            wanted = next(steps)
+        except StopIteration as end:
+            return end.value
+        (crossed if crossed is not None else []).append(wanted)
         for trial in wanted:
-            assert trial not in own.counts
-            (crossed if crossed is not None else []).append(trial)
-            own.counts[trial] = (2 if trial.fresh else 1) * np.array([rule(trial), 20 - rule(trial), 0, 0])
-    return own.minimal()
+            assert trial not in case.counts
+            case.counts[trial] = (2 if trial.fresh else 1) * np.array([rule(trial), 20 - rule(trial), 0, 0])
 
 
 def two_and_five(trial):
@@ -49,21 +58,18 @@ def test_the_parts_that_are_needed_are_found_and_scaled(how):
 
 
 def test_subsets_are_crossed_from_the_smallest_on_all_of_a_size_at_once():
-    own = case()
-    sizes = []
-    while wanted := own.wanted():
-        sizes.append({len(trial.parts) for trial in wanted if not trial.fresh and trial.scale == 1.0})
-        solve_once = {trial: two_and_five(trial) for trial in wanted}
-        own.counts.update({trial: np.array([goal, 20 - goal, 0, 0]) for trial, goal in solve_once.items()})
-        assert len(wanted) in (1, 8, 28)  # none, one of eight, two of eight; fresh episodes and scales one by one
-    assert sizes[:3] == [{0}, {1}, {2}]
-    assert own.minimal().subsets == 37
+    crossed = []
+    assert solve(case(), two_and_five, crossed).subsets == 37
+    # none, one of eight, two of eight; fresh episodes and scales one by one
+    assert [len(wanted) for wanted in crossed] == [1, 8, 28, 1, 1, 1, 1, 1, 1]
+    assert [{len(trial.parts) for trial in wanted} for wanted in crossed[:3]] == [{0}, {1}, {2}]
+    assert crossed[3] == [Trial((2, 5), fresh=True)] and crossed[4] == [Trial((2, 5), scale=0.5)]
 
 
 def test_greedy_crosses_each_part_once_and_what_is_left_once_more():
     crossed = []
     solve(case("greedy", parts=(7, 0, 5, 1, 2, 6, 3, 4)), two_and_five, crossed)
-    subsets = [trial.parts for trial in crossed if trial.scale == 1.0 and not trial.fresh]
+    subsets = [trial.parts for (trial,) in crossed if trial.scale == 1.0 and not trial.fresh]
     assert subsets[0] == tuple(range(7))  # without 7, which comes first
     # Eight, and 5 and 2 again without what was taken away after them.
     assert len(subsets) == len(set(subsets)) == 10
@@ -77,9 +83,7 @@ def test_greedy_and_exhaustive_agree_where_parts_only_add(seed):
     kernel = set(rng.choice(8, rng.integers(1, 5), replace=False).tolist())
     order = rng.permutation(8).tolist()
     rule = lambda trial: 0 if kernel <= set(trial.parts) and trial.scale > 0.3 else 20  # noqa: E731
-    whole = Trial(tuple(range(8)), fresh=True)
-    greedy = Case(parts=tuple(order), how="greedy", scalable=True, counts={whole: 2 * FAILS})
-    one, other = solve(case(), rule), solve(greedy, rule)
+    one, other = solve(case(), rule), solve(case("greedy", parts=order), rule)
     assert one.parts == other.parts == tuple(sorted(kernel))
     assert (one.scale, one.passing_scale) == (other.scale, other.passing_scale)
 
@@ -109,7 +113,7 @@ def test_fresh_episodes_refute(how):
     crossed = []
     found = solve(case(how, scalable=False), rule, crossed)
     assert found.parts == (3, 4)
-    assert Trial((3,), fresh=True) in crossed
+    assert [Trial((3,), fresh=True)] in crossed
     assert found.without[4].tolist() == [24, 16, 0, 0]  # the fresh ones, which are not selected
     assert found.without[3].tolist() == [20, 0, 0, 0]
     assert found.cause({3: 0.1, 4: 0.1}) == 3
@@ -141,86 +145,84 @@ def test_the_whole_terrain_is_the_last_and_a_terrain_without_parts_the_first():
 
 
 def test_too_many_invalid_episodes_say_nothing():
-    own = case(parts=range(2), scalable=False)
-    own.counts.update({Trial(()): PASSES, Trial((0,)): INVALID, Trial((1,)): PASSES})
-    assert own.minimal().parts == (0, 1)
-    assert own.minimal().cause({0: 0.1, 1: 0.3}) == 0  # without 1 nothing is known
+    known = case(parts=range(2), scalable=False)
+    known.counts.update({Trial(()): PASSES, Trial((0,)): INVALID, Trial((1,)): PASSES})
+    minimal = solve(known, lambda trial: 20)
+    assert minimal.parts == (0, 1)
+    assert minimal.cause({0: 0.1, 1: 0.3}) == 0  # without 1 nothing is known
+
+
+def test_where_flat_parts_alone_are_left_nothing_is_scaled():
+    crossed = []
+    slippery = replace(case(parts=range(3)), flat=(1,))
+    minimal = solve(slippery, lambda trial: 0 if 1 in trial.parts else 20, crossed)
+    assert (minimal.parts, minimal.scale, minimal.scales) == ((1,), None, {})
+    assert {trial.scale for wanted in crossed for trial in wanted} == {1.0}
 
 
 @pytest.fixture
 def failing():
     """Three elites that fail."""
     archive = small_archive(3)
-    fresh = replace(fresh_values(archive), goal_rate=np.full(3, 0.1), collision_rate=np.full(3, 0.8))
-    return replace(archive, fresh=fresh)
+    return replace(archive, fresh=replace(fresh_values(archive), goal_rate=np.full(3, 0.1)))
 
 
-def crossed(archive, cases, seen, opened=None, stop_after=None):
-    """Robots that fail where bumps 2 and 5 are there, higher than .6 of what the elite has."""
-    full = {number: np.abs(archive.genes[number, 7::8]) for number in cases}
+class Robots:
+    """Fail where bumps 2 and 5 are there, higher than .6 of what the elite has; note seeds and genes; then Ctrl-C."""
+
+    def __init__(self, archive, stop_after=None):
+        self.archive, self.stop_after, self.rows, self.opened = archive, stop_after, [], []
 
     @contextmanager
-    def open_evaluator(cfg):
-        (opened if opened is not None else []).append(cfg)
+    def __call__(self, cfg):
+        self.opened.append(cfg)
 
         def evaluate(genes, seeds, progress=None):
-            if stop_after is not None and len(seen) >= stop_after:
+            if self.stop_after is not None and len(self.rows) >= self.stop_after:
                 raise KeyboardInterrupt
-            seen.extend(zip(seeds.tolist(), map(tuple, genes.tolist()), strict=True))
-            heights = np.abs(genes[:, 7::8])
-            whose = [min(full, key=lambda number: np.abs(archive.genes[number] - row).sum()) for row in genes]
-            needed = np.array([(row > 0.6 * full[n])[[2, 5]].all() for row, n in zip(heights, whose, strict=True)])
+            self.rows += zip(seeds.tolist(), map(tuple, genes.tolist()), strict=True)
+            full = self.archive.genes
+            whose = [min(range(len(full)), key=lambda number: np.abs(full[number] - row).sum()) for row in genes]
+            needed = (np.abs(genes[:, 7::8]) > 0.6 * np.abs(full[whose][:, 7::8]))[:, [2, 5]].all(axis=1)
             fails = np.repeat(needed[:, None], cfg.num_replicas, axis=1)
             return make_result(np.ones((*fails.shape, 6)), base_collision=fails)
 
         yield evaluate
 
-    saves = []
-    minimise(
-        archive, cases, SUPER_GAUSSIAN, evaluator=EVALUATOR, open_evaluator=open_evaluator, seed=3,
-        save=lambda: saves.append(sum(len(case.counts) for case in cases.values())),
+
+def apart(archive, cases, robots, cache=None):
+    search = Search(
+        run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space="super_gaussian"
     )  # fmt: skip
-    return saves
+    with Crossings(ROBOT, Compute(workers="1"), cache=cache, open_evaluator=robots) as crossings:
+        return take_apart(archive, cases, SUPER_GAUSSIAN, search, crossings)
 
 
 @pytest.mark.parametrize("how", ["exhaustive", "greedy"])
 def test_elites_are_taken_apart_together(failing, how):
-    cases = {number: case(how) for number in (0, 2)}
-    opened, seen = [], []
-    saves = crossed(failing, cases, seen, opened)
-    assert len(opened) == 1 and (opened[0].num_replicas, opened[0].lots) == (5, 1)
-    assert [one.minimal().parts for one in cases.values()] == [(2, 5)] * 2
-    assert all(one.minimal().scale == 0.625 for one in cases.values())
-    assert saves == sorted(saves) and len(saves) > 4
+    cases, robots = {number: case(how) for number in (2, 0)}, Robots(failing)
+    minima = apart(failing, cases, robots)
+    assert len(robots.opened) == 1 and robots.opened[0].num_replicas == 5
+    assert {number: minimal.parts for number, minimal in minima.items()} == {0: (2, 5), 2: (2, 5)}
+    assert all(minimal.scale == 0.625 for minimal in minima.values())
     # An elite's 20 episodes are of four seeds, its 40 fresh ones of eight others.
-    assert len({seed for seed, _ in seen}) == 2 * (4 + 8)
-    assert sum(counts.sum() for one in cases.values() for counts in one.counts.values()) - 80 == 5 * len(seen)
+    assert len({seed for seed, _ in robots.rows}) == 2 * (4 + 8)
+    assert sum(counts.sum() for one in cases.values() for counts in one.counts.values()) - 80 == 5 * len(robots.rows)
 
 
 def test_an_elite_has_its_own_episodes_whatever_is_crossed_beside_it(failing):
-    together, alone = {0: case("greedy"), 2: case("greedy")}, {2: case("greedy")}
-    both, one = [], []
-    crossed(failing, together, both)
-    crossed(failing, alone, one)
-    assert set(one) < set(both)
-    assert {t: c.tolist() for t, c in alone[2].counts.items()} == {t: c.tolist() for t, c in together[2].counts.items()}
+    together, alone = Robots(failing), Robots(failing)
+    both = apart(failing, {0: case("greedy"), 2: case("greedy")}, together)
+    one = apart(failing, {2: case("greedy")}, alone)
+    assert set(alone.rows) < set(together.rows)
+    assert both[2].counts.tolist() == one[2].counts.tolist() and both[2].parts == one[2].parts
 
 
-def test_stopped_it_goes_on_with_what_was_crossed(failing):
-    stopped, seen = {0: case("greedy")}, []
+def test_stopped_it_goes_on_with_what_was_crossed(failing, tmp_path):
+    stopped, rest, every = Robots(failing, stop_after=20), Robots(failing), Robots(failing)
     with pytest.raises(KeyboardInterrupt):
-        crossed(failing, stopped, seen, stop_after=20)
-    rest = []
-    crossed(failing, stopped, rest)
-    whole, every = {0: case("greedy")}, []
-    crossed(failing, whole, every)
-    assert len(seen) + len(rest) == len(every) and 0 < len(rest) < len(every)
-    assert stopped[0].minimal().parts == whole[0].minimal().parts
-    again = []
-    crossed(failing, stopped, again)
-    assert not again
-
-
-def test_fresh_episodes_of_an_elite_are_counted(failing):
-    # Of 40 episodes 10 % arrive and 80 % collide.
-    assert fresh_counts(failing, 0).tolist() == [4, 32, 4, 0]
+        apart(failing, {0: case("greedy")}, stopped, tmp_path / "crossings")
+    minima = apart(failing, {0: case("greedy")}, rest, tmp_path / "crossings")
+    whole = apart(failing, {0: case("greedy")}, every)
+    assert sorted(stopped.rows + rest.rows) == sorted(every.rows) and 0 < len(rest.rows) < len(every.rows)
+    assert minima[0].parts == whole[0].parts

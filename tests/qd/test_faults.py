@@ -1,0 +1,123 @@
+"""Faults in numbers and in words."""
+
+import dataclasses
+
+import numpy as np
+
+from qd.faults import (
+    SPECIALIST,
+    count_faults,
+    elite_words,
+    fault_numbers,
+    fault_words,
+    fresh_counts,
+    fresh_numbers,
+    judgement,
+    rate_of,
+)
+from qd.groups import verdict_of
+from tests.builders import fresh_values, judged_archive, small_archive
+
+
+def test_numbers_by_hand():
+    archive = judged_archive()
+    numbers = fault_numbers(archive)
+    counts = {name: numbers[name] for name in ("failing", "confirmed", "certified", "faults_panel")}
+    assert counts == {"failing": 4, "confirmed": 2, "certified": 2, "faults_panel": 1}
+    assert numbers["certifiers"] == ["C-G", "S"]
+    assert numbers["mujoco_c"] == {"crossed": 2, "failing": 1} and numbers["crossed_resolved"] == 4
+    assert [one["certified"] for one in numbers["certificates"]] == [1, 1]
+    assert [one["crossed"] for one in numbers["certificates"]] == [4, 3]
+    # Nobody trained a specialist, looked for families, or knows what the certifiers were trained on.
+    names = ("faults", "faults_unseen", "families", "fault_families", "robust")
+    assert [numbers[name] for name in names] == [None] * 5
+    assert count_faults(archive) == 1
+
+
+def test_the_specialists_faults_count_beside_those_of_the_panel():
+    archive = judged_archive()
+    for names, expected in ((("C-G", SPECIALIST), (1, 0)), ((SPECIALIST, "S"), (1, 1))):
+        faults = dataclasses.replace(archive.faults, certifiers=names)
+        numbers = fault_numbers(dataclasses.replace(archive, faults=faults))
+        assert (numbers["faults"], numbers["faults_panel"]) == expected
+
+
+def test_faults_by_certifiers_that_trained_on_no_kin_and_families_of_faults():
+    # The fault is elite 0, which S crosses; elite 2 is certified by C-G alone and not confirmed.
+    archive, families = judged_archive(), np.array([0, 1, 1, 2, 0])
+    seen = np.zeros((5, 2), bool)
+    numbers = fault_numbers(archive, families, seen)
+    assert (numbers["faults_unseen"], numbers["families"], numbers["fault_families"]) == (1, 3, 1)
+    seen[0, 1] = True
+    assert fault_numbers(archive, families, seen)["faults_unseen"] == 0
+
+
+def test_numbers_of_what_nobody_looked_at_are_none():
+    fresh_alone = dataclasses.replace(judged_archive(), faults=None)
+    numbers = fault_numbers(fresh_alone)
+    assert numbers["failing"] == 4 and numbers["confirmed"] is numbers["certified"] is numbers["faults_panel"] is None
+    assert fault_numbers(small_archive())["failing"] is None
+    fine = dataclasses.replace(fresh_alone, fresh=dataclasses.replace(fresh_alone.fresh, goal_rate=np.ones(5)))
+    assert fault_numbers(fine)["faults"] == fault_numbers(fine)["confirmed"] == 0
+    archive = judged_archive()
+    waits = dataclasses.replace(archive.faults, resolved_outcomes=0 * archive.faults.resolved_outcomes)
+    numbers = fault_numbers(dataclasses.replace(archive, faults=waits))
+    assert (numbers["certified"], numbers["confirmed"], numbers["faults_panel"]) == (2, None, None)
+
+
+def test_numbers_of_fresh_episodes_by_hand():
+    archive = small_archive(3)
+    fresh = dataclasses.replace(
+        fresh_values(archive),
+        cell=np.array([0, 0, 5]),  # found in 0, 1 and 2
+        fitness=np.array([1.0, 2.0, 4.0]),
+        penalty_std=np.array([[1.0, 1.0], [2.0, 2.0], [9.0, 9.0]]),
+        invalid_episodes=np.array([0, 0, 11]),  # of 40: more than a quarter
+        reproduced=np.array([True, True, False]),
+    )
+    numbers = fresh_numbers(archive, fresh)
+    assert (numbers["reevaluated"], numbers["elites_reproduced"], numbers["elites_same_cell"]) == (3, 2, 1)
+    assert (numbers["mean_std"], numbers["mean_fitness_corrected"]) == (3.0, 1.5)
+    # Two land in cell 0, of which the fitter counts: 2 above the floor of -20.
+    assert (numbers["corrected_elites"], numbers["corrected_qd_score"]) == (1, 22.0)
+    assert numbers["corrected_coverage"] == 1 / archive.cells.num_cells
+    sampled = fresh_numbers(archive, fresh, sampled=True)
+    assert sampled.items() < numbers.items() and not any(name.startswith("corrected") for name in sampled)
+
+
+def test_words_name_the_counts():
+    archive = judged_archive()
+    # Wilson of 2 of 4: 15 to 85 %
+    words = " ".join(fault_words(archive))
+    for part in ("4 failing elites", "2 of 4 (50%, 15 to 85%)", "1 of 2 (50%", "1 fault:", "C-G or S"):
+        assert part in words
+    assert fault_words(dataclasses.replace(archive, faults=None)) == []
+
+
+def test_the_verdict_on_an_elite_and_its_words():
+    archive = judged_archive()
+    assert [verdict_of(archive, number) for number in range(5)] == ["fault", "confirmed", "certified", "failing", ""]
+    words = [elite_words(archive, number) for number in range(5)]
+    assert [("a fault" in text[-1], "not known" in text[-1]) for text in words] == [
+        (True, False), (False, True), (False, False), (False, True), (False, False),
+    ]  # fmt: skip
+    assert any("9 of 20 (45%, 26 to 66%)" in sentence for sentence in words[0])
+    assert elite_words(dataclasses.replace(archive, faults=None), 0) == []
+
+
+def test_rates_and_certificates_of_an_elite():
+    archive = judged_archive()
+    known = judgement(archive, 0)
+    # 9 of 20: (.45 + 3.842 / 40) / (1 + 3.842 / 20) = .4581, 1.96 sqrt(.45 .55 / 20 + 3.842 / 1600) / 1.1921 = .1999
+    assert known["resolved"] == {"goal_rate": 0.45, "goal_interval": [0.2582, 0.6579], "valid_episodes": 20}
+    (certificate,) = known["certificates"]
+    assert (certificate["controller"], certificate["searched"]["goal_rate"]) == ("S", 0.5)
+    assert judgement(dataclasses.replace(archive, faults=None), 0) == {"resolved": None, "certificates": []}
+    assert rate_of(np.array([14, 0, 0, 6]))["goal_rate"] is None  # 6 of 20 are invalid
+
+
+def test_fresh_episodes_of_an_elite_are_counted():
+    archive = small_archive(3)
+    fresh = dataclasses.replace(fresh_values(archive), goal_rate=np.full(3, 0.1), collision_rate=np.full(3, 0.8))
+    # Of 40 episodes 10 % arrive and 80 % collide.
+    assert fresh_counts(dataclasses.replace(archive, fresh=fresh), 0).tolist() == [4, 32, 4, 0]
