@@ -37,8 +37,8 @@ class Stand(OfRobot, OnDevice):
         robot = get_robot(self.robot)
         print(describe_model(robot), flush=True)
         device = resolve_device(self.device)
-        found = stand(robot, device=device, seconds=self.seconds, drops=self.drops, seed=self.seed)
-        text, fine = describe_standing(robot, found)
+        standing = stand(robot, device=device, seconds=self.seconds, drops=self.drops, seed=self.seed)
+        text, fine = describe_standing(robot, standing)
         print(text)
         return 0 if fine else 1
 

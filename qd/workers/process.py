@@ -12,7 +12,7 @@ from typing import Any, NoReturn, Protocol
 
 from numpy.typing import NDArray
 
-from sim.files.command import UserError, told
+from sim.files.command import UserError, with_traceback
 from sim.rollout import RolloutResult
 
 
@@ -138,9 +138,9 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
     except (EOFError, ConnectionError):  # the other end is gone: closed, or killed with unread messages
         sys.exit(0)
     except ValueError as error:
-        _send_last(connection, "refused", told(error, str(error)))
+        _send_last(connection, "refused", with_traceback(error, str(error)))
     except Exception as error:
-        _send_last(connection, "failed", told(error, f"{type(error).__name__}: {error}"))
+        _send_last(connection, "failed", with_traceback(error, f"{type(error).__name__}: {error}"))
 
 
 def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[NDArray, NDArray] | None]") -> None:

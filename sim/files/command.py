@@ -133,8 +133,8 @@ def debugging() -> bool:
     return os.environ.get(_DEBUG, "0") not in ("", "0")
 
 
-def told(error: BaseException, text: str) -> str:
-    """What a process says of an error to the one that waits for it: a text, and the traceback if that is wanted."""
+def with_traceback(error: BaseException, text: str) -> str:
+    """What a process sends of an error to the one that waits for it: a text, and the traceback when debugging."""
     return f"{text}\n{''.join(traceback.format_exception(error))}" if debugging() else text
 
 

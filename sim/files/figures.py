@@ -47,6 +47,6 @@ def bar_lengths(values: ArrayLike, intervals: Sequence[Sequence[float] | None]) 
         values: Shape (count,).
         intervals: Lower and upper limit of each.
     """
-    limits = np.array([(np.nan, np.nan) if one is None else one for one in intervals], np.float64).reshape(-1, 2)
+    limits = np.array([interval or (np.nan, np.nan) for interval in intervals], np.float64).reshape(-1, 2)
     means = np.asarray(values, np.float64)
     return np.maximum([means - limits[:, 0], limits[:, 1] - means], 0.0)  # equal limits may be off by rounding

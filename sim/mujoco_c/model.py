@@ -73,7 +73,7 @@ def crossing_model(
     time_constant_s: float | None = None,
     ground: GroundMaps | None = None,
 ) -> Any:
-    """The robot's own file on MuJoCo's heightfield, with a sensor of the net contact force on each geom with a role.
+    """The robot's file on MuJoCo's heightfield, with a sensor of the net contact force on each geom with a role.
 
     The solver may take as many iterations as it needs: the caps of the parallel simulation are themselves in question.
     Ground with maps is a geom a patch, whose friction and softness have priority over those of the robot: a box where
@@ -85,10 +85,6 @@ def crossing_model(
         heights: Height grid [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`.
         time_constant_s: Contact time constant of all geoms [s], critically damped; the file's if None.
         ground: Friction and softness of this one terrain.
-
-    Raises:
-        ValueError: If the robot is more than its MJCF says, MuJoCo does not read it, its geoms differ in friction or
-            stiffness, or ground is soft and not level.
     """
     root = _root_of(robot)
     ET.SubElement(root, "size", memory=_MEMORY)
@@ -124,11 +120,7 @@ _NO_SOFTNESS = (
 
 
 def refuse_softness(space: TerrainSpace) -> None:
-    """Refuses terrains of a space that plain MuJoCo would not have as they are, before any work.
-
-    Raises:
-        ValueError: If some are soft.
-    """
+    """Refuses, before any work, a space whose ground is soft."""
     if "softness" in space.ground:
         raise ValueError(_NO_SOFTNESS)
 
@@ -205,11 +197,7 @@ def _margin(span: tuple[int, int], count: int) -> tuple[int, int]:
 
 
 def _add_patches(root: ET.Element, heights: NDArray[np.floating], patches: list[_Patch]) -> Array:
-    """Adds a geom a patch, a box where it is level and else a heightfield; returns the data of these.
-
-    Raises:
-        ValueError: If a patch is soft and not level.
-    """
+    """Adds a geom a patch, a box where it is level and else a heightfield; returns the data of these."""
     data = [np.zeros(0)]
     for number, patch in enumerate(patches):
         part = heights[patch.rows, patch.cols]
@@ -233,19 +221,15 @@ def _add_patches(root: ET.Element, heights: NDArray[np.floating], patches: list[
 
 
 def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: list[_Patch]) -> None:
-    """Gives the geoms of the patches their contacts' friction and softness.
-
-    Raises:
-        ValueError: If the robot's geoms differ in these, so that a patch cannot have one of each.
-    """
-    own = (model.geom_contype != 0) & (model.geom_bodyid > 0)
+    """Gives the geoms of the patches their contacts' friction and softness."""
+    of_robot = (model.geom_contype != 0) & (model.geom_bodyid > 0)
     for name in ("friction", "solref", "solimp"):
-        if np.ptp(getattr(model, f"geom_{name}")[own], axis=0).any():
+        if np.ptp(getattr(model, f"geom_{name}")[of_robot], axis=0).any():
             raise ValueError(
                 f"robot '{robot.name}': plain MuJoCo needs one {name} of all its geoms on ground with friction or "
                 "softness of its own, got several: leave --ground out"
             )
-    first = int(np.flatnonzero(own)[0])
+    first = int(np.flatnonzero(of_robot)[0])
     model.geom_friction[geoms] = model.geom_friction[first]
     model.geom_friction[geoms, 0] *= [patch.friction for patch in patches]
     model.geom_solref[geoms], model.geom_solimp[geoms] = model.geom_solref[first], model.geom_solimp[first]

@@ -44,15 +44,7 @@ class Camera:
 
 
 def open_context(width: int, height: int) -> Any:
-    """A current OpenGL context without a screen: EGL on Linux, or what MUJOCO_GL names; free it with ``free()``.
-
-    Args:
-        width: Of the images [pixels].
-        height: Likewise.
-
-    Raises:
-        ValueError: If there is none.
-    """
+    """A current OpenGL context without a screen: EGL on Linux, or what MUJOCO_GL names; free it with ``free()``."""
     usual = {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
     name = os.environ.get("MUJOCO_GL", "").strip().lower() or usual
     try:
@@ -91,9 +83,6 @@ class Renderer:
             shadows: Whether the sun casts them; in software they take as long as all the rest.
             cfg: The crossing, for its goal.
             ground: Friction and softness of the terrain.
-
-        Raises:
-            ValueError: If there is no OpenGL, or the robot's file cannot be shown.
         """
         self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg, ground=ground)
         self._context = open_context(width, height)

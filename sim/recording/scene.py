@@ -78,9 +78,6 @@ def scene_model(
         height: Likewise.
         cfg: The crossing, for its goal.
         ground: Friction and softness of the terrain.
-
-    Raises:
-        ValueError: If MuJoCo cannot read the robot's file, or finds other joints in it.
     """
     spec = robot_spec(robot)
     for geom in spec.worldbody.geoms:

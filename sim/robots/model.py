@@ -8,7 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from sim.files.command import told
+from sim.files.command import with_traceback
 from sim.robots.model_files import ModelFiles, joints_without_effort, read_model_files
 from sim.robots.robot import RobotCfg
 
@@ -68,7 +68,7 @@ def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.Mod
         _add_model(builder, robot, files)
     except Exception as error:  # an importer can fail with anything
         said = ": ".join(filter(None, [type(error).__name__, " ".join(str(error).split())]))
-        return newton.ModelBuilder(), problems or [told(error, f"{robot.model_file} cannot be imported: {said}")]
+        return newton.ModelBuilder(), problems or [with_traceback(error, f"{robot.model_file} cannot be imported: {said}")]
     # The other checks need a tree of single joints, where joints and their columns are the same.
     structure = _structure_problems(builder)
     if structure:
