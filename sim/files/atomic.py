@@ -30,7 +30,10 @@ def write_atomically(path: Path, data: bytes) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        raise unwritable(path, error) from error
+        raise OSError(
+            f"{path} cannot be written: {error.strerror or error}: make room there or give another place; what was "
+            "saved before is whole"
+        ) from error
 
 
 def _sync_folder(folder: Path) -> None:
@@ -40,14 +43,6 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def unwritable(path: Path, error: OSError) -> OSError:
-    """The error of a failed write that names the file and the remedy; a bare one names neither."""
-    return OSError(
-        f"{path} cannot be written: {error.strerror or error}: make room there or give another place; "
-        "what was saved before is whole"
-    )
 
 
 def is_leftover(path: Path) -> bool:

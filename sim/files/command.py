@@ -196,18 +196,13 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 
 def command_line(name: str, **flags: object) -> str:
-    """A command as it is typed: ``faultline replay --run runs/x --elite 0``; flags as of :func:`command_words`."""
-    return shlex.join(["faultline", *command_words(name, **flags)])
-
-
-def command_words(name: str, **flags: object) -> list[str]:
-    """The words of a command after ``faultline``.
+    """A command as it is typed: ``faultline replay --run runs/x --elite 0``.
 
     Args:
         name: The word that calls it.
         flags: Values by field name; None, False and empty lists are left out, True is a bare flag.
     """
-    words = [name]
+    words = ["faultline", name]
     for field, value in flags.items():
         flag = f"--{field.replace('_', '-')}"
         if value is True:
@@ -218,7 +213,7 @@ def command_words(name: str, **flags: object) -> list[str]:
             words.append(f"{flag}={value}")
         elif value is not None and value is not False:
             words += [flag, str(value)]
-    return words
+    return shlex.join(words)
 
 
 def split_words(values: Sequence[str]) -> list[str]:

@@ -123,14 +123,6 @@ class Recording:
         cut["touching"] = self.touching[terrain : terrain + 1, :, : num_frames.max()]
         return replace(self, num_frames=num_frames, **cut)
 
-    def of_episode(self, episode: int) -> "Recording":
-        """The recording of one of the episodes alone, by its index among those recorded, on every terrain."""
-        rows = slice(episode, episode + 1)
-        num_frames = self.num_frames[:, rows]
-        cut = {name: getattr(self, name)[:, rows, : num_frames.max()] for name in (*FRAME_ARRAYS, "touching")}
-        cut |= {name: getattr(self, name)[:, rows] for name in ("outcome", "invalidity", "fallen", "duration_s")}
-        return replace(self, replicas=self.replicas[rows], num_frames=num_frames, **cut)
-
     def result(self) -> RolloutResult:
         """What came of the recorded episodes; positions are those of the last frame, what they took is not known."""
         last = np.maximum(self.num_frames - 1, 0)[..., None, None]

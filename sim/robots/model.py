@@ -67,8 +67,9 @@ def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.Mod
     try:
         _add_model(builder, robot, files)
     except Exception as error:  # an importer can fail with anything
-        said = ": ".join(filter(None, [type(error).__name__, " ".join(str(error).split())]))
-        return newton.ModelBuilder(), problems or [with_traceback(error, f"{robot.model_file} cannot be imported: {said}")]
+        reason = ": ".join(filter(None, [type(error).__name__, " ".join(str(error).split())]))
+        line = with_traceback(error, f"{robot.model_file} cannot be imported: {reason}")
+        return newton.ModelBuilder(), problems or [line]
     # The other checks need a tree of single joints, where joints and their columns are the same.
     structure = _structure_problems(builder)
     if structure:
