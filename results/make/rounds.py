@@ -38,13 +38,13 @@ def search_again(script: Script, name: str, policy: Path | None, seed: int) -> d
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Hardens in three rounds, and searches both ends again; a trial does neither the one nor the other to an end."""
+    """Hardens in three rounds, and searches both ends again; a trial is one tiny round alone."""
     script = parse(__doc__, argv, "rounds.json")
     run = script.runs / "hardening"
     cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
     if script.small:
         cfg = replace(
-            cfg, rounds=1, search=replace(cfg.search, episodes=128),
+            cfg, rounds=1, search=replace(cfg.search, episodes=16, emitters=2, batch_size=4, replicas=1),
             tune=replace(cfg.tune, num_envs=4, terrains=4, iterations=1),
             evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
         )  # fmt: skip

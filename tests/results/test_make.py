@@ -16,7 +16,7 @@ FILES = {
         name: f"{name}.json"
         for name in (
             "base", "penalty_ratios", "agreement", "distances", "dose", "train_speed", "solver_options", "tables",
-            "ablation", "speed", "scale", "search", "spaces",
+            "ablation", "speed", "scale", "search", "spaces", "rounds",
         )
     },
     "archive": "archive/archive.json",
