@@ -371,48 +371,6 @@ class Dose(OfRobot, Where):
         )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class MakePack(Who, Where):
-    """Make a pack of terrains from a judged run: faults and near-faults, to test any controller on.
-
-    The terrains are spread over the ways in which the searched controller fails and over families of kin. Faults come
-    first, and minimal terrains of the run are among them. Every controller crosses each terrain. pack.npz has the
-    terrains. pack.json has the rates and what is known of each terrain. pack.png shows some of them.
-    """
-
-    run: Path | None = None
-    """Run directory; the newest of the robot under runs/."""
-    space: str | None = None
-    """Terrain space of the run, where it is one of your own: file.py:CLASS."""
-    size: PositiveInt = 100
-    """How many terrains. There are fewer if the run has fewer faults and near-faults."""
-    controllers: tuple[str, ...] = ()
-    """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base, all of
-    results/<robot>/*.pt, and the robot's panel. The searched controller is always among them."""
-    episodes: PositiveInt = 20
-    """Episodes on each terrain."""
-    seed: NonNegativeInt = 0
-    """Draws other episodes."""
-    out: Path | None = None
-    """Folder to write to; runs/<robot>-pack."""
-
-    def execute(self) -> None:
-        """Makes it."""
-        from qd.evaluate.make_pack import make_pack
-        from qd.run.directory import find_run
-        from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
-
-        robot = get_robot(self.robot)
-        make_pack(
-            find_run(robot, self.run, published="never"),
-            controllers_of(self.controllers, robot) if self.controllers else {},
-            compute=Compute.resolve(self.device, self.workers, self.num_envs), robot=self.robot, policy=self.policy,
-            space=self.space, size=self.size, episodes=self.episodes, seed=self.seed, out=self.out,
-        )  # fmt: skip
-
-
 def default_preset(argv: Sequence[str]) -> str:
     """The preset that suits the device of a command line: wide on a GPU, small on the CPU."""
     device = peek(argv, "--device")

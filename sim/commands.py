@@ -4,12 +4,11 @@ Modules with Warp, torch or Newton are imported inside ``execute``, so that ``--
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from msgspec import Meta
 
-from sim.files.command import OfRobot, OnDevice, Who
+from sim.files.command import OfRobot, OnDevice
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
@@ -41,25 +40,3 @@ class Stand(OfRobot, OnDevice):
         text, fine = describe_standing(robot, standing)
         print(text)
         return 0 if fine else 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportPolicy(Who):
-    """Write a controller as one ONNX file, weights inside, for any batch size.
-
-    Input `observation` (batch, observation_size) and output `action` (batch, num_joints), float32. The controller must
-    be an rsl_rl checkpoint, such as the policy.pt of a training run.
-    """
-
-    out: Path = Path("policy.onnx")
-    """File to write."""
-
-    def execute(self) -> None:
-        """Writes the file and says what it holds."""
-        from sim.policy.loaders import load_checkpoint
-        from sim.policy.onnx import export_onnx
-        from sim.robots.find import get_robot
-
-        robot = get_robot(self.robot)
-        export_onnx(load_checkpoint(self.policy or robot.policy_file, robot), self.out)
-        print(f"written to {self.out}")

@@ -1,24 +1,24 @@
 """Figures of recorded crossings: height map, paths, where they ended, and where the penalties were incurred."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from qd.show.crossed import ENDINGS, Crossed, penalties_by_place
 from qd.show.figures import look_of
 from sim.files.figures import new_figure
 from sim.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 _BELOW: dict[str, Any] = {"loc": "outside lower center", "ncols": 6, "frameon": False, "handlelength": 3}  # a legend
 _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
 
-def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> "Figure":
+def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> Figure:
     """One terrain: its height map with the paths, its profile, and the penalties by place and by kind.
 
     Args:
@@ -48,7 +48,7 @@ def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> "
     return figure
 
 
-def draw_paths(crossed: Crossed, title: str) -> "Figure":
+def draw_paths(crossed: Crossed, title: str) -> Figure:
     """One terrain from above with the robots' paths, and marks where they ended, by how."""
     figure = new_figure(11.0, 6.2)
     axes = figure.subplots()
@@ -60,7 +60,7 @@ def draw_paths(crossed: Crossed, title: str) -> "Figure":
     return figure
 
 
-def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None = None) -> Any:
+def draw_map(axes: Axes, crossed: Crossed, limits: tuple[float, float] | None = None) -> Any:
     """The height map with every path, its end marked by how it ended; returns the image.
 
     Args:
@@ -81,9 +81,6 @@ def draw_map(axes: "Axes", crossed: Crossed, limits: tuple[float, float] | None 
 
 def _legend(drawn: Sequence[Crossed]) -> list[Any]:
     """Marks of the ends there are, with the lines of the paths to them, of start and goal; counts of a single map."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
     handles: list[Any] = []
     for outcome, end in ENDINGS.items():
         count = sum(int((crossed.outcome == outcome).sum()) for crossed in drawn)
@@ -106,7 +103,7 @@ def _x_limits(drawn: Sequence[Crossed]) -> tuple[float, float]:
     return float(xs.min()), float(xs.max())
 
 
-def _draw_profile(axes: "Axes", crossed: Crossed) -> None:
+def _draw_profile(axes: Axes, crossed: Crossed) -> None:
     """Heights along the straight line from start to goal."""
     heights = crossed.recording.heights[0]
     row = heights[heights.shape[0] // 2]
@@ -117,7 +114,7 @@ def _draw_profile(axes: "Axes", crossed: Crossed) -> None:
     axes.grid(alpha=0.3)
 
 
-def _draw_places(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) -> None:
+def _draw_places(axes: Axes, crossed: Crossed, penalties: tuple[str, ...]) -> None:
     """Scaled penalties of an episode by where they were incurred."""
     edges = np.arange(0.0, LENGTH + _PLACE / 2, _PLACE)
     amounts = penalties_by_place(crossed, penalties, edges)
@@ -131,7 +128,7 @@ def _draw_places(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) -> 
     axes.set_axisbelow(True)
 
 
-def _draw_penalties(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) -> None:
+def _draw_penalties(axes: Axes, crossed: Crossed, penalties: tuple[str, ...]) -> None:
     """Mean of each scaled penalty with its standard deviation over the episodes."""
     places = np.arange(len(penalties))
     means, stds = crossed.scaled.mean(axis=0), crossed.scaled.std(axis=0)
@@ -146,7 +143,7 @@ def _draw_penalties(axes: "Axes", crossed: Crossed, penalties: tuple[str, ...]) 
     axes.set_axisbelow(True)
 
 
-def draw_maps(crossings: Mapping[str, Crossed], title: str) -> "Figure":
+def draw_maps(crossings: Mapping[str, Crossed], title: str) -> Figure:
     """Several terrains or controllers side by side, each a map with paths, all in the same shades.
 
     Args:

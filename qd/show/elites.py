@@ -1,22 +1,42 @@
-"""Where the archive that is shown lies, and who was searched."""
+"""Where the archive that is shown lies, which of its terrains, and who was searched."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.fitness import FitnessCfg
-from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
+from qd.minimise import MinimalFound, read_minimal
+from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run, folder_for
 from qd.run.settings import SearchCfg, own_policy, suffix_of
 from sim.files.command import chosen_elites, command_line
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, label_suffix, spec_of
-
-if TYPE_CHECKING:
-    from qd.minimise import MinimalFound
-    from sim.robots.robot import RobotCfg
-    from sim.spaces.base import TerrainSpace
+from sim.robots.find import get_robot, robot_of
+from sim.robots.robot import RobotCfg
+from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import get_space, is_own
 
 _USUAL_ROBOT = "anymal"
+
+
+class Terrain(NamedTuple):
+    """An elite's terrain, or its minimal terrain."""
+
+    number: int
+    """Of the elite."""
+    genes: NDArray[np.float32]
+    """Shape (num_genes,)."""
+    stem: str
+    """Name of files about it: ``elite-3`` or ``minimal-3``."""
+    label: str
+    """What it is, in words."""
+    minimal: dict[str, object] | None = None
+    """What is known of a minimal terrain."""
+    words: str = ""
+    """The same in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +46,7 @@ class Found:
     run: Path
     """What was given: a run directory or an archive file."""
     archive: Archive
-    robot: "RobotCfg"
+    robot: RobotCfg
 
     @property
     def folder(self) -> Path:
@@ -34,17 +54,13 @@ class Found:
         return directory_of(self.run)
 
     @property
-    def space(self) -> "TerrainSpace":
+    def space(self) -> TerrainSpace:
         """What the genes mean."""
-        from sim.spaces.registry import get_space
-
         return get_space(self.archive.space, self.archive.space_sha256)
 
     @property
     def go_on(self) -> str:
         """How to let the search go on, for errors."""
-        from sim.spaces.registry import is_own
-
         searched, _ = self.as_searched()
         code = searched if ControllerSpec.parse(searched).runs_code else None
         more = {"resume": self.folder, "policy": code, "space": self.space.name if is_own(self.space.name) else None}
@@ -52,11 +68,7 @@ class Found:
         return f"let its search go on with `{command_line('archive', robot=self.robot.spec, **more)}`"
 
     def as_searched(self) -> tuple[str, FitnessCfg]:
-        """Controller and fitness of the search; defaults where the archive lies without its config.
-
-        Raises:
-            ValueError: If the config is not that of the archive, or damaged.
-        """
+        """Controller and fitness of the search; defaults where the archive lies without its config."""
         archive, cfg = self.archive, self._search()
         if cfg is None:
             return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)
@@ -67,38 +79,30 @@ class Found:
         if not file.exists():
             return None
         cfg = RunDirectory(self.folder).read_cfg()
-        there = (cfg.fitness.penalties, cfg.fitness.scales)
-        if there != (archive.penalties, archive.scales):
-            raise ValueError(
-                f"{file} must have the penalties and scales of its archive, {', '.join(archive.penalties)}: "
-                f"{archive.scales}, got {', '.join(there[0])}: {there[1]}: put back the one that is not this run's"
-            )
+        of_config, of_archive = (cfg.fitness.penalties, cfg.fitness.scales), (archive.penalties, archive.scales)
+        if of_config != of_archive:
+            raise ValueError(f"{file} must have the penalties and scales of its archive, {of_archive}, got {of_config}")
         return cfg
 
-    def policy(self, given: str | None) -> str:
+    def policy(self, given: str | None = None) -> str:
         """The controller to cross with: the one given, or that of the search.
 
         Raises:
-            ValueError: If that of the search is code, lost or another one now, or the config is not that of the
-                archive.
+            ValueError: If that of the search is code, lost or another one now.
         """
         cfg = self._search()
         if given is None and cfg is not None:
             return own_policy(self.run, cfg, self.robot)
         policy, searched = spec_of(given or SHIPPED, self.robot), self.archive.policy_sha256
-        if given is None and searched not in (None, found := controller_hash(policy)):
+        if given is None and searched not in (None, digest := controller_hash(policy)):
             raise ValueError(
                 f"{self.run} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
-                f"{found}): say with --policy which one to cross with"
+                f"{digest}): say with --policy which one to cross with"
             )
         return policy
 
     def suffix(self, policy: str) -> str:
-        """The ending of the names of what is made with a controller: empty for the search's, else such as ``-C-G``.
-
-        Raises:
-            ValueError: If the config is not that of the archive.
-        """
+        """The ending of the names of what is made with a controller: empty for the search's, else such as ``-C-G``."""
         cfg = self._search()
         if cfg is None:
             searched, own = self.archive.policy_sha256, str(self.robot.policy_file)
@@ -106,55 +110,64 @@ class Found:
             return "" if same else label_suffix(policy)
         return suffix_of(cfg, policy, self.robot)
 
-    def minima(self) -> "MinimalFound":
+    def output(self, stem: str, policy: str | None = None) -> Path:
+        """Where a file about a terrain goes, without its ending: into the run, or for a published one under runs/."""
+        return folder_for(self.run, self.robot.name) / (stem + (self.suffix(policy) if policy else ""))
+
+    def minima(self) -> MinimalFound:
         """The minimal terrains of its elites.
 
         Raises:
             FileNotFoundError: If there are none.
-            ValueError: If their file is damaged.
         """
-        from qd.minimise import read_minimal
+        minima = read_minimal(self.folder, self.archive)
+        if minima is None:
+            again = command_line("minimise", robot=self.robot.spec, run=self.run)
+            raise FileNotFoundError(f"{self.run} has no minimal terrains of its elites: make them with `{again}`")
+        return minima
 
-        found = read_minimal(self.folder, self.archive)
-        if found is None:
-            word = "judge" if self.archive.fresh is None else "minimise"
-            first = " first, then `faultline minimise`" if word == "judge" else ""
-            again = command_line(word, robot=self.robot.spec, run=self.run)
-            raise FileNotFoundError(f"{self.run} has no minimal terrains of its elites: `{again}`{first} makes them")
-        return found
+    def terrains(self, elite: str = "0", minimal: str | None = None) -> list[Terrain]:
+        """The terrains that a command line names.
 
-    def one(self, text: str) -> int:
-        """The elite that a command line names, where only one makes sense.
+        Args:
+            elite: Numbers of elites apart by spaces or commas, or ``all``.
+            minimal: The same of minimal terrains, which are then meant instead.
+        """
+        archive, whole = self.archive, f"of {len(self.archive):,} of {self.archive.robot}"
+        if minimal is None:
+            numbers = chosen_elites(elite, len(archive), self.run)
+            return [Terrain(n, archive.genes[n], f"elite-{n}", f"elite {n} {whole}") for n in numbers]
+        minima = self.minima()
+        return [
+            Terrain(
+                n, minima.genes[n], f"minimal-{n}", f"minimal terrain of elite {n} {whole}", minima.entry(n),
+                minima.words(n),
+            )
+            for n in minima.chosen(minimal, self.run)
+        ]  # fmt: skip
+
+    def terrain(self, elite: str = "0", minimal: str | None = None) -> Terrain:
+        """The terrain that a command line names, where only one makes sense.
 
         Raises:
             ValueError: If there is none of that number, or several are named.
         """
-        numbers = chosen_elites(text, len(self.archive), self.run)
-        if len(numbers) != 1:
-            raise ValueError(
-                f"--elite must name one elite here, got '{text}': give one of 0 to {len(self.archive) - 1}"
-            )
-        return numbers[0]
+        terrains = self.terrains(elite, minimal)
+        if len(terrains) != 1:
+            raise ValueError(f"one elite must be named here, got '{elite if minimal is None else minimal}'")
+        return terrains[0]
+
+    def one(self, elite: str) -> int:
+        """Number of the only elite that a command line names."""
+        return self.terrain(elite).number
 
 
-def robot_named(name: str | None) -> "RobotCfg":
-    """The robot that a command line names; ANYmal if it names none.
-
-    Raises:
-        ValueError: If there is no such robot.
-    """
-    from sim.robots.find import get_robot
-
-    return get_robot(name or _USUAL_ROBOT)
-
-
-def find_archive(named: str | None, run: Path | None, policy: str | None = None, *, space: str | None = None) -> Found:
+def find_archive(named: str | None, run: Path | None = None, *, space: str | None = None) -> Found:
     """The archive of a run; without one the robot's newest under runs/, else its published one.
 
     Args:
         named: The robot, as the command line names it; left out, that of the run.
         run: Run directory or archive file.
-        policy: Controller that the command line names, for the command that makes an archive.
         space: Terrain space that the command line names.
 
     Raises:
@@ -162,11 +175,7 @@ def find_archive(named: str | None, run: Path | None, policy: str | None = None,
         ValueError: If it is damaged, of another robot, of penalties that the robot does not have, or of a terrain space
             that is not at hand.
     """
-    from sim.robots.find import robot_of
-
-    if run is None or named is not None:
-        robot_named(named)  # an unknown name is said first
-    run = run or find_run(robot_named(named))
+    run = run or find_run(get_robot(named or _USUAL_ROBOT))
     archive = read_archive(run)
     robot = robot_of(archive.named(), named, run)
     check_space(archive, space)

@@ -2,10 +2,10 @@
 
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,189 +14,145 @@ from tqdm import tqdm
 from qd.archive import Archive
 from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
 from qd.run.directory import RUNS, folder_for
-from qd.show.elites import find_archive
+from qd.show.elites import Found
+from sim.bank import terrains_of
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.command import OfRobot, Which, chosen_elites, split_words
+from sim.files.command import chosen_elites
 from sim.files.records import provenance
-
-if TYPE_CHECKING:
-    from sim.ground import GroundMaps
+from sim.ground import GroundMaps
+from sim.maps.terrain_files import TYPICAL_BYTES, check_formats, write_terrain
+from sim.policy.loaders import load_checkpoint
+from sim.policy.onnx import export_onnx
+from sim.robots.find import robot_of
+from sim.robots.robot import RobotCfg
 
 INDEX_FILE = "index.json"
 """What was exported, in the folder of the files."""
+FORMATS = ("npz", "png", "xml", "stl")
 _FOLDER = "terrains"
 _AT_ONCE = 32  # terrains rasterised
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(OfRobot, Which):
-    """Write elites of an archive, or terrains of a pack, as files that other programs read.
-
-    For each elite it writes `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground
-    has them), `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml`
-    (MJCF: a scene of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a
-    closed block). `faultline cross --terrain elite-N.npz`, or with the .png, crosses it again.
-    """
-
-    pack: str | None = None
-    """Take the terrains of a pack instead: a folder that `faultline pack` made, or anymal or cassie for the published
-    one. --elite counts its terrains, from 0; their files are called as the pack calls them."""
-    out: Path | None = None
-    """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published; of minimal
-    terrains minimal-terrains/, of a pack runs/<robot>-pack-terrains."""
-    formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
-    """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
-    overwrite: bool = False
-    """Replace files of an earlier export; without it the command refuses to."""
-
-    def execute(self) -> None:
-        """Writes the files."""
-        export(self)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Source:
+class Source:
     """Terrains that may be exported."""
 
-    numbers: list[int]
-    """Those to be exported."""
     folder: Path
-    """Where their files go without ``--out``."""
+    """Where their files go if no other folder is named."""
+    stems: list[str]
+    """Name of each terrain's files."""
+    about: list[dict[str, Any]]
+    """What is known of each."""
+    genes: NDArray[np.float32]
+    """Shape (N, num_genes)."""
+    heights: Callable[[slice], tuple[NDArray[np.float32], GroundMaps | None]]
+    """Heights of some of them [m], shape (n, nrow, ncol), and their ground, if it is not as always."""
     origin: dict[str, Any]
     """Where they come from, for every file."""
     named: dict[str, Any]
     """The same for the index alone."""
-    stem: Callable[[int], str]
-    """Name of a terrain's files."""
-    genes: Callable[[int], NDArray[np.float32]] | None
-    """Of a terrain, shape (num_genes,)."""
-    terrains: "Callable[[list[int]], tuple[NDArray[np.float32], GroundMaps | None]]"
-    """Heights of some terrains [m], shape (number of them, nrow, ncol), and their ground, if it is not as always."""
-    about: Callable[[int], dict[str, Any]]
-    """What is known of a terrain."""
     ground: tuple[str, ...] = ()
-    """What its terrains have maps of beside heights."""
+    """What the terrains have maps of beside heights."""
 
 
-def export(cfg: Export) -> list[Path]:
-    """Writes the files.
+def source_of_archive(found: Found, elite: str = "0", minimal: str | None = None) -> Source:
+    """Elites of an archive, or their minimal terrains; arguments as of :meth:`qd.show.elites.Found.terrains`."""
+    archive, space = found.archive, found.space
+    terrains = found.terrains(elite, minimal)
+    genes = np.stack([terrain.genes for terrain in terrains])
+    return Source(
+        folder=folder_for(found.run, found.robot.name) / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),
+        stems=[terrain.stem for terrain in terrains],
+        about=[
+            about_elite(archive, terrain.number)
+            | ({"minimal": terrain.minimal} if terrain.minimal else {})
+            | {"terrain": space.describe(terrain.genes)}
+            for terrain in terrains
+        ],
+        genes=genes,
+        heights=lambda part: terrains_of(genes[part], space),
+        origin={"run": str(found.run), "space": archive.space, "space_sha256": archive.space_sha256},
+        named=archive.named(),
+        ground=space.ground,
+    )
+
+
+def source_of_pack(named: str, places: str = "all", robot: str | None = None) -> Source:
+    """Terrains of a pack.
+
+    Args:
+        named: As :func:`qd.evaluate.pack.pack_folder` takes it.
+        places: Their numbers, or ``all``.
+        robot: The robot that the command line names.
+    """
+    folder = pack_folder(named)
+    pack = read_pack(folder)
+    of_robot = robot_of(pack.content, robot, folder / PACK_FILE, flag="pack")
+    rows = chosen_elites(places, len(pack), folder)
+    return Source(
+        folder=RUNS / f"{of_robot.name}-pack-{_FOLDER}",
+        stems=[pack.terrains[row]["name"] for row in rows],
+        about=[{"robot": of_robot.name, "place": row, **pack.terrains[row]} for row in rows],
+        genes=pack.genes[rows],
+        heights=lambda part: (pack.heights[rows[part]], None),
+        origin={"pack": folder.name, "terrains_sha256": pack.content["terrains_sha256"]},
+        named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
+    )
+
+
+def export_terrains(
+    source: Source, *, formats: Sequence[str] = FORMATS, out: Path | None = None, overwrite: bool = False
+) -> list[Path]:
+    """Writes terrains as files that other programs read.
+
+    Args:
+        source: The terrains.
+        formats: Some of :data:`FORMATS`.
+        out: Folder to write to.
+        overwrite: Whether files of an earlier export are replaced.
 
     Returns:
         The files, the index last.
 
     Raises:
-        FileNotFoundError: If there is no archive or pack.
-        ValueError: If there is no such elite or format, a pack is damaged or of another robot, or there is no room;
-            before anything is written.
+        ValueError: If there is no such format or no room, or files would be replaced; before anything is written.
         OSError: If a file cannot be written.
     """
-    from sim.maps.terrain_files import check_formats, write_terrain
-
-    source = _of_archive(cfg) if cfg.pack is None else _of_pack(cfg, cfg.pack)
-    elites = source.numbers
-    formats = list(dict.fromkeys(split_words(cfg.formats)))
+    formats, folder = list(dict.fromkeys(formats)), out or source.folder
     check_formats(formats)
-    _tell_of_ground(source, formats)
-    folder = cfg.out or source.folder
-    if not cfg.overwrite:
-        _refuse_to_replace(folder, {source.stem(elite) for elite in elites})
-    _check_room(folder, len(elites), formats)
+    if source.ground and "npz" not in formats:
+        raise ValueError(
+            f"formats must have npz, which alone holds {' and '.join(source.ground)}, got {', '.join(formats)}"
+        )
+    if not overwrite:
+        _refuse_to_replace(folder, {*source.stems})
+    _check_room(folder, len(source.stems), formats)
     prepare_output(folder / INDEX_FILE)
     origin = {**source.origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
-    files, index = [], []
-    with tqdm(total=len(elites), desc="exporting", unit="terrain", file=sys.stderr, disable=None) as bar:
-        for first in range(0, len(elites), _AT_ONCE):
-            numbers = elites[first : first + _AT_ONCE]
-            grids, maps = source.terrains(numbers)
-            for place, (number, heights) in enumerate(zip(numbers, grids, strict=True)):
-                about, stem = source.about(number), folder / source.stem(number)
-                genes = None if source.genes is None else source.genes(number)
-                ground = None if maps is None else maps[place : place + 1]
-                told = {**about, **origin}
-                files += write_terrain(stem, heights, formats=formats, about=told, genes=genes, ground=ground)
-                index.append({**about, "files": stem.name})
+    files, index, count = [], [], len(source.stems)
+    with tqdm(total=count, desc="exporting", unit="terrain", file=sys.stderr, disable=None) as bar:
+        for first in range(0, count, _AT_ONCE):
+            part = slice(first, min(first + _AT_ONCE, count))
+            grids, maps = source.heights(part)
+            for k, heights in enumerate(grids):
+                about, stem = source.about[first + k], source.stems[first + k]
+                files += write_terrain(
+                    folder / stem, heights, formats=formats, about={**about, **origin}, genes=source.genes[first + k],
+                    ground=None if maps is None else maps[k : k + 1],
+                )  # fmt: skip
+                index.append({**about, "files": stem})
                 bar.update()
     files.append(folder / INDEX_FILE)
     write_atomically(files[-1], to_json({**source.named, "formats": formats, "elites": index, **origin}))
-    what = "elite" if cfg.pack is None and cfg.minimal is None else "terrain"
-    print(f"{len(elites)} {what}{'s' * (len(elites) != 1)} as {', '.join(formats)}: {folder}")
+    print(f"{count} terrain{'s' * (count != 1)} as {', '.join(formats)}: {folder}")
     return files
 
 
-def _tell_of_ground(source: _Source, formats: list[str]) -> None:
-    """Says which files hold friction and softness.
-
-    Raises:
-        ValueError: If none would.
-    """
-    if not source.ground:
-        return
-    others = ", ".join(ending for ending in formats if ending != "npz")
-    alone = f"{others} hold{'s' * (',' not in others)} heights alone"
-    if "npz" not in formats:
-        raise ValueError(
-            f"terrains have {' and '.join(source.ground)} of their own, which only npz holds, got --formats "
-            f"{' '.join(formats)}: add npz"
-        )
-    if others:
-        print(f"{' and '.join(source.ground).capitalize()} of the ground: in the npz; {alone}.")
-
-
-def _of_archive(cfg: Export) -> _Source:
-    """The elites of an archive."""
-    from sim.bank import terrains_of
-
-    found = find_archive(cfg.robot, cfg.run, space=cfg.space)
-    archive, space = found.archive, found.space
-    minima = None if cfg.minimal is None else found.minima()
-    what = "elite" if minima is None else "minimal"
-
-    def genes(elite: int) -> NDArray[np.float32]:
-        return archive.genes[elite] if minima is None else minima.genes[elite]
-
-    def about(elite: int) -> dict[str, Any]:
-        known = {} if minima is None else {"minimal": minima.entry(elite)}
-        return {**about_elite(archive, elite), **known, "terrain": space.describe(genes(elite))}
-
-    return _Source(
-        numbers=(
-            chosen_elites(cfg.elite, len(archive), found.run)
-            if minima is None
-            else minima.chosen(str(cfg.minimal), found.run)
-        ),
-        folder=folder_for(found.run, found.robot.name) / (_FOLDER if minima is None else f"{what}-{_FOLDER}"),
-        origin={"run": str(found.run), "space": archive.space, "space_sha256": archive.space_sha256},
-        named=archive.named(),
-        stem=lambda elite: f"{what}-{elite}",
-        genes=genes,
-        terrains=lambda numbers: terrains_of(np.stack([genes(elite) for elite in numbers]), space),
-        ground=space.ground,
-        about=about,
-    )
-
-
-def _of_pack(cfg: Export, named: str) -> _Source:
-    """The terrains of a pack."""
-    from sim.robots.find import robot_of
-
-    if (cfg.run, cfg.space, cfg.minimal) != (None, None, None):
-        raise ValueError(
-            "a pack has its own terrains, got --run, --space or --minimal beside --pack: leave one of them out"
-        )
-    folder = pack_folder(named)
-    pack = read_pack(folder)
-    robot = robot_of(pack.content, cfg.robot, folder / PACK_FILE, flag="pack")
-    return _Source(
-        numbers=chosen_elites(cfg.elite, len(pack), folder),
-        folder=RUNS / f"{robot.name}-pack-{_FOLDER}",
-        origin={"pack": folder.name, "terrains_sha256": pack.content["terrains_sha256"]},
-        named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
-        stem=lambda place: pack.terrains[place]["name"],
-        genes=None if pack.genes is None else pack.genes.__getitem__,
-        terrains=lambda numbers: (pack.heights[numbers], None),
-        about=lambda place: {"robot": robot.name, "place": place, **pack.terrains[place]},
-    )
+def export_controller(policy: str | None, robot: RobotCfg, out: Path) -> None:
+    """Writes a robot's controller, an rsl_rl checkpoint or by default the shipped one, as one ONNX file."""
+    export_onnx(load_checkpoint(policy or robot.policy_file, robot), out)
+    print(f"Controller: {out}")
 
 
 def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
@@ -222,27 +178,17 @@ def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
 
 
 def _refuse_to_replace(folder: Path, stems: set[str]) -> None:
-    there = [file for file in (folder / INDEX_FILE, *folder.glob("*-*")) if file.exists()]
-    wanted = {INDEX_FILE, *stems}
-    found = sorted({file.name for file in there if file.name == INDEX_FILE or file.stem in wanted})
-    if found:
-        names = ", ".join(found[:3]) + ", ..." * (len(found) > 3)
+    files = [file for file in (folder / INDEX_FILE, *folder.glob("*-*")) if file.exists()]
+    replaced = sorted({file.name for file in files if file.name == INDEX_FILE or file.stem in stems})
+    if replaced:
+        names = ", ".join(replaced[:3]) + ", ..." * (len(replaced) > 3)
         raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")
 
 
-def _check_room(folder: Path, count: int, formats: list[str]) -> None:
-    from sim.maps.terrain_files import TYPICAL_BYTES
-
+def _check_room(folder: Path, count: int, formats: Sequence[str]) -> None:
     needed = count * sum(TYPICAL_BYTES[ending] for ending in formats)
-    free = shutil.disk_usage(_that_exists(folder)).free
-    print(f"Writing about {needed / 1e6:,.0f} MB to {folder}.", flush=True)
+    free = shutil.disk_usage(next(path for path in (folder, *folder.absolute().parents) if path.exists())).free
     if needed > free:
         raise ValueError(
-            f"{folder} has room for {free / 1e6:,.0f} MB, but {count} elites as {', '.join(formats)} take about "
-            f"{needed / 1e6:,.0f} MB: leave stl out (--formats), or give another --out"
+            f"{folder} must have room for {needed / 1e6:,.0f} MB, got {free / 1e6:,.0f} MB: leave stl out of --formats"
         )
-
-
-def _that_exists(folder: Path) -> Path:
-    """The folder, or the nearest above it that is there."""
-    return next(path for path in (folder, *folder.absolute().parents) if path.exists())

@@ -2,20 +2,19 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 
 from qd.archive import Archive
 from qd.faults import FRESH_EPISODES, fault_numbers, fresh_numbers
 from qd.groups import Mode
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, bar_lengths, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
 
 CURVES_FILE = "curves.png"
 ARCHIVE_FIGURE_FILE = "archive.png"
@@ -88,7 +87,7 @@ def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, An
     return [folder / name for name in figures]
 
 
-def save_figure(path: Path, figure: "Figure") -> None:
+def save_figure(path: Path, figure: Figure) -> None:
     """Writes a figure, atomically."""
     write_atomically(path, as_png(figure))
 
@@ -97,7 +96,7 @@ def _title(archive: Archive) -> str:
     return f"{archive.robot}, {archive.iterations:,} iteration{'s' * (archive.iterations != 1)}"
 
 
-def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> "Figure":
+def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> Figure:
     """QD score, archive size with reachable coverage, and mean fitness over the iterations, and mean STD if looked at.
 
     Args:
@@ -127,7 +126,7 @@ def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> "Figure"
     return figure
 
 
-def _draw_std(axes: "Axes", looks: Sequence[dict[str, Any]]) -> None:
+def _draw_std(axes: Axes, looks: Sequence[dict[str, Any]]) -> None:
     """The paper's mean STD with its 95 % intervals, where elites were looked at again."""
     means = [row["mean_std"] for row in looks]
     lengths = bar_lengths(means, [row["mean_std_interval"] for row in looks])
@@ -136,14 +135,14 @@ def _draw_std(axes: "Axes", looks: Sequence[dict[str, Any]]) -> None:
     axes.set_ylim(bottom=0)
 
 
-def _add_coverage_axis(axes: "Axes", num_cells: int) -> None:
+def _add_coverage_axis(axes: Axes, num_cells: int) -> None:
     """A second scale on the right: elites as a share of the reachable cells."""
     right = axes.twinx()
     right.set_ylim(*(100.0 * limit / num_cells for limit in axes.get_ylim()))
     right.set_ylabel("reachable coverage [%]")
 
 
-def draw_archive(archive: Archive) -> "Figure":
+def draw_archive(archive: Archive) -> Figure:
     """Every elite as a line over one vertical axis a ratio, coloured by its fitness (the paper's archive figure).
 
     Args:
@@ -167,8 +166,8 @@ def draw_archive(archive: Archive) -> "Figure":
 
 
 def draw_elites(
-    axes: "Axes", penalties: Sequence[str], ratios: np.ndarray, values: np.ndarray, limits: tuple[float, float]
-) -> "LineCollection":
+    axes: Axes, penalties: Sequence[str], ratios: np.ndarray, values: np.ndarray, limits: tuple[float, float]
+) -> LineCollection:
     """Draws elites as lines over one vertical axis a ratio.
 
     Args:
@@ -181,9 +180,6 @@ def draw_elites(
     Returns:
         The lines, which a colour bar takes.
     """
-    from matplotlib.collections import LineCollection
-    from matplotlib.colors import Normalize
-
     positions, order = np.arange(len(penalties)), np.argsort(values)
     points = np.stack([np.broadcast_to(positions, ratios.shape), ratios], axis=2)[order]
     lines = LineCollection([*points], cmap="viridis", norm=Normalize(*limits), linewidths=0.8, alpha=0.6)
@@ -214,7 +210,7 @@ def spread(archive: Archive) -> np.ndarray:
     return counts
 
 
-def draw_spread(archive: Archive) -> "Figure":
+def draw_spread(archive: Archive) -> Figure:
     """How the elites spread over the intervals of each ratio, with and without base collisions.
 
     Args:

@@ -2,20 +2,23 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image as Images
+from PIL import ImageDraw, ImageFont
 
 from qd.show.crossed import ARRIVED, crossed_of, ending_of
 from qd.show.figures import label_of, look_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
+from sim.mujoco_c.model import surface_heights
 from sim.policy.spec import ControllerSpec
-
-if TYPE_CHECKING:
-    from sim.recording.recorder import Recording
-    from sim.recording.renderer import Camera, Renderer
+from sim.recording.recorder import Recording
+from sim.recording.renderer import Camera, Renderer
 
 WIDTH, VIEW_HEIGHT, PANEL_HEIGHT = 1280, 480, 240
 """Pixels of a film; the panel stands below the view."""
@@ -35,7 +38,7 @@ Image = NDArray[np.uint8]
 class Shot:
     """What a film shows: one episode of a recording, and others of the same terrain as ghosts."""
 
-    recording: "Recording"
+    recording: Recording
     """Of one terrain."""
     episode: int
     """Index of the episode."""
@@ -58,7 +61,7 @@ class Shot:
         return {name: sums[:, names.index(name)] / scale for name, scale in self.scales.items() if name in names}
 
 
-def typical_episode(recording: "Recording", scales: dict[str, float]) -> int:
+def typical_episode(recording: Recording, scales: dict[str, float]) -> int:
     """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties.
 
     Args:
@@ -90,16 +93,13 @@ def caption(shot: Shot) -> tuple[str, str]:
     return first, f"{of}: {', '.join(rates)}; in brackets 95 % intervals"
 
 
-def follow(shot: Shot, distance: float) -> list["Camera"]:
+def follow(shot: Shot, distance: float) -> list[Camera]:
     """A camera a frame: it follows the base smoothly, from as low as the ground nowhere hides the robot.
 
     Args:
         shot: What the film shows.
         distance: Of the camera from the base [m].
     """
-    from sim.mujoco_c.model import surface_heights
-    from sim.recording.renderer import Camera
-
     recording = shot.recording
     base = recording.base_position[0, shot.episode, : shot.num_frames].astype(np.float64)
     width = max(1, round(_SMOOTH_S / recording.dt)) | 1
@@ -118,7 +118,7 @@ def follow(shot: Shot, distance: float) -> list["Camera"]:
     return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
 
 
-def frames_of(shot: Shot, renderer: "Renderer", cameras: Sequence["Camera"], fps: int) -> Iterator[Image]:
+def frames_of(shot: Shot, renderer: Renderer, cameras: Sequence[Camera], fps: int) -> Iterator[Image]:
     """The pictures of a film, the last one held for a second.
 
     Args:
@@ -161,9 +161,6 @@ def num_pictures(shot: Shot, fps: int) -> int:
 
 def _lettered(view: Image, lines: tuple[str, str], clock: str) -> Image:
     """A view with the caption on a dark bar at its top, and the time at its bottom."""
-    from PIL import Image as Images
-    from PIL import ImageDraw, ImageFont
-
     view[:_BAR] = (0.35 * view[:_BAR]).astype(np.uint8)
     image = Images.fromarray(view)
     draw = ImageDraw.Draw(image)
@@ -184,9 +181,6 @@ class Panel:
     """
 
     def __init__(self, shot: Shot, width: int, height: int) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
         figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
         figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0 - _NUMBERS / width, 1.0))
         canvas = FigureCanvasAgg(figure)
@@ -227,9 +221,6 @@ class Panel:
 
     def _with_sums(self, image: Image, time_s: float) -> Image:
         """What each penalty has come to by now, behind its name in the legend."""
-        from PIL import Image as Images
-        from PIL import ImageDraw, ImageFont
-
         picture = Images.fromarray(image)
         draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
         for place, values in zip(self._places, self._penalties.values(), strict=True):

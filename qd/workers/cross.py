@@ -85,11 +85,15 @@ class Cache:
             arrays = read_arrays(file, wanted)
             if str(arrays.pop(_KEY, "")) != key:
                 raise ValueError("it is another key's")
-            os.utime(file)
+            self.touch(key)
         except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
             self.discard(key, error)
             return None
         return arrays
+
+    def touch(self, key: str) -> None:
+        """Notes that a file was used."""
+        os.utime(self.file(key))
 
     def discard(self, key: str, why: object) -> None:
         """Removes a damaged file and says so."""
@@ -104,9 +108,10 @@ class Cache:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         write_atomically(self.file(key), npz_bytes({_KEY: np.array(key), **arrays}))
-        self._remove_least_used(key)
+        self.remove_least_used(but=key)
 
-    def _remove_least_used(self, but: str) -> None:
+    def remove_least_used(self, *, but: str) -> None:
+        """Removes the files that were not used for longest, but one, until the folder has its size."""
         about = [(file, file.stat()) for file in self.folder.glob("*.npz")]
         size = sum(stat.st_size for _, stat in about)
         for file, stat in sorted(about, key=lambda pair: pair[1].st_mtime_ns):

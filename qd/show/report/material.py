@@ -126,7 +126,7 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
     """Reads what there is and makes sure that the page can be written."""
     if run is not None and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
         raise ValueError(f"{run} must hold a search that has ended an iteration, got no {ARCHIVE_FILE}: let it go on")
-    found = find_archive(robot, run, policy, space=space)
+    found = find_archive(robot, run, space=space)
     archive = found.archive
     if not len(archive):
         raise ValueError(f"{found.run} must have elites to report on, got an archive of none: {found.go_on}")

@@ -1,0 +1,219 @@
+"""The commands that show a run or a terrain: their flags, and nothing else."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from qd.show.film_cfg import FilmCfg
+from sim.files.command import OnDevice, Where, Which, Who
+from sim.files.settings import NonNegativeInt, PositiveInt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mapped:
+    """How large and how high a height map is."""
+
+    size: tuple[float, float] | None = None
+    """Of the map along x and y [m], such as 16 8; its file's if left out."""
+    scale: float | None = None
+    """Metres a gray level of the map; its file's if left out."""
+    offset: float | None = None
+    """Height of its gray level 0 [m]; its file's, or 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Who, OnDevice, Which):
+    """Print one elite of an archive, or its minimal terrain, and draw the terrain with the robots' paths.
+
+    Elites are numbered by falling fitness; after fresh episodes their corrected fitness counts. That is not the order
+    in which the controller fails: `faultline view` and `faultline report` list faults first.
+    """
+
+    replicas: PositiveInt = 20
+    """Episodes to run."""
+    seed: NonNegativeInt = 0
+    """Seed of the fresh episodes."""
+    out: Path | None = None
+    """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published; with
+    another controller elite-<number>-<its name>.png. Of a minimal terrain minimal-<number>..."""
+
+    def execute(self) -> None:
+        """Prints the numbers and writes the figure."""
+        from qd.show.elites import find_archive
+        from qd.show.replay import replay
+        from qd.workers.evaluator import resolve_device
+
+        found = find_archive(self.robot, self.run, space=self.space)
+        replay(
+            found, found.terrain(self.elite, self.minimal), policy=self.policy, replicas=self.replicas, seed=self.seed,
+            device=resolve_device(self.device), out=self.out,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film(Who, OnDevice, Which, Mapped):
+    """Film a robot on elites of an archive, or on a terrain of your own.
+
+    The episodes are those that `faultline replay` shows. Below the robot stand the map with all paths and what the
+    episode has cost so far, each penalty in multiples of its scale. Yellow arrows are contact forces of the feet, red
+    ones those beyond the robot's limit. The recording is stored beside the film, so that it can be filmed again
+    elsewhere. Without --out a film is elite-<number>.mp4 in the run, or of a published one in runs/<robot>-published;
+    with another controller elite-<number>-<its name>.mp4; of a minimal terrain minimal-<number>.mp4.
+    """
+
+    terrain: Path | None = None
+    """Instead of elites a height map of your own, an .npz or a .png (see `faultline cross --help`); or what was
+    recorded, a .recording.npz that stands beside a film."""
+    replicas: PositiveInt = 20
+    """Episodes to run."""
+    seed: NonNegativeInt = 0
+    """Seed of the episodes."""
+    out: Path | None = None
+    """File of the film, or with several elites their folder."""
+    look: FilmCfg = field(default_factory=FilmCfg)
+
+    def execute(self) -> None:
+        """Makes the films."""
+        from qd.show.cross import MapScale, read_own_terrain
+        from qd.show.elites import find_archive
+        from qd.show.film import RECORDING, film_elites, film_map, film_recording
+        from qd.workers.evaluator import resolve_device
+        from sim.robots.find import get_robot
+
+        if self.run is not None and self.terrain is not None:
+            raise ValueError("give one of --run and --terrain")
+        if self.terrain is not None and self.terrain.name.endswith(RECORDING):
+            film_recording(self.terrain, self.look, robot=self.robot, policy=self.policy, out=self.out)
+            return
+        crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed, "out": self.out}
+        crossing["device"] = resolve_device(self.device)
+        if self.terrain is not None:
+            terrain = read_own_terrain(self.terrain, MapScale(self.size, self.scale, self.offset))
+            film_map(terrain, get_robot(self.robot or "anymal"), self.look, **crossing)
+            return
+        found = find_archive(self.robot, self.run, space=self.space)
+        film_elites(found, found.terrains(self.elite, self.minimal), self.look, **crossing)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cross(Who, OnDevice, Mapped):
+    """Cross a height map of your own: how often does the controller get over, and what does it cost?
+
+    A map is a grid of heights over a rectangle: an .npz with an array `heights` (rows along y, columns along x, floats
+    in metres), or a grayscale .png of 8 or 16 bits seen from above (x to the right, y up) with the metres of a gray
+    level. Its size in metres is given here, or as `size_m` in the .npz, or with `scale_m` and `offset_m` in a .json of
+    the same name beside the .png, such as `faultline export` writes.
+
+    Robots start near x = 2 m, y = 4 m and walk to x = 14 m, y = 4 m. The middle of the map lies on the middle of what
+    they cross, 16 m x 8 m. The rest of a larger map is cut off. A smaller one goes on at the height of its edge. The
+    map is resampled to 0.05 m: linearly, or by weighted means where it is finer.
+    """
+
+    terrain: Path
+    """The height map: an .npz or a .png."""
+    episodes: PositiveInt = 20
+    """Crossings."""
+    seed: NonNegativeInt = 0
+    """Draws their starts."""
+    out: Path | None = None
+    """File for the numbers; runs/terrains/<map>-<robot>[-<controller>].json, where <map> is the path of the map with -
+    between its folders. The figure ...-paths.png is written beside it. Older files are replaced."""
+
+    def execute(self) -> None:
+        """Crosses the map, prints rates and costs, writes numbers and figure."""
+        from qd.show.cross import MapScale, cross_map, read_own_terrain
+        from qd.workers.evaluator import resolve_device
+        from sim.robots.find import get_robot
+
+        terrain = read_own_terrain(self.terrain, MapScale(self.size, self.scale, self.offset))
+        cross_map(
+            terrain, get_robot(self.robot or "anymal"), self.policy, episodes=self.episodes, seed=self.seed,
+            device=resolve_device(self.device), out=self.out,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackFlags(Where):
+    """How a pack is made."""
+
+    size: PositiveInt = 100
+    """How many terrains. There are fewer if the run has fewer faults and near-faults."""
+    controllers: tuple[str, ...] = ()
+    """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base, all of
+    results/<robot>/*.pt, and the robot's panel. The searched controller is always among them."""
+    episodes: PositiveInt = 20
+    """Episodes on each terrain."""
+    seed: NonNegativeInt = 0
+    """Draws other episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Who, Which):
+    """Write terrains as files that other programs read, a pack of terrains, or a controller as ONNX.
+
+    For each elite it writes `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground
+    has them), `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml`
+    (MJCF: a scene of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a
+    closed block). `faultline cross --terrain elite-N.npz`, or with the .png, crosses it again.
+
+    With --pack it makes a pack from a judged run: faults and near-faults, to test any controller on with `faultline
+    evaluate --pack`. The terrains are spread over the ways in which the searched controller fails and over families of
+    kin. Every controller crosses each terrain. pack.npz has the terrains, pack.json the rates and what is known of each
+    terrain, pack.png shows some of them.
+    """
+
+    from_pack: str | None = None
+    """Take the terrains of a pack instead of elites: its folder, or anymal or cassie for the published one. --elite
+    counts its terrains, from 0; their files are called as the pack calls them."""
+    formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
+    """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
+    overwrite: bool = False
+    """Replace files of an earlier export; without it the command refuses to."""
+    pack: bool = False
+    """Make a pack from the run."""
+    onnx: Path | None = None
+    """Write the controller (--policy, else the robot's own) as one ONNX file, weights inside, for any batch size. It
+    must be an rsl_rl checkpoint, such as the policy.pt of a training run."""
+    out: Path | None = None
+    """Folder to write to; terrains/ in the run directory, or of a published one in runs/<robot>-published; of minimal
+    terrains minimal-terrains/, of a pack's runs/<robot>-pack-terrains; of a new pack runs/<robot>-pack."""
+    making: PackFlags = field(default_factory=PackFlags)
+
+    def execute(self) -> None:
+        """Writes the files."""
+        from qd.show.elites import find_archive
+        from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
+        from sim.files.command import split_words
+        from sim.robots.find import get_robot
+
+        if sum([self.pack, self.from_pack is not None, self.onnx is not None]) > 1:
+            raise ValueError("give one of --pack, --from-pack and --onnx")
+        if self.onnx is not None:
+            export_controller(self.policy, get_robot(self.robot or "anymal"), self.onnx)
+            return
+        if self.pack:
+            self._make_pack()
+            return
+        if self.from_pack is not None:
+            if (self.run, self.space, self.minimal) != (None, None, None):
+                raise ValueError("a pack has its own terrains: leave --run, --space and --minimal out")
+            source = source_of_pack(self.from_pack, self.elite, self.robot)
+        else:
+            found = find_archive(self.robot, self.run, space=self.space)
+            source = source_of_archive(found, self.elite, self.minimal)
+        export_terrains(source, formats=split_words(self.formats), out=self.out, overwrite=self.overwrite)
+
+    def _make_pack(self) -> None:
+        from qd.evaluate.make_pack import make_pack
+        from qd.run.directory import find_run
+        from qd.workers.evaluator import Compute
+        from sim.policy.spec import controllers_of
+        from sim.robots.find import get_robot
+
+        making, robot = self.making, get_robot(self.robot or "anymal")
+        make_pack(
+            find_run(robot, self.run, published="never"),
+            controllers_of(making.controllers, robot) if making.controllers else {},
+            compute=Compute.resolve(making.device, making.workers, making.num_envs), robot=self.robot,
+            policy=self.policy, space=self.space, size=making.size, episodes=making.episodes, seed=making.seed,
+            out=self.out,
+        )  # fmt: skip
