@@ -11,12 +11,12 @@ import pytest
 from qd.archive import read_archive, write_archive
 from qd.causes import effects_of
 from qd.minimise import minimise
+from qd.show.commands import Export
 from qd.show.crossed import crossed_of
 from qd.show.crossing_figures import draw_paths
 from qd.show.elites import find_archive
-from qd.show.export import Export, export
 from qd.show.recordings import Recordings, on_elite, on_heights
-from qd.show.replay import ReplayElite, draw, replay
+from qd.show.replay import draw, replay
 from qd.show.report.relief import reliefs_of
 from qd.show.view.meshes import terrain_mesh
 from qd.workers.evaluator import Compute
@@ -88,16 +88,15 @@ def test_what_cannot_be_searched_is_said_in_a_line(words, says, capsys):
     assert says in capsys.readouterr().err
 
 
-def test_exported_ground_is_read_back(searched, capsys):
-    export(Export(run=searched, elite="0", formats=("npz", "xml")))
-    assert "Friction and softness of the ground: in the npz; xml holds heights alone." in capsys.readouterr().out
+def test_exported_ground_is_read_back(searched):
+    Export(run=searched, elite="0", formats=("npz", "xml")).execute()
     found = read_heightmap(searched / "terrains/elite-0.npz")
     heights, ground = terrains_of(read_archive(searched).genes[:1], get_space(SPACE))
     np.testing.assert_array_equal(found.heights, heights[0])
     np.testing.assert_array_equal(found.ground.friction, ground.friction)
     np.testing.assert_array_equal(found.ground.time_constant_s, ground.time_constant_s)
-    with pytest.raises(ValueError, match="which only npz holds, got --formats stl: add npz"):
-        export(Export(run=searched, elite="0", formats=("stl",), overwrite=True))
+    with pytest.raises(ValueError, match="npz"):
+        Export(run=searched, elite="0", formats=("stl",), overwrite=True).execute()
 
 
 @contextmanager
@@ -131,7 +130,7 @@ def test_a_minimal_terrain_may_be_a_patch(minimised, tmp_path):
     assert entry["bumps"] == [8 + 11] and entry["of"] >= 64 and entry["cause"]["kind"] == "slippery ground"
     assert entry["words"] == ["friction 0.15 at x = 6 to 8 m, y = 2 to 4 m"]
     assert (entry["height_m"], entry["scale"], entry["margin_m"], entry["scales"]) == (0.0, None, None, [])
-    export(Export(run=run, minimal="all", formats=("npz",)))
+    Export(run=run, minimal="all", formats=("npz",)).execute()
     found = read_heightmap(run / f"minimal-terrains/minimal-{number}.npz")
     slippery = np.ones((1, 4, 8), np.float32)
     slippery[0, 1, 3] = 0.15
@@ -142,7 +141,8 @@ def test_a_minimal_terrain_may_be_a_patch(minimised, tmp_path):
 
 def test_a_minimal_terrain_is_replayed_with_its_ground(minimised):
     run, number, _ = minimised
-    done = replay(ReplayElite(run=run, minimal=str(number), device="cpu", replicas=1, policy="shipped"))
+    found = find_archive(None, run)
+    done = replay(found, found.terrain("0", str(number)), replicas=1, policy="shipped")
     assert done.recording.ground.friction[0, 1, 3] == pytest.approx(0.15)
     assert np.count_nonzero(done.recording.ground.friction < 1.0) == 1 and not done.recording.heights.any()
     labels = [text.get_text() for text in draw(done).legends[0].get_texts()]

@@ -18,7 +18,7 @@ import faultline
 from qd.archive import read_archive
 from qd.commands import Archive
 from qd.judge import judge
-from qd.show.replay import ReplayElite, replay
+from qd.show.commands import Replay
 from qd.workers.evaluator import Compute
 from tests.builders import hashes
 from tests.sim.dogs import KINDS, write_dog
@@ -272,7 +272,7 @@ def test_a_run_that_is_handed_over_runs_nothing_of_its_own(searched, tmp_path, h
     settings = {**config["settings"], "robot": f"{tmp_path}/evil.py", "policy": f"{tmp_path}/evil.py:act"}
     (tmp_path / "config.json").write_text(json.dumps({**config, "settings": settings}))
     for command in (
-        lambda: replay(ReplayElite(robot=robot[1], run=tmp_path, device="cpu")),
+        lambda: Replay(robot=robot[1], run=tmp_path, device="cpu").execute(),
         lambda: archive_command(tmp_path),
         lambda: archive_command(tmp_path, robot=robot[1]),
         lambda: judge(tmp_path, compute=Compute()),

@@ -13,8 +13,8 @@ import pytest
 from qd.archive import read_archive
 from qd.commands import Archive
 from qd.judge import judge
+from qd.show.commands import Export
 from qd.show.elites import find_archive
-from qd.show.export import Export, export
 from qd.show.recordings import on_elite
 from qd.show.report import report
 from qd.workers.evaluator import Compute
@@ -134,7 +134,7 @@ def test_a_run_goes_on_with_no_other_space(ridges, searched, capsys, monkeypatch
 @pytest.mark.parametrize(
     "look",
     [
-        lambda: export(Export()),
+        lambda: Export().execute(),
         lambda: find_archive(None, None),
         lambda: judge(Path("runs/anymal-1"), compute=Compute()),
     ],
@@ -157,7 +157,7 @@ def test_fresh_episodes(ridges, searched):
 
 
 def test_elites_as_files(ridges, searched):
-    export(Export(run=searched, elite="1", formats=("npz",), space=ridges))
+    Export(run=searched, elite="1", formats=("npz",), space=ridges).execute()
     found = find_archive(None, searched, space=ridges)
     genes = found.archive.genes[1]
     heightmap = read_heightmap(searched / "terrains/elite-1.npz")

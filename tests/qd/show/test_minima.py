@@ -8,9 +8,9 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.archive import read_archive
+from qd.show.commands import Export
 from qd.show.elites import find_archive
-from qd.show.export import Export, export
-from qd.show.replay import ReplayElite, describe, draw, replay
+from qd.show.replay import describe, draw, replay
 from qd.show.view.plots import MINIMAL, Choice
 from qd.show.view.show import find_show
 from tests.qd.recordings import recording_of
@@ -59,27 +59,26 @@ def test_one_is_replayed(found, run, tmp_path, monkeypatch):
         return [dataclasses.replace(recording, genes=wanted[0].terrain[None])]
 
     monkeypatch.setattr("qd.show.recordings.Recordings.all_of", all_of)
-    done = replay(ReplayElite(run=run, minimal=str(first), device="cpu", replicas=2, policy="shipped"))
-    assert asked[0].label == f"minimal terrain of elite {first} of anymal" and done.out.name == f"minimal-{first}.png"
+    done = replay(found, found.terrain("0", str(first)), replicas=2, policy="shipped")
+    assert asked[0].label == f"minimal terrain of elite {first} of 20 of anymal"
+    assert (run / f"minimal-{first}.png").is_file()
     np.testing.assert_array_equal(asked[0].terrain, found.minima().genes[first])
     text = describe(done)
     assert f"minimal terrain of elite {first} of 20" in text and "minimal, now (2 episodes)" in text
     assert "Of the minimal terrain: 1 of 2 parts; goal reached 0% (0 to 9%)" in text
     assert f"minimal terrain of elite {first}" in draw(done).axes[0].get_title()
-    with pytest.raises(ValueError, match="--minimal must name one elite here"):
-        replay(ReplayElite(run=run, minimal="all"))
 
 
 def test_they_are_exported_beside_whole_elites(found, run, tmp_path):
     numbers = list(found.minima().genes)
-    files = export(Export(run=run, minimal="all", out=tmp_path, formats=("npz",)))
-    assert [file.name for file in files if file.suffix == ".npz"] == [f"minimal-{number}.npz" for number in numbers]
+    Export(run=run, minimal="all", out=tmp_path, formats=("npz",)).execute()
+    assert {file.name for file in tmp_path.glob("*.npz")} == {f"minimal-{number}.npz" for number in numbers}
     with np.load(tmp_path / f"minimal-{numbers[0]}.npz") as content:
         np.testing.assert_array_equal(content["genes"], found.minima().genes[numbers[0]])
     about = json.loads((tmp_path / f"minimal-{numbers[0]}.json").read_text())
     assert about["elite"] == numbers[0] and about["minimal"]["cause"]["kind"] == "rise"
     with pytest.raises(ValueError, match="holds an export already"):
-        export(Export(run=run, minimal="all", out=tmp_path, formats=("npz",)))
+        Export(run=run, minimal="all", out=tmp_path, formats=("npz",)).execute()
 
 
 def test_the_viewer_lists_them(found, run):
