@@ -94,6 +94,7 @@ def harden(
     except KeyboardInterrupt:
         raise Interrupted(f"Stopped; what is done is kept, and the same command goes on in {run_dir}.") from None
     _show(hardening.content)
+    print(f"The hardened controller: {hardening.policies[f'round-{cfg.rounds}']}")
     return hardening.content
 
 
