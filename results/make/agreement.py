@@ -29,10 +29,8 @@ def cross_in_all_ways(
     ``search`` has the first starts; ``again`` (the same settings), ``resolved`` and ``mujoco_c`` have the second.
     """
     episodes, in_mujoco_c = (1, 1) if script.small else (40, 40)
-    first, second = (
-        np.random.SeedSequence([KEY, script.seed], spawn_key=(stream,)).generate_state(len(genes), np.uint32)
-        for stream in (FIRST, SECOND)
-    )
+    sequences = [np.random.SeedSequence([KEY, script.seed], spawn_key=(stream,)) for stream in (FIRST, SECOND)]
+    first, second = (sequence.generate_state(len(genes), np.uint32).astype(np.uint32) for sequence in sequences)
 
     def cross(seeds: NDArray[np.uint32], how: How, count: int) -> NDArray[np.uint8]:
         result = crossings.cross(

@@ -12,12 +12,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     script = parse(__doc__, argv, "dose.json")
     controllers = published_controllers(script)
     doses = parse_doses(("step_up=0.1,0.4",) if script.small else (), ())
-    size = {"terrains": 1, "episodes": 1} if script.small else {}
+    size = 1 if script.small else None
     for resolved in (False,) if script.small else (False, True):
         out = script.out.with_stem(f"{script.out.stem}-resolved") if resolved else script.out
         measure_dose(
-            script.robot, controllers, doses, compute=script.compute, resolved=resolved, seed=script.seed, out=out,
-            **size,
+            script.robot, controllers, doses, compute=script.compute, resolved=resolved, terrains=size,
+            episodes=size, seed=script.seed, out=out,
         )  # fmt: skip
 
 

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from qd.evaluate.evaluate import SetsCfg, cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
 from results.make.common import SEEDS, Script, parse, published_controllers
+from sim.files.atomic import write_atomically
+from sim.files.npz import npz_bytes
 from sim.rates import crossing_rates
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import finetune
 
 MIXES = {"C-HC": "hand-crafted", "C-HR": "hard-random", "C-G": "generated"}
-EPISODES = 20
 RESAMPLES = 10_000
 
 
@@ -94,20 +95,21 @@ def main(argv: Sequence[str] | None = None) -> None:
     else:
         hardened = {name: file for name, file in controllers.items() if name == "hardened"}
         controllers = {"base": controllers["base"], **train_controllers(script), **hardened}
+    terrains, episodes = (2, 1) if script.small else (paper_terrains(script.robot.name), 20)
     cfg = SetsCfg(
         names=("hard_random", "generated") if script.small else (),
         archive=script.results / "archive",
         independent=None if script.small else script.results / "independent",
-        terrains=2 if script.small else paper_terrains(script.robot.name),
-        episodes=1 if script.small else EPISODES,
+        terrains=terrains,
+        episodes=episodes,
         seed=script.seed,
     )
     tables = evaluate_tables(script.robot, controllers, cfg, compute=script.compute, out=script.out)
     archive = script.read_archive()
     independent = None if cfg.independent is None else script.read_archive("independent")
-    sets = make_sets(cfg.names, cfg.terrains, cfg.seed, archive=archive, independent=independent)
+    sets = make_sets(cfg.names, terrains, cfg.seed, archive=archive, independent=independent)
     crossed = cross_sets(
-        controllers, sets, robot=script.robot, compute=script.compute, episodes=cfg.episodes, reward=True,
+        controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, reward=True,
         cache=crossings_folder(script.robot),
     )  # fmt: skip
     rates = {
@@ -119,8 +121,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         {"kind_differences": {name: differences(rates[name], families_of(sets[name]), cfg.seed) for name in sets}},
     )
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
-    arrays |= {f"{name}_family": families_of(terrains) for name, terrains in sets.items()}
-    np.savez_compressed(script.out.with_suffix(".npz"), controllers=np.array(list(controllers)), **arrays)
+    arrays |= {f"{name}_family": families_of(of_set) for name, of_set in sets.items()}
+    arrays["controllers"] = np.array(list(controllers))
+    write_atomically(script.out.with_suffix(".npz"), npz_bytes(arrays))
 
 
 if __name__ == "__main__":
