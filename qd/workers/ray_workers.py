@@ -38,6 +38,7 @@ _ROOMS = ("kernels", "sim", "qd")
 _CONNECT_LIMIT_S = 10.0
 _POLL_S = 0.25
 _GROW_EVERY_S = 2.0
+_GATHER_S = 60.0
 _PATIENCE_S = 600.0  # how long the evaluation waits while no worker is ready; building and compiling take minutes
 _MOST_TRIES = 5  # of which three may be bad luck
 
@@ -152,13 +153,14 @@ class RayWorkers(Pipeline):
         self._taken_at = time.perf_counter()
 
     def open(self) -> None:
-        """Starts the workers and waits for the first.
+        """Starts the workers and waits for them; once one is ready, no longer than a minute for the others.
 
         Raises:
             ValueError: If the simulation cannot be built as asked for.
             EvaluatorError: If no worker comes.
         """
-        while not self._idle:
+        began = time.monotonic()
+        while not self._idle or (self.status().workers < len(self._workers) and time.monotonic() - began < _GATHER_S):
             self._turn()
 
     def close(self) -> None:
