@@ -142,7 +142,7 @@ class RayWorkers(Pipeline):
         space = PackedCode.of(split_name(cfg.space)[0]) if is_own(cfg.space) else None
         packed = [ray.put(value) for value in (PackedCode.of(cfg.policy), pack_robot(get_robot(cfg.robot)), space)]
         self._arguments = replace(cfg, device="cuda:0" if gpus else "cpu", robot=""), *packed, build
-        self._code = code_fingerprint(_ROOMS)
+        self._code, self._size = code_fingerprint(_ROOMS), cfg.terrains_of_worker
         self._workers: set[Any] = set()
         self._idle: deque[Any] = deque()
         self._tasks: dict[Any, tuple[Any, _Shard | None]] = {}  # the worker of each, and what it crosses if prepared
@@ -176,7 +176,7 @@ class RayWorkers(Pipeline):
 
     def put(self, terrains: NDArray, seeds: NDArray) -> None:
         """Deals a lot out in shards of as many terrains as a worker has room for."""
-        size = self._cfg.terrains_of_worker
+        size = self._shard_size()
         lot = [_Shard(terrains[k : k + size], seeds[k : k + size]) for k in range(0, len(terrains), size)]
         if not self._lots:
             self._taken_at = time.perf_counter()
@@ -202,6 +202,11 @@ class RayWorkers(Pipeline):
         now = time.perf_counter()
         wall_s, self._taken_at = now - self._taken_at, now
         return replace(merged([shard.result for shard in lot if shard.result is not None], join=0), wall_s=wall_s)
+
+    def _shard_size(self) -> int:
+        """Terrains of a shard: smaller once the cluster has grown, never larger, for which workers have no room."""
+        self._size = min(self._size, self._cfg.terrains_of_worker)
+        return self._size
 
     def clear(self) -> None:
         """Forgets all lots; what workers still cross of them is of no later one."""
@@ -230,7 +235,7 @@ class RayWorkers(Pipeline):
         for _ in range((self._count or max(1, num_devices(self._cfg.device))) - len(self._workers)):
             worker = actor.options(**self._resources).remote(*self._arguments)
             self._workers.add(worker)
-            self._tasks[worker.prepare.remote(self._cfg.terrains_of_worker, self._code)] = worker, None
+            self._tasks[worker.prepare.remote(self._shard_size(), self._code)] = worker, None
 
     def _deal(self) -> None:
         while self._waiting and self._idle:
@@ -261,14 +266,15 @@ class RayWorkers(Pipeline):
             if _is_refusal(error) or self._failed_starts >= _MOST_TRIES:
                 raise _as_raised(error, f"a worker cannot build its simulation: {flaw}")
             return
+        if not any(shard in lot for lot in self._lots):  # forgotten meanwhile
+            return
         shard.tries += 1
         self._retries += 1
         what = f"{len(shard.terrains)} terrains"
         if shard.tries >= _MOST_TRIES:
             raise _as_raised(error, f"{what} failed {_MOST_TRIES} times; the last time: {flaw}")
-        if any(shard in lot for lot in self._lots):  # not forgotten meanwhile
-            tqdm.write(f"a worker failed ({flaw}); its {what} are crossed again by another", file=sys.stderr)
-            self._waiting.appendleft(shard)
+        tqdm.write(f"a worker failed ({flaw}); its {what} are crossed again by another", file=sys.stderr)
+        self._waiting.appendleft(shard)
 
 
 def _is_refusal(error: BaseException | None) -> bool:

@@ -34,9 +34,7 @@ def test_they_are_chosen_by_the_numbers_of_their_elites(found, run):
     minima = found.minima()
     first, second = minima.genes
     assert minima.chosen("all", run) == [first, second] and minima.chosen(f"{second}", run) == [second]
-    with pytest.raises(
-        ValueError, match=rf"has no minimal terrain of elite 19: expected all, or some of {first}, {second}"
-    ):
+    with pytest.raises(ValueError, match="elite 19"):
         minima.chosen(f"{first} 19", run)
     told = "1 of 2 parts; goal reached 0% (0 to 9%) when they were found; the cause is a rise; margin 12.0 cm"
     assert minima.words(first) == told
