@@ -79,7 +79,7 @@ class Script:
 
     def run_of_archive(self) -> Path:
         """The run of the published archive to work in; a copy of what is published where the run itself is gone."""
-        run = self.runs / "archive"
+        run = self.runs / ("copy" if self.small else "archive")
         if not (run / "archive.npz").exists():
             shutil.copytree(self.results / "archive", run, dirs_exist_ok=True)
         return run

@@ -78,7 +78,7 @@ def print_table(report: dict[str, Any]) -> None:
             row["kernel"], *("-" if value is None else f"{value:.4g}" for value in ms), f"{row['speedup']:.1f}x",
             f"{row['ceiling_share']:.1%}", row["bound_by"],
         )  # fmt: skip
-    Console().print(table)
+    Console(width=None if sys.stdout.isatty() else 100).print(table)
 
 
 def file_name(device_name: str) -> str:
