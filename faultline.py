@@ -1,9 +1,13 @@
-"""The command ``faultline``: one word after it says what to do, and only what that needs is loaded."""
+"""The command ``faultline``, and its functions for Python; only what a command or a function needs is loaded.
+
+``faultline.search``, ``judge``, ``cross``, ``evaluate`` and ``finetune`` do what the commands of these names do;
+docs/search.md shows them in twenty lines.
+"""
 
 import difflib
 import importlib
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Command(NamedTuple):
@@ -41,6 +45,28 @@ COMMANDS: dict[str, dict[str, Command]] = {
     },
 }
 """What can be done, by what it is for."""
+
+API = {
+    "search": "qd.search",
+    "judge": "qd.judge",
+    "cross": "qd.workers.cross",
+    "evaluate": "qd.evaluate.evaluate",
+    "make_sets": "qd.evaluate.sets",
+    "finetune": "train.finetune",
+    "preset": "qd.run.settings",
+    "FinetuneCfg": "train.cfg",
+    "Compute": "qd.workers.evaluator",
+    "get_robot": "sim.robots.find",
+}
+"""Functions and settings for Python by the modules that have them."""
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a function of :data:`API` when it is first asked for."""
+    if name not in API:
+        raise AttributeError(f"module 'faultline' has no attribute '{name}': it has {', '.join(API)}")
+    return getattr(importlib.import_module(API[name]), name)
+
 
 _BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}
 

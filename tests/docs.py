@@ -57,13 +57,6 @@ def commands_of(page: str) -> list[Line]:
     return lines
 
 
-def mentions_of(page: str) -> list[Line]:
-    """Commands that the sentences of a page name, which may be without the values of their flags."""
-    prose = re.sub(r"^```.*?^```$", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
-    spans = re.findall(rf"`((?:{'|'.join(_PROGRAMS)})\s[^`]+)`", prose)
-    return [Line(page, tuple(shlex.split(span))) for span in spans]
-
-
 def run_by_make(words: tuple[str, ...]) -> list[str]:
     """The last command that ``make`` would run, word by word; nothing runs.
 

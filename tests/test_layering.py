@@ -12,6 +12,8 @@ QD_DOORS_FOR_TRAIN = (
     "search", "archive", "space", "descriptors", "fitness", "fresh", "faults", "families", "run", "workers",
     "evaluate",
 )  # fmt: skip
+MAX_HIDDEN = 250
+"""Imports inside functions and TYPE_CHECKING blocks over all rooms: commands load lazily, hardly anything else does."""
 LIBRARY_DOORS = {  # a room, or a folder of one
     "warp": ("kernels", "sim"),
     "newton": ("sim",),
@@ -70,6 +72,40 @@ def test_file_keeps_to_its_room(path):
     assert offences(path, (ROOT / path).read_text(encoding="utf-8")) == []
 
 
+def imported_modules() -> dict[str, set[str]]:
+    """What each module of the rooms imports of them, inside functions too."""
+    names = {str(path.with_suffix("")).replace("/", ".").removesuffix(".__init__"): path for path in FILES}
+    modules = {}
+    for name, path in names.items():
+        tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+        imported = {full for _, full in imported_names(path, tree)}
+        imported |= {full.rpartition(".")[0] for full in imported}
+        modules[name] = (imported & names.keys()) - {name}
+    return modules
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    modules = imported_modules()
+    while leaves := {name for name, imported in modules.items() if not imported & modules.keys()}:
+        modules = {name: imported for name, imported in modules.items() if name not in leaves}
+    while tops := modules.keys() - set().union(*modules.values()):
+        modules = {name: imported for name, imported in modules.items() if name not in tops}
+    assert sorted(modules) == []
+
+
+def test_few_imports_are_hidden_and_only_the_registry_loads_commands():
+    hidden, offenders = 0, []
+    for path in FILES:
+        tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+        hidden += sum(
+            isinstance(node, ast.Import | ast.ImportFrom) and node.col_offset > 0 for node in ast.walk(tree)
+        )
+        offenders += [path for _, name in imported_names(path, tree) if name.split(".")[1:2] == ["commands"]]
+        offenders += [path for _, name in imported_names(path, tree) if ".show.commands" in name]
+    assert offenders == []
+    assert hidden <= MAX_HIDDEN
+
+
 def test_every_room_is_walked():
     assert {path.parts[0] for path in FILES} == set(ROOMS)
 
@@ -95,10 +131,10 @@ def test_every_room_is_walked():
         ("train/a.py", "from ribs.archives import GridArchive"),
         ("sim/a.py", "from rsl_rl.runners import OnPolicyRunner"),
         ("sim/a.py", "import imageio_ffmpeg"),
-        ("train/a.py", "from qd import archive, studies"),
+        ("train/a.py", "from qd import archive, show"),
         ("train/a.py", "import qd"),
         ("train/a.py", "from qd.show.replay import ReplayElite"),
-        ("train/a.py", "from ..qd.studies import compare"),
+        ("train/a.py", "from ..qd.show import figures"),
         ("sim/a.py", "from tests.oracles import height"),
         ("sim/a.py", "x = 1\n" * 501),
     ],
