@@ -70,7 +70,7 @@ def test_file_keeps_to_its_room(path):
 
 
 def imported_modules() -> dict[str, set[str]]:
-    """What each module of the rooms imports of them, inside functions too; but for Ray's, which is loaded if asked for."""
+    """What each module of the rooms imports of them, inside functions too, but for the door to Ray."""
     names = {str(path.with_suffix("")).replace("/", ".").removesuffix(".__init__"): path for path in FILES}
     modules = {}
     for name, path in names.items():
