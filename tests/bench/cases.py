@@ -196,9 +196,9 @@ def _contact_case(scene: Scene) -> Case:
     tables = counterparts.make_tables(*probes, spacing=SPACING, device=body_q.device)
     arguments = (body_q, wp.to_torch(sim.terrain_of_env), wp.to_torch(sim.bank.heights), SPACING, tables)
     num_probes, poses = len(probes[0]), 7 * len(np.unique(probes[3]))
-    # Poses, probes, the nodes under probes that could touch, and records; two triangles a cell under such a probe.
-    cells, nodes = counterparts.cells_in_reach(*arguments)
-    read = FLOAT * (sim.num_envs * (poses + 1) + nodes + 3 * num_probes)
+    # Poses and probes read, records written, and of each contact at least the four nodes of a cell: two triangles.
+    count = int(sim.contact_count.numpy()[0])
+    read = FLOAT * (sim.num_envs * (poses + 1) + 3 * num_probes + 4 * count)
     return Case(
         name="contact",
         launch=sim.collide,
@@ -208,8 +208,8 @@ def _contact_case(scene: Scene) -> Case:
         arguments=arguments,
         read_torch=lambda outputs: _torch_contacts(outputs, num_probes),
         work=Work(
-            bytes=read + int(sim.contact_count.numpy()[0]) * RECORD,
-            flops=2 * FLOPS_PER_TRIANGLE * cells + FLOPS_PER_PROBE * num_probes * sim.num_envs,
+            bytes=read + count * RECORD,
+            flops=2 * FLOPS_PER_TRIANGLE * count + FLOPS_PER_PROBE * num_probes * sim.num_envs,
         ),
         atol=5e-4,
         undecided=0.01,  # probes that just touch, that are equally deep, or whose centre lies on the surface

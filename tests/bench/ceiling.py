@@ -30,25 +30,14 @@ def do_nothing(out: wp.array[float]):
 def multiply_add(steps: int, factor: float, addend: float, out: wp.array[float]):
     """Grid (num_threads,): eight independent chains, so that none waits for the result before."""
     i = wp.tid()
-    a = float(i)
-    b = a + 1.0
-    c = a + 2.0
-    d = a + 3.0
-    e = a + 4.0
-    f = a + 5.0
-    g = a + 6.0
-    h = a + 7.0
+    a = wp.vec4(float(i), float(i) + 1.0, float(i) + 2.0, float(i) + 3.0)
+    b = a + wp.vec4(4.0, 4.0, 4.0, 4.0)
+    more = wp.vec4(addend, addend, addend, addend)
     for _step in range(steps):
         for _unrolled in range(16):
-            a = a * factor + addend
-            b = b * factor + addend
-            c = c * factor + addend
-            d = d * factor + addend
-            e = e * factor + addend
-            f = f * factor + addend
-            g = g * factor + addend
-            h = h * factor + addend
-    out[i] = a + b + c + d + e + f + g + h
+            a = a * factor + more
+            b = b * factor + more
+    out[i] = a[0] + a[1] + a[2] + a[3] + b[0] + b[1] + b[2] + b[3]
 
 
 @wp.kernel

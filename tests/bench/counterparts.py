@@ -238,14 +238,6 @@ def _from_edges(dx: Tensor, dy: Tensor, dz: Tensor, edge_x: float, edge_y: float
     return torch.stack([dx - share * edge_x, dy - share * edge_y, dz - share * edge_z], dim=-1)
 
 
-def window_nodes(p: Tensor, radius: float, window: int, spacing: float) -> tuple[Tensor, Tensor]:
-    """Rows and columns (E, N, window + 1) of the nodes around points that a sphere of ``radius`` could touch."""
-    nodes = torch.arange(window + 1, device=p.device)
-    row = ((p[..., 1] - radius) / spacing).floor().long()[..., None] + nodes
-    col = ((p[..., 0] - radius) / spacing).floor().long()[..., None] + nodes
-    return row, col
-
-
 def from_surface(
     heights: Tensor, terrain_of_env: Tensor, spacing: float, p: Tensor, radius: float, window: int
 ) -> Tensor:
@@ -253,7 +245,9 @@ def from_surface(
 
     The nearest point lies on a face or an edge; every edge of the window is looked at once.
     """
-    row, col = window_nodes(p, radius, window, spacing)
+    nodes = torch.arange(window + 1, device=p.device)
+    row = ((p[..., 1] - radius) / spacing).floor().long()[..., None] + nodes
+    col = ((p[..., 0] - radius) / spacing).floor().long()[..., None] + nodes
     h = node_heights(heights, terrain_of_env, row[..., :, None], col[..., None, :])  # (E, N, window + 1, window + 1)
     dx = (p[..., 0:1] - col * spacing)[..., None, :].expand_as(h)
     dy = (p[..., 1:2] - row * spacing)[..., :, None].expand_as(h)
@@ -281,34 +275,11 @@ def _pick(values: Tensor, probe: Tensor) -> Tensor:
     return values.gather(1, flat[..., None].expand(-1, -1, 3)).view(*probe.shape, 3)
 
 
-def probe_centres(body_q: Tensor, rotation: Tensor, tables: ProbeTables) -> Tensor:
-    """World centres (E, P, 3) of the probes."""
-    return body_q[:, tables.body, :3] + (rotation[:, tables.body] * tables.position[:, None, :]).sum(-1)
-
-
-def cells_in_reach(
-    body_q: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
-) -> tuple[int, int]:
-    """Cells that probes could touch, counted for each probe, and nodes around them, once an environment."""
-    centre = probe_centres(body_q, rotation_matrices(body_q[..., 3:]), tables)
-    cells, nodes = 0, []
-    for radius, window, group in tables.groups:
-        row, col = window_nodes(centre[:, group], radius, window, spacing)
-        row, col = row[..., :, None].expand(-1, -1, -1, window + 1), col[..., None, :].expand(-1, -1, window + 1, -1)
-        h = node_heights(heights, terrain_of_env, row, col)
-        highest = torch.nn.functional.max_pool2d(h, 2, stride=1)
-        near = centre[:, group, 2, None, None] - highest < radius
-        cells += int(near.sum())
-        env, probe = near.any(dim=(2, 3)).nonzero(as_tuple=True)
-        nodes.append(torch.stack([env[:, None, None].expand_as(row[env, probe]), row[env, probe], col[env, probe]], -1))
-    return cells, len(torch.cat([one.flatten(0, -2) for one in nodes]).unique(dim=0))
-
-
 def probe_contacts(
     body_q: Tensor, rotation: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
 ) -> tuple[Tensor, Tensor, Tensor]:
     """World centres (E, P, 3), signed distances (E, P) and normals (E, P, 3) of all probes, exact where they touch."""
-    centre = probe_centres(body_q, rotation, tables)
+    centre = body_q[:, tables.body, :3] + (rotation[:, tables.body] * tables.position[:, None, :]).sum(-1)
     vectors = [
         from_surface(heights, terrain_of_env, spacing, centre[:, group], radius, window)
         for radius, window, group in tables.groups

@@ -18,7 +18,7 @@ from tests.bench.ceiling import (
     launch,
     multiply_add,
 )
-from tests.bench.timing import MAX_LAUNCHES, Timing, Variant, fit_launches, time_in_turns
+from tests.bench.timing import Timing, Variant, time_in_turns
 
 KERNELS = ("rasterise", "contact", "scan", "observation", "penalties", "contact_forces")
 
@@ -131,25 +131,12 @@ def test_what_bounds_a_kernel(work, seconds, share, bound_by):
     assert CEILING.judge(work, seconds) == (pytest.approx(share), bound_by)
 
 
-def test_launches_fill_the_replay():
-    def make(launches):
-        return Variant(replay=lambda: sum(range(launches)), launches=launches, work=list)
-
-    assert fit_launches(make, "cpu", Timing(replay_s=1e-12)).launches == 1
-    assert fit_launches(make, "cpu", Timing(replay_s=1e3)).launches == MAX_LAUNCHES
-
-
 def test_variants_take_turns_after_a_warm_up():
     played = []
     variants = {name: Variant(replay=lambda name=name: played.append(name), launches=2, work=list) for name in "ab"}
     seconds = time_in_turns(variants, "cpu", Timing(rounds=3))
     assert played == ["a", "b"] * 4
     assert seconds.keys() == {"a", "b"} and min(seconds.values()) > 0
-
-
-def test_a_file_is_named_after_its_device():
-    assert file_name("NVIDIA H200") == "nvidia-h200.json"
-    assert file_name("CPU (x86_64, 2 cores)") == "cpu.json"
 
 
 @pytest.mark.slow
@@ -164,3 +151,4 @@ def test_command(tmp_path, device, capsys):
     assert {"command", "commit", "device", "versions", "seed", "date"} <= report.keys()
     printed = capsys.readouterr().out
     assert all(kernel in printed for kernel in KERNELS)
+    assert (file_name("NVIDIA H200"), file_name("CPU (x86_64, 2 cores)")) == ("nvidia-h200.json", "cpu.json")
