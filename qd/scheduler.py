@@ -253,7 +253,7 @@ _BY_RATIO = ("ratios", "penalty_mean", "penalty_std")
 _FIELDS = ("genes", *_BY_RATIO, *_RATES, *_COUNTS)
 
 
-def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: float) -> GridArchive:
+def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: Any) -> GridArchive:
     extra_fields: dict[str, Any] = {
         "genes": ((num_genes,), np.float32),
         **dict.fromkeys(_BY_RATIO, ((cells.num_ratios,), np.float64)),

@@ -228,6 +228,7 @@ def _saying_what_is_saved(path: Path) -> Iterator[None]:
 
 def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive:
     """What a search has found after a number of iterations."""
+    elites: dict[str, Any] = scheduler.elites()
     return Archive(
         robot=cfg.robot,
         robot_sha256=cfg.robot_sha256,
@@ -240,7 +241,7 @@ def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive
         intervals=cfg.intervals,
         collision_bit=cfg.collision_bit,
         iterations=iterations,
-        **scheduler.elites(),
+        **elites,
     )
 
 
