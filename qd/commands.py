@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Self
 
-from qd.run.settings import PRESETS, SchedulerCfg, preset_of
+from qd.run.presets import PRESETS, SchedulerCfg, preset_of
 from sim.files.command import InSpace, OfRobot, OnGround, Where, Who, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
 

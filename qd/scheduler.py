@@ -16,7 +16,7 @@ from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 from qd.surrogate import Surrogate
 from sim.spaces.base import TerrainSpace, clipped
 from sim.spaces.registry import get_space

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.networks import MEMBERS, Networks, Training
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 from qd.variation import varied
 from sim.corridor import corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 
 
 def varied(pool: Tensor, count: int, cfg: SchedulerCfg, genes_per_part: int | None, draw: torch.Generator) -> Tensor:

@@ -14,7 +14,8 @@ from qd import search as searching
 from qd.archive import Archive
 from qd.fitness import FitnessCfg
 from qd.judge import judge
-from qd.run.settings import SchedulerCfg, SearchCfg
+from qd.run.presets import SchedulerCfg
+from qd.run.settings import SearchCfg
 from qd.search import search
 from qd.show import figures
 from qd.workers.evaluator import Compute, OpenEvaluator

@@ -12,7 +12,7 @@ import pytest
 from qd.archive import read_archive, write_archive
 from qd.commands import Archive, Evaluate, Judge
 from qd.judge import judge
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 from qd.show.commands import Export, Film, Replay
 from qd.show.elites import find_archive
 from qd.show.recordings import Recordings, on_elite

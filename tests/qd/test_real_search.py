@@ -8,7 +8,7 @@ import pytest
 
 from qd.fitness import FitnessCfg
 from qd.minimal import Case, Trial, minimise
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
 from sim.crossing import CrossingCfg
 from sim.robots.find import get_robot

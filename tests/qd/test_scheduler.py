@@ -6,7 +6,7 @@ from qd import surrogate
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
-from qd.run.settings import METHODS, SchedulerCfg
+from qd.run.presets import METHODS, SchedulerCfg
 from qd.scheduler import RandomEmitter, Scheduler
 from tests.qd import stand_in
 

@@ -11,7 +11,7 @@ from qd import surrogate as module
 from qd.descriptors import Cells
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 from qd.scheduler import Scheduler
 from qd.surrogate import Surrogate
 from sim.corridor import SHAPE, corridor_heights

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 from qd.variation import varied
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 

@@ -9,7 +9,7 @@ import pytest
 from qd.descriptors import Cells
 from qd.run import checkpoint
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
-from qd.run.settings import SchedulerCfg
+from qd.run.presets import SchedulerCfg
 from qd.scheduler import Scheduler
 from qd.surrogate import MOST
 from tests.qd.test_scheduler import advance, make_search

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from qd.fitness import FitnessCfg
-from qd.run.settings import SchedulerCfg, as_settings, differences, from_settings, is_searched, own_policy, preset
+from qd.run.presets import SchedulerCfg
+from qd.run.settings import as_settings, differences, from_settings, is_searched, own_policy, preset
 from sim.files.records import robot_digest
 from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
