@@ -23,10 +23,12 @@ from qd.evaluate.sets import (
     set_rng,
     split_elites,
 )
+from qd.run.settings import as_settings
 from sim.bank import heights_of
 from sim.files.records import robot_digest
 from sim.spaces.course import COURSE
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.qd.searches import CFG
 from tests.train.archives import certified_archive, make_archive
 
 
@@ -196,7 +198,8 @@ def write_run(folder: Path, archive: Archive, robot, seed: int | None = None) ->
     digest = robot_digest(robot)
     write_archive(folder / "archive.npz", replace(archive, robot_sha256=digest))
     if seed is not None:
-        config = {"settings": {"seed": seed, "robot_sha256": digest}, "iterations": 3, "device": "CPU", "sessions": []}
+        settings = as_settings(replace(CFG, seed=seed))
+        config = {"settings": settings, "iterations": 3, "device": "CPU", "sessions": []}
         (folder / "config.json").write_text(json.dumps(config))
     return folder
 
