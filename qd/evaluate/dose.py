@@ -44,17 +44,8 @@ def measure_dose(
 ) -> dict[str, Any]:
     """Lets every controller cross every value of every dose; prints, writes and draws what came of it.
 
-    Args:
-        robot: The robot.
-        controllers: Policy of each by its name.
-        doses: By name (:func:`sim.spaces.dose.chosen_doses`).
-        compute: Where terrains are crossed.
-        resolved: Whether contact is resolved.
-        terrains: A value; by default as many as suit the device.
-        episodes: On each terrain; by default as many as suit the device.
-        seed: Draws the episodes.
-        out: File for the numbers; under runs/ if None. The figure is written beside it.
-        open_evaluator: Opens simulations.
+    Without ``terrains`` (a value) and ``episodes`` (a terrain) there are as many as suit the device. Without ``out``
+    the file lies under runs/. The figure is beside it.
 
     Returns:
         The report, with a row for each value and controller under ``dose`` (:func:`rows_of`) and one for each dose and
@@ -97,11 +88,7 @@ def measure_dose(
 def dose_set(name: str, dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
     """The terrains of a dose, those of all values at one place behind each other, so that workers share the hard ones.
 
-    Args:
-        name: Name of the dose.
-        dose: The dose.
-        num_terrains: Terrains a value.
-        seed: Draws their episodes, the same ones for all doses.
+    There are ``num_terrains`` a value. The seed draws their episodes, the same ones for all doses.
     """
     rng = set_rng("dose", seed)
     seeds = rng.integers(2**32, size=num_terrains, dtype=np.uint32).repeat(len(dose.values))

@@ -69,15 +69,7 @@ class SetsCfg:
 def sizes_for(
     compute: Compute, terrains: int | None, episodes: int | None, *, full: tuple[int, int], small: tuple[int, int]
 ) -> tuple[int, int]:
-    """Terrains and episodes a terrain: those asked for, or as many as suit the device; says so where they are fewer.
-
-    Args:
-        compute: Where terrains are crossed.
-        terrains: Asked for.
-        episodes: Asked for.
-        full: On a GPU.
-        small: Without one.
-    """
+    """Terrains and episodes a terrain: those asked for, else ``full`` on a GPU; ``small`` without one, in a line."""
     for name, count in (("terrains", terrains), ("episodes", episodes)):
         if count is not None and count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")
@@ -106,19 +98,7 @@ def cross_sets(
     cache: Path | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, dict[str, RolloutResult]]:
-    """Lets every controller cross every set, and prints how each fared.
-
-    Args:
-        controllers: Policy of each by its name.
-        sets: Sets by name.
-        robot: The robot.
-        compute: Where terrains are crossed.
-        episodes: On each terrain.
-        how: What crosses them.
-        reward: Whether the training task's reward is summed too.
-        penalties_from_s: Penalties are summed from this time of an episode on [s].
-        cache: Folder where crossings are stored and found again.
-        open_evaluator: Opens simulations.
+    """Lets every controller cross every set, as :meth:`qd.workers.cross.Crossings.cross` does; prints how each fared.
 
     Returns:
         Set -> controller -> crossings.
@@ -201,13 +181,7 @@ def evaluate_tables(
 ) -> dict[str, Any]:
     """The tables of controllers with where their terrains come from; prints, writes and draws them.
 
-    Args:
-        robot: The robot.
-        controllers: Policy of each by its name.
-        cfg: Which terrains.
-        compute: Where terrains are crossed.
-        out: File for the tables; under runs/ if None. The figure is written beside it.
-        open_evaluator: Opens simulations.
+    Without ``out`` the file lies under runs/; the figure is beside it.
 
     Raises:
         ValueError: If a controller was trained on what it is to be tested on, or a setting cannot be used; raised
@@ -280,19 +254,8 @@ def evaluate_rates(
 ) -> dict[str, Any]:
     """Rates of one controller on hand-crafted and hard-random terrains and its velocity error on flat ground.
 
-    Args:
-        robot: The robot.
-        policy: The controller.
-        compute: Where terrains are crossed.
-        terrains: A set; by default as many as suit the device.
-        episodes: On each terrain; by default as many as suit the device.
-        space: Terrain space of the hard-random terrains; super_gaussian if None.
-        seed: Draws the sets.
-        out: File for the numbers; under runs/ if None.
-        open_evaluator: Opens simulations.
-
-    Returns:
-        What ``base.json`` has.
+    Without ``terrains`` (a set) and ``episodes`` (a terrain) there are as many as suit the device; without ``out`` the
+    file lies under runs/. Returns what ``base.json`` has.
     """
     count, episodes = sizes_for(compute, terrains, episodes, full=(RATE_TERRAINS, EPISODES), small=_SMALL)
     check_policy(policy, robot, compute.device)

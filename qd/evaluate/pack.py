@@ -83,16 +83,8 @@ def evaluate_pack(
 ) -> dict[str, Any]:
     """Tests one controller on a pack: prints what fails beside the rates of the pack's controllers, and writes it.
 
-    Args:
-        pack: The pack.
-        robot: Its robot.
-        policy: The controller.
-        compute: Where terrains are crossed.
-        terrains: The first of the pack; all on a GPU.
-        episodes: On each terrain; by default as many as suit the device.
-        seed: Draws the episodes.
-        out: File for the numbers; under runs/ if None. The figure is written beside it.
-        open_evaluator: Opens simulations.
+    ``terrains`` are the first of the pack. Without it and ``episodes`` (a terrain) there are as many as suit the
+    device. Without ``out`` the file lies under runs/. The figure is beside it.
     """
     full = (len(pack), EPISODES)
     count, episodes = sizes_for(compute, terrains, episodes, full=full, small=(min(24, len(pack)), 4))
