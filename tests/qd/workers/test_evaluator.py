@@ -234,8 +234,6 @@ def test_large_height_maps_go_in_while_results_come_out():
 
 
 def test_leaving_ends_workers_in_the_midst_of_work():
-    began = time.monotonic()
-
     class EnoughError(Exception):
         pass
 
@@ -248,6 +246,7 @@ def test_leaving_ends_workers_in_the_midst_of_work():
             pytest.raises(EnoughError),
             open_evaluator(dataclasses.replace(CFG, policy="sleep", workers="2"), build=Crosser) as evaluate,
         ):
+            began = time.monotonic()
             signal.setitimer(signal.ITIMER_REAL, 0.3)
             evaluate(GENES, SEEDS)
     finally:
