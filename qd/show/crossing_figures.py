@@ -1,6 +1,5 @@
 """Figures of recorded crossings: height map, paths, where they ended, and where the penalties were incurred."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,13 +37,13 @@ def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> F
     _draw_penalties(figure.add_subplot(grid[1:, 1]), crossed, penalties)
     legend = figure.add_subplot(grid[0, 1])
     legend.set_axis_off()
-    handles = _legend([crossed])
+    handles = _legend(crossed)
     legend.legend(
         handles=handles, loc="center left", frameon=False, title="crossings", alignment="left", handlelength=3
     )
     for axes in (top, profile):
         axes.tick_params(labelbottom=False)
-    top.set_xlim(*_x_limits([crossed]))
+    top.set_xlim(*_x_limits(crossed))
     return figure
 
 
@@ -55,20 +54,14 @@ def draw_paths(crossed: Crossed, title: str) -> Figure:
     figure.colorbar(draw_map(axes, crossed), ax=axes, label="height [m]", shrink=0.7)
     axes.set_title(title)
     axes.set_xlabel("x [m]")
-    axes.set_xlim(*_x_limits([crossed]))
-    figure.legend(handles=_legend([crossed]), **_BELOW)
+    axes.set_xlim(*_x_limits(crossed))
+    figure.legend(handles=_legend(crossed), **_BELOW)
     return figure
 
 
-def draw_map(axes: Axes, crossed: Crossed, limits: tuple[float, float] | None = None) -> Any:
-    """The height map with every path, its end marked by how it ended; returns the image.
-
-    Args:
-        axes: Where.
-        crossed: The crossings.
-        limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
-    """
-    image = draw_heights(axes, crossed.recording.heights[0], limits, crossed.recording.ground)
+def draw_map(axes: Axes, crossed: Crossed) -> Any:
+    """The height map with every path, its end marked by how it ended; returns the image."""
+    image = draw_heights(axes, crossed.recording.heights[0], None, crossed.recording.ground)
     for outcome, end in ENDINGS.items():
         chosen = np.flatnonzero(crossed.outcome == outcome)
         for k in chosen:
@@ -79,27 +72,26 @@ def draw_map(axes: Axes, crossed: Crossed, limits: tuple[float, float] | None = 
     return image
 
 
-def _legend(drawn: Sequence[Crossed]) -> list[Any]:
-    """Marks of the ends there are, with the lines of the paths to them, of start and goal; counts of a single map."""
+def _legend(crossed: Crossed) -> list[Any]:
+    """Marks of the ends there are and how many, with the lines of the paths to them, of start and goal."""
     handles: list[Any] = []
     for outcome, end in ENDINGS.items():
-        count = sum(int((crossed.outcome == outcome).sum()) for crossed in drawn)
-        if count:
-            label = f"{end.words} ({count})" if len(drawn) == 1 else end.words
-            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line, "label": label}
-            handles.append(Line2D([], [], **looks, markeredgecolor="white", markersize=9))
+        if count := int((crossed.outcome == outcome).sum()):
+            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line}
+            label = f"{end.words} ({count})"
+            handles.append(Line2D([], [], **looks, label=label, markeredgecolor="white", markersize=9))
     handles += [Line2D([], [], **look) for look in (START, GOAL)]
-    grounds = [crossed.recording.ground for crossed in drawn if crossed.recording.ground is not None]
-    if any((ground.friction < 1.0).any() for ground in grounds):
+    ground = crossed.recording.ground
+    if ground is not None and (ground.friction < 1.0).any():
         handles.append(Patch(color=SLIPPERY, alpha=0.5, label="slippery"))
-    if any(ground.time_constant_s.any() for ground in grounds):
+    if ground is not None and ground.time_constant_s.any():
         handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
     return handles
 
 
-def _x_limits(drawn: Sequence[Crossed]) -> tuple[float, float]:
+def _x_limits(crossed: Crossed) -> tuple[float, float]:
     """The terrain, and what robots left it for."""
-    xs = np.concatenate([[0.0, LENGTH], *(crossed.ends[:, 0] for crossed in drawn)])
+    xs = np.concatenate([[0.0, LENGTH], crossed.ends[:, 0]])
     return float(xs.min()), float(xs.max())
 
 
@@ -141,29 +133,3 @@ def _draw_penalties(axes: Axes, crossed: Crossed, penalties: tuple[str, ...]) ->
     axes.set_xlabel("penalty an episode (scaled),\nmean and standard deviation", fontsize=9)
     axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)
-
-
-def draw_maps(crossings: Mapping[str, Crossed], title: str) -> Figure:
-    """Several terrains or controllers side by side, each a map with paths, all in the same shades.
-
-    Args:
-        crossings: By what stands over each map.
-        title: Of the figure.
-    """
-    columns = 2
-    rows = -(-len(crossings) // columns)
-    figure = new_figure(12.0, 3.0 * rows + 0.9)
-    figure.suptitle(title)
-    panels = [*np.ravel(figure.subplots(rows, columns, squeeze=False))]
-    heights = np.concatenate([crossed.recording.heights.ravel() for crossed in crossings.values()])
-    limits = (float(heights.min()), float(heights.max()))
-    for axes, (label, crossed) in zip(panels, crossings.items(), strict=False):
-        draw_map(axes, crossed, limits)
-        axes.set_title(label, fontsize=10)
-        axes.set_xlabel("x [m]")
-        axes.set_xlim(*_x_limits([crossed]))
-    for axes in panels[len(crossings) :]:
-        axes.set_axis_off()
-    figure.colorbar(panels[0].images[0], ax=list(panels), label="height [m]", shrink=0.6)
-    figure.legend(handles=_legend([*crossings.values()]), **_BELOW)
-    return figure

@@ -363,28 +363,10 @@ def cross(
     cache: Path | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, RolloutResult]:
-    """Lets each controller cross each terrain several times.
+    """Lets each controller cross each terrain several times: one result a controller, by its name.
 
-    Args:
-        controllers: By name, as :func:`sim.policy.loaders.load_policy` takes them.
-        terrains: Genes, shape (B, num_genes), or heights [m], shape (B, nrow, ncol).
-        seeds: One a terrain, shape (B,), uint32.
-        robot: The robot, or its name or settings file.
-        compute: Where terrains are crossed; by default on the CPU, by a process a core.
-        replicas: Episodes a terrain.
-        space: Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it.
-        how: What crosses them.
-        reward: Whether the training task's reward is summed too.
-        penalties_from_s: Penalties are summed from this time of an episode on [s].
-        cache: Folder where crossings are stored and found again.
-        open_evaluator: Opens simulations.
-
-    Returns:
-        One result a controller.
-
-    Raises:
-        AllInvalidError: If no episode of a controller is valid.
-        EvaluatorError: If a worker is lost.
+    Arguments are those of :class:`Crossings` and :meth:`Crossings.cross`. Terrains are crossed on the CPU, by a process a
+    core, if nothing else is said.
     """
     with Crossings(robot, compute or Compute(), cache=cache, open_evaluator=open_evaluator) as crossings:
         return {

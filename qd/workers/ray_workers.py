@@ -188,7 +188,7 @@ class RayWorkers(Pipeline):
         """Waits for the lot that was put in first.
 
         Raises:
-            ValueError: If a worker refused its terrains five times.
+            ValueError: If a worker refused its terrains.
             EvaluatorError: If terrains failed five times, or no worker is left and none comes.
         """
         lot, self._seen_at = self._lots[0], time.monotonic()
@@ -264,15 +264,18 @@ class RayWorkers(Pipeline):
         if shard is None:
             self._failed_starts += 1
             if _is_refusal(error) or self._failed_starts >= _MOST_TRIES:
-                raise _as_raised(error, f"a worker cannot build its simulation: {flaw}")
+                kind = ValueError if _is_refusal(error) else EvaluatorError
+                raise kind(f"a worker cannot build its simulation: {flaw}")
             return
         if not any(shard in lot for lot in self._lots):  # forgotten meanwhile
             return
+        if _is_refusal(error):  # as any other worker would
+            raise ValueError(flaw)
         shard.tries += 1
         self._retries += 1
         what = f"{len(shard.terrains)} terrains"
         if shard.tries >= _MOST_TRIES:
-            raise _as_raised(error, f"{what} failed {_MOST_TRIES} times; the last time: {flaw}")
+            raise EvaluatorError(f"{what} failed {_MOST_TRIES} times; the last time: {flaw}")
         tqdm.write(f"a worker failed ({flaw}); its {what} are crossed again by another", file=sys.stderr)
         self._waiting.appendleft(shard)
 
@@ -280,10 +283,6 @@ class RayWorkers(Pipeline):
 def _is_refusal(error: BaseException | None) -> bool:
     """Whether a worker raised a ValueError, which the user can mend."""
     return isinstance(error, RayTaskError) and isinstance(error.cause, ValueError)
-
-
-def _as_raised(error: BaseException | None, message: str) -> Exception:
-    return ValueError(message) if _is_refusal(error) else EvaluatorError(message)
 
 
 def _reason_of(error: BaseException) -> str:
