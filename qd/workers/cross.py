@@ -365,8 +365,8 @@ def cross(
 ) -> dict[str, RolloutResult]:
     """Lets each controller cross each terrain several times: one result a controller, by its name.
 
-    Arguments are those of :class:`Crossings` and :meth:`Crossings.cross`. Terrains are crossed on the CPU, by a process a
-    core, if nothing else is said.
+    Arguments are those of :class:`Crossings` and :meth:`Crossings.cross`; without ``compute`` the CPU crosses, by a
+    process a core.
     """
     with Crossings(robot, compute or Compute(), cache=cache, open_evaluator=open_evaluator) as crossings:
         return {

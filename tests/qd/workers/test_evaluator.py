@@ -1,8 +1,6 @@
 import dataclasses
-import multiprocessing
 import os
 import signal
-import threading
 import time
 
 import numpy as np
@@ -17,7 +15,6 @@ from qd.workers.evaluator import (
     parse_workers,
     pipeline_of,
 )
-from qd.workers.process import _serve
 from qd.workers.shards import merged
 from sim.robots.find import get_robot
 from tests.qd import crossers, stand_in
@@ -128,13 +125,6 @@ def test_lots_come_one_by_one_while_the_next_is_under_way():
     assert part == slice(12, 15) and seen == sorted(seen) and seen[-1] == 1.0
     # lots as large as there is room for go one after the other
     assert [part.stop for part, _ in evaluator._Here(Crosser(CFG, 6), 6).in_lots(GENES, SEEDS, 6)] == [6, 12, 15]
-
-
-def test_a_small_last_lot_waits_for_nobody_where_there_is_room():
-    crosser = Crosser(CFG, 15)
-    for part, result in evaluator._Here(crosser, 15).in_lots(GENES, SEEDS, 10):
-        assert same(result, stand_in.evaluate(GENES[part], SEEDS[part], 4))
-        assert len(crosser.lots) == (15 - part.stop) // 5  # 10 and 5 are put in together
 
 
 def test_contact_is_resolved_at_the_same_control_rate():
@@ -260,18 +250,3 @@ def test_seeds_must_be_one_a_terrain():
         pytest.raises(ValueError, match=r"seeds must have shape \(15,\)"),
     ):
         evaluate(GENES, SEEDS[:3])
-
-
-def test_a_worker_whose_parent_was_killed_with_unread_messages_leaves_quietly():
-    ours, theirs = multiprocessing.Pipe()
-
-    def die() -> None:
-        assert ours.poll(10)  # "ready" is there and stays unread: the worker's next read is a reset, no end of file
-        ours.close()
-
-    parent = threading.Thread(target=die)
-    parent.start()
-    with pytest.raises(SystemExit) as exit:
-        _serve(theirs, None, 1, lambda cfg, num_terrains: None)
-    parent.join()
-    assert exit.value.code == 0
