@@ -298,6 +298,6 @@ def test_it_is_trained_and_evaluated(project, calibrated, searched, home, wrong,
     assert (report["robot"], report["policy"]) == ("dog", "dog.pt")
     assert report["hand_crafted"]["goal_rate"] == 0.0  # after two iterations
     tables = ["--policies", f"base=shipped trot={home}/dog_trot.py:Trot", "--sets", "hand_crafted"]
-    run("evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--run-dir", str(home / "tables"))
-    crossed = json.loads((home / "tables" / "tables.json").read_text())
+    run("evaluate", *robot, *tables, "--terrains", "2", "--episodes", "1", "--out", str(home / "tables.json"))
+    crossed = json.loads((home / "tables.json").read_text())
     assert crossed["robot"] == "dog" and set(crossed["controllers"]) == {"base", "trot"}
