@@ -54,8 +54,9 @@ class Script:
 
     @property
     def runs(self) -> Path:
-        """Folder for runs that are not published."""
-        return self.out.parent / "runs" if self.small else Path("runs/make") / self.robot.name
+        """Folder for runs that are not published; runs of other sources are not gone on with."""
+        made = Path("runs/make") / sources_sha256()[:12] / self.robot.name
+        return self.out.parent / "runs" if self.small else made
 
     def search_cfg(self, iterations: int | None = None, **changes: Any) -> SearchCfg:
         """Settings of a search of preset wide; in a trial of four terrains, which no specialist can be trained on.
