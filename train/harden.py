@@ -86,6 +86,7 @@ def harden(
     hardening = _begin(robot, cfg, run_dir, compute, certifiers, open_evaluator)
     try:
         with claimed(run_dir):
+            write_atomically(run_dir / ROUNDS_FILE, to_json(hardening.stored))  # by which the directory is known
             for number in range(cfg.rounds + 1):
                 if number:
                     hardening.train(number)
@@ -122,12 +123,15 @@ def _begin(
     }  # fmt: skip
     del settings["rounds"]
     settings = json.loads(to_json(settings))  # as they are read again
-    content = {**origin_of(compute.device, cfg.seed, compute.workers), "robot": robot.name, "settings": settings}
+    content = {
+        **origin_of(compute.device, cfg.seed, compute.workers), "robot": robot.name, "settings": settings, "rounds": [],
+        "choices": {},
+    }  # fmt: skip
     if (run_dir / ROUNDS_FILE).exists():
         content = read_json(run_dir / ROUNDS_FILE)
         if different := differences(content.get("settings", {}), settings):
             raise ValueError(f"{run_dir} holds a hardening of other settings: {', '.join(different)}: give those")
-        done = len(content.get("rounds", [])) - 1
+        done = len(content["rounds"]) - 1
         if cfg.rounds < done:
             raise ValueError(f"rounds must be at least {done}, which {run_dir} has done, got {cfg.rounds}")
     elif run_dir.is_dir() and not all(map(is_leftover, run_dir.iterdir())):
@@ -159,7 +163,7 @@ class _Hardening:
     certifiers: Mapping[str, str] | None
     open_evaluator: OpenEvaluator
     stored: dict[str, Any]
-    """What an earlier session wrote, or nothing but settings."""
+    """What an earlier session wrote, or settings without a round."""
     policies: dict[str, str]
     """Controller after each round so far, by its name."""
     start: str | None
@@ -215,7 +219,7 @@ class _Hardening:
     def _choose(self, controllers: Mapping[str, str], searches: Sequence[Path], name: str) -> dict[str, Any]:
         """Whether to keep a training, by goal rates on validation terrains; of the same controllers as stored."""
         sha256 = [controller_hash(policy) for policy in controllers.values()]
-        stored = self.stored.get("choices", {}).get(name)
+        stored = self.stored["choices"].get(name)
         if stored is not None and stored["sha256"] == sha256:
             return stored
         sets = dict(make_sets(FIXED_SETS, self.terrains, 0, space=self.space, part="validation"))
@@ -281,9 +285,9 @@ class _Hardening:
         )  # fmt: skip
         rows = [
             *self.rows,
-            *self.stored.get("rounds", [])[len(self.rows) :],
+            *self.stored["rounds"][len(self.rows) :],
         ]
-        self.content = {**self.stored, "rounds": rows, "choices": {**self.stored.get("choices", {}), **self.choices}}
+        self.content = {**self.stored, "rounds": rows, "choices": {**self.stored["choices"], **self.choices}}
         if len(rows) == len(self.rows):
             self.content["tables"] = dict(tables)
         write_atomically(self.path / ROUNDS_FILE, to_json(self.content))

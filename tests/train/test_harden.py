@@ -45,13 +45,14 @@ class World:
         self.searched, self.trained, self.crossed = {}, {}, []
 
     def _work(self, run) -> bool:
-        """Whether there is something to do in a run; Ctrl-C comes there where that is asked for."""
+        """Whether there is something to do in a run; Ctrl-C comes in the middle of it where that is asked for."""
+        if (run / "done").exists():
+            return False
+        run.mkdir(exist_ok=True)
         if run.name == self.stop_in:
             self.stop_in = ""
             raise KeyboardInterrupt
-        if run.exists():
-            return False
-        run.mkdir()
+        (run / "done").touch()
         return True
 
     def search(self, cfg, run, compute, **_) -> None:
