@@ -23,12 +23,6 @@ def test_round_trip(tmp_path, num_elites):
     )
 
 
-def test_equal_archives_are_equal_bytes(tmp_path):
-    write_archive(tmp_path / "a.npz", small_archive())
-    write_archive(tmp_path / "b.npz", small_archive())
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-
-
 @pytest.mark.parametrize("num_elites", [0, 3])
 def test_fresh_values_come_back_too(tmp_path, num_elites):
     archive = dataclasses.replace(small_archive(num_elites), fresh=fresh_values(small_archive(num_elites)))

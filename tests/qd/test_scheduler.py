@@ -76,16 +76,6 @@ def test_an_invalid_terrain_is_never_an_elite():
     assert sorted(search.elites()["cell"].tolist()) == [6, 7, 8, 9, 10, 11]
 
 
-def test_iterations_without_a_valid_terrain_are_survived():
-    search = make_search(SchedulerCfg(method="cma_mae", emitters=2, batch_size=6, restart_rule=1))
-    for iteration in (1, 2):
-        search.ask()
-        search.tell(told([0] * 12, [FITNESS_FLOOR] * 12, invalid=[4] * 12), iteration)
-    assert len(search.elites()["fitness"]) == 0
-    advance(search, 3, 5)
-    assert len(search.elites()["fitness"]) > 0
-
-
 def test_cell_of_an_elite_is_the_cell_of_its_ratios():
     search = make_search()
     advance(search, 1, 10)

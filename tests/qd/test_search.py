@@ -247,19 +247,6 @@ def test_a_simulation_that_cannot_be_built_leaves_no_directory(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_two_searches_do_not_share_a_directory(tmp_path):
-    path = tmp_path / "run"
-
-    @contextmanager
-    def intruding(cfg: EvaluatorCfg):
-        with pytest.raises(ValueError, match="another command works in"):
-            run(path)
-        yield lambda genes, seeds, progress=None: stand_in.evaluate(genes, seeds)
-
-    run(path, open_evaluator=intruding)
-    assert len(rows_of(path)) == 2
-
-
 SLOW_SEARCH = """
 import signal, sys, time
 from contextlib import contextmanager
@@ -333,8 +320,3 @@ def test_invalid_episodes_are_counted_and_many_of_them_reported(tmp_path, capsys
     run(tmp_path / "run", open_evaluator=invalid_from(2, 0.25))
     assert "12 of 48 episodes" in capsys.readouterr().out
     assert [row["invalid_reasons"] for row in rows_of(tmp_path / "run")] == [{}, {"state": 12}]
-
-
-def test_terrains_with_many_invalid_episodes_are_no_elites(tmp_path):
-    # Two of four episodes of each terrain: over a quarter.
-    assert len(run(tmp_path / "run", open_evaluator=invalid_from(1, 0.5))) == 0

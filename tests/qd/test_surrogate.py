@@ -113,11 +113,6 @@ def test_it_learns_from_friction_where_heights_say_nothing():
     assert len(search.propose(10, genes, truth.cell, truth.fitness, genes[:0])) == 10
 
 
-def test_networks_differ_and_learn_apart(learned):
-    ratios = predicted(learned, SUPER_GAUSSIAN.hard_random(10, 5))["ratios"]
-    assert (ratios.std(axis=0).sum(axis=1) > 1e-3).all()
-
-
 def test_grouped_networks_are_the_same_as_one_by_one(learned):
     maps = mapped(learned, SUPER_GAUSSIAN.hard_random(5, 6))[:, None].expand(-1, module.MEMBERS, -1, -1, -1)
     with torch.no_grad():
@@ -260,11 +255,6 @@ def test_cells_are_the_archives(cells):
     edge = torch.zeros(1, cells.num_ratios)
     edge[0, :2] = 0.5  # 5 + 5 intervals leave nothing for the others: a single point, in no cell
     assert search._cells(edge, torch.tensor([False])).tolist() == [-1]
-
-
-def test_the_best_of_each_cell_by_what_it_adds():
-    cells, gain = torch.tensor([3, 1, 3, -1, 2, 1, 0]), torch.tensor([1.0, 2.0, 5.0, 9.0, 0.0, 2.0, 3.0])
-    assert module._best_of_each(cells, gain, 4).tolist() == [2, 6, 1]
 
 
 def test_before_it_knows_enough_it_draws_and_varies():
