@@ -174,7 +174,7 @@ def metrics_row(
         result: The iteration's crossings.
         evaluation: What the emitters were told of them.
         iteration: Number of the iteration, from 1.
-        search_s: Time that the search took to learn of them and to ask again, without crossing anything [s].
+        search_s: Time that telling and asking the emitters took [s].
     """
     return {
         "iteration": iteration,

@@ -84,9 +84,6 @@ def read_archive_of(robot: RobotCfg, run: Path, space: str | None = None) -> Arc
         robot: The robot.
         run: Run directory or archive file.
         space: Terrain space that the command line names, for one of a user's own.
-
-    Raises:
-        FileNotFoundError: If there is none.
     """
     archive = read_archive(run)
     check_space(archive, space)
@@ -158,11 +155,7 @@ class RunDirectory:
         return os.path.lexists(self.path / CONFIG_FILE)
 
     def read_config(self) -> dict[str, Any]:
-        """What the run was asked to do: ``settings``, ``iterations``, ``sessions``, and provenance of its beginning.
-
-        Raises:
-            FileNotFoundError: If there is no run here.
-        """
+        """What the run was asked to do: ``settings``, ``iterations``, ``sessions``, and provenance of its beginning."""
         file = self.path / CONFIG_FILE
         if not self.exists():
             raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
@@ -173,11 +166,7 @@ class RunDirectory:
         return config
 
     def read_cfg(self) -> SearchCfg:
-        """The search as its config has it.
-
-        Raises:
-            FileNotFoundError: If there is no run here.
-        """
+        """The search as its config has it."""
         config = self.read_config()
         try:
             return from_settings(config["settings"], config["iterations"])
@@ -223,10 +212,8 @@ class RunDirectory:
             cfg: The search that is to go on.
 
         Returns:
-            None if there is no run yet, or it was killed before its first checkpoint.
-
-        Raises:
-            ValueError: If the directory holds a run of other settings, or something else.
+            None if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
+            something else in the directory, is a ValueError.
         """
         if not self.exists():
             if not all(map(is_leftover, self.path.iterdir())):
@@ -262,11 +249,7 @@ class RunDirectory:
             return {}
 
     def read_metrics(self) -> Metrics:
-        """Rows of the metrics file, without reading the checkpoint.
-
-        Raises:
-            FileNotFoundError: If there is none.
-        """
+        """Rows of the metrics file, without reading the checkpoint."""
         file = self.path / METRICS_FILE
         try:
             rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]

@@ -12,8 +12,6 @@ from qd.run.settings import SearchCfg
 from qd.workers.invalid import WARNED_SHARE, reason_words
 from sim.policy.spec import SHIPPED
 
-_EPISODE_STEPS = 4000  # 20 s at 200 Hz
-_STEPS_PER_S = {"cpu": 15_000.0, "cuda": 3_500_000.0}  # of one process on one core, and of a large GPU
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
 
 
@@ -27,23 +25,19 @@ def clock(seconds: float) -> str:
 def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
     """What a search is about to do, in words, after ``done`` iterations, by so many processes or GPUs."""
     left = cfg.iterations - done
-    on_gpu = device.startswith("cuda")
     where = f"{workers} process{'es' * (workers > 1)} on the CPU"
-    if on_gpu:
+    if device.startswith("cuda"):
         where = device if workers == 1 else f"{workers} GPUs"
     controller = "its shipped controller" if cfg.policy == SHIPPED else f"controller {cfg.policy}"
     if not left:
         return f"All {done} iterations of {path} are done."
     iterations = f"{left:,} iterations" + (f" after {done:,} done" if done else "")
-    steps_per_s = workers * _STEPS_PER_S["cuda" if on_gpu else "cpu"]
-    duration = clock(left * cfg.episodes_per_iteration * _EPISODE_STEPS / steps_per_s)
     return "\n".join(
         [
             f"Searching for terrains that break {cfg.robot} with {controller}, each in its own way.",
             f"  preset {cfg.preset}, seed {cfg.seed}, space {cfg.space}: {iterations} of "
             f"{cfg.scheduler.num_terrains} terrains x {cfg.replicas} episodes of up to 20 s",
-            f"  {left * cfg.episodes_per_iteration:,} episodes on {where}: about {duration}, and a minute or two more "
-            "where kernels must be compiled",
+            f"  {left * cfg.episodes_per_iteration:,} episodes on {where}; kernels are compiled first, once a machine",
             f"  {cfg.cells.num_cells:,} reachable cells of {len(cfg.fitness.penalties)} penalties; results in {path}",
         ]
     )
