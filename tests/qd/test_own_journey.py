@@ -108,9 +108,7 @@ def project():
 @pytest.fixture(scope="module")
 def calibrated(project, home, robot, trot):
     """Scales, measured by a Ray worker, which has none of the dog's files but those it is sent."""
-    return run(
-        "calibrate", *robot, *trot, "--terrains", "4", "--most-terrains", "4", "--replicas", "2", "--workers", "ray:1"
-    )
+    return run("calibrate", *robot, *trot, "--terrains", "4", "--most-terrains", "4", "--workers", "ray:1")
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +206,7 @@ def test_wrong_steps_with_its_run(searched, home, wrong, robot, trot):
         "archive": (*resume, "--iterations", "3"),
         "replay": ("replay", *who, *run),
         "film": ("film", *who, *run),
-        "reevaluate": ("reevaluate", *who, *run),
+        "judge": ("judge", *who, *run),
         "report": ("report", *who, *run),
         "export": ("export", *robot, *run, "--elite", "0"),
         "evaluate": ("evaluate", *robot, *CPU, "--archive", "run"),

@@ -48,7 +48,7 @@ def test_an_added_penalty_is_one_function(project):
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    assert name in run("calibrate", "--terrains", "2", "--most-terrains", "2", "--replicas", "2")
+    assert name in run("calibrate", "--terrains", "2", "--most-terrains", "2")
     assert list(json.loads(dog.with_suffix(".scales.json").read_text())["scales"]) == [
         "yaw_rate",
         "vel_x",
