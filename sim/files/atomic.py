@@ -93,19 +93,6 @@ def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name}, which is no number")
 
 
-def has_shape(value: Any, shape: Any) -> bool:
-    """Whether a JSON value has a shape: a type, [shape of every item], {key: shape} or {...: shape of every value}."""
-    if isinstance(shape, list):
-        return isinstance(value, list) and all(has_shape(item, shape[0]) for item in value)
-    if not isinstance(shape, dict):
-        return isinstance(value, shape)
-    if not isinstance(value, dict):
-        return False
-    if ... in shape:
-        return all(has_shape(item, shape[...]) for item in value.values())
-    return all(key in value and has_shape(value[key], part) for key, part in shape.items())
-
-
 def check_zip(path: Path) -> None:
     """Compares the parts of a zip file, such as torch and NumPy write, with their checksums.
 

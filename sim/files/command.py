@@ -10,8 +10,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -115,17 +114,6 @@ class _HasDefaults(Protocol):
     """A command whose defaults follow from some of its flags, such as those of a robot that they name."""
 
     def defaults(self, argv: Sequence[str]) -> Any: ...
-
-
-@contextmanager
-def naming_what_is_next(state: str, command: Callable[[], str]) -> Iterator[None]:
-    """Adds what is saved (``state``) and how to go on to the error of work that stops or fails half way."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise Interrupted(f"Stopped; {state}. {command()}") from None
-    except (UserError, OSError) as error:
-        raise type(error)(f"{error}. {command()}") from error
 
 
 def debugging() -> bool:

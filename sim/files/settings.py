@@ -6,7 +6,7 @@ A range is written ``Annotated[int, Meta(ge=1)]`` with :class:`msgspec.Meta`. Fl
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import MISSING, field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
@@ -43,7 +43,7 @@ def problems(settings: Any, prefix: str = "") -> list[str]:
         value, name = getattr(settings, setting.name), f"{prefix}{setting.name}"
         if is_dataclass(value):
             lines += problems(value, f"{name}.")
-        elif expected := _mismatch(setting.type, value) or _out_of_range(setting, value):
+        elif expected := _mismatch(setting.type, value):
             lines.append(f"{name} must be {expected}, got {_brief(value)}")
         elif setting.type is Interval and value[0] > value[1]:
             lines.append(f"{name} must have its lower limit first, got {_brief(value)}")
@@ -125,27 +125,3 @@ def _numbers(value: Any) -> tuple[Any, ...]:
 def _brief(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
-
-
-def setting(default: Any = MISSING, **limits: Any) -> Any:
-    """A dataclass field with a default and limits of its numbers: least, above, most, one_of, rising."""
-    return field(default=default, metadata=limits)
-
-
-def _out_of_range(setting: Any, value: Any) -> str | None:
-    limits = setting.metadata
-    if value is None or not limits:
-        return None
-    if "one_of" in limits:
-        return None if value in limits["one_of"] else f"one of {', '.join(map(str, limits['one_of']))}"
-    low, above, high = (limits.get(key) for key in ("least", "above", "most"))
-    numbers = _numbers(value)
-    if any(
-        (low is not None and number < low)
-        or (above is not None and number <= above)
-        or (high is not None and number > high)
-        for number in numbers
-    ):
-        words = [f"at least {low:g}" if low is not None else "", f"above {above:g}" if above is not None else ""]
-        return " and ".join(filter(None, [*words, f"at most {high:g}" if high is not None else ""]))
-    return "rising" if limits.get("rising") and list(numbers) != sorted(numbers) else None

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
 
 from sim.files.command import InSpace, OnDevice, Who
-from sim.files.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +23,7 @@ class Report(Who, OnDevice, InSpace):
     out: Path | None = None
     """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published; with another
     controller report-<its name>.html."""
-    elites: int = setting(5, least=1, most=10)
+    elites: Annotated[int, Meta(ge=1, le=10)] = 5
     """How many of the worst and of the most reproducible elites to show, with one of each failure mode."""
 
     def execute(self) -> None:

@@ -17,7 +17,6 @@ from sim.files.command import (
     Who,
     chosen_elites,
     command_line,
-    naming_what_is_next,
     peek,
     publish,
     run_command,
@@ -111,18 +110,6 @@ def test_the_option_groups_are_flags(capsys):
     text = capsys.readouterr().out
     assert "usage: faultline toy" in text and "Fail as told." in text
     assert [flag for flag in ("robot", "policy", "device", "workers", "run", "elite") if f"--{flag}" not in text] == []
-
-
-def test_work_that_stops_says_what_comes_next():
-    saved = naming_what_is_next("3 are saved", lambda: "Go on with x")
-    with pytest.raises(Interrupted, match=r"^Stopped; 3 are saved\. Go on with x$"), saved:
-        raise KeyboardInterrupt
-    for error in (UserError("lost"), OSError("disk full")):
-        saved = naming_what_is_next("3 are saved", lambda: "Go on with x")
-        with pytest.raises(type(error), match=r"^(lost|disk full)\. Go on with x$"), saved:
-            raise error
-    with pytest.raises(ZeroDivisionError), naming_what_is_next("", lambda: "x"):
-        raise ZeroDivisionError
 
 
 def test_a_command_line_can_be_typed():
