@@ -138,11 +138,10 @@ class OwnSpace(TerrainSpace):
             raise self._wrong(method, f"must return genes: {error}") from None
 
     def _call(self, method: str, *arguments: Any) -> Any:
-        function = getattr(self._own, method)
         try:
-            return function(*arguments)
+            return getattr(self._own, method)(*arguments)
         except Exception as error:  # a user's code can fail with anything
-            raise self._wrong(method, f"fails: {in_one_line(error, function)}") from error
+            raise self._wrong(method, f"fails: {in_one_line(error)}") from error
 
     def _wrong(self, what: str, text: str) -> ValueError:
         return ValueError(f"space '{self.name}': {what} {text}: docs/own-space.md")

@@ -222,13 +222,6 @@ def test_what_is_wrong_with_code_is_said(tmp_path, write, anymal, source, call, 
         load_policy(f"{write(source)}:{call.format(actor)}", anymal, "cpu")
 
 
-def test_a_python_file_alone_is_asked_for_what_to_call(write, anymal):
-    with pytest.raises(ValueError, match=r"Python file: name what to call in it, .*mine\.py:CALLABLE"):
-        load_policy(write("def act(row): return row"), anymal, "cpu")
-    with pytest.raises(ValueError, match=r"gone\.py: no such file"):
-        load_policy("gone.py:act", anymal, "cpu")
-
-
 @pytest.mark.parametrize(
     ("text", "place", "name", "file", "label"),
     [
@@ -246,13 +239,6 @@ def test_names_are_taken_apart(text, place, name, file, label):
     assert str(spec) == text
     assert spec.runs_code == (place is not None)
     assert str(ControllerSpec.parse(Path(text))) == text
-
-
-def test_a_file_of_that_name_is_a_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert ControllerSpec.parse("mine:act").runs_code
-    (tmp_path / "mine:act").write_bytes(b"x")
-    assert not ControllerSpec.parse("mine:act").runs_code
 
 
 def test_the_hash_is_of_all_that_is_in_files(tmp_path, write):
