@@ -59,7 +59,10 @@ def test_a_whole_archive_in_some_formats_elsewhere(run, monkeypatch):
     assert not list(Path("out").glob("*.stl"))
     heights = heights_of(small_archive(10).genes[9:])[0]
     np.testing.assert_array_equal(as_terrain(read_heightmap("out/elite-9.npz")), heights)
-    assert json.loads(Path("out/elite-9.json").read_text())["fresh"] is None
+    about = json.loads(Path("out/elite-9.json").read_text())
+    assert about["elite"] == 9 and about["fresh"] is None
+    with np.load("out/elite-9.npz") as content:
+        np.testing.assert_array_equal(content["genes"], small_archive(10).genes[9])
 
 
 def test_mistakes_are_refused_before_anything_is_written(run, monkeypatch):
@@ -74,8 +77,9 @@ def test_mistakes_are_refused_before_anything_is_written(run, monkeypatch):
 
 
 def test_files_of_an_earlier_export_are_replaced_only_if_that_is_asked_for(run):
-    (file, _, _) = export("0", formats=("npz",))
+    (file, _, index) = export("0", formats=("npz",))
     file.write_bytes(b"mine")
+    index.unlink()
     with pytest.raises(ValueError, match="overwrite"):
         export("0", formats=("npz",))
     assert file.read_bytes() == b"mine"
