@@ -69,7 +69,7 @@ def test_an_invalid_terrain_is_not_reproduced():
 def test_collision_intervals_by_hand():
     collides, invalid = np.zeros((4, 40), bool), np.zeros((4, 40), bool)
     collides[0, :10] = True
-    collides[1] = invalid[1] = True
+    collides[1] = invalid[1, :30] = True
     collides[3, :5], invalid[3, 5:10] = True, True
     fresh = fresh_of(archive_of([0.45] * 4), evaluator([0.45] * 4, base_collision=collides, invalid=invalid))
     # Wilson with z = 1.96, z^2 = 3.842: of 10 of 40 the centre is (.25 + 3.842/80) / (1 + 3.842/40) = .2719, half the
