@@ -15,6 +15,7 @@ from qd.archive import read_archive, write_archive
 from qd.fitness import FitnessCfg
 from qd.judge import drawn_elites, elite_seeds, find_search, fresh_values, judge, outcome_counts, seen_by
 from qd.show import figures
+from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute
 from sim.mujoco_c.crossing import PlainCrossings
 from sim.policy.spec import controller_hash
@@ -256,6 +257,11 @@ def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_re
     assert last.faults.certifiers == ("C-G", "specialist")
     assert not last.faults.certificates()[:, 1].any() and last.faults.certificates()[:, 0].any()
     assert last.faults.certifier_sha256[1] == controller_hash(str(nobody))
+    # Where the new one was not asked, nothing is known of it.
+    with Crossings("anymal", HERE, open_evaluator=Judges()) as crossings:
+        row = np.flatnonzero(both.failing)[:1]
+        one = judging.certify(both, row, {"specialist": str(nobody)}, find_search(path), crossings)
+    assert np.flatnonzero(one.faults.certifier_outcomes[:, 1].any(axis=1)).tolist() == row.tolist()
 
 
 def test_the_panel_and_the_runs_own_certifiers_judge_without_the_searched_controller(path, tmp_path, monkeypatch):
