@@ -61,6 +61,11 @@ def test_the_angle_to_the_way_is_that_of_the_slope():
     assert shape.slope_deg == pytest.approx(np.rad2deg(np.arctan(0.4)), abs=0.5)
 
 
+def test_how_far_a_part_reaches_to_either_side():
+    shape = shape_of(plateau(7.0, 7.6, 0.2, run=0.05, y_from=3.8), HALF_WIDTH)  # the way is at y = 4
+    assert (shape.left_m, shape.right_m) == pytest.approx((4.05, 0.25))
+
+
 def test_parts_are_told_from_the_rest():
     genes = SUPER_GAUSSIAN.hard_random(1, 5)
     fields = effects_of(genes[0], [0, 3, 7], SUPER_GAUSSIAN).heights

@@ -40,7 +40,7 @@ def test_they_are_chosen_by_the_numbers_of_their_elites(found, run):
     assert minima.words(first) == told
     (run / "minimal.json").rename(run / "away.json")
     try:
-        with pytest.raises(FileNotFoundError, match=r"has no minimal terrains of its elites: `.*faultline minimise"):
+        with pytest.raises(FileNotFoundError, match="minimal"):
             found.minima()
     finally:
         (run / "away.json").rename(run / "minimal.json")
