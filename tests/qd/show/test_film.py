@@ -1,7 +1,5 @@
-"""Films from the command line to their files, and help that answers at once."""
+"""Films from the command line to their files."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +7,9 @@ import pytest
 
 from qd.archive import write_archive
 from qd.show.commands import Film
-from qd.show.elites import find_archive
-from qd.show.recordings import Recordings, on_elite
 from sim.files.command import run_command
 from sim.recording.file import read_recording
-from sim.recording.recorder import record
 from sim.recording.renderer import open_context
-from sim.rollout import Rollout
 from tests.builders import small_archive
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -29,21 +23,6 @@ def run(tmp_path, monkeypatch):
     folder.mkdir(parents=True)
     write_archive(folder / "archive.npz", small_archive(3))
     return folder
-
-
-def test_an_elite_is_recorded_in_the_episodes_that_a_rollout_has(run):
-    found = find_archive("anymal", run / "archive.npz")
-    policy = "tests.sim.policies:stretch"
-    wanted = [on_elite(found.archive, k, policy=policy, replicas=4) for k in (2, 1)]
-    recordings = Recordings(found.robot).all_of(wanted)
-    assert [one.labels for one in recordings] == [("elite 2 of anymal",), ("elite 1 of anymal",)]
-    rollout = Rollout(found.robot, policy, num_terrains=2, num_replicas=4, device="cpu")  # side by side
-    seeds = np.array([one.terrain_seed for one in wanted], np.uint32)
-    result, both = record(rollout, found.archive.genes[[2, 1]], seeds, policy=policy)
-    for k, recording in enumerate(recordings):
-        for name in ("penalties", "outcome", "duration_s", "fallen"):
-            np.testing.assert_array_equal(getattr(recording.result(), name)[0], getattr(result, name)[k])
-        np.testing.assert_array_equal(both.of_terrain(k).qpos(0, 3), recording.qpos(0, 3))
 
 
 def film(*argv):
@@ -102,19 +81,3 @@ def test_without_opengl_nothing_is_crossed(run, capsys, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "no_such_way")
     assert run_command(Film, ["--device", "cpu"], name="film") == 2
     assert "no_such_way" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["film", "export", "cross", "replay", "report", "view"])
-def test_help_is_fast(name):
-    code = f"""
-import sys, faultline
-try:
-    faultline.main(["{name}", "--help"])
-finally:
-    slow = ("torch", "warp", "newton", "mujoco", "imageio_ffmpeg", "matplotlib", "scipy", "viser", "ribs")
-    print("slow imports:", [name for name in slow if name in sys.modules])
-"""
-    root = Path(__file__).parents[3]
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True)
-    assert "--run" in done.stdout or "--terrain" in done.stdout
-    assert "slow imports: []" in done.stdout

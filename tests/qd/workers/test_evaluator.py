@@ -138,17 +138,6 @@ def test_contact_is_resolved_at_the_same_control_rate():
     assert (as_searched.sim.solver.mjw_model.geom_solref.numpy()[..., 0] > 0.005).all()
 
 
-def test_lots_of_one_terrain_are_dealt_round():
-    """Six terrains on four processes that have room for two each: a crosser with more than that fails."""
-    cfg = dataclasses.replace(CFG, workers="4")
-    assert cfg.terrains_of_worker == 2
-    with open_evaluator(cfg, build=Crosser) as evaluate:
-        for own in (slice(k, k + 1) for k in range(6)):
-            evaluate.put(GENES[own], SEEDS[own])
-        results = [evaluate.take() for _ in range(6)]
-    assert same(merged(results, join=1), stand_in.evaluate(GENES[:6], SEEDS[:6], 4))
-
-
 @pytest.mark.parametrize("device", ["cpu", "cuda:0"])
 def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(device):
     def stop(share: float) -> None:
@@ -242,11 +231,3 @@ def test_leaving_ends_workers_in_the_midst_of_work():
     finally:
         signal.signal(signal.SIGALRM, before)
     assert time.monotonic() - began < 15
-
-
-def test_seeds_must_be_one_a_terrain():
-    with (
-        open_evaluator(CFG, build=Crosser) as evaluate,
-        pytest.raises(ValueError, match=r"seeds must have shape \(15,\)"),
-    ):
-        evaluate(GENES, SEEDS[:3])
