@@ -245,12 +245,11 @@ def test_the_script_of_a_page_searches_judges_crosses_and_trains(tmp_path):
     ):
         assert page_size in text
         text = text.replace(page_size, small_size)
-    (tmp_path / "search.py").write_text("from qd.run.settings import SchedulerCfg\n" + text)
+    (tmp_path / "search.py").write_text("from qd.run.presets import SchedulerCfg\n" + text)
     (tmp_path / "results").symlink_to(ROOT / "results")
-    done = subprocess.run(
-        [sys.executable, "search.py"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True,
-        text=True, timeout=580,
-    )  # fmt: skip
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    command = [sys.executable, "search.py"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=580)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "runs/mine-tuned/policy.pt").exists() and "elites" in done.stdout
 

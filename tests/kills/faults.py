@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["tests.kills.runs"])
+_CONTEXT.set_forkserver_preload(["tests.kills.nursery"])
 _PATIENCE_S = 300.0
 
 

@@ -1,19 +1,11 @@
-"""A search and a training of a fraction of a second, by their own commands, and what each comes to.
+"""A search and a training of a fraction of a second, by their own commands, and what each comes to."""
 
-The fork server imports this module once: what every child needs is imported and compiled here. It must stay without
-threads and hold no simulation that a child would not have made alike.
-"""
-
-import gc
 import json
-import os
-import tempfile
-import threading
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
-import tqdm
 
 import faultline
 from qd import search as searching
@@ -40,14 +32,12 @@ _TRAIN = (
 )
 _OF_A_CLOCK = (*TIMES, "rollout_s", "physics_steps", "robot_steps", "idle_share")
 
-os.environ.setdefault("FAULTLINE_COMMIT", "under test")  # spares asking git
-tqdm.tqdm.monitor_interval = 0  # or the first bar starts a thread
-tqdm.tqdm.set_lock(threading.RLock())  # its own is one for all processes: a killed child would keep it
-torch.set_num_threads(1)
-_TASK = CommandTask(
-    get_robot("anymal"), TaskCfg(curriculum=CurriculumCfg(num_columns=2, noise_columns=1)),
-    num_envs=6, device="cpu", seed=0,
-)  # fmt: skip
+
+@cache
+def task() -> CommandTask:
+    """The task of the training, as new in every child that was forked after it was built."""
+    cfg = TaskCfg(curriculum=CurriculumCfg(num_columns=2, noise_columns=1))
+    return CommandTask(get_robot("anymal"), cfg, num_envs=6, device="cpu", seed=0)
 
 
 def search(path: Path, *, iterations: int, **watched: Any) -> int:
@@ -87,7 +77,7 @@ def saved_iterations(path: Path) -> int:
 
 def train(path: Path, *, iterations: int, **watched: Any) -> int:
     """Begins a training or goes on with it, saving every iteration; arguments and result as of :func:`search`."""
-    training.CommandTask = lambda *_, **__: _TASK
+    training.CommandTask = lambda *_, **__: task()
     training.SAVE_EVERY_S = 0.0
     if watched:
         Steps(path, **watched)
@@ -112,9 +102,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     return value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
-
-
-with tempfile.TemporaryDirectory() as _folder:
-    search(Path(_folder) / "run", iterations=2)  # compiles the evolution strategy
-gc.collect()
-gc.freeze()  # or a child's first collection copies every page
