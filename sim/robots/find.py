@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from sim.files.records import check_identity
-from sim.robots.own import load_robot
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 
@@ -24,6 +23,8 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     if spec in ROBOTS:
         return ROBOTS[spec]
     if spec.endswith(".py"):
+        from sim.robots.own import load_robot  # Newton takes seconds to load: not for the help of commands
+
         return load_robot(Path(spec))
     raise ValueError(
         f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or a Python file that sets ROBOT "

@@ -8,8 +8,6 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from kernels.observation import NUM_BASE_COLUMNS
-from kernels.penalties import BASE, FOOT, LIMB
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.records import check_identity
@@ -109,6 +107,8 @@ class RobotCfg:
     @property
     def observation_size(self) -> int:
         """Columns of the observation row."""
+        from kernels.observation import NUM_BASE_COLUMNS  # Warp takes a second to load: not for the help of commands
+
         return NUM_BASE_COLUMNS + 3 * self.num_joints + self.num_scan_points
 
     @property
@@ -138,6 +138,8 @@ class RobotCfg:
 
     def role_of(self, geom: str) -> int:
         """Role bits of a geom (:mod:`kernels.penalties`)."""
+        from kernels.penalties import BASE, FOOT, LIMB
+
         return BASE * (geom in self.base_geoms) + FOOT * (geom in self.foot_geoms) + LIMB * (geom in self.limb_geoms)
 
     def scan_points(self) -> tuple[np.ndarray, np.ndarray]:
