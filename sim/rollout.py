@@ -185,11 +185,13 @@ class Rollout:
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
         bank = TerrainBank(self.num_terrains, device=device, with_ground=self._with_ground)
         self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
-        self._lots: deque[_Lot] = deque()
-        self._first_free = self._waiting = 0  # the ring's next slot, and episodes that no robot may take yet
-        self._most = round(self.cfg.max_duration_s / self.robot.control_dt)
-        self._steps = self._began = self._taken_at = 0  # control steps: now, when all waited, at the last result
-        self._taken_s = time.perf_counter()
+        self._lots: deque[_Lot] = deque()  # under way, the oldest first
+        self._next_slot = 0  # of the ring, where the next terrain goes
+        self._num_unreleased = 0  # episodes that were put in and no robot may take yet
+        self._steps_an_episode = round(self.cfg.max_duration_s / self.robot.control_dt)  # at most
+        self._step = 0  # control steps made so far
+        self._began_at = 0  # the step at which all robots last began together
+        self._taken_at, self._taken_s = 0, time.perf_counter()  # step and time of the last result
         with wp.ScopedDevice(device):
             self._allocate()
             self._policy = PolicyRunner(policy, self._observation, self._action, self._queue.begins)
@@ -306,7 +308,7 @@ class Rollout:
         if not self._lots:
             return
         self._lots.clear()
-        self._waiting = 0
+        self._num_unreleased = 0
         for _, episode in self._latches:
             episode.outcome.fill_(int(Outcome.TIME_OUT))
         self._queue.episode_of_env.fill_(-1)
@@ -328,18 +330,18 @@ class Rollout:
             raise ValueError(f"seeds must have shape ({count},), one a terrain, got {seeds.shape}")
         if not 1 <= count <= self.num_free:
             raise ValueError(f"terrains must be 1 to {self.num_free} at once here, got {count}")
-        first = 0 if idle else self._first_free
+        first = 0 if idle else self._next_slot
         slots = ring_slices(first, count, self.num_terrains)
         self._write_terrains(terrains, seeds, slots, ground)
         num_episodes = count * self.num_replicas
-        most_steps = self._most * -(-num_episodes // self.num_envs)
-        self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._steps))
-        self._first_free = (first + count) % self.num_terrains
-        self._waiting += num_episodes
+        most_steps = self._steps_an_episode * -(-num_episodes // self.num_envs)
+        self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._step))
+        self._next_slot = (first + count) % self.num_terrains
+        self._num_unreleased += num_episodes
         if idle:
             self._queue.counts.zero_()
             self._queue.busy.zero_()
-            self._began = self._taken_at = self._steps
+            self._began_at = self._taken_at = self._step
             self._taken_s = time.perf_counter()
         if idle or self._policy.memory is not Memory.WHOLE:
             self._release(begin=idle)
@@ -363,11 +365,11 @@ class Rollout:
         Args:
             begin: Whether all of them wait and are to begin now; else each takes one when its own has ended.
         """
-        count = self._waiting
+        count = self._num_unreleased
         if self._policy.memory is Memory.WHOLE:
             count = min(count, self.num_envs)
             self._policy.reset()
-        self._waiting -= count
+        self._num_unreleased -= count
         with wp.ScopedDevice(self.sim.device):
             make_ready(count, self._queue)
         if begin:
@@ -382,12 +384,12 @@ class Rollout:
         if watcher is not None:
             watcher.after_step()
         self.sim.launch(self._turn_graph)
-        self._steps += 1
+        self._step += 1
 
     def _advance(self, watcher: Watcher | None = None) -> None:
         """Make the control steps up to the next look at what has ended."""
-        poll, since = max(1, round(self.cfg.poll_every_s / self.robot.control_dt)), self._steps - self._began
-        stop = min((since // every + 1) * every for every in (poll, self._most))
+        poll, since = max(1, round(self.cfg.poll_every_s / self.robot.control_dt)), self._step - self._began_at
+        stop = min((since // every + 1) * every for every in (poll, self._steps_an_episode))
         for _ in range(stop - since):
             self.control_step(watcher)
 
@@ -409,19 +411,19 @@ class Rollout:
         lot, share = self._lots[0], 0.0
         while True:
             ended = self._num_ended(lot)
-            share = max(share, ended / lot.num_episodes, (self._steps - lot.put_at) / lot.most_steps)
-            if progress is not None and self._steps > lot.put_at:
+            share = max(share, ended / lot.num_episodes, (self._step - lot.put_at) / lot.most_steps)
+            if progress is not None and self._step > lot.put_at:
                 progress(min(1.0, share))
             if ended == lot.num_episodes:
                 break
-            under_way = sum(other.num_episodes for other in self._lots) - self._waiting
-            if self._waiting and sum(map(self._num_ended, self._lots)) == under_way:
+            under_way = sum(other.num_episodes for other in self._lots) - self._num_unreleased
+            if self._num_unreleased and sum(map(self._num_ended, self._lots)) == under_way:
                 self._release(begin=True)
             self._advance(watcher)
         result = self._collect(lot)
         self._lots.popleft()
         going = any(self._num_ended(other) < other.num_episodes for other in self._lots)
-        if going and not self._waiting and watcher is None:
+        if going and not self._num_unreleased and watcher is None:
             self._advance()
         return result
 
@@ -445,11 +447,11 @@ class Rollout:
             reward[outcome == Outcome.INVALID] = np.nan
         with np.errstate(invalid="ignore"):
             upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)
-        physics_steps = (self._steps - self._taken_at) * robot.decimation
+        physics_steps = (self._step - self._taken_at) * robot.decimation
         busy_steps = int(queue.busy.numpy().sum(dtype=np.int64)) * robot.decimation
         queue.busy.zero_()
         wall_s = time.perf_counter() - self._taken_s
-        self._taken_at, self._taken_s = self._steps, self._taken_s + wall_s
+        self._taken_at, self._taken_s = self._step, self._taken_s + wall_s
         return RolloutResult(
             penalties=penalties,
             penalty_names=robot.penalties,
@@ -478,20 +480,3 @@ def _saying_what_does_not_fit(num_envs: int, num_terrains: int, device: str) -> 
             f"{num_envs:,} robots and {num_terrains:,} terrains at once need more memory than {device} has free: "
             "give fewer robots (--num-envs), or fewer terrains"
         ) from error
-
-
-def evaluate(
-    robot: RobotCfg, policy: PolicySpec, terrains: np.ndarray, replicas: int, *, seed: int = 0, device: str = "cpu"
-) -> RolloutResult:
-    """Cross each terrain ``replicas`` times with one controller (:class:`Rollout` for repeated use).
-
-    Args:
-        robot: Robot settings.
-        policy: The controller.
-        terrains: Genes (num_terrains, 64) or heights (num_terrains, nrow, ncol).
-        replicas: Episodes a terrain.
-        seed: Seeds the terrains' streams.
-        device: Warp device name.
-    """
-    rollout = Rollout(robot, policy, num_terrains=len(terrains), num_replicas=replicas, device=device)
-    return rollout.evaluate(terrains, np.random.SeedSequence(seed).generate_state(len(terrains), np.uint32))

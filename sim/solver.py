@@ -89,41 +89,26 @@ def use_own_solver(wanted: bool = True) -> None:
     solver.solve = _solve if wanted else solve_theirs
 
 
-def why_not(m: Any, d: Any) -> str | None:
-    """What keeps :class:`Dynamics` from this model, None if nothing does."""
+def fits_dynamics(m: Any, d: Any) -> bool:
+    """Whether :class:`Dynamics` takes this model: robots of joints and position actuators, and nothing else."""
     flags = types.DisableBit
     unforced = flags.GRAVITY | flags.SPRING | flags.DAMPER | flags.ACTUATION | flags.CLAMPCTRL
     joints, actuated = m.jnt_type.numpy(), m.actuator_trnid.numpy()[:, 0]
     free, bodies = joints == types.JointType.FREE, m.jnt_bodyid.numpy()
-    gain, bias = m.actuator_gaintype.numpy(), m.actuator_biastype.numpy()
-    of_joints = (m.actuator_trntype.numpy() == types.TrnType.JOINT).all() and not free[actuated].any()
-    reasons = {
-        "contacts that our kernel cannot solve": not fits(m, d),
-        "more bodies than find room": not lanes.fits(tree_sizes_of(m).words),
-        "collisions of its own": m.opt.run_collision_detection,
-        "surfaces that move": m.flg_surfacevel,
-        "callbacks": any(vars(m.callback).values()),
-        "sensors": m.nsensor,
-        "no actuators": not m.nactuator,
-        "another integrator than implicitfast": m.opt.integrator != types.IntegratorType.IMPLICITFAST,
-        "disabled gravity, springs, dampers, actuation or control ranges": m.opt.disableflags & unforced,
-        "equalities, tendons or soft bodies": m.neq or m.ntendon or m.nflex,
-        "mocap bodies": m.nmocap,
-        "delays": m.nhistory,
-        "a fluid": m.has_fluid,
-        "adhesion": m.flg_adhesion,
-        "compensated gravity": m.body_gravcomp.numpy().any(),
-        "ball joints": (joints == types.JointType.BALL).any(),
-        "free bodies that carry nothing": m.body_freeadr.size,
-        "a free joint beside others of its body": (np.bincount(bodies, minlength=1)[bodies[free]] != 1).any(),
-        "springs of free joints": m.jnt_stiffness.numpy()[:, free].any(),
-        "springs or dampers that are not linear": m.jnt_stiffnesspoly.numpy().any() or m.dof_dampingpoly.numpy().any(),
-        "actuators that are not of one joint each": not of_joints or len(set(actuated)) != len(actuated),
-        "actuators with states": m.actuator_dyntype.numpy().any(),
-        "actuators without controls": (m.actuator_ctrlnum.numpy() != 1).any(),
-        "actuators that are not affine": (gain != types.GainType.FIXED).any() or (bias > types.BiasType.AFFINE).any(),
-    }
-    return next((reason for reason, holds in reasons.items() if holds), None)
+    unlike = (
+        m.opt.run_collision_detection or m.flg_surfacevel or any(vars(m.callback).values()) or m.nsensor,
+        m.opt.integrator != types.IntegratorType.IMPLICITFAST or m.opt.disableflags & unforced,
+        m.neq or m.ntendon or m.nflex or m.nmocap or m.nhistory or m.has_fluid or m.flg_adhesion,
+        m.body_gravcomp.numpy().any() or m.body_freeadr.size,
+        (joints == types.JointType.BALL).any() or (np.bincount(bodies, minlength=1)[bodies[free]] != 1).any(),
+        m.jnt_stiffness.numpy()[:, free].any(),
+        m.jnt_stiffnesspoly.numpy().any() or m.dof_dampingpoly.numpy().any(),
+        not m.nactuator or len(set(actuated)) != len(actuated) or free[actuated].any(),
+        (m.actuator_trntype.numpy() != types.TrnType.JOINT).any() or (m.actuator_ctrlnum.numpy() != 1).any(),
+        m.actuator_dyntype.numpy().any() or (m.actuator_gaintype.numpy() != types.GainType.FIXED).any(),
+        (m.actuator_biastype.numpy() > types.BiasType.AFFINE).any(),
+    )
+    return fits(m, d) and lanes.fits(tree_sizes_of(m).words) and not any(unlike)
 
 
 def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +139,7 @@ class Dynamics:
     """
 
     def __init__(self, m: Any, d: Any) -> None:
-        """For a model of which :func:`why_not` says nothing."""
+        """For a model that :func:`fits_dynamics`."""
         self._model, self._data = m, d
         order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
@@ -224,4 +209,4 @@ class TheirDynamics:
 
 def dynamics_of(m: Any, d: Any) -> Dynamics | TheirDynamics:
     """Ours where the model lets it, else mujoco_warp's."""
-    return Dynamics(m, d) if why_not(m, d) is None else TheirDynamics(m, d)
+    return Dynamics(m, d) if fits_dynamics(m, d) else TheirDynamics(m, d)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.solver import Dynamics, TheirDynamics, dynamics_of, why_not
+from sim.solver import Dynamics, TheirDynamics, dynamics_of, fits_dynamics
 
 Mujoco: Any = mujoco  # it names its types at run time
 WORLDS = 12
@@ -91,7 +91,7 @@ def test_every_quantity_of_a_step(device: str) -> None:
     m.body_mass = wp.array(
         np.repeat(mass, WORLDS, 0) * np.linspace(0.9, 1.1, WORLDS)[:, None], dtype=float, device=device
     )
-    assert why_not(m, d) is None
+    assert fits_dynamics(m, d)
     ours, theirs = Dynamics(m, d), TheirDynamics(m, d)
     shake(m, d)
     limited = {"force": 0, "joint": 0, "control": 0}
@@ -163,27 +163,26 @@ def test_too_many_rows_and_contacts_are_told(device: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "reason"),
+    "changes",
     [
-        ({"option": 'solver="CG"'}, "cannot solve"),
-        ({"option": 'density="1.2"'}, "fluid"),
-        ({"inner": '<body><joint type="ball"/><geom size=".02"/></body>'}, "ball"),
-        ({"outer": '<body pos="1 1 1"><freejoint/><geom size=".1"/></body>'}, "free bodies"),
-        ({"outer": '<body pos="1 1 1" mocap="true"><geom size=".1"/></body>'}, "mocap"),
-        ({"inner": '<body gravcomp="1"><geom size=".02"/></body>'}, "gravity"),
-        ({"actuator": '<motor joint="knee"/>'}, "one joint each"),
-        ({"actuator": '<general joint="elbow" dyntype="filter" dynprm="1"/>'}, "states"),
-        ({"actuator": '<general joint="elbow" gaintype="affine" gainprm="1 1 1"/>'}, "affine"),
-        ({"inner": '<geom size=".1" surfacevel="0 0 0 0 0 3"/>'}, "surfaces"),
-        ({"more": '<sensor><jointpos joint="knee"/></sensor>'}, "sensors"),
-        ({"inner": "<body>" * 400 + '<geom size=".1"/>' + "</body>" * 400}, "room"),
-        ({"more": '<equality><joint joint1="elbow" joint2="tail"/></equality>'}, "equalities"),
+        {"option": 'solver="CG"'},
+        {"option": 'density="1.2"'},
+        {"inner": '<body><joint type="ball"/><geom size=".02"/></body>'},
+        {"outer": '<body pos="1 1 1"><freejoint/><geom size=".1"/></body>'},
+        {"outer": '<body pos="1 1 1" mocap="true"><geom size=".1"/></body>'},
+        {"inner": '<body gravcomp="1"><geom size=".02"/></body>'},
+        {"actuator": '<motor joint="knee"/>'},
+        {"actuator": '<general joint="elbow" dyntype="filter" dynprm="1"/>'},
+        {"actuator": '<general joint="elbow" gaintype="affine" gainprm="1 1 1"/>'},
+        {"inner": '<geom size=".1" surfacevel="0 0 0 0 0 3"/>'},
+        {"more": '<sensor><jointpos joint="knee"/></sensor>'},
+        {"inner": "<body>" * 400 + '<geom size=".1"/>' + "</body>" * 400},
+        {"more": '<equality><joint joint1="elbow" joint2="tail"/></equality>'},
     ],
 )
-def test_other_models_take_their_step(device: str, changes: dict[str, str], reason: str) -> None:
+def test_other_models_take_their_step(device: str, changes: dict[str, str]) -> None:
     m, d = model_of(device, **changes)
-    assert reason in str(why_not(m, d))
-    assert isinstance(dynamics_of(m, d), TheirDynamics)
+    assert not fits_dynamics(m, d) and isinstance(dynamics_of(m, d), TheirDynamics)
 
 
 def test_disabled_forces_take_their_step(device: str) -> None:
@@ -196,4 +195,4 @@ def test_disabled_forces_take_their_step(device: str) -> None:
 def test_a_model_that_collides_itself_takes_its_step(device: str) -> None:
     m, d = model_of(device)
     m.opt.run_collision_detection = True
-    assert "collisions" in str(why_not(m, d))
+    assert not fits_dynamics(m, d)

@@ -12,7 +12,7 @@ from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import step_penalties, to_mujoco
 from sim.policy.loaders import load_policy
-from sim.rollout import Rollout, evaluate
+from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
 from tests.sim.policies import NanAfterASecond, stand, stretch
@@ -303,12 +303,6 @@ def test_a_robots_choice_of_penalties_is_kept(anymal, device):
     everything = crossing(anymal, device).evaluate(FLAT[None], np.array([1]))
     assert result.penalty_names == ("collision", "vel_y")
     np.testing.assert_allclose(result.penalties, everything.penalties[..., [5, 2]], rtol=1e-4, atol=1e-5)
-
-
-def test_evaluate_in_one_call(anymal, device):
-    result = evaluate(anymal, "tests.sim.policies:stand", spike()[None], 4, seed=1, device=device)
-    assert result.outcome.shape == (1, 4)
-    assert result.base_collision.all()
 
 
 @pytest.mark.parametrize(
