@@ -152,9 +152,6 @@ def collide_strips(
         probes: Sphere probes of the robot.
         layout: Strides of the flat model arrays.
         contacts_out: Records; contacts past the capacity are counted but not written.
-
-    Raises:
-        ValueError: If ``body_q`` does not hold ``bodies_per_env`` poses for each environment.
     """
     num_envs = terrain_of_env.shape[0]
     if body_q.shape[0] != num_envs * layout.bodies_per_env:

@@ -112,34 +112,10 @@ _NUM_PARAMETERS = GENES_PER_ELEMENT - 2
 _Table = wp.types.matrix(shape=(_NUM_KINDS, _NUM_PARAMETERS), dtype=float)
 _LOWS, _HIGHS, _WHOLE = (_Table(*(float(row[part]) for kind in Kind for row in PARAMETERS[kind])) for part in range(3))
 
-_MAX_STEPS = wp.constant(int(PARAMETERS[Kind.STAIRS][2].high))
-_FIRST = wp.constant(FIRST_COL)
-_LAST = wp.constant(LAST_COL)
-_CENTRE = wp.constant(CENTRE_ROW)
-_SLOPE_ROWS = wp.constant(SLOPE_ROWS)
-_MOST = wp.constant(MAX_ELEMENTS)
-_GENES = wp.constant(GENES_PER_ELEMENT)
-_KINDS = wp.constant(_NUM_KINDS)
-_LEAD_LOW = wp.constant(float(LEAD.low))
-_LEAD_HIGH = wp.constant(float(LEAD.high))
-_CELL = wp.constant(SPACING)
-_CELLS_PER_M = wp.constant(20.0)
-_HALF = wp.constant(
-    0.501
-)  # rounds to the nearest node; not at .5 exactly, where round numbers lie and devices may differ
-
-_FLAT = wp.constant(int(Kind.FLAT))
-_RAMP = wp.constant(int(Kind.RAMP))
-_CROSS_SLOPE = wp.constant(int(Kind.CROSS_SLOPE))
-_SILL = wp.constant(int(Kind.SILL))
-_RAIL = wp.constant(int(Kind.RAIL))
-_KERB = wp.constant(int(Kind.KERB))
-_STEP = wp.constant(int(Kind.STEP))
-_STAIRS = wp.constant(int(Kind.STAIRS))
-_PALLET = wp.constant(int(Kind.PALLET))
-_DITCH = wp.constant(int(Kind.DITCH))
-_BRIDGE = wp.constant(int(Kind.BRIDGE))
-_STONES = wp.constant(int(Kind.STONES))
+_MAX_STEPS = int(PARAMETERS[Kind.STAIRS][2].high)
+_LEAD_LOW, _LEAD_HIGH = float(LEAD.low), float(LEAD.high)
+_CELLS_PER_M = 20.0
+_HALF = 0.501  # rounds to the nearest node; not at .5 exactly, where round numbers lie and devices may differ
 
 
 @wp.struct
@@ -187,11 +163,7 @@ def _riser(k: int, tread: float) -> int:
 @wp.func
 def _faces(kind: int) -> int:
     """Cells of what stands on the ground that are its two faces, beside those of its top."""
-    if kind == _SILL:
-        return 2
-    if kind == _RAIL:
-        return 2
-    if kind == _PALLET:
+    if kind == Kind.SILL or kind == Kind.RAIL or kind == Kind.PALLET:
         return 2
     return 0
 
@@ -199,9 +171,9 @@ def _faces(kind: int) -> int:
 @wp.func
 def _fitted(element: Element, shortest: float, room: int) -> Element:
     """The element with the cells that it takes, cut to those that are left; FLAT without cells if it does not fit."""
-    if element.kind == _KERB or element.kind == _STEP:
+    if element.kind == Kind.KERB or element.kind == Kind.STEP:
         element.cells = 1
-    elif element.kind == _STAIRS:
+    elif element.kind == Kind.STAIRS:
         for _ in range(_MAX_STEPS):
             element.cells = _riser(int(element.detail) - 1, element.length) + 1
             if element.cells > room and element.detail > 2.0:
@@ -212,7 +184,7 @@ def _fitted(element: Element, shortest: float, room: int) -> Element:
         if element.length < shortest:
             element.cells = room + 1
     if element.cells > room:
-        element.kind = _FLAT
+        element.kind = int(Kind.FLAT)
         element.cells = 0
         element.length = 0.0
     return element
@@ -220,11 +192,11 @@ def _fitted(element: Element, shortest: float, room: int) -> Element:
 
 @wp.func
 def _rise_of(element: Element) -> float:
-    if element.kind == _RAMP:
-        return _sign(element.turn) * element.size * float(element.cells) * _CELL
-    if element.kind == _KERB or element.kind == _STEP:
+    if element.kind == Kind.RAMP:
+        return _sign(element.turn) * element.size * float(element.cells) * SPACING
+    if element.kind == Kind.KERB or element.kind == Kind.STEP:
         return _sign(element.turn) * element.size
-    if element.kind == _STAIRS:
+    if element.kind == Kind.STAIRS:
         return _sign(element.turn) * element.size * element.detail
     return 0.0
 
@@ -232,7 +204,7 @@ def _rise_of(element: Element) -> float:
 @wp.func
 def _placed(element: Element, shortest: float, first: int, ground: float) -> Element:
     """The element as it lies behind a node, on ground of a height."""
-    element = _fitted(element, shortest, _LAST - first)
+    element = _fitted(element, shortest, LAST_COL - first)
     element.first = first
     element.ground = ground
     element.rise = _rise_of(element)
@@ -252,18 +224,18 @@ def _lay_out_kernel(
 ):
     """Grid (num_terrains,)."""
     t = wp.tid()
-    col = int(_FIRST)
+    col = int(FIRST_COL)
     ground = float(0.0)
-    for e in range(_MOST):
-        g = e * _GENES
+    for e in range(MAX_ELEMENTS):
+        g = e * GENES_PER_ELEMENT
         element = Element()
-        element.kind = int(_decode(genes[t, g], 0.0, float(_KINDS - 1), 1.0))
+        element.kind = int(_decode(genes[t, g], 0.0, float(_NUM_KINDS - 1), 1.0))
         k = element.kind
         element.size = _decode(genes[t, g + 2], lows[k, 0], highs[k, 0], whole[k, 0])
         element.length = _decode(genes[t, g + 3], lows[k, 1], highs[k, 1], whole[k, 1])
         element.detail = _decode(genes[t, g + 4], lows[k, 2], highs[k, 2], whole[k, 2])
         element.turn = _decode(genes[t, g + 5], lows[k, 3], highs[k, 3], whole[k, 3])
-        col = wp.min(col + int(_decode(genes[t, g + 1], _LEAD_LOW, _LEAD_HIGH, 1.0)), _LAST)
+        col = wp.min(col + int(_decode(genes[t, g + 1], _LEAD_LOW, _LEAD_HIGH, 1.0)), LAST_COL)
         element = _placed(element, lows[k, 1], col, ground)
         elements_out[t, e] = element
         col += element.cells
@@ -288,42 +260,41 @@ def _is_on_stone(element: Element, s: int, row: int) -> bool:
     if along < 0:
         return False
     shift = ((along / pitch) % 2) * (pitch / 2)
-    across = (row - _CENTRE + side / 2 + shift + 1000 * pitch) % pitch  # the first stones: one in the middle of the way
+    across = (row - CENTRE_ROW + side / 2 + shift + 1000 * pitch) % pitch  # one of the first lies on the way
     return along % pitch <= side and across <= side
 
 
 @wp.func
 def _relief(element: Element, s: int, row: int) -> float:
     """Height over the ground before an element [m], at the node s cells in; 0 < s < its cells."""
-    if element.kind == _RAMP:
+    if element.kind == Kind.RAMP:
         return element.rise * float(s) / float(element.cells)
-    if element.kind == _CROSS_SLOPE:  # grows over a third of its length, and goes back over another
+    if element.kind == Kind.CROSS_SLOPE:  # grows over a third of its length, and goes back over another
         tilt = wp.min(1.0, 3.0 * float(wp.min(s, element.cells - s)) / float(element.cells))
-        beside = float(wp.clamp(row - _CENTRE, -_SLOPE_ROWS, _SLOPE_ROWS)) * _CELL
+        beside = float(wp.clamp(row - CENTRE_ROW, -SLOPE_ROWS, SLOPE_ROWS)) * SPACING
         return _sign(element.turn) * element.size * tilt * beside
-    if element.kind == _SILL or element.kind == _RAIL:
+    if element.kind == Kind.SILL or element.kind == Kind.RAIL:
         return element.size
-    if element.kind == _PALLET:
+    if element.kind == Kind.PALLET:
         return element.size * element.detail
-    if element.kind == _STAIRS:
+    if element.kind == Kind.STAIRS:
         passed = float(0.0)
         for k in range(_MAX_STEPS):
             if k < int(element.detail) and s > _riser(k, element.length):
                 passed += 1.0
         return _sign(element.turn) * element.size * passed
-    if element.kind == _FLAT:
-        return 0.0
-    if element.kind == _DITCH:
-        return -element.size
-    if element.kind == _BRIDGE:
-        off = row - _CENTRE - int(element.turn) + int(element.detail) / 2
+    if element.kind == Kind.BRIDGE:
+        off = row - CENTRE_ROW - int(element.turn) + int(element.detail) / 2
         if off >= 0 and off <= int(element.detail):
             return 0.0
-        return -element.size
-    if element.kind == _STONES:
-        if _is_on_stone(element, s, row):
+    if element.kind == Kind.STONES:
+        on_stone = _is_on_stone(element, s, row)  # of another element its pitch may be 0
+        if on_stone:
             return 0.0
+    if element.kind == Kind.DITCH or element.kind == Kind.BRIDGE or element.kind == Kind.STONES:
         return -element.size
+    if element.kind == Kind.FLAT:
+        return 0.0
     block = int(element.detail)
     phase = _scattered((s - 1) / block, row / block) + element.turn + 1.0
     return element.size * wp.abs(2.0 * (phase - wp.floor(phase)) - 1.0)  # evenly spread, and continuous in the phase
@@ -353,9 +324,6 @@ def lay_out(genes: Any) -> Any:
 
     Returns:
         Warp array of :class:`Element`, shape (num_terrains, 6).
-
-    Raises:
-        ValueError: If the shape does not fit.
     """
     num_genes = MAX_ELEMENTS * GENES_PER_ELEMENT
     if genes.ndim != 2 or genes.shape[1] != num_genes:
@@ -396,9 +364,6 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
         genes: As of :func:`lay_out`.
         spacing: Distance of neighbouring grid nodes [m]: 0.05, in which elements are measured.
         heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
-
-    Raises:
-        ValueError: If the shapes do not fit each other, or the spacing is another.
     """
     if spacing != SPACING:
         raise ValueError(f"spacing must be {SPACING} m, got {spacing}: elements have whole numbers of such cells")

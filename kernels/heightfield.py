@@ -216,11 +216,7 @@ def ceiling_shape(num_terrains: int, nrow: int, ncol: int) -> tuple[int, int, in
 
 
 def max_blocks(heights: Any, ceilings_out: Any) -> None:
-    """Write the highest node of each block of ``heights`` (num_terrains, nrow, ncol) [m] to ``ceilings_out``.
-
-    Raises:
-        ValueError: If ``ceilings_out`` has not the shape :func:`ceiling_shape` gives.
-    """
+    """Write the highest node of each block of ``heights`` (num_terrains, nrow, ncol) [m] to ``ceilings_out``."""
     expected = ceiling_shape(*heights.shape)
     if tuple(ceilings_out.shape) != expected:
         raise ValueError(

@@ -143,9 +143,6 @@ def write_observation(
         noise: Noise widths.
         noise_seed: One integer on the device, to be advanced by the caller; shape (1,).
         observation_out: Shape (num_envs, 12 + 3 * num_joints + num_scan_points).
-
-    Raises:
-        ValueError: If ``observation_out`` has another shape.
     """
     num_envs, num_joints = last_action.shape
     expected = (num_envs, NUM_BASE_COLUMNS + 3 * num_joints + sensors.scan_x.shape[0])
@@ -177,9 +174,6 @@ def write_scan(joint_q: Any, terrain_of_env: Any, terrain: Terrain, sensors: Sen
         terrain: Height grids.
         sensors: Holds the scan points.
         scan_out: Shape (num_envs, num_scan_points).
-
-    Raises:
-        ValueError: If ``scan_out`` has another shape.
     """
     expected = (joint_q.shape[0], sensors.scan_x.shape[0])
     if tuple(scan_out.shape) != expected:
@@ -213,9 +207,6 @@ def apply_action(action: Any, sensors: Sensors, scale: float, last_action_out: A
         scale: Radians per unit of action.
         last_action_out: The clipped action, shape (num_envs, num_joints).
         targets_out: Targets in columns 7 and up, shape (num_envs, 7 + num_joints).
-
-    Raises:
-        ValueError: If ``action`` has another shape than ``last_action_out``.
     """
     if tuple(action.shape) != tuple(last_action_out.shape):
         raise ValueError(f"action must have shape {tuple(last_action_out.shape)}, got {tuple(action.shape)}")

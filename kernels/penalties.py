@@ -216,9 +216,6 @@ def add_penalties(
         dt: Physics step [s].
         counted: 0 where the step does not count, shape (num_envs,).
         sums_out: Sums so far, shape (num_envs, 6).
-
-    Raises:
-        ValueError: If ``sums_out`` has not one column a penalty.
     """
     if tuple(sums_out.shape) != (counted.shape[0], len(PENALTIES)):
         raise ValueError(

@@ -146,11 +146,7 @@ def _clear_rows_kernel(mask: wp.array[int], stride: int, rows_out: wp.array2d[fl
 
 
 def clear_rows(mask: Any, rows_out: Any) -> None:
-    """Set the rows of ``rows_out`` (num_envs, num_columns) to zero where the int ``mask`` (num_envs,) is not 0.
-
-    Raises:
-        ValueError: If the mask has not one entry a row.
-    """
+    """Set the rows of ``rows_out`` (num_envs, num_columns) to zero where the int ``mask`` (num_envs,) is not 0."""
     if mask.shape[0] != rows_out.shape[0]:
         raise ValueError(f"mask must have shape ({rows_out.shape[0]},), got {tuple(mask.shape)}")
     stride = min(_CLEARING_THREADS, rows_out.shape[1])

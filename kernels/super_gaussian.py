@@ -89,9 +89,6 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
         genes: Warp array, shape (num_terrains, 8 * num_bumps); per bump in the order of :data:`PARAMETERS`.
         spacing: Distance of neighbouring grid nodes [m].
         heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
-
-    Raises:
-        ValueError: If the shapes do not fit each other.
     """
     if genes.ndim != 2 or genes.shape[1] == 0 or genes.shape[1] % GENES_PER_BUMP != 0:
         raise ValueError(

@@ -39,9 +39,6 @@ class TerrainBank:
             nrow: Nodes along y.
             ncol: Nodes along x.
             with_ground: Whether they have maps of friction and softness, which contacts then pay for.
-
-        Raises:
-            ValueError: If there is no terrain or a grid has no cell.
         """
         if num_terrains < 1 or nrow < 2 or ncol < 2:
             raise ValueError(f"a bank needs at least 1 terrain of 2 x 2 nodes, got {num_terrains} of {nrow} x {ncol}")
@@ -69,9 +66,6 @@ class TerrainBank:
             heights: Shape (number of slots, nrow, ncol).
             slots: Which are replaced; all if left out.
             ground: Their friction and softness; ground that changes nothing if left out.
-
-        Raises:
-            ValueError: If the shape differs, a height is not finite, or the bank has no maps for the ground.
         """
         replaced = self.heights[slots]
         expected = tuple(replaced.shape)
@@ -106,9 +100,6 @@ class TerrainBank:
             genes: Shape (number of slots, num_genes).
             space: What the genes mean.
             slots: Which are replaced; all if left out.
-
-        Raises:
-            ValueError: If the shape differs, a gene is not finite, or the bank has no maps for the ground.
         """
         valid, replaced = space.validate(genes), self.heights[slots]
         if len(valid) != len(replaced):
@@ -144,9 +135,6 @@ def heights_of(
 
     Returns:
         Float32, shape (num_terrains, NUM_ROWS, NUM_COLS), or fewer rows and columns.
-
-    Raises:
-        ValueError: If the shape differs or a gene is not finite.
     """
     if every == 1 or not space.any_spacing:
         return terrains_of(genes, space, device=device)[0][:, ::every, ::every]

@@ -19,11 +19,7 @@ _SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(GROUND_KINDS)}))+)$")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroundMaps:
-    """Friction and softness of the patches of T terrains; docs/spaces.md says what the numbers do.
-
-    Raises:
-        ValueError: If a shape or a value is not as it must be.
-    """
+    """Friction and softness of the patches of T terrains; docs/spaces.md says what the numbers do."""
 
     friction: NDArray[np.float32]
     """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""
@@ -73,20 +69,12 @@ def patches_at(places: ArrayLike, length: float, count: int) -> NDArray[np.int64
 
 
 def check_friction(friction: NDArray[np.floating]) -> None:
-    """That values are frictions of the patches of terrains.
-
-    Raises:
-        ValueError: If not.
-    """
+    """That values are frictions of the patches of terrains."""
     _check_map("friction", friction, (friction >= LEAST_FRICTION - 1e-6) & (friction <= 1.0), f"{LEAST_FRICTION} to 1")
 
 
 def check_time_constant(time_constant_s: NDArray[np.floating]) -> None:
-    """That values are contact time constants [s] of the patches of terrains.
-
-    Raises:
-        ValueError: If not.
-    """
+    """That values are contact time constants [s] of the patches of terrains."""
     low, high = LEAST_TIME_CONSTANT_S - 1e-6, MOST_TIME_CONSTANT_S + 1e-6
     allowed = (time_constant_s == FIRM) | ((time_constant_s >= low) & (time_constant_s <= high))
     words = f"{FIRM:g} (firm), or {LEAST_TIME_CONSTANT_S} to {MOST_TIME_CONSTANT_S} s"

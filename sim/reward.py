@@ -37,9 +37,6 @@ def make_motion(sim: Simulation, cfg: TrainingCfg, *, command: Any, action: Any)
         cfg: Which joints are to keep still, how soft their limits are, and how long feet are to be in the air.
         command: Command the action answers, shape (num_envs, 3).
         action: Clipped action of the step, shape (num_envs, num_joints).
-
-    Raises:
-        ValueError: If a steady joint is none of the robot's.
     """
     robot = sim.robot
     unknown = [name for name in cfg.steady_joints if name not in robot.joint_names]
@@ -83,9 +80,6 @@ class Reward:
             command: Command the action answers, shape (num_envs, 3).
             action: Clipped action of the step, shape (num_envs, num_joints).
             falls: Outcomes that cost what a fall does.
-
-        Raises:
-            ValueError: If the settings do not fit the robot.
         """
         robot = sim.robot
         self._motion = make_motion(sim, cfg, command=command, action=action)

@@ -164,9 +164,6 @@ class Rollout:
             solver: Solver options.
             space: What the genes of terrains mean.
             with_ground: Whether heights may come with maps of the ground; with genes the space decides.
-
-        Raises:
-            ValueError: If the policy does not fit the robot, a number is not positive, or memory is too small.
         """
         if num_terrains < 1 or num_replicas < 1 or (num_envs is not None and num_envs < 1):
             raise ValueError(
@@ -291,9 +288,6 @@ class Rollout:
             ground: Friction and softness of terrains that are given by heights.
             watcher: Looks on.
             progress: Called now and then with the share that is done.
-
-        Raises:
-            ValueError: If a shape does not fit, a value is not finite, or there are too many.
         """
         self.clear()
         try:
@@ -321,9 +315,6 @@ class Rollout:
             terrains: As of :meth:`evaluate`, seeds and ground too; at most :attr:`num_free` of them.
             seeds: One a terrain.
             ground: Of heights.
-
-        Raises:
-            ValueError: As of :meth:`evaluate`.
         """
         count, idle = len(terrains), not self._lots
         if seeds.shape != (count,):

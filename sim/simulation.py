@@ -98,9 +98,6 @@ class Simulation:
             friction: Coulomb friction of each robot, shape (num_envs,); the file's where None.
             added_base_mass: Mass added to each base [kg], shape (num_envs,).
             cfg: Solver options.
-
-        Raises:
-            ValueError: If a terrain index is out of range or the robot's file and settings disagree.
         """
         if terrain_of_env.min() < 0 or terrain_of_env.max() >= bank.num_terrains:
             raise ValueError(

@@ -108,9 +108,6 @@ def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
 
     Returns:
         Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
-
-    Raises:
-        ValueError: If ``kind`` is unknown or ``level`` out of range.
     """
     d = _difficulty(kind, CROSSING_TYPES, level)
     rng = np.random.default_rng(seed)
@@ -138,9 +135,6 @@ def hand_crafted_crossings(count: int, seed: Seed) -> tuple[np.ndarray, np.ndarr
     Returns:
         Heights [m] float32 of shape (count, NUM_ROWS, NUM_COLS), types (count,) and levels (count,), both int;
         a type is an index into :data:`CROSSING_TYPES`.
-
-    Raises:
-        ValueError: If ``count`` is not positive.
     """
     _check_positive(count=count)
     types = np.arange(count) % len(CROSSING_TYPES)
@@ -166,9 +160,6 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
 
     Returns:
         Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
-
-    Raises:
-        ValueError: If ``kind`` is unknown or ``level`` out of range.
     """
     d = _difficulty(kind, TILE_TYPES, level)
     rng = np.random.default_rng(seed)
@@ -195,9 +186,6 @@ def training_tiles(num_levels: int, num_columns: int, seed: Seed) -> tuple[np.nd
     Returns:
         Heights [m] float32 of shape (num_levels * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
         index level * num_columns + column, and types (num_columns,) int, indices into :data:`TILE_TYPES`.
-
-    Raises:
-        ValueError: If ``num_levels`` is not in 1..10 or ``num_columns`` not positive.
     """
     _check_positive(num_levels=num_levels, num_columns=num_columns)
     if num_levels > NUM_LEVELS:

@@ -38,10 +38,6 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
 
     Visual shapes are left out, bodies that are fixed to each other become one. Collision shapes of a URDF are called as
     their link, with a number from 0 behind where it has several (``LF_SHANK_0``).
-
-    Raises:
-        ValueError: If a file is missing or cannot be read, or file and settings do not agree; all that is wrong is
-            named at once.
     """
     builder, problems = read_robot(robot)
     if problems:

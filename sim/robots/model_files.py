@@ -41,9 +41,6 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
         model_file: The MJCF or URDF.
         visuals: Whether a URDF keeps what it shows of a link, where that is a primitive or a mesh that is there and
             can be read; the simulation needs none of it.
-
-    Raises:
-        ValueError: If it is neither MJCF nor URDF, a xacro file, or files are missing; all of them are named.
     """
     lines: dict[ET.Element, int] = {}
     root = _parse(model_file, lines, visuals=visuals)

@@ -23,12 +23,7 @@ _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 
 
 def load_robot(path: Path) -> RobotCfg:
-    """Runs a settings file and checks the robot that it sets against its model.
-
-    Raises:
-        ValueError: If the file is missing or fails, sets no ``ROBOT``, or something in the settings or the model is
-            wrong. The message names all that is wrong.
-    """
+    """Runs a settings file and checks the robot that it sets against its model."""
     robot: Any = getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__

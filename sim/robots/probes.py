@@ -191,9 +191,6 @@ def hull_probes(vertices: _Array) -> HullProbes:
 
     Args:
         vertices: Shape (num_vertices, 3) [m].
-
-    Raises:
-        ValueError: If they span no volume.
     """
     return _probes_of(np.ascontiguousarray(vertices, dtype=np.float64).tobytes())
 
@@ -277,9 +274,6 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
         scale: Newton's shape scale [m]: (radius,), (radius, half height) or (half x, half y, half z); of a mesh its
             factors along x, y and z.
         mesh: Newton's mesh, which collides as its convex hull.
-
-    Raises:
-        ValueError: For any other shape, one without size or longer than :data:`MAX_SIDE`, or a mesh without volume.
     """
     sizes = np.asarray(scale, dtype=np.float64)[: _NUM_SIZES.get(shape_type, 0)]
     vertices = np.asarray(mesh.vertices, dtype=np.float64) * scale if shape_type in _MESHES else np.zeros((1, 3))
@@ -314,11 +308,7 @@ def placed(pose: Any, point: np.ndarray) -> Any:
 
 
 def make_probes(builder: newton.ModelBuilder) -> Probes:
-    """Sphere probes of all collision shapes of one robot, on the current device.
-
-    Raises:
-        ValueError: If a shape has no probes; all such shapes are named.
-    """
+    """Sphere probes of all collision shapes of one robot, on the current device."""
     centres, radius, spread, body, shape, problems = [], [], [], [], [], []
     for k in range(builder.shape_count):
         if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:

@@ -157,9 +157,6 @@ class RobotCfg:
 
         Args:
             policy: Controller that the command line names, for the command that measures them.
-
-        Raises:
-            ValueError: If they were never measured, not for these penalties, or with a robot that has changed since.
         """
         given = policy if self.settings_file is not None else None  # a shipped robot's are of its own controller
         remedy = f"run `{command_line('calibrate', robot=self.spec, policy=given)}`"

@@ -25,9 +25,6 @@ def robot_spec(robot: RobotCfg) -> Any:
     Shapes without a name are named as the simulation names them: those of a URDF by their link, those of an MJCF that
     touch anything ``<body>_geom_<k>``. A body with visual shapes shows those alone: what a URDF shows of a link, and
     meshes of an MJCF that touch nothing.
-
-    Raises:
-        ValueError: If MuJoCo cannot read the file, or finds other joints.
     """
     try:
         spec = _urdf_spec(robot) if read_model_files(robot.model_file).is_urdf else _mjcf_spec(robot)
@@ -43,11 +40,7 @@ def robot_spec(robot: RobotCfg) -> Any:
 
 
 def robot_model(spec: Any, robot: RobotCfg) -> Any:
-    """The ``MjModel`` of a specification of the robot, which may have been added to.
-
-    Raises:
-        ValueError: If MuJoCo cannot make one.
-    """
+    """The ``MjModel`` of a specification of the robot, which may have been added to."""
     try:
         return spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
@@ -132,11 +125,7 @@ class Skeleton:
     """A robot's bodies; the world is none of them."""
 
     def __init__(self, robot: RobotCfg) -> None:
-        """Read the robot's file.
-
-        Raises:
-            ValueError: If MuJoCo cannot read the file, or its joints are not a free one and the robot's.
-        """
+        """Read the robot's file."""
         self._model = model = robot_model(robot_spec(robot), robot)
         self.num_coordinates = _FREE_COORDINATES + robot.num_joints
         """Columns of ``qpos``."""
@@ -149,11 +138,7 @@ class Skeleton:
         """What is to be seen of it, in the file's order."""
 
     def geom(self, name: str) -> Geom:
-        """A shape by the name that the simulation has for it, to be seen or not.
-
-        Raises:
-            ValueError: If there is none of that name.
-        """
+        """A shape by the name that the simulation has for it, to be seen or not."""
         model = self._model
         names = [model.geom(k).name for k in range(model.ngeom)]
         if name not in names:
@@ -197,9 +182,6 @@ class Skeleton:
         Returns:
             Origins in the world [m], shape (num_frames, num_bodies, 3), and body-to-world quaternions w x y z, shape
             (num_frames, num_bodies, 4).
-
-        Raises:
-            ValueError: If the shape is another one.
         """
         if qpos.ndim != 2 or qpos.shape[1] != self.num_coordinates:
             raise ValueError(f"qpos must have shape (num_frames, {self.num_coordinates}), got {qpos.shape}")

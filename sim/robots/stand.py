@@ -71,11 +71,7 @@ class Standing:
 
 
 def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32, seed: int = 0) -> Standing:
-    """Stands one robot on flat ground for ``seconds`` and drops ``drops`` others in drawn poses on drawn terrains.
-
-    Raises:
-        ValueError: If settings and model do not agree.
-    """
+    """Stands one robot on flat ground for ``seconds`` and drops ``drops`` others in drawn poses on drawn terrains."""
     builder = build_robot(robot)
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)

@@ -118,21 +118,13 @@ class TerrainSpace(Protocol):
         return ()
 
     def uniform_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
-        """Genes drawn uniformly from [-1, 1], shape (count, num_genes).
-
-        Raises:
-            ValueError: If ``count`` is not positive.
-        """
+        """Genes drawn uniformly from [-1, 1], shape (count, num_genes)."""
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
         return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, self.num_genes)).astype(np.float32)
 
     def validate(self, genes: ArrayLike) -> NDArray[np.float32]:
-        """Genes as float32, shape (num_terrains, num_genes), not clipped.
-
-        Raises:
-            ValueError: If the shape differs or a gene is not finite.
-        """
+        """Genes as float32, shape (num_terrains, num_genes), not clipped."""
         array = np.asarray(genes, dtype=np.float32)
         if array.ndim != 2 or array.shape[1] != self.num_genes:
             raise ValueError(

@@ -90,9 +90,6 @@ class Course(TerrainSpace):
 
         Args:
             genes: Shape (num_terrains, 36).
-
-        Raises:
-            ValueError: If the shape differs or a gene is not finite.
         """
         with wp.ScopedDevice(host_device()):
             found: Any = course.lay_out(wp.array(self.validate(genes), dtype=float)).numpy()

@@ -35,9 +35,6 @@ def rendered(crossed: Crossed, robot: RobotCfg, scales: dict[str, float]) -> byt
         crossed: At least one valid crossing of the terrain.
         robot: Who crossed it.
         scales: What each penalty is divided by.
-
-    Raises:
-        ValueError: If there is no OpenGL.
     """
     recording = crossed.recording
     episode = typical_episode(recording, scales)
