@@ -91,7 +91,7 @@ class EvaluatorCfg:
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
-    """Terrain space of the genes, as :func:`sim.space.load_space` takes it."""
+    """Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it."""
     resolved: bool = False
     """Whether contact is resolved (:func:`sim.simulation.resolved`), which takes five times as long."""
 
