@@ -107,7 +107,7 @@ class RobotCfg:
     @property
     def observation_size(self) -> int:
         """Columns of the observation row."""
-        from kernels.observation import NUM_BASE_COLUMNS  # Warp takes a second to load: not for the help of commands
+        from kernels.observation import NUM_BASE_COLUMNS  # with Warp, which the help of commands does not need
 
         return NUM_BASE_COLUMNS + 3 * self.num_joints + self.num_scan_points
 
@@ -138,7 +138,7 @@ class RobotCfg:
 
     def role_of(self, geom: str) -> int:
         """Role bits of a geom (:mod:`kernels.penalties`)."""
-        from kernels.penalties import BASE, FOOT, LIMB
+        from kernels.penalties import BASE, FOOT, LIMB  # likewise
 
         return BASE * (geom in self.base_geoms) + FOOT * (geom in self.foot_geoms) + LIMB * (geom in self.limb_geoms)
 

@@ -63,7 +63,6 @@ CHANGES = [  # what is changed in the settings, and the field or part that the e
     (MORE, MORE + GAINS, "FL_hip"),  # the file has position actuators
     (MORE, f"{MORE} effort_limit=(1.0,) * 4,", "effort_limit"),
     (MORE, f"{MORE} contact_time_constant_s=0.004,", "contact_time_constant_s"),
-    ("height=0.29", "height=0,29", "SyntaxError"),
 ]
 
 
