@@ -121,14 +121,6 @@ def test_robots_whose_episode_ended_are_parked_and_the_others_left_alone(device)
     assert np.isfinite(q).all()
 
 
-def test_the_episode_lasts_twenty_seconds(device, anymal):
-    # 20 s of 0.005 s are 4,000 steps: the 3,999th leaves it running, the 4,000th ends it.
-    state = make_state(1, device, steps=3998)
-    assert latch(upright(1, 3), device, anymal, state) == [Outcome.RUNNING]
-    assert latch(upright(1, 3), device, anymal, state) == [Outcome.TIME_OUT]
-    assert state.steps.numpy()[0] == 4000
-
-
 def test_an_invalid_episode_says_why_and_a_cause_goes_before_what_comes_of_it(device, anymal):
     # Seven robots: one fault each, then two that have several, of which the first in the order ACTION, OVERFLOW, STATE,
     # SPEED is named; the last one walks.

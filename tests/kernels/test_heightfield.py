@@ -174,17 +174,7 @@ def test_block_maxima_share_the_border_nodes(device):
     np.testing.assert_array_equal(make_terrain(grid, device).ceilings.numpy(), [[[2, 2], [2, 2]]])
 
 
-def test_ceilings_below_zero_stay_below(device):
-    np.testing.assert_array_equal(make_terrain(np.full((1, 9, 17), -3.0), device).ceilings.numpy(), [[[-3, -3]]])
-
-
 def test_wrong_ceiling_shape_is_named(device):
     heights = wp.zeros((2, 17, 33), dtype=float, device=device)
     with pytest.raises(ValueError, match=r"\(2, 2, 4\).*got \(2, 2, 5\).*ceiling_shape"):
         max_blocks(heights, wp.zeros((2, 2, 5), dtype=float, device=device))
-
-
-def test_cpu_is_deterministic():
-    terrain, points = make_terrain(rough(33, 49)[None], "cpu"), scatter(33, 49, 300)
-    for one, other in zip(sample(terrain, points, 0.05, "cpu"), sample(terrain, points, 0.05, "cpu"), strict=True):
-        np.testing.assert_array_equal(one, other)

@@ -124,13 +124,6 @@ def test_a_start_depends_on_its_seed_and_replica_alone(device, anymal):
     assert len(np.unique(qd[:, 0])) == 9
 
 
-def test_cpu_is_deterministic(anymal):
-    grids = rough(161, 321)[None]
-    one, other = start([3], 10, grids, "cpu", anymal), start([3], 10, grids, "cpu", anymal)
-    np.testing.assert_array_equal(one[0], other[0])
-    np.testing.assert_array_equal(one[1], other[1])
-
-
 def test_only_masked_rows_are_cleared(device):
     rows = wp.array(np.arange(1, 13, dtype=np.float32).reshape(4, 3), device=device)
     clear_rows(wp.array([0, 1, 0, 7], dtype=int, device=device), rows)

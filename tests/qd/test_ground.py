@@ -16,7 +16,6 @@ from qd.show.crossed import crossed_of
 from qd.show.crossing_figures import draw_paths
 from qd.show.elites import find_archive
 from qd.show.recordings import Recordings, on_elite, on_heights
-from qd.show.replay import draw, replay
 from qd.show.report.relief import reliefs_of
 from qd.show.view.meshes import terrain_mesh
 from qd.workers.evaluator import Compute
@@ -76,18 +75,6 @@ def test_the_run_names_its_ground_and_goes_on_with_it(searched, capsys):
     assert "--ground" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("--ground", "ice"), "unknown ground 'ice': expected friction, softness or both"),
-        (("--ground", "friction", "--space", "course+softness"), "has ground of its own, softness"),
-    ],
-)
-def test_what_cannot_be_searched_is_said_in_a_line(words, says, capsys):
-    assert search("--run-dir", "run", "--iterations", "1", *TINY, *words) == 2
-    assert says in capsys.readouterr().err
-
-
 def test_exported_ground_is_read_back(searched):
     Export(run=searched, elite="0", formats=("npz", "xml")).execute()
     found = read_heightmap(searched / "terrains/elite-0.npz")
@@ -137,26 +124,6 @@ def test_a_minimal_terrain_may_be_a_patch(minimised, tmp_path):
     assert not found.heights.any()
     np.testing.assert_allclose(found.ground.friction, slippery, rtol=1e-6)
     assert not found.ground.time_constant_s.any()
-
-
-def test_a_minimal_terrain_is_replayed_with_its_ground(minimised):
-    run, number, _ = minimised
-    found = find_archive(None, run)
-    done = replay(found, found.terrain("0", str(number)), replicas=1, policy="shipped")
-    assert done.recording.ground.friction[0, 1, 3] == pytest.approx(0.15)
-    assert np.count_nonzero(done.recording.ground.friction < 1.0) == 1 and not done.recording.heights.any()
-    labels = [text.get_text() for text in draw(done).legends[0].get_texts()]
-    assert "slippery" in labels and "soft" not in labels
-
-
-def test_a_map_with_ground_must_have_the_size_of_a_terrain(tmp_path):
-    file = tmp_path / "hill.npz"
-    np.savez(file, heights=np.zeros((20, 20)), size_m=(4.0, 4.0), friction=np.ones((4, 8)))
-    with pytest.raises(ValueError, match="must be 16 m x 8 m, got 4 m x 4 m"):
-        read_heightmap(file)
-    np.savez(file, heights=FLAT, size_m=(16.0, 8.0), friction=np.full((4, 8), 3.0))
-    with pytest.raises(ValueError, match=r"hill\.npz: friction must be 0.15 to 1, got 3"):
-        read_heightmap(file)
 
 
 def test_recordings_keep_the_ground(searched, anymal):

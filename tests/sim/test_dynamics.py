@@ -190,9 +190,3 @@ def test_disabled_forces_take_their_step(device: str) -> None:
     assert isinstance(dynamics_of(m, d), Dynamics)
     m.opt.disableflags |= Mujoco.mjtDisableBit.mjDSBL_GRAVITY
     assert isinstance(dynamics_of(m, d), TheirDynamics)
-
-
-def test_a_model_that_collides_itself_takes_its_step(device: str) -> None:
-    m, d = model_of(device)
-    m.opt.run_collision_detection = True
-    assert not fits_dynamics(m, d)

@@ -1,9 +1,7 @@
-"""Figures of all elites: shares against each other, and failure modes.
+"""The figure of the failure modes.
 
 Okabe and Ito's colours, apart for every kind of colour blindness; markers and hatches tell the same apart in grey.
 """
-
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,70 +11,8 @@ from qd.groups import TOLERANCE, Elites, Modes
 from qd.show.figures import label_of, look_of
 from sim.files.figures import new_figure
 
-_MODE_LOOKS = {
-    "collision_rate": (("#d55e00", "X"), ("#e69f00", "D"), ("#cc79a7", "^")),
-    "other_rate": (("#0072b2", "s"), ("#56b4e9", "v")),
-    "goal_rate": (("#009e73", "o"), ("#000000", "P")),
-}
-"""Colours and markers of failure modes by how most of their crossings end, as of the ends themselves."""
 _ENDS = (("goal_rate", "goal", "#009e73", "o"), ("collision_rate", "base collision", "#d55e00", "X"),
          ("other_rate", "stuck, late or off", "#0072b2", "s"))  # fmt: skip
-
-
-def mode_looks(modes: Modes) -> list[tuple[str, str]]:
-    """Colour and marker of each mode, no two alike."""
-    free = {end: list(looks) for end, looks in _MODE_LOOKS.items()}
-    chosen = []
-    for mode in modes.modes:
-        own = max(free, key=lambda end: getattr(mode, end))
-        chosen.append((free[own] or max(free.values(), key=len)).pop(0))
-    return chosen
-
-
-def draw_pairs(elites: Elites, modes: Modes) -> Figure:
-    """Every two shares of the penalties against each other, a point an elite, by failure mode.
-
-    Args:
-        elites: What to draw.
-        modes: The modes they are in.
-    """
-    count = len(elites.penalties)
-    figure = new_figure(1.75 * (count - 1) + 1.2, 1.7 * (count - 1) + 0.9)
-    grid: Any = figure.subplots(count - 1, count - 1, sharex="col", sharey="row", squeeze=False)
-    top = min(1.0, 0.1 * np.ceil(10.0 * float(elites.ratios.max()) + 0.2))
-    ticks = np.arange(0.0, top + 1e-9, 0.2 if top > 0.3 else 0.1)
-    for row, column in np.ndindex(count - 1, count - 1):
-        axes = grid[row, column]
-        if column > row:
-            axes.set_axis_off()
-            continue
-        _scatter(axes, elites, modes, column, row + 1)
-        axes.set(xlim=(-0.02, top), ylim=(-0.02, top))
-        axes.set(xticks=ticks, yticks=ticks)
-        axes.set_aspect("equal")
-        axes.grid(alpha=0.3)
-        if row == count - 2:
-            axes.set_xlabel(look_of(elites.penalties[column]).label, fontsize=9)
-        if column == 0:
-            axes.set_ylabel(look_of(elites.penalties[row + 1]).label, fontsize=9)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    place: dict[str, Any] = (
-        {"loc": "upper right"} if count > 3 else {"loc": "outside lower center", "ncols": len(labels)}
-    )
-    figure.legend(handles, labels, title="mode (elites)", markerscale=1.8, frameon=False, **place)
-    return figure
-
-
-def _scatter(axes: Axes, elites: Elites, modes: Modes, x: int, y: int) -> None:
-    if len(crossed := np.flatnonzero(modes.labels == 0)):
-        style = {"s": 8, "color": "0.75", "marker": ".", "linewidths": 0}
-        axes.scatter(
-            elites.ratios[crossed, x], elites.ratios[crossed, y], label=f"not failing ({len(crossed)})", **style
-        )
-    for mode, (colour, marker) in zip(modes.modes, mode_looks(modes), strict=True):
-        style = {"s": 12, "color": colour, "marker": marker, "alpha": 0.65, "linewidths": 0}
-        label = f"{mode.number}: {mode.ending} ({len(mode.members)})"
-        axes.scatter(elites.ratios[mode.members, x], elites.ratios[mode.members, y], label=label, **style)
 
 
 def draw_modes(elites: Elites, modes: Modes) -> Figure:

@@ -7,12 +7,10 @@ import numpy as np
 from qd.archive import Archive
 from qd.faults import FRESH_EPISODES, any_of, count_faults, fault_words
 from qd.fitness import FAILING_GOAL_RATE
-from qd.groups import Elites
 from qd.run.progress import clock
 from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
 from qd.show.report.elites import failures
 from qd.show.report.evaluation import most_mended
-from qd.show.report.figures import draw_pairs
 from qd.show.report.material import Shown
 from qd.show.report.page import (
     Block,
@@ -194,45 +192,13 @@ def archive_section(shown: Shown) -> list[Block]:
         paragraph(lines),
         picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
         Folded(
-            "Show the elites by interval of each share, and every two shares against each other",
+            "Show the elites by interval of each share",
             [
                 paragraph(spread_text),
                 picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
-                *_pairs(shown),
             ],
         ),
     ]
-
-
-def _pairs(shown: Shown) -> list[Block]:
-    """Every two shares against each other."""
-    elites = shown.elites
-    if len(elites) < 3:
-        too_few = f"The projections are left out: they need 3 elites, and there are {len(elites)}."
-        longer = without_machine(command_line("archive", resume=shown.material.run, iterations="N"))
-        return [absent(f"{too_few} A longer search finds more:", longer)]
-    text = (
-        f"Each point is one of {counted(len(elites), 'elite')}, in the look of its failure mode; grey ones do not fail."
-    )
-    text += _related(elites)
-    shows = "Scatter plots of every two shares of the penalties, by failure mode"
-    return [paragraph(text), picture("pairs", draw_pairs(elites, shown.modes), shows)]
-
-
-def _related(elites: Elites) -> str:
-    """Which shares go together, and in how few directions they vary; nothing of shares that do not."""
-    changing = np.flatnonzero(elites.ratios.std(axis=0) > 0.0)
-    if len(changing) < 3:  # of two shares, one is what the other leaves
-        return ""
-    related = np.corrcoef(elites.ratios[:, changing].T) - np.eye(len(changing))
-    names = [label_of(elites.penalties[column]) for column in changing]
-    low, high = (np.unravel_index(pick(related), related.shape) for pick in (np.argmin, np.argmax))
-    text = f" The shares of {names[low[0]]} and {names[low[1]]} are the most opposed (correlation {related[low]:.2f})"
-    if related[high] > 0.0:
-        text += f", those of {names[high[0]]} and {names[high[1]]} go together the most ({related[high]:.2f})"
-    variances = np.linalg.eigvalsh(np.cov(elites.ratios.T))[::-1]
-    share = float(variances[:2].sum() / variances.sum())
-    return f"{text}. Two principal directions hold {percent(share)} of their variance."
 
 
 def origin_section(shown: Shown) -> list[Block]:

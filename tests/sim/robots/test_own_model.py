@@ -15,10 +15,8 @@ from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes
 from sim.rollout import Rollout
 from sim.simulation import Simulation
-from tests.kernels import oracle
-from tests.sim.dogs import GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, urdf, with_mesh, write_dog
-from tests.sim.robots.test_drops import above_ground, measure_gaps, mixed_ground
-from tests.sim.scenes import Stepper, put, velocities
+from tests.sim.dogs import GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, urdf, with_mesh, write_dog
+from tests.sim.scenes import put
 
 FLAT = np.zeros((1, 161, 321), np.float32)
 
@@ -126,21 +124,6 @@ def test_friction_and_time_constant_of_the_settings_count(tmp_path, device):
     assert (np.abs(solref - [0.02, 1.0]).max(axis=1) < 1e-6).sum() >= 13
 
 
-@pytest.mark.parametrize("actuators", ["motor", "none"])
-def test_gains_of_the_settings_are_those_of_position_actuators(tmp_path, device, actuators):
-    robots = [
-        get_robot(str(write_dog(tmp_path / "a"))),
-        get_robot(str(write_dog(tmp_path / "b", model=mjcf(actuators=actuators), more=GAINS))),
-    ]
-    ends = []
-    for robot in robots:
-        rollout = Rollout(robot, f"{tmp_path}/a/dog_trot.py:Trot", num_terrains=1, num_replicas=4, device=device)
-        result = rollout.evaluate(FLAT, np.zeros(1, np.uint32))
-        assert (result.outcome == Outcome.GOAL).all()
-        ends.append(result)
-    np.testing.assert_allclose(ends[0].duration_s, ends[1].duration_s, atol=1.0)
-
-
 def test_the_trot_takes_a_urdf_to_the_goal(tmp_path, device):
     dog = get_robot(str(write_dog(tmp_path, **KINDS["urdf"])))
     rollout = Rollout(dog, f"{tmp_path}/dog_trot.py:Trot", num_terrains=1, num_replicas=4, device=device)
@@ -159,34 +142,6 @@ def test_a_mesh_of_a_file_is_read(mesh_dog):
     reach = [np.abs(probes.position.numpy()[starts[k] : starts[k + 1]]).max(0) + radii[k] for k in mine]
     np.testing.assert_allclose(np.max(reach, axis=0), TRUNK, atol=0.01)
     assert len(read_model_files(mesh_dog.model_file).files) == 2
-
-
-def test_dropped_dogs_with_a_mesh_lie_on_the_ground(mesh_dog, device):
-    grids, terrain_of_env = mixed_ground(24, device)
-    bank = TerrainBank(len(grids), device=device)
-    bank.set_heights(grids)
-    sim = Simulation(mesh_dog, bank, terrain_of_env)
-    put(sim, above_ground(sim, mesh_dog, np.random.default_rng(5)))
-    overflow = np.zeros(24, int)
-    Stepper(sim).run(3.0, lambda: np.bitwise_or(overflow, np.array(sim.overflow.numpy()), out=overflow))
-    gap, _ = measure_gaps(sim)
-    settled = np.abs(velocities(sim)[:, :6]).max(axis=1) < 0.5
-    assert not (overflow & 0xFFFF & ~(512 | 1024)).any()
-    assert settled.mean() > 0.8
-    assert gap.min() > -0.02 and gap[settled].max() < 0.02
-    # Corners of the trunk, as the mesh has them: none deeper than the probes leave open.
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * TRUNK
-    heights = np.array(bank.heights.numpy(), dtype=np.float64)
-    poses = np.array(sim.joint_q.numpy(), dtype=np.float64)
-    deepest = min(
-        oracle.nearest_on_surface(
-            heights[terrain_of_env[env]], 0.05, pose[:3] + oracle.rotation_matrix(pose[3:7]) @ corner, 0.3
-        )[0]
-        for env, pose in enumerate(poses)
-        for corner in corners
-        if settled[env]
-    )
-    assert deepest > -0.03
 
 
 def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):

@@ -47,7 +47,7 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
     assert b"default-src 'none'" in content and str(out.parent.parent).encode() not in content
     figures = sorted(path.name for path in (out.parent / "report-figures").iterdir())
     assert len(figures) == len(page.resources)
-    assert {"curves.png", "archive.png", "spread.png", "pairs.png", "modes.png", "elite-0.png"} <= set(figures)
+    assert {"curves.png", "archive.png", "spread.png", "modes.png", "elite-0.png"} <= set(figures)
     assert sum(name.startswith("failing-") for name in figures) == 2
     for name in figures:
         assert matplotlib.image.imread(out.parent / "report-figures" / name).std() > 0.01  # something is drawn

@@ -142,18 +142,6 @@ def test_the_worst_elite_is_there_with_its_crossing(tab):
     assert tab._clock.duration_s == pytest.approx(20.0)
 
 
-def test_a_folder_of_any_name_is_shown_as_text(show, run, tmp_path):
-    folder = tmp_path / "a`<img src=x onerror=alert(1)>"
-    folder.mkdir()
-    (folder / "archive.npz").write_bytes((run / "archive.npz").read_bytes())
-    odd = find_show(folder, elite="0", policies=("base=shipped",))
-    shown = Shown(odd, Recordings(odd.robot, folder=tmp_path / "cache"))
-    try:
-        assert "a`&lt;img src=x onerror=alert(1)&gt;" in shown.tab._list._title.content
-    finally:
-        shown.close()
-
-
 def test_what_one_tab_does_no_other_tab_sees(shown):
     one, two = shown.tab, shown.come("?elite=171&t=3")
     assert "Elite 0" in one._panel._details.content and "Elite 171" in two._panel._details.content
@@ -194,16 +182,6 @@ def test_a_link_opens_what_it_was_copied_from(shown):
     while not any(two._query in script for script in shown.visitors[1].scripts):
         assert time.perf_counter() < until
         time.sleep(0.05)
-
-
-def test_the_address_follows_the_camera(shown):
-    visitor, tab = shown.visitors[0], shown.tab
-    visitor.look((1.0, 2.0, 9.0), (3.0, 4.0, 0.5))
-    until = time.perf_counter() + 10.0
-    while "initialCameraPosition=1.00,2.00,9.00&initialCameraLookAt=3.00,4.00,0.50" not in tab._query:
-        assert time.perf_counter() < until, tab._query
-        time.sleep(0.05)
-        tab.show_address()
 
 
 def test_what_is_not_there_is_refused_in_words(shown):
@@ -247,17 +225,6 @@ def test_what_touches_is_coloured_while_it_touches(shown):
     tab._show_episode()
     assert not any(handle.visible for handle in tab.scene._touches.values())
     assert "before touches of bodies were kept" in status(tab)
-
-
-def test_one_goes_from_mark_to_mark(shown):
-    tab, found = shown.tab, []
-    for _ in range(4):
-        shown.do((tab.go_to_next_mark,))
-        found.append(tab._clock.time_s)
-    marks = tab._crossing.marks
-    assert [mark.words for mark in marks] == ["first stumble", "first collision", "end: out of time"]
-    assert found == pytest.approx([mark.time_s for mark in (*marks, marks[0])])
-    assert all(f"{mark.words}, {mark.time_s:.1f} s" in tab._panel._curves.content for mark in marks)
 
 
 def test_episodes_are_chosen_by_their_outcome(shown):
@@ -388,22 +355,6 @@ def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
     assert not tab.scene._ghost.visible and tab._panel._ghost_status.content == ""
     shown.do((tab.choose_controller, "base"), (tab.choose_ghost, "none"))
     assert not tab.scene._ghost.visible
-
-
-def test_time_lasts_until_the_longer_of_both_has_ended(shown):
-    tab = shown.tab
-    shown.do((tab.choose_replica, 16))  # 5.3 s
-    short = tab._clock.duration_s
-    assert short < 6.0
-    shown.do((tab.choose_ghost, "other"))
-    tab.ghost.recording = dataclasses.replace(  # the others' way: 20 s
-        tab.ghost.recording, num_frames=np.roll(tab.ghost.recording.num_frames, 1, axis=1),
-        duration_s=np.roll(tab.ghost.recording.duration_s, 1, axis=1),
-    )  # fmt: skip
-    shown.do((tab.choose_replica, 15), (tab.choose_replica, 16), (tab.seek, 19.0))
-    assert tab._clock.duration_s == pytest.approx(20.0) and tab._clock.time_s == 19.0
-    ended = tab._crossing.positions[-1, 0]
-    np.testing.assert_allclose(tab.scene._bodies[0].position, ended)  # it stays where it ended
 
 
 def test_a_ghost_is_recorded_like_what_is_shown(shown):

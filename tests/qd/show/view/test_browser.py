@@ -98,63 +98,6 @@ def test_a_line_of_the_plot_is_named_and_clicked(opened):
     see(page, f"^Elite {named[1]}$")
 
 
-def test_two_tabs_have_states_of_their_own(opened):
-    one, two = opened("?elite=0"), opened("?elite=0&controller=C-G")
-    for page in (one, two):
-        see(page, "^Episode 1: ")
-    one.bring_to_front()
-    one.keyboard.press("m")
-    wait_until(one, lambda now: float(now.get("t", 0)) > 0.0)
-    one.keyboard.press("o")
-    two.bring_to_front()
-    two.wait_for_timeout(1500)
-    assert (said(two)["controller"], said(two)["t"]) == ("C-G", "0")
-    number = click_another(two, "0")
-    see(two, f"^Elite {number}$")
-    wait_until(two, lambda now: now["elite"] == number)
-    one.bring_to_front()
-    one.wait_for_timeout(1500)
-    assert said(one)["elite"] == "0" and said(one)["controller"] == "base"
-    assert said(one)["initialCameraPosition"] != said(two)["initialCameraPosition"]
-
-
-def test_a_link_opens_what_it_shows_and_a_reload_keeps_it(opened):
-    one = opened("?elite=0&controller=C-G&ghost=base&episode=17&t=1.4")
-    see(one, "^Episode 17: ")
-    see(one, "^Ghost, base: ")
-    one.keyboard.press("o")
-    one.wait_for_timeout(1500)
-    one.get_by_role("button", name="copy link").click()
-    see(one, "^Link copied$")
-    link = one.evaluate("navigator.clipboard.readText()")
-    before = said(one)
-    assert (before["t"], before["episode"], before["controller"], before["ghost"]) == ("1.4", "17", "C-G", "base")
-    two = opened(link)
-    one.reload()
-    for page in (one, two):
-        page.bring_to_front()  # a browser draws nothing in a tab behind another
-        see(page, "^Episode 17: ")
-        page.wait_for_timeout(2000)
-        assert said(page) == before
-
-
-def test_what_is_not_there_is_refused_in_words(opened):
-    page = opened("?elite=99999")
-    see(page, r"^There is no elite 99999 here: there are 0 to \d+\.$")
-    see(page, "^Episode 1: ")
-    number = page.locator("form input[type=text], form input:not([type])").first
-    number.fill("")
-    number.press_sequentially("88888", delay=100)
-    page.wait_for_timeout(1000)
-    assert said(page)["elite"] == "0"  # nothing happens before Enter
-    number.press("Enter")
-    see(page, "^There is no elite '88888' here")
-    number.fill("")
-    number.press_sequentially("12", delay=100)
-    number.press("Enter")
-    see(page, "^Elite 12$")
-
-
 def test_keys_do_what_the_panels_do(opened):
     page = opened("?elite=0")
     see(page, "^Episode 1: ")
@@ -211,11 +154,3 @@ def test_the_robot_can_be_seen_in_windows_of_all_sizes(opened, size):
         panel = page.get_by_text("faultline", exact=True).first
         panel.click()  # folds the rest
         page.get_by_role("button", name="Play").wait_for(state="hidden")
-
-
-def test_the_command_is_copied(opened):
-    page = opened("?elite=0")
-    see(page, "^Episode 1: ")
-    page.get_by_role("button", name="copy command").click()
-    see(page, "^Command copied$")
-    assert "replay --robot anymal" in page.evaluate("navigator.clipboard.readText()")
