@@ -124,11 +124,11 @@ def test_a_run_goes_on_with_no_other_space(ridges, searched, capsys, monkeypatch
         assert search("--resume", "run", "--iterations", "3", "--device", "cpu", *words) == 2
         return capsys.readouterr().err
 
-    assert "which is code: name it again (--space mine/space.py:Ridges)" in refused()
+    assert "--space mine/space.py:Ridges" in refused()
     assert "mine/space.py:Ridges" in refused("--space", "course")
     file = searched.parent / "mine/space.py"
     file.write_text(file.read_text().replace("0.9", "0.8"))
-    assert "its code has changed since" in refused("--space", ridges)
+    assert "has changed" in refused("--space", ridges)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_a_run_alone_runs_nothing(searched, monkeypatch, look):
     searched.rename(searched.parent / "moved")
     (searched.parent / "runs").mkdir()
     (searched.parent / "moved").rename(searched.parent / "runs/anymal-1")
-    with pytest.raises(ValueError, match=r"which is code: name it again \(--space mine/space.py:Ridges\)"):
+    with pytest.raises(ValueError, match="--space mine"):
         look()
     assert not spaces._loaded
 
