@@ -113,12 +113,13 @@ def differences(stored: Settings, settings: Settings, prefix: str = "") -> list[
     """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
     lines = []
     for name in sorted(stored.keys() | settings.keys()):
-        pair = stored.get(name), settings.get(name)
-        if isinstance(pair[0], dict) and isinstance(pair[1], dict):
-            lines += differences(*pair, f"{prefix}{name}.")
-        elif pair[0] != pair[1]:
-            before, after = (text if len(text := json.dumps(value)) <= 40 else f"{text[:37]}..." for value in pair)
-            lines.append(f"{prefix}{name} ({before} there, {after} wanted)")
+        before, after = stored.get(name), settings.get(name)
+        if isinstance(before, dict) and isinstance(after, dict):
+            lines += differences(before, after, f"{prefix}{name}.")
+        elif before != after:
+            texts = (json.dumps(value) for value in (before, after))
+            shown, asked = (text if len(text) <= 40 else f"{text[:37]}..." for text in texts)
+            lines.append(f"{prefix}{name} ({shown} there, {asked} wanted)")
     return lines
 
 
