@@ -106,6 +106,13 @@ def test_a_damaged_pack_is_refused(pack, file):
         read_pack(Path("pack"))
 
 
+def test_terrains_of_another_making_are_refused(pack):
+    chosen = [candidate(elite) for elite in (3, 7, 9)]
+    write_terrains(Path("pack"), rounded(pack[::-1]), chosen, {})
+    with pytest.raises(ValueError, match=r"pack\.npz"):
+        read_pack(Path("pack"))
+
+
 @pytest.mark.parametrize("key", ["terrains", "rates", "terrains_sha256", "robot_sha256"])
 def test_a_pack_without_something_is_refused(pack, key):
     content = json.loads(Path("pack/pack.json").read_text())
@@ -132,6 +139,10 @@ def test_rates_over_a_pack_are_means_with_families_drawn_together():
     assert rates["goal_interval"] == [0.0, 1.0]  # two families: a quarter of the resamples each has one alone
     (line,) = grouped(abouts, {"this": rows})["mode"]
     assert (line["terrains"], line["failing"]) == (3, {"this": 1})
+    # Nine of one family that all arrive, and one that does not: resamples of terrains hardly ever have 3 of that.
+    many = [{**abouts[0], "family": int(place == 9)} for place in range(10)]
+    wide = over_all(rows_of(result_of([[GOAL] * 4] * 9 + [[HIT] * 4])), many, 0)
+    assert wide["goal_rate"] == pytest.approx(0.9) and wide["goal_interval"] == [0.0, 1.0]
     # An invalid terrain is in no rate.
     rows = rows_of(result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4]))
     rates = over_all(rows, abouts, 0)
