@@ -241,6 +241,13 @@ def test_names_are_taken_apart(text, place, name, file, label):
     assert str(ControllerSpec.parse(Path(text))) == text
 
 
+def test_a_file_of_that_name_is_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert ControllerSpec.parse("mine:act").runs_code
+    (tmp_path / "mine:act").write_bytes(b"x")
+    assert not ControllerSpec.parse("mine:act").runs_code
+
+
 def test_the_hash_is_of_all_that_is_in_files(tmp_path, write):
     file, code = tmp_path / "m.pt", write("x = 1")
     file.write_bytes(b"weights")
