@@ -29,8 +29,8 @@ COMMANDS: dict[str, dict[str, Command]] = {
     },
     "Look at it": {
         "replay": Command("qd.show.commands:Replay", "one elite again: numbers, and paths over its terrain"),
-        "view": Command("qd.show.view.command:View", "an archive in the browser"),
-        "report": Command("qd.show.report.command:Report", "one page about a run"),
+        "view": Command("qd.show.commands:View", "an archive in the browser"),
+        "report": Command("qd.show.commands:Report", "one page about a run"),
         "film": Command("qd.show.commands:Film", "film the robot on an elite or on a map of your own"),
         "export": Command("qd.show.commands:Export", "elites as files, faults as a pack, a controller as ONNX"),
     },

@@ -70,7 +70,7 @@ def refused(home, capsys, monkeypatch):
 @pytest.fixture(scope="module")
 def calibrated(home, robot, trot):
     """Scales, measured by a Ray worker, which has none of the dog's files but those it is sent."""
-    run("calibrate", *robot, *trot, "--terrains", "4", "--most-terrains", "4", "--replicas", "2", "--workers", "ray:1")
+    run("calibrate", *robot, *trot, "--terrains", "4", "--most-terrains", "4", "--workers", "ray:1")
     return json.loads((home / "dog.scales.json").read_text())
 
 

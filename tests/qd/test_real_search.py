@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from qd.fitness import FitnessCfg
-from qd.minimal import Case, Trial, minimise
 from qd.run.presets import SchedulerCfg
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, episode_seeds, open_evaluator
 from sim.crossing import CrossingCfg
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.builders import fresh_values, small_archive
 from tests.qd.searches import rows_of, run, without_figures
 
 ROBOT = get_robot("anymal")
@@ -110,31 +108,3 @@ def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go(tmp_path, 
     for name in ("genes", "cell", "fitness", "iteration", "ratios"):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name), err_msg=name)
     assert all(0.0 <= row["idle_share"] <= 1.0 for row in rows_of(tmp_path / "pieces"))
-
-
-@pytest.mark.slow
-def test_a_terrain_is_taken_apart_by_real_crossings(device):
-    """Two bumps near the goal; what is crossed does not depend on who crosses it, and can be crossed again."""
-    if device != "cpu":
-        pytest.skip("a GPU adds in any order")
-    genes = np.zeros((1, 64), np.float32)
-    genes[0, :8] = (1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 1.0)  # .25 m up to x = 13 m, then an edge
-    genes[0, 8:16] = (1.0, 0.0, 1.0, 1.0, -1.0, -1.0, 0.0, -1.0)  # a wide hollow around it
-    archive = small_archive(1)
-    archive = dataclasses.replace(archive, genes=genes, fresh=fresh_values(archive))
-
-    def taken_apart(workers):
-        case = Case(parts=(0, 1), how="exhaustive", scalable=True, counts={})
-        case.counts[Trial((0, 1), fresh=True)] = np.array([4, 36, 0, 0])
-        minimise(
-            archive, {0: case}, SUPER_GAUSSIAN, evaluator=dataclasses.replace(CFG, workers=workers), seed=1,
-            open_evaluator=lambda cfg: open_evaluator(cfg, build=short_rollout), save=lambda: None,
-        )  # fmt: skip
-        return case
-
-    one, two = taken_apart("1"), taken_apart("2")
-    assert {t: c.tolist() for t, c in one.counts.items()} == {t: c.tolist() for t, c in two.counts.items()}
-    assert all(counts.sum() == trial.episodes for trial, counts in one.counts.items())
-    flat, whole = one.counts[Trial(())], one.counts[Trial((0, 1), fresh=True)]
-    assert flat[0] > 10 > whole[0]  # the flat way to the goal is crossed, or there would be nothing to find
-    assert one.minimal().parts and one.minimal().scale <= 1.0

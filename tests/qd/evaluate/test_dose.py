@@ -91,7 +91,6 @@ def test_a_stopped_dose_goes_on(measured):
     assert not Path("runs/anymal-dose/dose.json").exists()
     measured(again)
     assert Counter(stopped.terrains()) + Counter(again.terrains()) == {WEAK: 18, STRONG: 18}
-    assert again.terrains()[STRONG] >= 12
     measured(fewer, "step_up=0.1,0.3")  # each terrain by itself is known
     assert not fewer.crossed
 

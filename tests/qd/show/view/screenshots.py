@@ -15,7 +15,7 @@ from PIL import Image
 from qd.groups import rank
 from qd.show.elites import find_archive
 from qd.show.recordings import Recordings, on_elite
-from qd.show.report.command import Report, html_report
+from qd.show.report.report import write_report
 from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode
 from sim.recording.renderer import Renderer
 from tests.builders import free_port
@@ -103,7 +103,7 @@ def main() -> None:
     flags.add_argument("--elite", type=int, help="the first of the list if left out")
     flags.add_argument("--report", type=Path, default=Path("runs/anymal-published/report.html"))
     args = flags.parse_args()
-    report = args.report if args.report.exists() else html_report(Report(run=args.run, out=args.report, device="cpu"))
+    report = args.report if args.report.exists() else write_report(args.run, out=args.report, device="cpu")
     found = find_archive(None, args.run)
     elite = rank(found.archive, found.space).worst(1)[0] if args.elite is None else args.elite
     port = free_port()
