@@ -37,7 +37,7 @@ from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
 from sim.mujoco_c.crossing import PlainCrossings, cross_terrains
-from sim.policy.spec import controller_hash
+from sim.policy.spec import controller_hash, spec_of
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -371,7 +371,7 @@ def cross(
     with Crossings(robot, compute or Compute(), cache=cache, open_evaluator=open_evaluator) as crossings:
         return {
             name: crossings.cross(
-                policy, terrains, seeds, replicas=replicas, space=space, how=how, reward=reward,
+                spec_of(policy, crossings.robot), terrains, seeds, replicas=replicas, space=space, how=how, reward=reward,
                 penalties_from_s=penalties_from_s, label=name,
             )
             for name, policy in controllers.items()
