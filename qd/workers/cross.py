@@ -371,8 +371,8 @@ def cross(
     with Crossings(robot, compute or Compute(), cache=cache, open_evaluator=open_evaluator) as crossings:
         return {
             name: crossings.cross(
-                spec_of(policy, crossings.robot), terrains, seeds, replicas=replicas, space=space, how=how, reward=reward,
-                penalties_from_s=penalties_from_s, label=name,
+                spec_of(policy, crossings.robot), terrains, seeds, replicas=replicas, space=space, how=how,
+                reward=reward, penalties_from_s=penalties_from_s, label=name,
             )
             for name, policy in controllers.items()
         }  # fmt: skip
