@@ -3,6 +3,7 @@
 import json
 import shutil
 import socket
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,8 +78,8 @@ def test_what_is_wrong_is_said_before_a_page_opens(changes, field, run):
 
 
 def test_a_run_without_elites_is_refused(tmp_path):
-    archive = small_archive().rows(np.array([], dtype=int))
-    archive.robot_sha256 = robot_digest(get_robot("anymal"))
+    whole = replace(small_archive(), robot_sha256=robot_digest(get_robot("anymal")))
+    archive = whole.rows(np.array([], dtype=int))
     write_archive(tmp_path / "archive.npz", archive)
     with pytest.raises(ValueError, match="no elites"):
         find_show(tmp_path)
