@@ -34,6 +34,7 @@ from sim.mujoco_c.model import (
     crossing_model,
     goal_commands,
     observations,
+    refuse_softness,
     step_penalties,
     to_mujoco,
 )
@@ -274,6 +275,8 @@ def cross_terrains(
     Yields:
         The number of each terrain with its crossings, as they are done.
     """
+    if terrains.ndim == 2:
+        refuse_softness(space)
     robot, solver = with_contact_resolved(robot) if resolved else (robot, SolverCfg())
     heights, ground = (terrains, None) if terrains.ndim == 3 else terrains_of(terrains, space, device=device)
     with _process_pool(robot, policy, processes) as pool:
