@@ -32,7 +32,7 @@ from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, SUMMARY_FILE, R
 from qd.run.settings import SearchCfg, as_settings, is_searched, own_policy
 from qd.show import figures
 from qd.workers.cross import Crossings, How
-from qd.workers.evaluator import Compute, Evaluate, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.intervals import wilson_interval
 from sim.files.records import identity
@@ -90,7 +90,12 @@ def drawn_elites(archive: Archive, most: int, seed: int) -> Archive:
 
 
 def fresh_values(
-    archive: Archive, evaluate: Evaluate, fitness: FitnessCfg, *, num_replicas: int, seed: int
+    archive: Archive,
+    evaluate: Callable[[NDArray, NDArray], RolloutResult],
+    fitness: FitnessCfg,
+    *,
+    num_replicas: int,
+    seed: int,
 ) -> FreshValues:
     """Evaluates every elite again with 40 fresh episodes.
 
@@ -401,7 +406,7 @@ def judge(
 def _evaluated_again(archive: Archive, search: Search, crossings: Crossings, seed: int) -> Archive:
     """The archive with what 40 fresh episodes of each elite say."""
 
-    def evaluate(terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None) -> RolloutResult:
+    def evaluate(terrains: NDArray, seeds: NDArray) -> RolloutResult:
         return crossings.cross(
             search.policy, terrains, seeds, replicas=FRESH_EPISODES, space=search.space, label="fresh episodes"
         )

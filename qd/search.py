@@ -20,15 +20,14 @@ from qd.scheduler import Scheduler
 from qd.show.figures import summary, write_figures
 from qd.workers.evaluator import (
     Compute,
-    Evaluate,
     EvaluatorCfg,
     OpenEvaluator,
+    Pipeline,
+    WorkerStatus,
     check_policy,
     episode_seeds,
     open_evaluator,
     origin_of,
-    pipeline_of,
-    worker_status,
 )
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import merged
@@ -85,10 +84,10 @@ def search(
         if note := robot.scaled_by_another(policy):
             print(note)
         if done < cfg.iterations:
-            with _saying_what_is_saved(path), open_evaluator(evaluator) as evaluate:
+            with _saying_what_is_saved(path), open_evaluator(evaluator) as pipeline:
                 run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
                 with ProgressBar(cfg.iterations, done) as bar:
-                    run_iterations(cfg, run, scheduler, metrics, evaluate, bar)
+                    run_iterations(cfg, run, scheduler, metrics, pipeline, bar)
         archive = archive_of(cfg, scheduler, len(metrics))
         if (stored := _written_archive(run, archive)) is not None:
             return stored
@@ -97,7 +96,7 @@ def search(
 
 
 def run_iterations(
-    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, evaluate: Evaluate, bar: ProgressBar
+    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: ProgressBar
 ) -> None:
     """Runs the iterations that are left, and saves each.
 
@@ -110,10 +109,10 @@ def run_iterations(
         run: Where it is saved.
         scheduler: Its state, told so far.
         metrics: Rows so far; one more an iteration.
-        evaluate: Crosses terrains.
+        pipeline: Crosses terrains.
         bar: Shows progress.
     """
-    pipeline, num_groups = pipeline_of(evaluate), cfg.scheduler.num_groups
+    num_groups = cfg.scheduler.num_groups
     pipeline.clear()
     num_under_way, began = 0, time.perf_counter()
     for iteration in range(len(metrics) + 1, cfg.iterations + 1):
@@ -138,14 +137,13 @@ def run_iterations(
         archive = archive_of(cfg, scheduler, iteration)
         row = metrics_row(archive, merged(results, join=1), concatenated(evaluations), iteration, search_s)
         if samples:
-            row |= _sample_elites(cfg, archive, evaluate)
+            row |= _sample_elites(cfg, archive, pipeline)
         ended = time.perf_counter()
-        row |= _timing(row, ended - began, evaluate)  # from the end of the iteration before, so saving counts
+        row |= _timing(row, ended - began, pipeline.status())  # from the end of the iteration before, so saving counts
         began = ended
         metrics.append(row)
         run.save(cfg, scheduler.state(), metrics, archive)
-        status = worker_status(evaluate)
-        bar.show(row, None if status is None else str(status))
+        bar.show(row, pipeline.status())
 
 
 def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: int) -> NDArray[np.uint32]:
@@ -153,8 +151,7 @@ def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: in
     return episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
 
 
-def _timing(row: dict[str, Any], wall_s: float, evaluate: Evaluate) -> dict[str, Any]:
-    status = worker_status(evaluate)
+def _timing(row: dict[str, Any], wall_s: float, status: WorkerStatus | None) -> dict[str, Any]:
     workers = {"workers": status.workers, "retries": status.retries} if status else {}
     return {"wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **workers}
 
@@ -190,10 +187,10 @@ def metrics_row(
     }
 
 
-def _sample_elites(cfg: SearchCfg, archive: Archive, evaluate: Evaluate) -> dict[str, Any]:
+def _sample_elites(cfg: SearchCfg, archive: Archive, pipeline: Pipeline) -> dict[str, Any]:
     """How reliable some elites of this iteration are, in fresh episodes (the paper's mean STD over iterations)."""
     sample = drawn_elites(archive, MOST_DRAWN, cfg.seed)
-    fresh = fresh_values(sample, evaluate, cfg.fitness, num_replicas=cfg.replicas, seed=cfg.seed)
+    fresh = fresh_values(sample, pipeline, cfg.fitness, num_replicas=cfg.replicas, seed=cfg.seed)
     return fresh_numbers(sample, fresh, sampled=True)
 
 

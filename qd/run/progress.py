@@ -80,7 +80,7 @@ class ProgressBar(tqdm):
         """A function that moves the bar to a share of an iteration, counted from 1, or of one of its equal parts."""
         return lambda share: self._move_to(iteration - 1 + (part + share) / parts)
 
-    def show(self, row: dict[str, Any], workers: str | None = None) -> None:
+    def show(self, row: dict[str, Any], workers: object = None) -> None:
         """Shows where the search stands after an iteration.
 
         Args:

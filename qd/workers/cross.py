@@ -29,7 +29,6 @@ from qd.workers.evaluator import (
     Pipeline,
     open_evaluator,
     parse_workers,
-    pipeline_of,
 )
 from qd.workers.invalid import tell_invalid
 from qd.workers.shards import merged
@@ -326,7 +325,7 @@ class Crossings:
             if replace(opened, num_terrains=cfg.num_terrains) == cfg and room >= cfg.num_terrains:
                 return pipeline
         self.close()
-        pipeline = pipeline_of(self._stack.enter_context(self._open_evaluator(cfg)))
+        pipeline = self._stack.enter_context(self._open_evaluator(cfg))
         self._opened = (cfg, pipeline)
         return pipeline
 

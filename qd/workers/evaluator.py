@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
-from qd.workers.shards import merged, taken
+from qd.workers.shards import merged
 from sim.device import resolve_device as resolve_warp_device
 from sim.files.records import provenance
 from sim.policy.loaders import load_policy
@@ -159,27 +159,6 @@ class Compute:
         return cls(resolve_device(device, workers), workers, num_envs)
 
 
-class Evaluate(Protocol):
-    """Evaluates any number of terrains."""
-
-    def __call__(
-        self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
-    ) -> RolloutResult:
-        """Cross each terrain once a replica.
-
-        Args:
-            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
-            seeds: One a terrain, uint32.
-            progress: Called now and then with the share that is done.
-        """
-        ...
-
-
-def worker_status(evaluate: Evaluate) -> WorkerStatus | None:
-    """How the Ray workers of an evaluator fare; None if it has none."""
-    return evaluate.status() if isinstance(evaluate, Pipeline) else None
-
-
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = 0) -> NDArray[np.uint32]:
     """Seeds of the terrains of one evaluation; the same for the same numbers, so that a resumed search repeats nothing.
 
@@ -271,20 +250,17 @@ def _ray_workers() -> Any:
 
 
 Build = Callable[[EvaluatorCfg, int], Crosser]
-OpenEvaluator = Callable[[EvaluatorCfg], AbstractContextManager[Evaluate]]
+OpenEvaluator = Callable[[EvaluatorCfg], AbstractContextManager["Pipeline"]]
 """Opens what crosses terrains, as :func:`open_evaluator` does."""
 
 
 @contextmanager
-def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterator[Evaluate]:
+def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterator["Pipeline"]:
     """Builds the simulation, in as many processes as there is work for or on a Ray cluster, and keeps it until the end.
 
     Args:
         cfg: What, with what, where.
         build: Makes the simulation; a module-level function, since processes import it by name.
-
-    Yields:
-        A function of terrains and seeds.
 
     Raises:
         ValueError: If the simulation cannot be built as asked for.
@@ -313,7 +289,7 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
 
 
 class Pipeline(ABC):
-    """Evaluates any number of terrains (:class:`Evaluate`): lots of them are put in, and come out in the same order.
+    """Evaluates any number of terrains: lots of them are put in, and come out in the same order.
 
     Robots go on with the lots behind while the last robots of the first one still walk.
 
@@ -343,7 +319,13 @@ class Pipeline(ABC):
     def __call__(
         self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
     ) -> RolloutResult:
-        """Crosses each terrain once a replica; nothing else may be under way."""
+        """Crosses each terrain once a replica; nothing else may be under way.
+
+        Args:
+            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
+            seeds: One a terrain, uint32.
+            progress: Called now and then with the share that is done.
+        """
         count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
         return merged([result for _, result in self.in_lots(terrains, seeds, size, progress)], join=1)
@@ -354,7 +336,7 @@ class Pipeline(ABC):
         """Crosses each terrain once a replica, in lots; nothing else may be under way.
 
         Args:
-            terrains: As of :class:`Evaluate`.
+            terrains: As of a call, and so are seeds and progress.
             seeds: One a terrain.
             size: Terrains of a lot.
             progress: Called now and then with the share that is done.
@@ -445,41 +427,6 @@ class _Processes(Pipeline):
         """Waits for what is under way."""
         while self._lots:
             self.take()
-
-
-class _AllAtOnce(Pipeline):
-    """An evaluator that knows a single evaluation at a time: it crosses together all lots that have been put in."""
-
-    def __init__(self, evaluate: Evaluate) -> None:
-        super().__init__(1)
-        self._evaluate = evaluate
-        self._lots: list[tuple[NDArray, NDArray]] = []
-        self._results: deque[Any] = deque()
-
-    def put(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Keeps a lot until one is waited for."""
-        self._lots.append((terrains, seeds))
-
-    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
-        """Crosses all lots there are, unless the first of them is crossed already."""
-        if not self._results:
-            terrains, seeds = (np.concatenate(arrays) for arrays in zip(*self._lots, strict=True))
-            result, first = self._evaluate(terrains, seeds, progress), 0
-            for own, _ in self._lots:
-                self._results.append(taken(result, len(own), first=first))
-                first += len(own)
-            self._lots.clear()
-        return self._results.popleft()
-
-    def clear(self) -> None:
-        """Forgets what was put in."""
-        self._lots.clear()
-        self._results.clear()
-
-
-def pipeline_of(evaluate: Evaluate) -> Pipeline:
-    """An evaluator as a pipeline; one that knows a single evaluation at a time crosses together what was put in."""
-    return evaluate if isinstance(evaluate, Pipeline) else _AllAtOnce(evaluate)
 
 
 def _share_of(progress: Callable[[float], None], start: float, share: float) -> Callable[[float], None]:

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from qd.run.settings import preset
-from qd.workers.evaluator import EvaluatorCfg, available_cores, open_evaluator, worker_status
+from qd.workers.evaluator import EvaluatorCfg, available_cores, open_evaluator
 from results.make.common import parse
 from sim.spaces.registry import SUPER_GAUSSIAN
 
@@ -27,7 +27,7 @@ def time_evaluation(cfg: EvaluatorCfg, seed: int, rounds: int) -> float:
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
     with open_evaluator(cfg) as evaluate:
         seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]
-        status = worker_status(evaluate)
+        status = evaluate.status()
     if status is not None and (status.workers != cfg.num_workers or status.retries):
         raise RuntimeError(f"expected {cfg.num_workers} workers throughout, got {status}: nothing was measured")
     return statistics.median(seconds[1:])

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from kernels.episode import Outcome
-from qd.workers.evaluator import EvaluatorCfg
+from qd.workers.evaluator import EvaluatorCfg, Pipeline
 from sim.rollout import RolloutResult
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
@@ -47,7 +47,24 @@ def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> Rol
     return make_result(penalties, base_collision=collides)
 
 
+class Stub(Pipeline):
+    """Crosses lots by a function of terrains and seeds, each when it is waited for."""
+
+    def __init__(self, evaluate) -> None:
+        super().__init__(num_terrains=1_000_000)
+        self.evaluate, self.lots = evaluate, []
+
+    def put(self, terrains, seeds):
+        self.lots.append((terrains, seeds))
+
+    def take(self, progress=None):
+        return self.evaluate(*self.lots.pop(0))
+
+    def clear(self):
+        self.lots.clear()
+
+
 @contextmanager
 def open_stand_in(cfg: EvaluatorCfg) -> Iterator:
     """Opened like the real evaluator."""
-    yield lambda genes, seeds, progress=None: evaluate(genes, seeds, cfg.num_replicas)
+    yield Stub(lambda genes, seeds: evaluate(genes, seeds, cfg.num_replicas))

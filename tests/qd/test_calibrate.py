@@ -17,7 +17,7 @@ from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
-from tests.qd.stand_in import make_result
+from tests.qd.stand_in import Stub, make_result
 
 ROBOT = get_robot("anymal")
 
@@ -67,7 +67,7 @@ class Robots:
             self.counts.append(len(genes))
             return self.change(stand_in.evaluate(genes, seeds, cfg.num_replicas))
 
-        yield evaluate
+        yield Stub(evaluate)
 
 
 def failing(share):

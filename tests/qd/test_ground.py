@@ -32,6 +32,7 @@ from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.recordings import NAMES
 from tests.qd.searches import without_figures
+from tests.qd.stand_in import Stub
 from tests.qd.test_own_space import TINY, search
 from tests.sim.policies import stand
 
@@ -94,7 +95,7 @@ def nobody_crosses_ice(cfg):
         fails = np.repeat(genes[:, 64 + 11, None] < 0.0, cfg.num_replicas, axis=1)
         return stand_in.make_result(np.ones((*fails.shape, 6)), base_collision=fails)
 
-    yield evaluate
+    yield Stub(evaluate)
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from tests.builders import small_archive
 from tests.qd import stand_in
-from tests.qd.stand_in import make_result
+from tests.qd.stand_in import Stub, make_result
 
 RESULTS = Path(__file__).parents[2] / "results"
 OTHER = {"C-G": f"{RESULTS}/anymal/C-G.pt"}
@@ -165,13 +165,11 @@ class Judges:
             arrived = np.repeat(crosses(cfg.policy, cfg.resolved, genes)[:, None], cfg.num_replicas, axis=1)
             return make_result(np.ones((*arrived.shape, 6)), base_collision=~arrived)
 
-        yield evaluate
+        yield Stub(evaluate)
 
 
 def judged(path, opened=None, stages=("resolved", "others"), certifiers=OTHER, **changes):
-    return judge(
-        path, compute=HERE, stages=stages, certifiers=certifiers, open_evaluator=opened or Judges(), **changes
-    )
+    return judge(path, compute=HERE, stages=stages, certifiers=certifiers, open_evaluator=opened or Judges(), **changes)
 
 
 def numbers_in(path):

@@ -15,7 +15,7 @@ from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.searches import CFG
-from tests.qd.stand_in import make_result
+from tests.qd.stand_in import Stub, make_result
 
 PASSES, FAILS, INVALID = np.array([20, 0, 0, 0]), np.array([0, 20, 0, 0]), np.array([0, 9, 0, 11])
 ROBOT = get_robot("anymal")
@@ -187,7 +187,7 @@ class Robots:
             fails = np.repeat(needed[:, None], cfg.num_replicas, axis=1)
             return make_result(np.ones((*fails.shape, 6)), base_collision=fails)
 
-        yield evaluate
+        yield Stub(evaluate)
 
 
 def apart(archive, cases, robots, cache=None):

@@ -14,7 +14,7 @@ from qd.minimise import minimise, read_minimal
 from qd.workers.evaluator import Compute
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
-from tests.qd.stand_in import make_result
+from tests.qd.stand_in import Stub, make_result
 
 RESULTS = Path(__file__).parents[2] / "results"
 OTHER = {"C-G": f"{RESULTS}/anymal/C-G.pt"}
@@ -37,7 +37,7 @@ class Robots:
             fails = np.repeat(fails[:, None], cfg.num_replicas, axis=1)
             return make_result(np.ones((*fails.shape, 6)), base_collision=fails)
 
-        yield evaluate
+        yield Stub(evaluate)
 
 
 @pytest.fixture

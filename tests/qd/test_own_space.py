@@ -29,6 +29,7 @@ from sim.spaces.registry import load_space
 from tests.qd import stand_in
 from tests.qd.recordings import stand_in_cross
 from tests.qd.searches import crossing_by, without_figures
+from tests.qd.stand_in import Stub
 from tests.sim.spaces.spaces import move, write_ridges
 
 TINY = ["--device", "cpu", "--scheduler.emitters", "2", "--scheduler.batch-size", "4", "--replicas", "2"]
@@ -51,7 +52,7 @@ def open_rasterising(cfg):
         noise = np.stack([np.random.default_rng(int(seed)).uniform(0.9, 1.1, (cfg.num_replicas, 6)) for seed in seeds])
         return stand_in.make_result((0.1 + rough[:, None]) * noise)
 
-    yield evaluate
+    yield Stub(evaluate)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,8 +184,6 @@ def test_a_recording_is_read_without_the_code(ridges, searched, tmp_path, monkey
 def test_a_page_about_it(ridges, searched, monkeypatch):
     monkeypatch.setattr("sim.files.figures._png_of", lambda figure: PICTURE)
     monkeypatch.setattr(report, "check_policy", lambda policy, robot, device: None)
-    out = report.write_report(
-        searched, space=ridges, device="cpu", episodes=2, num_elites=1, cross=stand_in_cross([])
-    )
+    out = report.write_report(searched, space=ridges, device="cpu", episodes=2, num_elites=1, cross=stand_in_cross([]))
     page = out.read_text()
     assert re.search(r"ridges of 0\.\d\d m", page)

@@ -47,7 +47,7 @@ def opens(evaluate):
 
     @contextmanager
     def opened(cfg: EvaluatorCfg):
-        yield lambda genes, seeds, progress=None: evaluate(genes, seeds)
+        yield stand_in.Stub(evaluate)
 
     return opened
 
@@ -257,10 +257,10 @@ from tests.qd import searches, stand_in
 
 @contextmanager
 def slow(cfg):
-    def evaluate(genes, seeds, progress=None):
+    def evaluate(genes, seeds):
         time.sleep(0.3)
         return stand_in.evaluate(genes, seeds)
-    yield evaluate
+    yield stand_in.Stub(evaluate)
 
 @dataclass
 class Slow:

@@ -18,6 +18,7 @@ from sim.files.command import Interrupted, run_command
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from tests.builders import fresh_values
+from tests.qd.stand_in import Stub
 from tests.train.archives import make_archive
 from tests.train.results import result_of
 from tests.train.starts import PPO, write_actor
@@ -85,7 +86,7 @@ class World:
             ends[:, 1::2] = Outcome.GOAL if arrive else Outcome.BASE_COLLISION
             return result_of(ends, names=ROBOT.penalties, reward=np.ones(ends.shape))
 
-        yield evaluate
+        yield Stub(evaluate)
 
 
 @pytest.fixture

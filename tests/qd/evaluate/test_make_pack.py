@@ -18,7 +18,7 @@ from qd.workers.evaluator import Compute
 from sim.robots.find import get_robot
 from tests.qd.evaluate.test_pack import Crosser
 from tests.qd.searches import found_and_fresh, without_figures
-from tests.qd.stand_in import make_result
+from tests.qd.stand_in import Stub, make_result
 
 RESULTS = Path(__file__).parents[3] / "results"
 TUNED = {"C-G": f"{RESULTS}/anymal/C-G.pt"}
@@ -35,7 +35,7 @@ def judges(cfg):
         fails = np.repeat(fails[:, None], cfg.num_replicas, axis=1)
         return make_result(np.ones((*fails.shape, 6)), base_collision=fails)
 
-    yield evaluate
+    yield Stub(evaluate)
 
 
 @pytest.fixture(scope="module")

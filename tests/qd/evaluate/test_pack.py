@@ -14,6 +14,7 @@ from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.files.records import identity
 from sim.terrain import NUM_COLS, NUM_ROWS
+from tests.qd.stand_in import Stub
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
 CPU = Compute(workers="1")
@@ -37,7 +38,7 @@ class Crosser:
             passes = (np.abs(heights).max(axis=(1, 2)) < 0.2) | ("C-G" in cfg.policy)
             return result_of([[GOAL if passed else HIT] * cfg.num_replicas for passed in passes], names=NAMES)
 
-        yield evaluate
+        yield Stub(evaluate)
 
 
 def candidate(elite, *, fault=True, family=0, mode=1, kind="elite", rate=0.0):

@@ -15,6 +15,7 @@ from qd.workers.invalid import AllInvalidError
 from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
+from tests.qd.stand_in import Stub
 
 ROBOT = get_robot("anymal")
 POLICY = str(ROBOT.policy_file)
@@ -41,7 +42,7 @@ class StandIn:
             invalid = np.ones(result.invalid.shape, bool)
             return stand_in.make_result(result.penalties, invalid=invalid) if self.invalid else result
 
-        yield evaluate
+        yield Stub(evaluate)
 
 
 def cross_all(opened, cache=None, genes=GENES, seeds=SEEDS, *, replicas=20, policy=POLICY, **kwargs):

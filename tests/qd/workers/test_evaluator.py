@@ -13,9 +13,7 @@ from qd.workers.evaluator import (
     EvaluatorError,
     open_evaluator,
     parse_workers,
-    pipeline_of,
 )
-from qd.workers.shards import merged
 from sim.robots.find import get_robot
 from tests.qd import crossers, stand_in
 
@@ -148,30 +146,6 @@ def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(device):
         with pytest.raises(KeyboardInterrupt):
             evaluate(GENES, SEEDS, stop)  # of lots of three, two are in
         assert same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
-
-
-def test_an_evaluator_of_one_evaluation_at_a_time_crosses_all_lots_together():
-    counts, seen = [], []
-
-    def evaluate(terrains, seeds, progress=None):
-        counts.append(len(terrains))
-        result = stand_in.evaluate(terrains, seeds)
-        return dataclasses.replace(result, robot_steps=1000, busy_steps=700, physics_steps=100, wall_s=10.0)
-
-    pipeline = pipeline_of(evaluate)
-    lots = [slice(0, 3), slice(3, 7), slice(7, 15)]
-    for own in lots[:2]:
-        pipeline.put(GENES[own], SEEDS[own])
-    results = [pipeline.take(seen.append)]
-    pipeline.put(GENES[lots[2]], SEEDS[lots[2]])
-    results += [pipeline.take(), pipeline.take()]
-    assert counts == [7, 8]
-    assert same(merged(results, join=1), stand_in.evaluate(GENES, SEEDS))
-    # Two evaluations of 1000 steps; of the first, 3 and 4 of 7 terrains have 428 and 572.
-    assert [one.robot_steps for one in results] == [428, 572, 1000]
-    whole = merged(results, join=1)
-    assert (whole.robot_steps, whole.busy_steps, whole.physics_steps) == (2000, 1400, 200)
-    assert whole.wall_s == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize(
