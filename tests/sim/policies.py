@@ -20,16 +20,6 @@ def sway(observation):
     return -0.5 * torch.sin(3.0 * observation[:, 12:24])
 
 
-def too_few_actions(observation):
-    """Forgets the last joint."""
-    return stand(observation)[:, :-1]
-
-
-def not_finite(observation):
-    """Returns NaN."""
-    return stand(observation) * float("nan")
-
-
 class NanAfterASecond:
     """Stands for a second, then returns NaN: weights that training has spoiled, say."""
 
@@ -42,32 +32,3 @@ class NanAfterASecond:
     def __call__(self, observation):
         self.calls += 1
         return stand(observation) + (float("nan") if self.calls > 50 else 0.0)  # 50 control steps of 0.02 s
-
-
-nan_after_a_second = NanAfterASecond()
-
-
-def list_of_actions(observation):
-    """Returns no tensor."""
-    return [0.0] * NUM_JOINTS
-
-
-def fails(observation):
-    """Raises."""
-    raise RuntimeError("expected 48 columns")
-
-
-class Controller:
-    """Made with robot and device, as a factory asks for."""
-
-    faultline_factory = True
-
-    def __init__(self, robot, device):
-        self.num_joints = robot.num_joints
-        self.device = device
-
-    def __call__(self, observation):
-        return torch.full((len(observation), self.num_joints), 0.25, device=self.device)
-
-
-NOT_CALLABLE = 3

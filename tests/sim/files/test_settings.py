@@ -3,23 +3,12 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
-import tyro
-from msgspec import Meta
 
-from sim.files.settings import (
-    Interval,
-    NonNegativeFloat,
-    PositiveFloat,
-    PositiveInt,
-    Share,
-    check,
-    from_builtins,
-    problems,
-)
+from sim.files.settings import Interval, NonNegativeFloat, PositiveInt, Share, check, from_builtins, problems
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,10 +20,8 @@ class Inner:
 @dataclass(frozen=True, kw_only=True)
 class Outer:
     count: PositiveInt = 1
-    length: PositiveFloat = 1.0
-    any_length: float = 0.0
+    length: float = 0.0
     maybe: NonNegativeFloat | None = None
-    few: Annotated[int, Meta(ge=1, le=3)] = 1
     flag: bool = False
     names: tuple[str, ...] = ()
     gains: tuple[NonNegativeFloat, ...] | None = None
@@ -45,7 +32,7 @@ class Outer:
 
 def test_values_within_their_ranges_pass():
     inner = Inner(share=1, span=(2.0, 2.0))
-    check(Outer(count=3, length=2, maybe=0.0, names=("a",), gains=(0.0, np.float64(2.0)), inner=inner))
+    check(Outer(count=3, length=np.float64(2), maybe=0.0, names=("a",), gains=(0.0, np.float64(2.0)), inner=inner))
 
 
 @pytest.mark.parametrize(
@@ -53,21 +40,14 @@ def test_values_within_their_ranges_pass():
     [
         ({"count": 0}, "count"),
         ({"count": 1.5}, "count"),
-        ({"count": True}, "count"),
-        ({"length": 0.0}, "length"),
-        ({"length": np.float64(-1.0)}, "length"),
-        ({"any_length": math.nan}, "any_length"),
-        ({"any_length": math.inf}, "any_length"),
-        ({"any_length": "3"}, "any_length"),
-        ({"maybe": -1.0}, "maybe"),
-        ({"few": 4}, "few"),
+        ({"length": math.inf}, "length"),
+        ({"length": "3"}, "length"),
+        ({"maybe": np.float64(-1.0)}, "maybe"),
         ({"flag": 1}, "flag"),
-        ({"names": ("a", 1)}, "names"),
         ({"names": ["a"]}, "names"),
         ({"gains": (1.0, -1.0)}, "gains"),
-        ({"gains": (1.0, math.inf)}, "gains"),
+        ({"gains": (1.0, math.nan)}, "gains"),
         ({"mode": "middling"}, "mode"),
-        ({"file": "x"}, "file"),
         ({"inner": 3}, "inner"),
         ({"inner": Inner(share=1.5)}, "inner.share"),
         ({"inner": Inner(span=(1.0, 0.0))}, "inner.span"),
@@ -80,29 +60,14 @@ def test_a_wrong_value_is_named(values, field):
     assert line.startswith(f"{field} must ")
 
 
-def test_a_range_is_said_in_words():
-    assert problems(Outer(few=4, length=0.0)) == ["length must be above 0, got 0.0", "few must be at most 3, got 4"]
-
-
-def test_all_problems_are_named_at_once():
-    with pytest.raises(ValueError, match=r"task\.count .*; task\.length .*; task\.inner\.share "):
-        check(Outer(count=0, length=-1.0, inner=Inner(share=-1.0)), "task.")
-
-
-def test_a_command_line_has_flags_of_such_types():
-    settings = tyro.cli(Outer, args=["--count", "2", "--gains", "1", "2", "--inner.span", "1", "2", "--maybe", "3"])
-    assert settings == Outer(count=2, gains=(1.0, 2.0), inner=Inner(span=(1.0, 2.0)), maybe=3.0)
+def test_all_problems_are_named_at_once_in_plain_words():
+    with pytest.raises(ValueError, match=r"task\.count .*at least 1.*; task\.inner\.share .*at most 1"):
+        check(Outer(count=0, inner=Inner(share=2.0)), "task.")
 
 
 def test_settings_come_back_from_json():
-    values = {
-        "count": 2,
-        "length": 3,
-        "names": ["a"],
-        "file": "y",
-        "inner": {"share": 0, "span": [1, 2]},
-        "maybe": None,
-    }
+    inner = {"share": 0, "span": [1, 2]}
+    values = {"count": 2, "length": 3, "names": ["a"], "file": "y", "inner": inner, "maybe": None}
     settings = from_builtins(Outer, values, "outer")
     assert settings == Outer(count=2, length=3, names=("a",), file=Path("y"), inner=Inner(share=0, span=(1, 2)))
 
@@ -112,12 +77,10 @@ def test_settings_come_back_from_json():
     [
         (7, "outer"),
         ({"count": 0}, "count"),
-        ({"colour": 3}, "colour"),
         ({"inner": {"colour": 3}}, "colour"),
         ({"inner": {"span": [1]}}, "span"),
         ({"inner": {"span": [2, 1]}}, "span"),
-        ({"names": [1]}, "names"),
-        ({"any_length": math.nan}, "any_length"),
+        ({"length": math.nan}, "length"),
     ],
     ids=str,
 )

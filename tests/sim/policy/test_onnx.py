@@ -1,6 +1,5 @@
 """Controllers in ONNX files: they act as their weights say, and what does not fit is refused; and their export."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -10,16 +9,12 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from sim.crossing import CrossingCfg
 from sim.policy.loaders import load_checkpoint, load_policy
 from sim.policy.mlp import MlpPolicy
 from sim.policy.onnx import OnnxPolicy, export_onnx, load_onnx
-from sim.robots.find import get_robot
-from sim.rollout import Rollout
-from sim.terrain import crossing_terrain
+from tests.builders import ACTIONS, OBSERVATIONS
 
-OBSERVATIONS, ACTIONS = 235, 12
-FLOAT, DOUBLE, INT64 = TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.INT64
+FLOAT, DOUBLE = TensorProto.FLOAT, TensorProto.DOUBLE
 
 
 def layer(observations=OBSERVATIONS, actions=ACTIONS):
@@ -31,20 +26,25 @@ def port(name, shape, kind=FLOAT):
     return helper.make_tensor_value_info(name, kind, shape)
 
 
-def graph_model(nodes, inputs, outputs, weights=(), domains=()):
+def graph_model(nodes, inputs, outputs, weights=()):
     graph = helper.make_graph(list(nodes), "policy", inputs, outputs, initializer=list(weights))
-    opsets = [helper.make_opsetid(domain, version) for domain, version in (("", 17), *((name, 1) for name in domains))]
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("their.own", 1)]
     return helper.make_model(graph, opset_imports=opsets, ir_version=8)
 
 
-def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", out_batch="batch", columns=None):
-    """One layer, as a foreign exporter would write it: other names than ours, no checksum."""
-    weights = [
-        numpy_helper.from_array(value, name) for value, name in zip(layer(observations, actions), "wb", strict=True)
-    ]
+def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=None, bias=None):
+    """One layer, as a foreign exporter would write it: other names than ours."""
+    weight, offset = layer(observations, actions)
+    weights = [numpy_helper.from_array(weight, "w"), numpy_helper.from_array(offset if bias is None else bias, "b")]
     node = helper.make_node("Gemm", ["obs", "w", "b"], ["actions"], transB=1)
-    shapes = [batch, columns or observations], [out_batch, columns or actions]
-    return graph_model([node], [port("obs", shapes[0])], [port("actions", shapes[1])], weights)
+    ports = [port("obs", [batch, columns or observations])], [port("actions", [batch, columns or actions])]
+    return graph_model([node], *ports, weights)
+
+
+def one_node(kind, inputs, outputs, **attributes):
+    """A graph of one node whose inputs and outputs are rows of as many columns as a robot has joints."""
+    ports = [[port(name, ["b", ACTIONS]) for name in names] for names in (inputs, outputs)]
+    return graph_model([helper.make_node(kind, inputs, outputs, **attributes)], *ports)
 
 
 def save(path, model):
@@ -52,83 +52,48 @@ def save(path, model):
     return path
 
 
-def place(device):
-    return "cuda" if device.startswith("cuda") else "cpu"
+def rows_of(count):
+    return torch.randn(count, OBSERVATIONS, generator=torch.Generator().manual_seed(1))
 
 
-@pytest.mark.parametrize("batch", [1, 4, 33])
-def test_it_acts_as_its_weights_say(tmp_path, anymal, device, batch):
+def test_it_acts_as_its_weights_say(tmp_path, anymal, device):
+    place = "cuda" if device.startswith("cuda") else "cpu"
     policy = load_policy(str(save(tmp_path / "policy.onnx", linear())), anymal, device)
-    rows = torch.randn(batch, OBSERVATIONS, generator=torch.Generator().manual_seed(batch))
+    actions = policy(rows_of(33).to(place))
+    assert actions.device.type == place and actions.dtype == torch.float32
     weight, bias = layer()
-    got = policy(rows.to(place(device)))
-    assert got.device.type == place(device)
-    assert got.dtype == torch.float32
     # Sums of 235 float32 products of order 0.1 in another order than NumPy's float64.
-    np.testing.assert_allclose(got.cpu(), rows.double().numpy() @ weight.T.astype(float) + bias, rtol=1e-5, atol=1e-5)
+    expected = rows_of(33).double().numpy() @ weight.T.astype(float) + bias
+    np.testing.assert_allclose(actions.cpu(), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_a_row_is_answered_alike_in_any_batch(tmp_path, anymal):
     policy = load_policy(save(tmp_path / "policy.onnx", linear()), anymal, "cpu")
-    rows = torch.randn(60, OBSERVATIONS, generator=torch.Generator().manual_seed(1))
-    together = policy(rows)
+    together = policy(rows_of(60))
     for size in (1, 4, 7, 20):
-        assert torch.equal(torch.cat([policy(part) for part in rows.split(size)]), together), size
+        assert torch.equal(torch.cat([policy(part) for part in rows_of(60).split(size)]), together), size
 
 
 def test_unknown_widths_are_settled_by_trying(tmp_path, anymal):
     free = save(tmp_path / "free.onnx", linear(columns="columns"))
     assert isinstance(load_policy(free, anymal, "cpu"), OnnxPolicy)
-    with pytest.raises(ValueError, match=r"other\.onnx' failed"):
-        load_policy(save(tmp_path / "other.onnx", linear(48, 12, columns="columns")), anymal, "cpu")
-    with pytest.raises(ValueError, match="actions"):  # it follows from the weights
-        load_policy(save(tmp_path / "other.onnx", linear(235, 10, columns="columns")), anymal, "cpu")
-
-
-def typed(kind):
-    cast = helper.make_node("Cast", ["obs"], ["x"], to=FLOAT)
-    cut = helper.make_node("Slice", ["x", "first", "end", "axis"], ["actions"])
-    ends = [numpy_helper.from_array(np.array([n]), name) for n, name in ((0, "first"), (ACTIONS, "end"), (1, "axis"))]
-    inputs = [port("obs", ["batch", OBSERVATIONS], kind)]
-    return graph_model([cast, cut], inputs, [port("actions", ["batch", ACTIONS])], ends)
-
-
-def many(inputs, outputs):
-    nodes = [helper.make_node("Sum", [f"in_{k}" for k in range(inputs)], ["sum"])]
-    nodes += [helper.make_node("Identity", ["sum"], [f"out_{k}"]) for k in range(outputs)]
-    ports = [[port(f"{name}_{k}", ["b", ACTIONS]) for k in range(n)] for name, n in (("in", inputs), ("out", outputs))]
-    return graph_model(nodes, *ports)
-
-
-def flat():
-    node = helper.make_node("Identity", ["obs"], ["actions"])
-    return graph_model([node], [port("obs", [OBSERVATIONS])], [port("actions", [OBSERVATIONS])])
-
-
-def of_a_foreign_operator():
-    node = helper.make_node("Surprise", ["obs"], ["actions"], domain="their.own")
-    ports = [port("obs", ["b", OBSERVATIONS])], [port("actions", ["b", ACTIONS])]
-    return graph_model([node], *ports, domains=["their.own"])
-
-
-def not_a_number():
-    model = linear()
-    model.graph.initializer[1].CopyFrom(numpy_helper.from_array(np.full(ACTIONS, np.nan, np.float32), "b"))
-    return model
+    for sizes in ((48, 12), (235, 10)):
+        with pytest.raises(ValueError, match=r"other\.onnx"):
+            load_policy(save(tmp_path / "other.onnx", linear(*sizes, columns="columns")), anymal, "cpu")
 
 
 MODELS = {
     "another robot's rows": linear(48),
     "another robot's joints": linear(235, 10),
-    "a batch of one": linear(batch=1, out_batch=1),
-    "a batch of four": linear(batch=4, out_batch=4),
-    "doubles": typed(DOUBLE),
-    "integers": typed(INT64),
-    "no batch": flat(),
-    "two inputs": many(2, 1),
-    "two outputs": many(1, 2),
-    "a foreign operator": of_a_foreign_operator(),
-    "NaN": not_a_number(),
+    "a batch of four": linear(batch=4),
+    "NaN": linear(bias=np.full(ACTIONS, np.nan, np.float32)),
+    "no batch": graph_model([helper.make_node("Identity", ["obs"], ["a"])], [port("obs", [12])], [port("a", [12])]),
+    "doubles": graph_model(
+        [helper.make_node("Identity", ["obs"], ["a"])], [port("obs", ["b", 12], DOUBLE)], [port("a", ["b", 12], DOUBLE)]
+    ),
+    "two inputs": one_node("Sum", ["a", "b"], ["c"]),
+    "two outputs": one_node("Split", ["a"], ["b", "c"], axis=0),
+    "a foreign operator": one_node("Surprise", ["obs"], ["actions"], domain="their.own"),
     "no graph": graph_model([], [], []),
 }
 
@@ -140,7 +105,7 @@ def test_a_model_that_does_not_fit_is_refused(tmp_path, anymal, model, capfd):
     assert capfd.readouterr() == ("", ""), "onnxruntime says it a second time"
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
 def test_a_truncated_file_is_refused(tmp_path, anymal, share):
     whole = linear().SerializeToString()
     (tmp_path / "half.onnx").write_bytes(whole[: int(share * len(whole))])
@@ -148,48 +113,31 @@ def test_a_truncated_file_is_refused(tmp_path, anymal, share):
         load_policy(tmp_path / "half.onnx", anymal, "cpu")
 
 
-def externalised(folder):
-    """The layer with its weights in a file of their own, as exporters write them by default."""
-    onnx.save(linear(), folder / "split.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
-    return folder / "split.onnx"
-
-
-@pytest.mark.parametrize("there", [True, False])
-def test_weights_in_another_file_are_refused(tmp_path, anymal, monkeypatch, there):
-    path = externalised(tmp_path)
+@pytest.mark.parametrize("deep", [False, True])
+def test_weights_in_another_file_are_refused(tmp_path, anymal, monkeypatch, deep):
+    path = tmp_path / "split.onnx"
+    onnx.save(linear(), path, save_as_external_data=True, location="weights.bin", size_threshold=0)
     monkeypatch.chdir(tmp_path)
-    if there:  # onnxruntime would read them: the refusal is ours
-        onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
-    else:
-        (tmp_path / "weights.bin").unlink()
-    with pytest.raises(ValueError, match=r"2 of its tensors in another file"):
+    # As exporters write them by default; onnxruntime would read them: the refusal is ours.
+    onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
+    if deep:
+        tensor, model = onnx.load(path, load_external_data=False).graph.initializer[1], linear()
+        branch = helper.make_graph(
+            [helper.make_node("Constant", [], ["c"], value=tensor)], "branch", [], [port("c", [ACTIONS])]
+        )
+        model.graph.node.append(helper.make_node("If", ["yes"], ["unused"], then_branch=branch, else_branch=branch))
+        save(path, model)
+    with pytest.raises(ValueError, match="2 of its tensors"):
         load_policy(path, anymal, "cpu")
-
-
-def test_another_file_is_found_in_a_subgraph(tmp_path, anymal):
-    outside = externalised(tmp_path)
-    tensor = onnx.load(outside, load_external_data=False).graph.initializer[1]
-    model = linear()
-    branch = helper.make_graph(
-        [helper.make_node("Constant", [], ["c"], value=tensor)], "branch", [], [port("c", [ACTIONS])]
-    )
-    model.graph.node.append(helper.make_node("If", ["yes"], ["unused"], then_branch=branch, else_branch=branch))
-    with pytest.raises(ValueError, match="2 of its tensors in another file"):
-        load_policy(save(tmp_path / "deep.onnx", model), anymal, "cpu")
 
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="this one can use a GPU")
 def test_without_cuda_in_onnxruntime_it_computes_on_the_cpu_and_says_so(tmp_path):
     path = save(tmp_path / "policy.onnx", linear())
-    with pytest.warns(
-        UserWarning, match=r"policy\.onnx' runs on the CPU, with copies to and from cuda:0.*onnxruntime-gpu"
-    ):
+    with pytest.warns(UserWarning, match="onnxruntime-gpu"):
         policy = load_onnx(path, (OBSERVATIONS, ACTIONS), "cuda:0")
     assert policy.device == torch.device("cpu")
     assert policy(torch.zeros(3, OBSERVATIONS)).shape == (3, ACTIONS)
-
-
-ANYMAL = get_robot("anymal")
 
 
 def actor(*sizes, normalised=False):
@@ -205,9 +153,8 @@ def actor(*sizes, normalised=False):
     return MlpPolicy(state)
 
 
-@pytest.mark.parametrize("normalised", [False, True])
-@pytest.mark.parametrize("sizes", [(235, 12), (169, 64, 12), (48, 32, 16, 8, 3)])
-def test_the_file_is_the_controller(tmp_path, sizes, normalised):
+@pytest.mark.parametrize(("sizes", "normalised"), [((235, 12), False), ((48, 32, 16, 8, 3), True)])
+def test_an_exported_file_is_the_controller(tmp_path, sizes, normalised):
     policy, path = actor(*sizes, normalised=normalised), tmp_path / "new" / "policy.onnx"
     export_onnx(policy, path)
     assert [file.name for file in path.parent.iterdir()] == ["policy.onnx"]
@@ -215,56 +162,22 @@ def test_the_file_is_the_controller(tmp_path, sizes, normalised):
     for batch in (1, 7):
         rows = torch.randn((batch, sizes[0]), generator=torch.Generator().manual_seed(9)) * 3
         with torch.inference_mode():
-            expected, got = policy(rows), loaded(rows)
+            expected, actions = policy(rows), loaded(rows)
         # Both round sums of up to 235 float32 products, each in its own order: a part of the largest of them.
-        assert (got - expected).abs().max() <= 1e-5 * max(1.0, expected.abs().max())
-
-
-def test_the_file_is_as_promised_to_others(tmp_path):
-    export_onnx(actor(48, 8, 3, normalised=True), tmp_path / "policy.onnx")
-    model = onnx.load(tmp_path / "policy.onnx", load_external_data=False)
+        assert (actions - expected).abs().max() <= 1e-5 * max(1.0, expected.abs().max())
+    model = onnx.load(path, load_external_data=False)
     onnx.checker.check_model(model, full_check=True)
     shapes = [
-        (
-            port.name,
-            port.type.tensor_type.elem_type,
-            [d.dim_param or d.dim_value for d in port.type.tensor_type.shape.dim],
-        )
+        (port.name, [d.dim_param or d.dim_value for d in port.type.tensor_type.shape.dim])
         for port in (*model.graph.input, *model.graph.output)
     ]
-    assert shapes == [
-        ("observation", onnx.TensorProto.FLOAT, ["batch", 48]),
-        ("action", onnx.TensorProto.FLOAT, ["batch", 3]),
-    ]
-    assert [node.op_type for node in model.graph.node] == ["Sub", "Div", "Gemm", "Elu", "Gemm"]
+    assert shapes == [("observation", ["batch", sizes[0]]), ("action", ["batch", sizes[-1]])]
 
 
-@pytest.mark.parametrize("name", ["policy.pt", "policy"])
-def test_the_name_must_say_what_it_is(tmp_path, name):
-    with pytest.raises(ValueError, match=r"must end in \.onnx"):
-        export_onnx(actor(48, 3), tmp_path / name)
+def test_only_a_checkpoint_can_be_exported_and_to_an_onnx_file(tmp_path, anymal):
+    with pytest.raises(ValueError, match=r"policy\.pt"):
+        export_onnx(actor(48, 3), tmp_path / "policy.pt")
     assert not list(tmp_path.iterdir())
-
-
-def test_only_a_checkpoint_can_be_exported(tmp_path):
-    export_onnx(load_checkpoint(ANYMAL.policy_file, ANYMAL), tmp_path / "a.onnx")
-    with pytest.raises(ValueError, match="must be an rsl_rl checkpoint"):
-        load_checkpoint(tmp_path / "a.onnx", ANYMAL)
-
-
-def test_crossings_are_those_of_the_original(tmp_path):
-    export_onnx(load_policy(ANYMAL.policy_file, ANYMAL, "cpu"), tmp_path / "policy.onnx")
-    terrains = np.stack([crossing_terrain(*kind) for kind in (("stairs_up_down", 9, 3), ("boxes", 5, 1))])
-    results = []
-    for policy in (ANYMAL.policy_file, tmp_path / "policy.onnx"):
-        cfg = CrossingCfg(max_duration_s=0.6, poll_every_s=0.1)
-        rollout = Rollout(ANYMAL, policy, num_terrains=2, num_replicas=4, device="cpu", cfg=cfg)
-        results.append(dataclasses.asdict(rollout.evaluate(terrains, np.array([7, 8]))))
-    first, second = results
-    np.testing.assert_array_equal(second["outcome"], first["outcome"])
-    np.testing.assert_array_equal(second["fallen"], first["fallen"])
-    np.testing.assert_allclose(second["duration_s"], first["duration_s"])
-    # Actions differ by 1e-6, which contacts make 1.5e-5 of a penalty within 0.6 s.
-    np.testing.assert_allclose(second["penalties"], first["penalties"], rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(second["final_position"], first["final_position"], atol=1e-4)
-    assert (first["penalties"][..., 0] > 0).all()
+    export_onnx(load_checkpoint(anymal.policy_file, anymal), tmp_path / "a.onnx")
+    with pytest.raises(ValueError, match=r"a\.onnx"):
+        load_checkpoint(tmp_path / "a.onnx", anymal)

@@ -44,15 +44,13 @@ def test_recorded_episodes_are_those_of_an_evaluation(rollout, recorded):
     for name in names if rollout.sim.device == "cpu" else ("outcome",):
         np.testing.assert_array_equal(getattr(result, name), getattr(evaluated, name))
     assert (result.base_collision[0] & ~result.base_collision[1]).all()
-    for name in ("outcome", "duration_s", "fallen"):
-        np.testing.assert_array_equal(getattr(recording, name), getattr(result, name))
-    for t, k in np.ndindex(2, 4):
-        last = recording.num_frames[t, k] - 1
-        # float32 sums, kept as they are: equal, not close
-        np.testing.assert_array_equal(recording.penalties[t, k, last], result.penalties[t, k])
-        # The last frame is up to a control step after the end, at less than 2 m/s.
-        assert last * recording.dt - 0.02 - 1e-6 < result.duration_s[t, k] <= last * recording.dt + 1e-6
-        np.testing.assert_allclose(recording.base_position[t, k, last], result.final_position[t, k], atol=0.04)
+    for name in ("outcome", "duration_s", "fallen", "penalties"):  # float32 sums, stored as they are: equal, not close
+        np.testing.assert_array_equal(getattr(recording.result(), name), getattr(result, name))
+    last = recording.num_frames - 1
+    # The last frame is up to a control step after the end, at less than 2 m/s.
+    assert (last * recording.dt - 0.02 - 1e-6 < result.duration_s).all()
+    assert (result.duration_s <= last * recording.dt + 1e-6).all()
+    np.testing.assert_allclose(recording.result().final_position, result.final_position, atol=0.04)
 
 
 def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anymal):
@@ -65,35 +63,32 @@ def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anym
     assert (recording.penalties[:, :, 0] == 0).all() and (recording.foot_force[:, :, 0] == 0).all()
     # Toward the goal, from the start on, at 0.75 m/s; once ended, no command.
     np.testing.assert_allclose(np.linalg.norm(recording.command[:, :, 0, :2], axis=-1), 0.75, atol=1e-3)
-    assert (recording.command[0, 0, recording.num_frames[0, 0] - 1] == 0).all()
+    count = recording.num_frames[0, 0]
+    assert (recording.command[0, 0, count - 1] == 0).all()
     assert (np.diff(recording.penalties[1], axis=1) >= 0).all()
     assert (recording.num_frames[1] == 51).all() and (recording.num_frames[0] < 51).all()
-    assert recording.base_position.shape == (2, 4, 51, 3)
     for name in FRAME_ARRAYS:
         array = getattr(recording, name)
-        assert np.isnan(array[0, 0, recording.num_frames[0, 0] :]).all()
-        assert np.isfinite(array[0, 0, : recording.num_frames[0, 0]]).all()
-    # A robot that walks is carried by its feet: 50.6 kg, give or take its bouncing.
-    upward = recording.foot_force[1, :, 25:, :, 2].sum(axis=2).mean()
-    mass = mujoco.MjModel.from_xml_path(str(anymal.model_file)).body_mass.sum()
-    assert upward == pytest.approx(9.81 * mass, rel=0.1)
+        assert array.shape[:3] == (2, 4, 51)
+        assert np.isnan(array[0, 0, count:]).all() and np.isfinite(array[0, 0, :count]).all()
 
 
-def test_feet_that_push_are_on_the_ground(recording, anymal):
+def test_feet_that_push_are_on_the_ground_and_carry_the_robot(recording, anymal):
     """The poses as MuJoCo places them: a foot with force touches the surface, and none lies below it."""
     model = mujoco.MjModel.from_xml_path(str(anymal.model_file))
     data = mujoco.MjData(model)
-    gaps, forces = [], []
-    for frame, qpos in enumerate(recording.qpos(1, 2)):
+    gaps = []
+    for qpos in recording.qpos(1, 2):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         feet = np.array([data.geom(name).xpos for name in recording.foot_names])
         gaps.append(feet[:, 2] - 0.03 - surface_heights(SLOPE, feet[:, 0], feet[:, 1]))
-        forces.append(np.linalg.norm(recording.foot_force[1, 2, frame], axis=1))
-    gaps, forces = np.array(gaps), np.array(forces)
+    gaps, forces = np.array(gaps), np.linalg.norm(recording.foot_force[1, 2], axis=-1)
     assert (forces > 50).sum() > 40
     assert np.abs(gaps[forces > 50]).max() < 0.01
     assert gaps.min() > -0.01 and gaps.max() > 0.02
+    upward = recording.foot_force[1, :, 25:, :, 2].sum(axis=2).mean()
+    assert upward == pytest.approx(9.81 * model.body_mass.sum(), rel=0.1)  # 50.6 kg, give or take its bouncing
 
 
 def test_geoms_that_touch_are_those_that_are_pushed(recording, anymal):
@@ -101,7 +96,7 @@ def test_geoms_that_touch_are_those_that_are_pushed(recording, anymal):
     assert not recording.touching[:, :, 0].any()
     feet = [recording.geom_names.index(name) for name in recording.foot_names]
     force = np.nan_to_num(np.linalg.norm(recording.foot_force, axis=-1))
-    near = np.abs(force - 0.1) < 1e-3  # forces are kept in float16
+    near = np.abs(force - 0.1) < 1e-3  # forces are stored in float16
     assert (recording.touching[..., feet] == (force > 0.1))[~near].all()
     # On the spike every episode ends with a touch of the base; the slope is walked over on the feet alone.
     last = recording.num_frames[0] - 1
@@ -114,14 +109,14 @@ def test_geoms_that_touch_are_those_that_are_pushed(recording, anymal):
 
 
 def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
-    def break_one(share):
+    def break_joint(share):
         values = np.array(rollout.sim.joint_q.numpy())
         values[rollout.state.episode.numpy() == 6, 8] = np.nan  # terrain 1, replica 2
         rollout.sim.joint_q.assign(values)
 
     terrains = np.stack([FLAT, FLAT])
-    _, recording = record(rollout, terrains, SEEDS, policy=anymal.policy_file, progress=break_one)
-    assert recording.outcome[1, 2] == Outcome.INVALID
+    _, recording = record(rollout, terrains, SEEDS, policy=anymal.policy_file, progress=break_joint)
+    assert recording.outcome[1, 2] == Outcome.INVALID and np.isnan(recording.result().penalties[1, 2]).all()
     assert recording.num_frames[1, 2] == 26  # broken after 0.5 s, in the 26th control step; frames 0 to 25
     np.testing.assert_allclose(recording.duration_s[1, 2], 0.505, atol=1e-6)
     assert np.isfinite(recording.qpos(1, 2)[:25]).all()
@@ -137,15 +132,13 @@ def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
         np.testing.assert_array_equal(value, expected)
         assert type(value) is type(expected) and getattr(value, "dtype", 0) == getattr(expected, "dtype", 0)
     assert back.origin["policy_sha256"] == hashlib.sha256(anymal.policy_file.read_bytes()).hexdigest()
-    assert {"policy", "command", "commit", "device", "versions", "seed", "date"} <= back.origin.keys()
+    assert {"policy", "space", "command", "commit", "device", "versions", "seed", "date"} <= back.origin.keys()
     assert back.labels == ("spike", "slope") and back.robot == "anymal" and back.genes is None
-    with np.load(tmp_path / "a.npz") as content:
-        assert {name: content[name].dtype for name in FRAME_ARRAYS} == FRAME_ARRAYS
     # A frame is 3 + 4 + 6 floats of 4 bytes and 12 + 12 + 3 of 2; with two height grids no more than that.
     assert (tmp_path / "a.npz").stat().st_size < 8 * 51 * 106 + 2 * 161 * 321 * 4
 
 
-def test_terrains_given_by_genes_are_kept_as_genes(rollout, anymal, tmp_path):
+def test_terrains_given_by_genes_are_stored_as_genes(rollout, anymal, tmp_path):
     genes = SUPER_GAUSSIAN.uniform_random(2, 3)
     _, recording = record(rollout, genes, SEEDS, policy=anymal.policy_file)
     write_recording(tmp_path / "a.npz", recording)
@@ -162,9 +155,7 @@ CHANGES = {
     "no format": {"format": None},
     "a lost array": {"command": None},
     "neither genes nor heights": {"heights": None},
-    "floats as integers": {"outcome": np.ones((2, 4))},
     "a joint too few": {"joint_names": np.array(["a"] * 11)},
-    "another number of terrains": {"seeds": np.arange(3, dtype=np.uint32)},
     "another number of frames": {"touching": np.zeros((2, 4, 50, 13), bool)},
     "an origin that is no JSON": {"origin": np.array("{")},
     "objects": {"robot": np.array({"a": 1}, dtype=object)},
@@ -188,7 +179,7 @@ def test_a_damaged_file_is_refused(recording, tmp_path):
     whole = path.read_bytes()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 4
-    for content in (whole[:-100], whole[: len(whole) // 2], b"hello", b"", bytes(flipped)):
+    for content in (whole[:-100], b"hello", b"", bytes(flipped)):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"a\.npz"):
             read_recording(path)
@@ -196,7 +187,7 @@ def test_a_damaged_file_is_refused(recording, tmp_path):
         read_recording(tmp_path / "elsewhere.npz")
 
 
-def test_one_terrain_can_be_taken_out(recording):
+def test_the_recording_of_one_terrain(recording):
     terrain, most = recording.of_terrain(0), int(recording.num_frames[0].max())
     for name in (*FRAME_ARRAYS, "touching"):
         np.testing.assert_array_equal(getattr(terrain, name), getattr(recording, name)[:1, :, :most])
