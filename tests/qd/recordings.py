@@ -13,7 +13,7 @@ NAMES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 FRAMES = 21
 
 
-def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0) -> Recording:
+def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0, frames=FRAMES) -> Recording:
     """Episodes that ended so, there; each penalty grows evenly to its sum.
 
     Args:
@@ -22,28 +22,30 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0) -> Re
         penalties: Raw sums, shape (episodes, 6); 1 each.
         fallen: Of each episode; nobody.
         seed: Of terrain and episodes.
+        frames: Of each episode.
     """
-    count, joints = len(outcomes), get_robot("anymal").joint_names
+    count, robot = len(outcomes), get_robot("anymal")
+    joints, feet = robot.joint_names, robot.foot_geoms
     sums = np.ones((count, 6)) if penalties is None else np.asarray(penalties, float)
-    share = np.linspace(0.0, 1.0, FRAMES)
-    position = np.zeros((1, count, FRAMES, 3), np.float32)
+    share, shape = np.linspace(0.0, 1.0, frames), (1, count, frames)
+    position = np.zeros((*shape, 3), np.float32)
     position[0, :, :, 0] = 2.0 + (np.asarray(ends_x, float)[:, None] - 2.0) * share
     position[0, :, :, 1] = 4.0 + 0.1 * np.arange(count)[:, None]
-    quaternion = np.zeros((1, count, FRAMES, 4), np.float32)
+    quaternion = np.zeros((*shape, 4), np.float32)
     quaternion[..., 0] = 1.0
     return Recording(
-        robot="anymal", joint_names=joints, foot_names=("foot",), penalty_names=NAMES, dt=0.02, labels=("made up",),
+        robot="anymal", joint_names=joints, foot_names=feet, penalty_names=NAMES, dt=0.02, labels=("made up",),
         heights=np.random.default_rng(seed).normal(0.0, 0.2, (1, 161, 321)).astype(np.float32), genes=None,
         seeds=np.array([seed], np.uint32), replicas=np.arange(count, dtype=np.int32),
         outcome=np.array([outcomes], np.uint8), invalidity=np.zeros((1, count), np.uint8),
         fallen=np.array([[False] * count if fallen is None else fallen]),
-        duration_s=np.full((1, count), 0.4, np.float32), num_frames=np.full((1, count), FRAMES, np.int32),
-        base_position=position, base_quaternion=quaternion,
-        joint_position=np.zeros((1, count, FRAMES, len(joints)), np.float32),
-        foot_force=np.zeros((1, count, FRAMES, 1, 3), np.float32),
+        duration_s=np.full((1, count), 0.02 * (frames - 1), np.float32),
+        num_frames=np.full((1, count), frames, np.int32), base_position=position, base_quaternion=quaternion,
+        joint_position=np.zeros((*shape, len(joints)), np.float32),
+        foot_force=np.zeros((*shape, len(feet), 3), np.float32),
         penalties=(sums[None, :, None, :] * share[:, None]).astype(np.float32),
-        command=np.zeros((1, count, FRAMES, 3), np.float32), origin={"policy": "made up"},
-        geom_names=(), touching=np.zeros((1, count, FRAMES, 0), bool),
+        command=np.zeros((*shape, 3), np.float32), origin={"policy": "made up"},
+        geom_names=(), touching=np.zeros((*shape, 0), bool),
     )  # fmt: skip
 
 
@@ -52,14 +54,16 @@ def stand_in_cross(crossed: list):
 
     def cross(wanted, progress):
         made = []
-        for one in wanted:
-            crossed.append(one.label)
-            number = int(one.label.split()[1])  # elite 3 of anymal
+        for crossing in wanted:
+            crossed.append(crossing.label)
+            number = int("".join(filter(str.isdigit, crossing.label)) or 0)  # elite 3 of anymal
             ends = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT)
-            outcomes = [ends[(number + k) % 4] for k in range(one.replicas)]
-            recording = recording_of(outcomes, np.linspace(6.0, 14.0, one.replicas), seed=one.terrain_seed)
-            origin = identity(get_robot("anymal"), one.policy) | {"space": "super_gaussian"}
-            made.append(replace(recording, genes=one.terrain[None], labels=(one.label,), origin=origin))
+            outcomes = [ends[(number + k) % 4] for k in range(crossing.replicas)]
+            recording = recording_of(outcomes, np.linspace(6.0, 14.0, crossing.replicas), seed=crossing.terrain_seed)
+            origin = identity(get_robot("anymal"), crossing.policy) | {"space": "super_gaussian"}
+            origin["seed"] = crossing.seed
+            given = {"genes" if crossing.terrain.ndim == 1 else "heights": crossing.terrain[None]}
+            made.append(replace(recording, labels=(crossing.label,), origin=origin, **given))
         progress(1.0)
         return made
 

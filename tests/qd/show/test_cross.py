@@ -11,14 +11,13 @@ from PIL import Image
 from kernels.episode import Invalidity, Outcome
 from qd.show.commands import Cross
 from qd.show.cross import MapScale, cross_map, numbers_of, read_own_terrain
-from qd.show.crossed import crossed_of
+from qd.show.crossed import crossed_of, penalties_by_place
 from sim.files.command import run_command
-from sim.robots.find import get_robot
 from tests.qd.recordings import NAMES, recording_of
 
 
 @pytest.fixture(autouse=True)
-def in_a_folder_of_its_own(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
@@ -54,37 +53,45 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     assert numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "(m/s)^2 s"}  # of 1 and 3
     assert numbers["duration_s"] == 10.0  # of 4 and 16
     assert (numbers["invalid_episodes"], numbers["invalid_reasons"]) == (1, {"speed": 1})
-    broken = dataclasses.replace(
-        made, outcome=np.full((1, 3), Outcome.INVALID, np.uint8), invalidity=np.full((1, 3), Invalidity.SPEED, np.uint8)
-    )
-    numbers = numbers_of(crossed_of(broken, NAMES, (1.0,) * 6))
-    assert numbers["rates"]["goal"] == {"rate": None, "hits": 0, "interval": None} and numbers["duration_s"] is None
 
 
-def test_mistakes_are_refused_and_the_map_is_never_overwritten():
-    robot = get_robot("anymal")
-    np.savez("hill.npz", heights=np.zeros((3, 5)))
-    with pytest.raises(ValueError, match="size"):
-        read_own_terrain(Path("hill.npz"))
-    with pytest.raises(ValueError, match="100 m"):
-        read_own_terrain(Path("hill.npz"), MapScale(size_m=(0.0, 8.0)))
-    with pytest.raises(FileNotFoundError):
-        read_own_terrain(Path("none.npz"))
+def test_crossings_in_numbers_by_hand():
+    outcomes = [Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.BASE_COLLISION, Outcome.INVALID]
+    sums = np.arange(24.0).reshape(4, 6)
+    recording = recording_of(outcomes, [14.0, 5.0, 7.0, 3.0], penalties=sums, fallen=[False, True, False, True])
+    crossed = crossed_of(recording, ("vel_x", "stumble"), (2.0, 4.0))
+    assert crossed.chosen.tolist() == [0, 1, 2]
+    assert crossed.scaled.tolist() == [[0.5, 1.0], [3.5, 2.5], [6.5, 4.0]]
+    assert str(crossed.rates["reached the goal"]) == "1 of 3 (33%, 6 to 79%)"
+    hits = {label: rate.hits for label, rate in crossed.rates.items()}
+    assert hits == {"reached the goal": 1, "base collision": 2, "out of time": 0, "left the terrain": 0, "fallen": 1}
+    np.testing.assert_allclose(crossed.ends[:, 0], [14.0, 5.0, 7.0])
+    assert crossed.failed_at == pytest.approx(6.0)
+
+
+def test_penalties_by_place_add_up():
+    recording = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0], penalties=np.full((2, 6), 10.0))
+    edges = np.array([0.0, 3.0, 16.0])
+    amounts = penalties_by_place(crossed_of(recording, NAMES, (1.0,) * 6), NAMES, edges)
+    # the first robot makes a step of 0.5 m twenty times, of which one ends below x = 3; the second stays at 2
+    np.testing.assert_allclose(amounts[:, 0], [(0.5 + 10.0) / 2, 9.5 / 2], rtol=1e-5)
+    np.testing.assert_allclose(amounts.sum(axis=0), 10.0, rtol=1e-5)
+
+
+def test_mistakes_are_refused_and_the_map_is_never_overwritten(anymal):
+    for folder in ("a", "b"):  # two maps of one name have files of their own
+        Path(folder).mkdir()
+        np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)))
+        with pytest.raises(ValueError, match="size"):
+            read_own_terrain(Path(folder) / "hill.npz")
+        assert read_own_terrain(Path(folder) / "hill.npz", MapScale(size_m=(16.0, 8.0))).name == f"{folder}-hill.npz"
     Image.fromarray(np.zeros((3, 5), np.uint8)).save("hill.png")
     Path("hill.json").write_text('{"scale_m": 0.01, "size_m": [16, 8]}')
     before = {path.name: path.read_bytes() for path in Path().glob("hill.*")}
     terrain = read_own_terrain(Path("hill.png"))
-    with pytest.raises(ValueError, match="overwrite"):
-        cross_map(terrain, robot, out=Path("hill.json"))
+    with pytest.raises(ValueError, match="out"):
+        cross_map(terrain, anymal, out=Path("hill.json"))
     with pytest.raises(ValueError, match=r"none\.pt"):
-        cross_map(terrain, robot, "none.pt")
+        cross_map(terrain, anymal, "none.pt")
     assert {path.name: path.read_bytes() for path in Path().glob("hill.*")} == before
     assert not list(Path().rglob("*-paths.png"))
-
-
-def test_two_maps_of_one_name_have_files_of_their_own():
-    for folder in ("a", "b"):
-        Path(folder).mkdir()
-        np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)), size_m=[16.0, 8.0])
-    names = [read_own_terrain(Path(folder) / "hill.npz").name for folder in ("a", "b")]
-    assert names == ["a-hill.npz", "b-hill.npz"]

@@ -7,6 +7,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from qd.faults import fresh_numbers
 from qd.show.figures import draw_archive, draw_curves, draw_spread, save_figure, spread, summary, write_figures
 from tests.builders import fresh_values, small_archive
 
@@ -39,15 +40,11 @@ def test_curves_show_what_the_metrics_say():
 
 
 def test_archive_figure_has_a_line_an_elite_and_the_worst_on_top():
-    archive = small_archive(30)
-    (lines,) = draw_archive(archive).axes[0].collections
-    segments = lines.get_segments()
-    assert len(segments) == 30 and np.allclose(segments[-1][:, 1], archive.ratios[0])
-    assert (np.diff(lines.get_array()) >= 0).all()
-
-
-def test_archive_figure_shows_the_fresh_values_that_are_valid():
     archive = small_archive(4)
+    (lines,) = draw_archive(archive).axes[0].collections
+    np.testing.assert_array_equal([line[:, 1] for line in lines.get_segments()], archive.ratios[::-1])
+    assert lines.get_array().tolist() == archive.fitness[::-1].tolist()
+    # with fresh values those that are valid, in their order
     ratios = np.array([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7], [0.4, 0.6]])
     fresh = dataclasses.replace(fresh_values(archive), ratios=ratios, invalid_episodes=np.array([0, 40, 0, 0]))
     (lines,) = draw_archive(dataclasses.replace(archive, fresh=fresh)).axes[0].collections
@@ -55,7 +52,7 @@ def test_archive_figure_shows_the_fresh_values_that_are_valid():
     assert np.allclose([line[:, 1] for line in lines.get_segments()], ratios[[3, 2, 0]])
 
 
-@pytest.mark.parametrize("num_elites", [0, 1, 3])
+@pytest.mark.parametrize("num_elites", [0, 1])
 def test_figures_are_files_for_archives_of_any_size(tmp_path, num_elites):
     for file in write_figures(tmp_path, small_archive(num_elites), rows(1)):
         assert matplotlib.image.imread(file).std() > 0.01  # something is drawn
@@ -81,27 +78,9 @@ def test_summary_by_hand():
     }  # fmt: skip
     numbers = summary(archive, rows(4), gpus=1, origin={"seed": 9})
     assert {name: numbers[name] for name in expected} == expected
-
-
-def test_summary_with_fresh_values_by_hand():
-    archive = dataclasses.replace(small_archive(), penalty_std=np.array([[1.0, 2.0], [0.5, 0.5], [3.0, 2.0]]))
-    fresh = dataclasses.replace(
-        fresh_values(archive),
-        fitness=np.array([5.0, 1.0, -20.0]),
-        cell=np.array([4, 4, 0]),
-        collision_rate=np.array([0.0, 0.5, 0.0]),
-        invalid_episodes=np.array([0, 0, 11]),
-    )
-    archive = dataclasses.replace(archive, fresh=fresh, collision_rate=np.array([0.5, 0.0, 0.1]))
-    expected = {
-        "reevaluated": 3, "elites_reproduced": 2,
-        # the third is invalid; the first two share a cell, of which the fitter stays, 5 above -20 by 25
-        "corrected_elites": 1, "corrected_coverage": 1 / 10, "corrected_qd_score": 25.0, "mean_fitness_corrected": 3.0,
-        "mean_std": 2.0, "mean_std_interval": [1.0, 3.0],  # of 1 + 2 and .5 + .5
-        "with_collision": 2, "without_collision": 1,  # as found
-    }  # fmt: skip
-    numbers = summary(archive, rows(4), gpus=1, origin={})
-    assert {name: numbers[name] for name in expected} == expected
+    fresh = dataclasses.replace(fresh_values(archive), collision_rate=np.zeros(3))
+    numbers = summary(dataclasses.replace(archive, fresh=fresh), rows(4), gpus=1, origin={})
+    assert fresh_numbers(archive, fresh).items() <= numbers.items() and numbers["with_collision"] == 3  # as found
 
 
 def test_spread_by_hand():

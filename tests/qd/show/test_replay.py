@@ -23,13 +23,12 @@ from tests.qd.searches import CFG
 
 
 @pytest.fixture
-def done(tmp_path):
-    cells = Cells(2)
+def done(tmp_path, anymal):
     ratios = np.array([[0.35, 0.65]])
     archive = dataclasses.replace(
         small_archive(1),
         ratios=ratios,
-        cell=cells.cell_of(ratios),
+        cell=Cells(2).cell_of(ratios),
         penalty_mean=np.array([[2.0, 3.0]]),
         penalty_std=np.array([[1.0, 0.5]]),
         fitness=np.array([3.25]),
@@ -41,9 +40,9 @@ def done(tmp_path):
     sums = np.tile([2.0, 16.0, 0.0, 0.0, 0.0, 0.0], (4, 1))
     outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.GOAL]
     recording = recording_of(outcomes, [5.0, 14.0, 14.0, 14.0], penalties=sums)
+    found = Found(run=tmp_path, archive=archive, robot=anymal)
     fitness = FitnessCfg(penalties=archive.penalties, scales=archive.scales)
-    found = Found(run=tmp_path, archive=archive, robot=get_robot("anymal"))
-    fresh = evaluation_of(recording.result(), cells, fitness)
+    fresh = evaluation_of(recording.result(), Cells(2), fitness)
     return Replay(found=found, terrain=found.terrain(), recording=recording, fresh=fresh)
 
 
@@ -59,26 +58,24 @@ def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
     assert "base collision 1 of 4 (25%, 5 to 70%) 1 of 4 (25%, 5 to 70%)" in lines
     assert "goal reached 3 of 4 (75%, 30 to 95%) 3 of 4 (75%, 30 to 95%)" in lines
     assert "fitness 3.25 10.50" in lines  # fresh: 4 + 8 - 0 - 2 * 3/4
-    assert "It lands in its cell or a neighbour of it again." in lines
-    other = lines_of(dataclasses.replace(done, controller="runs/tuned/C-G.pt"))
-    assert any("runs/tuned/C-G.pt" in line for line in other)
-    assert "It lands in its cell or a neighbour of it again." not in other
+    far = dataclasses.replace(done, fresh=dataclasses.replace(done.fresh, cell=np.array([9])))
+    other = dataclasses.replace(done, controller="runs/tuned/C-G.pt")
+    near, beyond, by_other = (["its cell" in line for line in lines_of(case)] for case in (done, far, other))
+    assert sum(near) == sum(beyond) == 1 and not any(by_other) and lines_of(far) != lines
+    assert any("runs/tuned/C-G.pt" in line for line in lines_of(other))
 
 
 def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
     fresh = dataclasses.replace(fresh_values(done.found.archive), invalid_episodes=np.array([8]))
     archive = dataclasses.replace(done.found.archive, fresh=fresh)
-    corrected = dataclasses.replace(done, found=dataclasses.replace(done.found, archive=archive))
-    lines = lines_of(corrected)
-    assert lines[1:3] == ["found (4 episodes) corrected (40 episodes) now (4 episodes)", "fitness 3.25 1.62 10.50"]
-    # 8 of the 40 are invalid
-    assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) 1 of 4 (25%, 5 to 70%)" in lines
-    assert draw(corrected).axes[0].get_title().endswith("3.25 as found, 1.62 corrected, 10.50 in 4 fresh episodes")
-
-
-def test_of_an_invalid_terrain_no_rate_is_known(done):
-    fresh = dataclasses.replace(done.fresh, invalid_episodes=np.array([3]), collision_rate=np.array([0.0]))
-    assert "base collision 1 of 4 (25%, 5 to 70%) no valid episode" in lines_of(dataclasses.replace(done, fresh=fresh))
+    invalid = dataclasses.replace(done.fresh, invalid_episodes=np.array([3]), collision_rate=np.array([0.0]))
+    case = dataclasses.replace(done, found=dataclasses.replace(done.found, archive=archive), fresh=invalid)
+    lines = lines_of(case)
+    assert lines[2].split() == ["fitness", "3.25", "1.62", "10.50"]
+    # 8 of the 40 are invalid, and now the terrain as a whole
+    assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) no valid episode" in lines
+    title = draw(case).axes[0].get_title()
+    assert all(number in title for number in ("3.25", "1.62", "10.50"))
 
 
 def test_the_drawing_has_all_paths_and_how_they_ended(done):
@@ -93,22 +90,21 @@ def test_the_drawing_has_all_paths_and_how_they_ended(done):
 
 
 def test_a_terrain_is_crossed_by_the_controller_that_is_named_and_drawn_in_the_run(done, monkeypatch):
-    asked = []
+    asked, found = [], done.found
 
     def all_of(recordings, wanted):
         asked.extend(wanted)
         return [done.recording]
 
     monkeypatch.setattr(Recordings, "all_of", all_of)
-    folder = done.found.folder
-    replayed = replay(done.found, done.found.terrain("0"), replicas=4, seed=2)
-    assert replayed.controller == "" and (folder / "elite-0.png").is_file()
-    assert (asked[0].policy, asked[0].replicas, asked[0].seed) == (str(done.found.robot.policy_file), 4, 2)
-    assert replay(done.found, done.found.terrain("0"), policy="os.path:join").controller == "os.path:join"
-    assert (folder / "elite-0-os.path-join.png").is_file()
-    np.testing.assert_array_equal(asked[1].terrain, done.found.archive.genes[0])
+    assert replay(found, found.terrain("0"), replicas=4, seed=2).controller == ""
+    assert (found.folder / "elite-0.png").is_file()
+    assert (asked[0].policy, asked[0].replicas, asked[0].seed) == (str(found.robot.policy_file), 4, 2)
+    assert replay(found, found.terrain("0"), policy="os.path:join").controller == "os.path:join"
+    assert (found.folder / "elite-0-os.path-join.png").is_file()
+    np.testing.assert_array_equal(asked[1].terrain, found.archive.genes[0])
     with pytest.raises(ValueError, match="out"):
-        replay(done.found, done.found.terrain("0"), out=folder / "a.jpg")
+        replay(found, found.terrain("0"), out=found.folder / "a.jpg")
 
 
 def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
@@ -121,13 +117,6 @@ def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
     assert suffix_of(cfg, "mine/row.py:adapt@my model.onnx", robot) == "-row.py-adapt-my-model"
 
 
-def test_a_config_of_another_search_is_refused(tmp_path):
-    write_archive(tmp_path / "archive.npz", small_archive())  # of two of the config's six penalties
-    RunDirectory(tmp_path).begin_session(CFG, {"command": "", "commit": "", "device": "cpu"}, 0)
-    with pytest.raises(ValueError, match=r"config\.json .* penalties and scales"):
-        find_archive(None, tmp_path).as_searched()
-
-
 def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path):
     archive = tmp_path / "archive.npz"
     write_archive(archive, small_archive())
@@ -137,7 +126,7 @@ def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path):
     for elite in ("3", "-1", "x"):
         with pytest.raises(ValueError, match="elite"):
             found.terrains(elite)
-    with pytest.raises(ValueError, match="one elite"):
+    with pytest.raises(ValueError, match="elite"):
         found.terrain("all")
     with pytest.raises(FileNotFoundError, match="minimal"):
         found.terrains("0", "all")
@@ -145,13 +134,15 @@ def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path):
         find_archive("cassie", archive)
     with pytest.raises(FileNotFoundError):
         find_archive(None, tmp_path / "elsewhere")
+    RunDirectory(tmp_path).begin_session(CFG, {"command": "", "commit": "", "device": "cpu"}, 0)
+    with pytest.raises(ValueError, match=r"config\.json"):  # which has six penalties
+        find_archive(None, tmp_path).as_searched()
 
 
-def test_a_run_says_which_robot_it_is_of_and_has_penalties_that_the_robot_has(tmp_path):
-    penalties = ("yaw_rate", "vel_x")
-    robot = {"robot": "cassie", **robot_identity(get_robot("cassie"))}
-    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), penalties=penalties, **robot))
+def test_a_run_names_its_robot_and_has_penalties_that_the_robot_has(tmp_path, cassie):
+    robot = {"robot": "cassie", **robot_identity(cassie)}
+    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), **robot))
     assert find_archive(None, tmp_path).robot.name == "cassie"
     write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), penalties=("yaw_rate", "<b>")))
-    with pytest.raises(ValueError, match=r"penalties .* <b>"):
+    with pytest.raises(ValueError, match="penalties"):
         find_archive("anymal", tmp_path)
