@@ -114,20 +114,26 @@ class _File:
         return getattr(self._file, name)
 
 
-def run_child(log: Path, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> tuple[int, str]:
-    """Exit code and output of a function in a process of its own, forked from one that has everything imported."""
-    process = _CONTEXT.Process(target=_live, args=(log, function, arguments, named))
+def run_child(log: Path, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> tuple[int | None, str]:
+    """Runs a function in a process of its own, forked from one that has everything imported.
+
+    Returns:
+        What the function returned, None if the process ended before; and the process's output.
+    """
+    code = log.with_name(f"{log.name}.code")
+    code.unlink(missing_ok=True)
+    process = _CONTEXT.Process(target=_run_here, args=(log, code, function, arguments, named))
     process.start()
     if not connection.wait([process.sentinel], _PATIENCE_S):
         process.kill()
         raise AssertionError(f"a child hangs:\n{log.read_text()}")
     process.join()
-    return process.exitcode or 0, log.read_text(errors="replace")
+    return int(code.read_text()) if code.exists() else None, log.read_text(errors="replace")
 
 
-def _live(log: Path, function: Callable[..., Any], arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+def _run_here(log: Path, code: Path, function: Callable[..., Any], arguments: tuple[Any, ...], named: Any) -> None:
     handle = os.open(log, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
     for stream in (sys.stdout, sys.stderr):
         os.dup2(handle, stream.fileno())
     signal.signal(signal.SIGINT, signal.default_int_handler)  # the fork server ignores it
-    sys.exit(function(*arguments, **named))
+    code.write_text(str(function(*arguments, **named)))

@@ -19,6 +19,7 @@ from tests.qd.searches import TIMES, crossing_by
 from tests.qd.stand_in import open_stand_in
 from train.ppo import training
 from train.ppo.checkpoint import CHECKPOINT, read_checkpoint
+from train.ppo.training import POLICY
 from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
 
@@ -85,20 +86,12 @@ def train(path: Path, *, iterations: int, **watched: Any) -> int:
 
 
 def train_outcome(path: Path) -> tuple[Any, ...]:
-    """What a training comes to: all of its checkpoint but what a clock says, as plain values."""
-    content = read_checkpoint(path / CHECKPOINT)
-    return tuple((key, _plain(value)) for key, value in sorted(content.items()) if key != "progress")
+    """What a training comes to: its iterations and controller. Weights differ, for episodes begin anew on a resume."""
+    policy = torch.load(path / POLICY, weights_only=True)
+    return saved_updates(path), policy["iter"], {key: value.shape for key, value in policy["actor_state_dict"].items()}
 
 
 def saved_updates(path: Path) -> int:
     """Iterations that the checkpoint of a training has; 0 without one."""
     file = path / CHECKPOINT
     return read_checkpoint(file)["iter"] if file.exists() else 0
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
