@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from qd.faults import (
     SPECIALIST,
@@ -15,54 +16,51 @@ from qd.faults import (
     judgement,
     rate_of,
 )
-from qd.groups import verdict_of
 from tests.builders import fresh_values, judged_archive, small_archive
+
+
+def numbers_of(archive, *names, **known):
+    numbers = fault_numbers(archive, **known)
+    return tuple(numbers[name] for name in names)
 
 
 def test_numbers_by_hand():
     archive = judged_archive()
-    numbers = fault_numbers(archive)
-    counts = {name: numbers[name] for name in ("failing", "confirmed", "certified", "faults_panel")}
-    assert counts == {"failing": 4, "confirmed": 2, "certified": 2, "faults_panel": 1}
-    assert numbers["certifiers"] == ["C-G", "S"]
-    assert numbers["mujoco_c"] == {"crossed": 2, "failing": 1} and numbers["crossed_resolved"] == 4
-    assert [one["certified"] for one in numbers["certificates"]] == [1, 1]
-    assert [one["crossed"] for one in numbers["certificates"]] == [4, 3]
+    assert numbers_of(archive, "failing", "confirmed", "certified", "faults_panel") == (4, 2, 2, 1)
+    assert numbers_of(archive, "certifiers", "crossed_resolved") == (["C-G", "S"], 4)
+    assert numbers_of(archive, "mujoco_c") == ({"crossed": 2, "failing": 1},)
+    (certificates,) = numbers_of(archive, "certificates")
+    assert [(entry["crossed"], entry["certified"]) for entry in certificates] == [(4, 1), (3, 1)]
     # Nobody trained a specialist, looked for families, or knows what the certifiers were trained on.
     names = ("faults", "faults_unseen", "families", "fault_families", "robust")
-    assert [numbers[name] for name in names] == [None] * 5
-    assert count_faults(archive) == 1
+    assert numbers_of(archive, *names) == (None,) * 5 and count_faults(archive) == 1
 
 
-def test_the_specialists_faults_count_beside_those_of_the_panel():
+@pytest.mark.parametrize(("certifiers", "expected"), [(("C-G", SPECIALIST), (1, 0)), ((SPECIALIST, "S"), (1, 1))])
+def test_the_specialists_faults_count_beside_those_of_the_panel(certifiers, expected):
     archive = judged_archive()
-    for names, expected in ((("C-G", SPECIALIST), (1, 0)), ((SPECIALIST, "S"), (1, 1))):
-        faults = dataclasses.replace(archive.faults, certifiers=names)
-        numbers = fault_numbers(dataclasses.replace(archive, faults=faults))
-        assert (numbers["faults"], numbers["faults_panel"]) == expected
+    archive = dataclasses.replace(archive, faults=dataclasses.replace(archive.faults, certifiers=certifiers))
+    assert numbers_of(archive, "faults", "faults_panel") == expected and count_faults(archive) == 1
 
 
 def test_faults_by_certifiers_that_trained_on_no_kin_and_families_of_faults():
     # The fault is elite 0, which S crosses; elite 2 is certified by C-G alone and not confirmed.
-    archive, families = judged_archive(), np.array([0, 1, 1, 2, 0])
-    seen = np.zeros((5, 2), bool)
-    numbers = fault_numbers(archive, families, seen)
-    assert (numbers["faults_unseen"], numbers["families"], numbers["fault_families"]) == (1, 3, 1)
+    archive, families, seen = judged_archive(), np.array([0, 1, 1, 2, 0]), np.zeros((5, 2), bool)
+    names = ("faults_unseen", "families", "fault_families")
+    assert numbers_of(archive, *names, families=families, seen=seen) == (1, 3, 1)
     seen[0, 1] = True
-    assert fault_numbers(archive, families, seen)["faults_unseen"] == 0
+    assert numbers_of(archive, *names, families=families, seen=seen) == (0, 3, 1)
 
 
 def test_numbers_of_what_nobody_looked_at_are_none():
-    fresh_alone = dataclasses.replace(judged_archive(), faults=None)
-    numbers = fault_numbers(fresh_alone)
-    assert numbers["failing"] == 4 and numbers["confirmed"] is numbers["certified"] is numbers["faults_panel"] is None
-    assert fault_numbers(small_archive())["failing"] is None
-    fine = dataclasses.replace(fresh_alone, fresh=dataclasses.replace(fresh_alone.fresh, goal_rate=np.ones(5)))
-    assert fault_numbers(fine)["faults"] == fault_numbers(fine)["confirmed"] == 0
-    archive = judged_archive()
-    waits = dataclasses.replace(archive.faults, resolved_outcomes=0 * archive.faults.resolved_outcomes)
-    numbers = fault_numbers(dataclasses.replace(archive, faults=waits))
-    assert (numbers["certified"], numbers["confirmed"], numbers["faults_panel"]) == (2, None, None)
+    archive, names = judged_archive(), ("failing", "certified", "confirmed", "faults_panel")
+    assert numbers_of(small_archive(), *names) == (None,) * 4
+    fresh_alone = dataclasses.replace(archive, faults=None)
+    assert numbers_of(fresh_alone, *names) == (4, None, None, None)
+    fine = dataclasses.replace(fresh_alone, fresh=dataclasses.replace(archive.fresh, goal_rate=np.ones(5)))
+    assert numbers_of(fine, *names) == (0,) * 4
+    faults = dataclasses.replace(archive.faults, resolved_outcomes=0 * archive.faults.resolved_outcomes)
+    assert numbers_of(dataclasses.replace(archive, faults=faults), *names) == (4, 2, None, None)
 
 
 def test_numbers_of_fresh_episodes_by_hand():
@@ -85,24 +83,20 @@ def test_numbers_of_fresh_episodes_by_hand():
     assert sampled.items() < numbers.items() and not any(name.startswith("corrected") for name in sampled)
 
 
-def test_words_name_the_counts():
+def test_words_say_counts_and_verdicts():
     archive = judged_archive()
     # Wilson of 2 of 4: 15 to 85 %
     words = " ".join(fault_words(archive))
     for part in ("4 failing elites", "2 of 4 (50%, 15 to 85%)", "1 of 2 (50%", "1 fault:", "C-G or S"):
         assert part in words
-    assert fault_words(dataclasses.replace(archive, faults=None)) == []
-
-
-def test_the_verdict_on_an_elite_and_its_words():
-    archive = judged_archive()
-    assert [verdict_of(archive, number) for number in range(5)] == ["fault", "confirmed", "certified", "failing", ""]
     words = [elite_words(archive, number) for number in range(5)]
+    # a fault, confirmed alone, certified alone, failing alone, not failing
     assert [("a fault" in text[-1], "not known" in text[-1]) for text in words] == [
         (True, False), (False, True), (False, False), (False, True), (False, False),
     ]  # fmt: skip
-    assert any("9 of 20 (45%, 26 to 66%)" in sentence for sentence in words[0])
-    assert elite_words(dataclasses.replace(archive, faults=None), 0) == []
+    assert "9 of 20 (45%, 26 to 66%)" in words[0][0]
+    unjudged = dataclasses.replace(archive, faults=None)
+    assert fault_words(unjudged) == elite_words(unjudged, 0) == []
 
 
 def test_rates_and_certificates_of_an_elite():
@@ -112,6 +106,8 @@ def test_rates_and_certificates_of_an_elite():
     assert known["resolved"] == {"goal_rate": 0.45, "goal_interval": [0.2582, 0.6579], "valid_episodes": 20}
     (certificate,) = known["certificates"]
     assert (certificate["controller"], certificate["searched"]["goal_rate"]) == ("S", 0.5)
+    (certificate,) = judgement(archive, 2)["certificates"]
+    assert (certificate["searched"]["goal_rate"], certificate["resolved"]["goal_rate"]) == (1.0, 0.5)
     assert judgement(dataclasses.replace(archive, faults=None), 0) == {"resolved": None, "certificates": []}
     assert rate_of(np.array([14, 0, 0, 6]))["goal_rate"] is None  # 6 of 20 are invalid
 
