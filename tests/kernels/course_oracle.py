@@ -43,8 +43,9 @@ def gene(wanted, span):
 def element(kind, *, lead=4, size=None, length=None, detail=None, turn=None):
     """Six genes of one element; what is not given is at the low end of its range."""
     given = [size, length, detail, turn]
-    spans = RANGES[kind]
-    parameters = [-1.0 if one is None else gene(one, span) for one, span in zip(given, spans, strict=True)]
+    parameters = [
+        -1.0 if number is None else gene(number, span) for number, span in zip(given, RANGES[kind], strict=True)
+    ]
     place = {"whole": (0, len(KINDS) - 1)}
     return [gene(KINDS.index(kind), place), gene(lead, {"whole": (4, 16)}), *parameters]
 

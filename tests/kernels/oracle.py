@@ -1,4 +1,4 @@
-"""Terrain, contact and contact forces written a second time: float64 NumPy, from the definitions, slow and plain.
+"""Terrain and contact written a second time: float64 NumPy, from the definitions, slow and plain.
 
 The tests hold the kernels against it, and against :mod:`sim.mujoco_c.model` for observation,
 command and penalties; nothing in either is shared with the kernels or ported from them. Vectors are world-local.
@@ -110,18 +110,3 @@ def rotation_matrix(quaternion_xyzw: Array) -> Array:
     x, y, z, w = np.float64(quaternion_xyzw) / np.linalg.norm(np.float64(quaternion_xyzw))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
-
-
-def geom_forces(
-    world: Array, column: Array, frame: Array, efc_address: Array, efc_force: Array,
-    shape: tuple[int, int],
-) -> Array:  # fmt: skip
-    """Sum of contact forces on each geom, (num_envs, num_geoms, 3), each along its frame's normal and two tangents.
-
-    ``column`` is the geom's column in the result, -1 for none; an ``efc_address`` below 0 is a contact without force.
-    """
-    total = np.zeros((*shape, 3))
-    for c in np.flatnonzero((column >= 0) & (efc_address[:, 0] >= 0)):
-        force = efc_force[world[c], efc_address[c, :3]].astype(np.float64)
-        total[world[c], column[c]] += force @ frame[c].astype(np.float64)
-    return total

@@ -59,14 +59,14 @@ def collide(poses, terrain_of_env, grids, strips, device, capacity=None, spread=
         buffer,
     )
     count = int(buffer.count.numpy()[0])
-    found = {name: getattr(buffer, name).numpy()[:count] for name in ContactBuffer.vars if name != "count"}
-    found["count"] = count
-    found["env"], found["strip"] = np.divmod(found["shape1"] - FIRST_SHAPE, len(strips))
-    found["rotation"] = np.array([oracle.rotation_matrix(poses[k, 3:]) for k in found["shape1"] - FIRST_SHAPE])
-    origin = np.float64(poses)[found["shape1"] - FIRST_SHAPE, :3]
-    found["centre"] = origin + np.einsum("nij,nj->ni", found["rotation"].reshape(-1, 3, 3), found["point1"])
-    found["distance"] = ((found["centre"] - found["point0"]) * found["normal"]).sum(1)
-    return found
+    records = {name: getattr(buffer, name).numpy()[:count] for name in ContactBuffer.vars if name != "count"}
+    records["count"] = count
+    records["env"], records["strip"] = np.divmod(records["shape1"] - FIRST_SHAPE, len(strips))
+    records["rotation"] = np.array([oracle.rotation_matrix(poses[k, 3:]) for k in records["shape1"] - FIRST_SHAPE])
+    origin = np.float64(poses)[records["shape1"] - FIRST_SHAPE, :3]
+    records["centre"] = origin + np.einsum("nij,nj->ni", records["rotation"].reshape(-1, 3, 3), records["point1"])
+    records["distance"] = ((records["centre"] - records["point0"]) * records["normal"]).sum(1)
+    return records
 
 
 def random_rotations(rng, count):
@@ -95,33 +95,26 @@ def sphere_poses(rng, grid, count):
     return np.float32(poses)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["genes", "stairs_up_down", "boxes", "noise"])
+@pytest.mark.parametrize("kind", ["genes", "boxes"])
 def test_random_spheres_against_the_oracle(device, kind):
-    rng = np.random.default_rng(7)
-    grid = hard_terrain(kind)
-    poses = sphere_poses(rng, grid, 500)
-    found = collide(poses, np.zeros(500, int), grid[None], [(np.zeros(3), radius) for radius in RADII], device)
-    distance_of = {
-        (env, strip): d for env, strip, d in zip(found["env"], found["strip"], found["distance"], strict=True)
-    }
-    assert len(distance_of) == found["count"], "one sphere gave two contacts"
-    invented, missed, touching, sidelong = [], [], 0, 0
+    rng, grid = np.random.default_rng(7), hard_terrain(kind)
+    poses = sphere_poses(rng, grid, 120)
+    records = collide(poses, np.zeros(120, int), grid[None], [(np.zeros(3), radius) for radius in RADII], device)
+    distance_of = dict(zip(zip(records["env"], records["strip"], strict=True), records["distance"], strict=True))
+    assert len(distance_of) == records["count"], "one sphere gave two contacts"
+    touching, sidelong = 0, 0
     for env, strip in np.ndindex(poses.shape[:2]):
         centre, radius = poses[env, strip, :3], RADII[strip]
         expected, nearest = oracle.nearest_on_surface(grid, SPACING, centre, radius + UNDECIDED)
-        got = distance_of.get((env, strip))
-        if expected < radius - UNDECIDED and got is None:
-            missed.append((centre, radius, expected))
-        if expected > radius + UNDECIDED and got is not None:
-            invented.append((centre, radius, expected, got))
-        if got is not None and abs(expected) < radius - UNDECIDED:
+        distance = distance_of.get((env, strip))
+        if abs(expected - radius) > UNDECIDED:
+            assert (distance is not None) == (expected < radius), (centre, radius, expected)
+        if distance is not None and abs(expected) < radius - UNDECIDED:
             touching += 1
             sidelong += abs(nearest[2] - centre[2]) < 0.5 * abs(expected)
-            assert got == pytest.approx(expected, abs=1e-4)
-    assert (missed, invented) == ([], [])
-    assert touching > 300
-    assert sidelong > 10 or kind == "genes"  # the case that approximate nearest points get wrong
+            assert distance == pytest.approx(expected, abs=1e-4)
+    assert touching > 80
+    assert sidelong > 5 or kind == "genes"  # the case that approximate nearest points get wrong
 
 
 def test_a_row_that_sags_is_looked_at_where_it_touches(device):
@@ -129,56 +122,53 @@ def test_a_row_that_sags_is_looked_at_where_it_touches(device):
     sagging = [[-0.3, 0, 0.5], [0, 0.2, 0.02], [0.3, 0, 0.5]]
     poses = np.float32([[8, 4, 0, 0, 0, 0, 1]])
     flat = np.zeros((1, 161, 321), np.float32)
-    found = collide(poses, [0], flat, [(np.array(sagging), 0.05)], device, spread=0.52)
-    assert found["count"] == 1
-    np.testing.assert_allclose(found["point1"][0], sagging[1], atol=1e-6)
+    records = collide(poses, [0], flat, [(np.array(sagging), 0.05)], device, spread=0.52)
+    assert records["count"] == 1
+    np.testing.assert_allclose(records["point1"][0], sagging[1], atol=1e-6)
     assert collide(poses, [0], flat, [(np.array(sagging), 0.05)], device)["count"] == 0
 
 
 def test_strips_report_first_deepest_and_last(device):
-    rng = np.random.default_rng(8)
     grid = hard_terrain("boxes")
-    centres, radius = np.linspace([0, 0, -0.2], [0, 0, 0.2], 15), 0.04
-    poses = sphere_poses(rng, grid, 150)[:, :1]
-    found = collide(poses, np.zeros(150, int), grid[None], [(centres, radius)], device)
+    centres, radius = np.linspace([0, 0, -0.2], [0, 0, 0.2], 9), 0.04
+    poses = sphere_poses(np.random.default_rng(8), grid, 100)[:, :1]
+    records = collide(poses, np.zeros(100, int), grid[None], [(centres, radius)], device)
     touched = 0
     for env, pose in enumerate(np.float64(poses[:, 0])):
         world = pose[:3] + centres @ oracle.rotation_matrix(pose[3:]).T
         distance = np.array([oracle.nearest_on_surface(grid, SPACING, p, radius + UNDECIDED)[0] for p in world])
         if (np.abs(distance - radius) < UNDECIDED).any() or (np.sort(distance)[:2] == -np.inf).any():
             continue  # too close to call, or so deep that the depth is another definition
-        expected = np.flatnonzero(distance < radius)
-        mine = found["env"] == env
-        if len(expected) == 0:
-            assert not mine.any()
-            continue
-        touched += 1
-        wanted = {expected[0], expected[-1], np.argmin(distance)}
-        got = {int(np.argmin(np.abs(centres - point).sum(1))) for point in found["point1"][mine]}
-        tied = np.flatnonzero(distance < distance.min() + 2e-5)
-        assert got in [{expected[0], expected[-1], k} for k in tied], (wanted, got)
-        assert mine.sum() == len(got)
-    assert touched > 30
+        touching, reported = np.flatnonzero(distance < radius), records["point1"][records["env"] == env]
+        chosen = {int(np.argmin(np.abs(centres - point).sum(1))) for point in reported}
+        assert len(reported) == len(chosen)
+        if len(touching):
+            touched += 1
+            deepest = np.flatnonzero(distance < distance.min() + 2e-5)  # several where they are as deep
+            assert chosen in [{touching[0], touching[-1], probe} for probe in deepest]
+        else:
+            assert not chosen
+    assert touched > 20
 
 
 def test_records_are_what_the_solver_reads(device):
     rng = np.random.default_rng(9)
     grid = hard_terrain("genes")
     poses = sphere_poses(rng, grid, 100)
-    found = collide(
+    records = collide(
         poses, np.zeros(100, int), grid[None], [(rng.normal(0, 0.02, 3), radius) for radius in RADII], device
     )
-    assert found["count"] > 50
-    radius = np.array(RADII)[found["strip"]]
-    assert (found["shape0"] == GROUND_SHAPE).all()
-    assert (found["margin0"] == 0).all()
-    assert not found["offset0"].any()
-    np.testing.assert_array_equal(found["margin1"], np.float32(radius))
-    np.testing.assert_allclose(np.linalg.norm(found["normal"], axis=1), 1, atol=1e-5)
+    assert records["count"] > 50
+    radius = np.array(RADII)[records["strip"]]
+    assert (records["shape0"] == GROUND_SHAPE).all()
+    assert (records["margin0"] == 0).all()
+    assert not records["offset0"].any()
+    np.testing.assert_array_equal(records["margin1"], np.float32(radius))
+    np.testing.assert_allclose(np.linalg.norm(records["normal"], axis=1), 1, atol=1e-5)
     # offset1, turned into the world, leads from the centre to the sphere's lowest point against the normal.
-    offset_w = np.einsum("nij,nj->ni", found["rotation"], found["offset1"])
-    np.testing.assert_allclose(offset_w, -found["normal"] * radius[:, None], atol=1e-6)
-    for point in found["point0"][np.abs(found["distance"]) < radius]:
+    offset_w = np.einsum("nij,nj->ni", records["rotation"], records["offset1"])
+    np.testing.assert_allclose(offset_w, -records["normal"] * radius[:, None], atol=1e-6)
+    for point in records["point0"][np.abs(records["distance"]) < radius]:
         assert abs(oracle.nearest_on_surface(grid, SPACING, point, 0.05)[0]) < 1e-5
 
 
@@ -186,27 +176,22 @@ def test_depth_by_hand(device):
     # A sphere of radius 0.1 whose centre is 0.06 m over flat ground at 0.25: distance 0.06, normal up; 0.11 m over it:
     # no contact; 0.04 m under it: distance -0.04, still pushed up.
     poses = [[5, 4, 0.31, 0, 0, 0, 1], [5, 4, 0.36, 0, 0, 0, 1], [5, 4, 0.21, 0, 0, 0, 1]]
-    found = collide(poses, np.zeros(3, int), np.full((1, 161, 321), 0.25), [(np.zeros(3), 0.1)], device)
-    order = np.argsort(found["env"])
-    assert found["env"][order].tolist() == [0, 2]
-    np.testing.assert_allclose(found["distance"][order], [0.06, -0.04], atol=1e-6)
-    np.testing.assert_allclose(found["normal"], [[0, 0, 1]] * 2, atol=1e-6)
+    records = collide(poses, np.zeros(3, int), np.full((1, 161, 321), 0.25), [(np.zeros(3), 0.1)], device)
+    order = np.argsort(records["env"])
+    assert records["env"][order].tolist() == [0, 2]
+    np.testing.assert_allclose(records["distance"][order], [0.06, -0.04], atol=1e-6)
+    np.testing.assert_allclose(records["normal"], [[0, 0, 1]] * 2, atol=1e-6)
 
 
 def test_contacts_past_the_capacity_are_counted_but_not_written(device):
     poses = np.tile([5, 4, 0.05, 0, 0, 0, 1], (6, 1))
-    found = collide(poses, np.zeros(6, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device, capacity=4)
-    assert found["count"] == 6
-    assert (found["shape1"] >= FIRST_SHAPE).sum() == 4
+    records = collide(poses, np.zeros(6, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device, capacity=4)
+    assert records["count"] == 6
+    assert (records["shape1"] >= FIRST_SHAPE).sum() == 4
 
 
 def test_a_state_that_is_not_finite_touches_nothing(device):
-    poses = np.full((2, 7), np.nan)
-    found = collide(poses, np.zeros(2, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device)
-    assert found["count"] == 0
-
-
-def test_wrong_number_of_poses_is_named(device):
-    poses = np.zeros((3, 7))
-    with pytest.raises(ValueError, match=r"4 x 1 poses, got 3"):
-        collide(poses, np.zeros(4, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device)
+    strip, flat = [(np.zeros(3), 0.1)], np.zeros((1, 161, 321))
+    assert collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip, device)["count"] == 0
+    with pytest.raises(ValueError, match="body_q"):
+        collide(np.zeros((3, 7)), np.zeros(4, int), flat, strip, device)

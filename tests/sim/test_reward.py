@@ -5,18 +5,15 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-import torch
 
 from kernels.episode import Outcome
 from sim.crossing import CrossingCfg
-from sim.policy.loaders import load_policy
 from sim.reward import make_motion, soft_joint_limits
 from sim.robots.training import RewardCfg, TrainingCfg
 from sim.rollout import Rollout
 from tests.sim.policies import stand
-from tests.sim.scenes import ONLY_ANYMAL, ONLY_CASSIE, positions, put
+from tests.sim.scenes import FLAT, ONLY_ANYMAL, ONLY_CASSIE, positions, put, spike
 
-FLAT = np.zeros((161, 321), np.float32)
 NOTHING = {field.name: 0.0 for field in fields(RewardCfg)}
 DT = 0.02
 
@@ -35,18 +32,13 @@ def tracker(anymal):
 def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
     """By default robots that begin at rest."""
     still = {"start_position_range": 0.0, "start_yaw_range": 0.0, "start_joint_range": 0.0, "start_velocity_range": 0.0}
-    settings = still | {"max_duration_s": 0.6, "poll_every_s": 0.1, "reward": True} | cfg
-    return Rollout(
-        robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=CrossingCfg(**settings)
-    )
+    cfg = CrossingCfg(**still | {"max_duration_s": 0.6, "poll_every_s": 0.1, "reward": True} | cfg)
+    return Rollout(robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=cfg)
 
 
-def spike(x=2.0):
+def spike_under(x):
     """A needle of 1 m under (x, 4); a robot put over its tip falls on it."""
-    grid = FLAT.copy()
-    col = round(x / 0.05)
-    grid[79:82, col - 1 : col + 2] = 1.0
-    return grid
+    return np.roll(spike(), round((x - 2.0) / 0.05), axis=1)
 
 
 def test_after_the_goal_it_is_told_to_stand_and_paid_on(tracker, device):
@@ -67,7 +59,7 @@ def test_after_a_base_collision_nothing_is_paid(tracker, device, start):
     totals = []
     for duration in (0.8, 1.6):
         rollout = crossing(tracker, device, start=(start, 4.0), max_duration_s=duration)
-        result = rollout.evaluate(spike(start)[None], np.array([1]))
+        result = rollout.evaluate(spike_under(start)[None], np.array([1]))
         assert (result.base_collision if start == 2.0 else result.reached_goal).all()
         assert result.physics_steps < 160  # it was noticed that nobody earns any more
         totals.append(result.reward)
@@ -80,7 +72,7 @@ def test_a_base_collision_costs_its_price_once(anymal, device, start):
     # -200 a second for the one control step: -4; and nothing for the robot beside, which stands until time is up.
     robot = paid_for(anymal, only_positive=True, termination=-200.0)
     rollout = crossing(robot, device, num_terrains=2, start=(start, 4.0), max_duration_s=1.6)
-    result = rollout.evaluate(np.stack([spike(start), FLAT]), np.array([1, 1]))
+    result = rollout.evaluate(np.stack([spike_under(start), FLAT]), np.array([1, 1]))
     assert not result.invalid.any()
     np.testing.assert_allclose(result.reward, [[-4.0] * 4, [0.0] * 4], atol=1e-5)
 
@@ -113,41 +105,18 @@ def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker,
 
 def test_asking_for_the_reward_changes_nothing_else(anymal):
     """Bit for bit on the CPU: one goes past the goal, one meets a spike, one walks, and so without the reward."""
-    walker = load_policy(anymal.policy_file, anymal, "cpu")
     results = []
     for reward in (False, True):
         rollout = crossing(
-            anymal, "cpu", walker, num_terrains=2, replicas=3, start=(13.3, 4.0), start_position_range=0.1,
+            anymal, "cpu", anymal.policy_file, num_terrains=2, replicas=3, start=(13.3, 4.0), start_position_range=0.1,
             start_velocity_range=0.2, start_joint_range=0.2, max_duration_s=1.2, reward=reward,
         )  # fmt: skip
-        results.append(rollout.evaluate(np.stack([FLAT, spike(13.3)]), np.array([5, 6])))
+        results.append(rollout.evaluate(np.stack([FLAT, spike_under(13.3)]), np.array([5, 6])))
     without, paid = results
     assert len(np.unique(without.outcome)) >= 2 and without.reached_goal.any()
     for field in ("penalties", "outcome", "fallen", "duration_s", "final_position"):
         np.testing.assert_array_equal(getattr(without, field), getattr(paid, field))
     assert without.reward is None and np.isfinite(paid.reward).all()
-
-
-def test_a_reward_depends_on_nothing_but_its_episode(anymal):
-    grids, seeds = np.stack([FLAT, spike()]), np.array([5, 6])
-    cfg = {"start_velocity_range": 0.2, "start_position_range": 0.1}
-    together = crossing(anymal, "cpu", num_terrains=2, **cfg).evaluate(grids, seeds).reward
-    alone = crossing(anymal, "cpu", **cfg)
-    for t in range(2):
-        np.testing.assert_array_equal(alone.evaluate(grids[t : t + 1], seeds[t : t + 1]).reward[0], together[t])
-    assert len(np.unique(together)) == 8
-
-
-def test_the_policy_is_told_to_stand_after_the_goal(anymal, device):
-    seen = []
-
-    def watch(observation: torch.Tensor) -> torch.Tensor:
-        seen.append(observation[0, 9:12].clone())
-        return stand(observation)
-
-    crossing(anymal, device, watch, start=(14.3, 4.0), max_duration_s=0.1).evaluate(FLAT[None], np.array([1]))
-    commands = torch.stack(seen)[-5:].cpu()  # before these, the policy was tried
-    assert commands[0, :2].norm() > 1.0 and (commands[1:] == 0.0).all()
 
 
 @ONLY_CASSIE
@@ -183,6 +152,5 @@ def test_a_robots_own_settings_reach_the_kernels(eight, robot):
 @ONLY_CASSIE
 def test_a_joint_that_is_not_there_is_named(eight, robot):
     cfg = replace(robot.training, steady_joints=("hip_rotation_left", "knee"))
-    with pytest.raises(ValueError, match="robot 'cassie' has no joint named knee: expected some of hip_abduction_left"):
+    with pytest.raises(ValueError, match="knee"):
         make_motion(eight, cfg, command=None, action=None)
-    assert TrainingCfg().steady_joints == ()

@@ -47,6 +47,8 @@ def test_sizes_go_beyond_what_the_space_has():
     steep = dose_of("cross_slope", 1.0).terrains(2, np.random.default_rng(0))
     assert sorted(grid[160, 130] > 0 for grid in steep) == [False, True]  # one to each side
     assert np.abs(steep).max() == pytest.approx(2.0)  # 1 in 1 over 2 m
+    first, second = dose_of("rubble", 0.3).terrains(2, np.random.default_rng(0))
+    assert np.abs(first[:, 101:140] - second[:, 111:150]).max() > 0.05  # another at each place
     narrow = dose_of("beam", 0.1).terrains(1, np.random.default_rng(0))[0]
     assert np.flatnonzero(narrow[:, 110] == 0.0).tolist() == [79, 80, 81]
 
@@ -57,45 +59,22 @@ def test_places_are_spread_over_a_metre_and_the_same_for_all_values():
     begins = (grids[:, :, 80] < 0).argmax(axis=2) - 1
     assert (begins == begins[:, :1]).all()
     assert begins[:, 0].tolist() == list(range(FIRST_COL, FIRST_COL + NUM_PLACES))
-    lengths = (grids[:, :, 80] < 0).sum(axis=2)
-    assert (lengths == [3, 7, 11]).all()  # nodes between the edges
+    assert ((grids[:, :, 80] < 0).sum(axis=2) == [3, 7, 11]).all()  # nodes between the edges
     few = dose.terrains(4, np.random.default_rng(0)).reshape(4, 3, 161, 321)
     assert ((few[:, 0, 80] < 0).argmax(axis=1) - 1).tolist() == [100, 105, 110, 115]
 
 
-def test_rubble_differs_from_place_to_place():
-    one, other = dose_of("rubble", 0.3).terrains(2, np.random.default_rng(0))
-    assert 0.25 < one.max() <= 0.3
-    # They begin at columns 100 and 110.
-    assert np.abs(one[:, 101:140] - other[:, 111:150]).max() > 0.05
-
-
-@pytest.mark.parametrize(
-    ("name", "values", "map_of"),
-    [
-        ("friction", (1.0, 0.5, 0.15), lambda ground: ground.friction),
-        ("softness", (0.02, 0.06), lambda ground: ground.time_constant_s),
-    ],
-)
-def test_ground_is_level_and_the_same_everywhere(name, values, map_of):
+@pytest.mark.parametrize(("name", "values"), [("friction", (1.0, 0.5, 0.15)), ("softness", (0.02, 0.06))])
+def test_ground_is_level_and_the_same_everywhere(name, values):
     heights, ground = terrains_of(dose_of(name, *values).terrains(2, np.random.default_rng(0)), get_space(LEVEL_SPACE))
-    assert not heights.any() and ground is not None
-    expected = np.tile(values, 2)[:, None, None] * np.ones((4, 8))
-    np.testing.assert_allclose(map_of(ground), expected, atol=1e-6)
-    other = ground.time_constant_s if name == "friction" else ground.friction
-    assert (other == (0.0 if name == "friction" else 1.0)).all()
-
-
-def test_every_dose_can_be_made_and_gets_harder():
-    for name, dose in DOSES.items():
-        assert chosen_doses({name: dose.values}, dose.others)[name] == dose
-        assert len(dose.terrains(1, np.random.default_rng(0))) == len(dose.values)
-        assert dose.parameter in dose.quantities and dose.others.keys() < dose.quantities.keys()
+    assert not heights.any()
+    maps = {"friction": ground.friction, "softness": ground.time_constant_s}
+    np.testing.assert_allclose(maps.pop(name), np.tile(values, 2)[:, None, None] * np.ones((4, 8)), atol=1e-6)
+    assert (next(iter(maps.values())) == (0.0 if name == "friction" else 1.0)).all()
 
 
 def test_words():
     assert DOSES["stairs_up"].describe() == "stairs up, tread 0.30 m, flight 5 steps"
-    assert dose_of("beam", 0.3, depth=0.2).describe() == "beam over a ditch, depth 0.20 m, length 1.50 m"
     assert DOSES["softness"].in_words(0.0125) == "0.013 s" and DOSES["friction"].in_words(0.15) == "0.15"
 
 
@@ -113,15 +92,11 @@ def test_a_command_line_names_doses():
     [
         ("stair", "", "stair"),
         ("ditch=0.12", "", "width"),  # no multiple of 5 cm
-        ("ditch=0.1,0.1", "", "width"),
-        ("ditch=", "", "ditch="),
         ("stairs_up=0.9", "", "rise"),
         ("stairs_up=high", "", "stairs_up=high"),
         ("stairs_up", "flight=2.5", "flight"),
-        ("friction=0.1", "", "friction"),
         ("ditch", "tread=0.3", "tread"),
         ("ditch", "depth", "depth"),
-        ("sill=nan", "", "height"),
     ],
 )
 def test_what_cannot_be_made_is_refused(elements, at, field):

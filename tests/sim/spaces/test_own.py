@@ -31,14 +31,14 @@ def ridges(tmp_path):
 
 
 @pytest.fixture
-def written(tmp_path):
+def write(tmp_path):
     """Writes a file; returns the name of the space in it."""
 
-    def write(text):
+    def write_space(text):
         (tmp_path / "space.py").write_text(text)
         return f"{tmp_path / 'space.py'}:Space"
 
-    return write
+    return write_space
 
 
 def test_a_space_from_a_file(ridges):
@@ -55,8 +55,8 @@ def test_a_space_from_a_file(ridges):
     assert not heights_of(space.without(space.hard_random(2, 0), [0]), space).any()
 
 
-def test_what_a_space_may_leave_out(written):
-    space = load_space(written(LEAST))
+def test_what_a_space_may_leave_out(write):
+    space = load_space(write(LEAST))
     assert space.hard_random(3, 0).shape == (3, 2)
     assert space.describe([0.5, -1.0]) == "genes 0.50, -1.00" and space.parts([0.5, -1.0]) == ()
     assert space.sigma0 == 2.0
@@ -64,8 +64,8 @@ def test_what_a_space_may_leave_out(written):
         space.without(np.zeros((1, 2)), [0])
 
 
-def test_numpy_will_do(written):
-    name = written("import numpy as np\n" + LEAST.replace("return", "return np.ones((len(genes), *x.shape)) #"))
+def test_numpy_will_do(write):
+    name = write("import numpy as np\n" + LEAST.replace("return", "return np.ones((len(genes), *x.shape)) #"))
     assert (heights_of(np.zeros((2, 2)), load_space(name)) == 1.0).all()
 
 
@@ -73,27 +73,26 @@ def test_numpy_will_do(written):
     ("old", "new", "field"),
     [
         ("num_genes = 2", "num_genes = 0", "num_genes"),
-        ("num_genes = 2", "num_genes = '2'", "num_genes"),
         ("    def", "    sigma0 = -1\n    def", "sigma0"),
         ("    def", "    genes_per_part = 3\n    def", "genes_per_part"),
         ("def rasterise", "def draw", "rasterise"),
         ("    def", "    def parts(self, genes):\n        return []\n    def", "without"),
-        ("* x", "", "rasterise must return shape"),
-        ("* x", "/ 0 * x", "rasterise must return finite"),
-        ("return", "return None #", "rasterise must return a tensor"),
-        ("genes[:, 0,", "genes[:, 7,", "rasterise fails: IndexError.*line 6"),
+        ("* x", "", "rasterise"),
+        ("* x", "/ 0 * x", "rasterise"),
+        ("return", "return None #", "rasterise"),
+        ("genes[:, 0,", "genes[:, 7,", "IndexError.*line 6"),
         ("class", "1 / 0\nclass", "ZeroDivisionError"),
         ("class Space", "class Other", "Other"),
         (
             "    def",
             "    def hard_random(self, count, rng):\n        return rng.uniform(-1, 1, (count, 5))\n    def",
-            "hard_random must return genes",
+            "hard_random",
         ),
     ],
 )
-def test_a_space_that_does_not_work_says_so_before_any_work(written, old, new, field):
+def test_a_space_that_does_not_work_says_so_before_any_work(write, old, new, field):
     assert old in LEAST
-    name = written(LEAST.replace(old, new, 1))
+    name = write(LEAST.replace(old, new, 1))
     with pytest.raises(ValueError, match=field) as error:
         load_space(name)
     assert "space.py" in str(error.value)
@@ -101,6 +100,9 @@ def test_a_space_that_does_not_work_says_so_before_any_work(written, old, new, f
 
 def test_no_record_runs_code(ridges):
     with pytest.raises(ValueError, match="--space"):
+        get_space(ridges, "0" * 64)
+    load_space(ridges)
+    with pytest.raises(ValueError, match="changed"):
         get_space(ridges, "0" * 64)
 
 
@@ -116,14 +118,7 @@ def test_a_space_is_known_by_the_hash_of_its_code(ridges, tmp_path):
     assert get_space(elsewhere) is changed
 
 
-def test_code_that_has_changed_since_is_refused(ridges):
-    load_space(ridges)
-    with pytest.raises(ValueError, match="changed"):
-        get_space(ridges, "0" * 64)
-
-
-def test_what_is_no_space():
+@pytest.mark.parametrize("name", ["nowhere", "nowhere.py:Space"])
+def test_what_is_no_space(name):
     with pytest.raises(ValueError, match="nowhere"):
-        load_space("nowhere")
-    with pytest.raises(ValueError, match=r"nowhere\.py"):
-        load_space("nowhere.py:Space")
+        load_space(name)
