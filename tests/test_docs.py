@@ -105,7 +105,7 @@ def settings_of(page: str, folder: Path) -> dict[str, str]:
 @pytest.mark.parametrize("page", ["README.md", "docs/own-robot.md"])
 def test_the_robot_is_read(page, tmp_path):
     assert "dog.py" in settings_of(page, tmp_path)
-    (tmp_path / "dog.xml").write_text(mjcf(actuators="none"))
+    (tmp_path / "dog.xml").write_text(mjcf(drive=""))
     with pytest.raises(ValueError, match="no gains for FL_hip"):
         get_robot(str(tmp_path / "dog.py"))
     (tmp_path / "dog.xml").write_text(mjcf())

@@ -114,8 +114,8 @@ def draw_starts(
     return to_mujoco(joint_q.numpy()[order], joint_qd.numpy()[order], np.array(base_com))
 
 
-class _Episodes:
-    """States of the running episodes of one terrain, stepped one by one."""
+class Episodes:
+    """States of the episodes of one terrain, stepped one by one."""
 
     def __init__(self, robot: RobotCfg, model: Any, starts: Starts) -> None:
         self._model, self._robot = model, robot
@@ -127,6 +127,7 @@ class _Episodes:
         self.warned = np.zeros(len(self.data), bool)
 
     def step(self, running: NDArray[np.intp]) -> None:
+        """One physics step of the numbered episodes."""
         for k in running:
             data = self.data[k]
             _mj.mj_step(self._model, data)
@@ -135,12 +136,13 @@ class _Episodes:
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
 
     def hold(self, running: NDArray[np.intp], targets: Array) -> None:
+        """Sets the joint targets [rad] of the numbered episodes."""
         for k, target in zip(running, targets, strict=True):
             self.data[k].ctrl[:] = target
 
 
 def _judge(
-    robot: RobotCfg, episodes: _Episodes, running: NDArray[np.intp], base: NDArray[np.bool_], cfg: CrossingCfg
+    robot: RobotCfg, episodes: Episodes, running: NDArray[np.intp], base: NDArray[np.bool_], cfg: CrossingCfg
 ) -> Array:
     """Outcome of each running episode after a physics step, the gravest of several."""
     qpos, qvel = episodes.qpos[running], episodes.qvel[running]
@@ -180,7 +182,7 @@ def cross(
     """
     cfg = cfg or CrossingCfg()
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
-    episodes = _Episodes(robot, model, starts)
+    episodes = Episodes(robot, model, starts)
     count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
     default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)

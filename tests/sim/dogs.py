@@ -10,41 +10,35 @@ import numpy as np
 
 LEGS = {"FL": (0.2, 0.12), "FR": (0.2, -0.12), "HL": (-0.2, 0.12), "HR": (-0.2, -0.12)}
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "knee"))
-TRUNK, THIGH, SHANK, FOOT = (0.25, 0.08, 0.05), (0.03, 0.15), (0.015, 0.15), 0.025
+TRUNK, THIGH, SHANK, FOOT = (0.25, 0.08, 0.05), (0.03, 0.15), (0.015, 0.13), 0.025
 """Half sizes of the trunk's box; radius and length of thigh and shank; radius of a foot [m]."""
 STAND = 0.295
 """Height of the trunk over its feet's soles in the default pose [m]."""
 MASS = 8.0 + 4 * (0.8 + 0.3 + 0.1)
+DRIVE = '<position name="{0}" joint="{0}" kp="60" kv="2" forcerange="-30 30"/>'
 
 
-def mjcf(*, actuators: str = "position", trunk: str | None = None, asset: str = "", unnamed: bool = False) -> str:
+def mjcf(*, drive: str = DRIVE, trunk: str | None = None, asset: str = "") -> str:
     """The dog's MJCF; hips turn forward, knees backward, about the axis to the left."""
     trunk = trunk or f'type="box" size="{" ".join(map(str, TRUNK))}"'
-    thigh = [" " if unnamed else f'name="{leg}_thigh"' for leg in LEGS]
     legs = "".join(
         f"""
       <body name="{leg}_thigh" pos="{x} {y} 0">
         <inertial mass="0.8" pos="0 0 -0.07" diaginertia="0.002 0.002 0.0005"/>
         <joint name="{leg}_hip" axis="0 1 0" range="-1.5 2.5"/>
-        <geom {thigh[k]} type="capsule" size="{THIGH[0]}" fromto="0 0 0 0 0 -{THIGH[1]}"/>
+        <geom name="{leg}_thigh" type="capsule" size="{THIGH[0]}" fromto="0 0 0 0 0 -{THIGH[1]}"/>
         <body name="{leg}_shank" pos="0 0 -0.15">
           <inertial mass="0.3" pos="0 0 -0.07" diaginertia="0.0006 0.0006 0.0001"/>
           <joint name="{leg}_knee" axis="0 1 0" range="-2.6 -0.1"/>
-          <geom name="{leg}_shank" type="capsule" size="{SHANK[0]}" fromto="0 0 0 0 0 -{SHANK[1] - 0.02}"/>
+          <geom name="{leg}_shank" type="capsule" size="{SHANK[0]}" fromto="0 0 0 0 0 -{SHANK[1]}"/>
           <body name="{leg}_toe" pos="0 0 -0.15">
             <inertial mass="0.1" pos="0 0 0" diaginertia="0.00005 0.00005 0.00005"/>
             <geom name="{leg}_foot" type="sphere" size="{FOOT}"/>
           </body>
         </body>
       </body>"""
-        for k, (leg, (x, y)) in enumerate(LEGS.items())
+        for leg, (x, y) in LEGS.items()
     )
-    tags = {
-        "position": '<position name="{0}" joint="{0}" kp="60" kv="2" forcerange="-30 30"/>',
-        "motor": '<motor name="{0}" joint="{0}"/>',
-        "general": '<general name="{0}" joint="{0}" biastype="affine" gainprm="60" biasprm="0 -60 -2"/>',
-    }
-    drives = "".join(tags[actuators].format(joint) for joint in JOINTS) if actuators in tags else ""
     return f"""<mujoco model="dog">
   <compiler angle="radian" autolimits="true"/>
   <default>
@@ -59,59 +53,55 @@ def mjcf(*, actuators: str = "position", trunk: str | None = None, asset: str = 
       <geom name="trunk" {trunk}/>{legs}
     </body>
   </worldbody>
-  <actuator>{drives}</actuator>
+  <actuator>{"".join(drive.format(joint) for joint in JOINTS)}</actuator>
 </mujoco>
 """
+
+
+def _link(name: str, mass: float, com: float, inertia: tuple[float, float, float], shape: str, z: float = 0.0) -> str:
+    x, y, z_inertia = inertia
+    return f"""
+  <link name="{name}">
+    <inertial><origin xyz="0 0 {com}"/><mass value="{mass}"/>
+      <inertia ixx="{x}" iyy="{y}" izz="{z_inertia}" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0 0 {z}"/><geometry>{shape}</geometry></collision>
+  </link>"""
+
+
+def _joint(name: str, parent: str, child: str, xyz: str, limit: str = "") -> str:
+    return f"""
+  <joint name="{name}" type="{"revolute" if limit else "fixed"}">
+    <parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}"/><axis xyz="0 1 0"/>{limit}
+  </joint>"""
 
 
 def urdf(*, trunk: str | None = None) -> str:
     """The same dog as a URDF, with a capsule tag, cylinders, visuals that are nowhere, and feet on fixed joints."""
     trunk = trunk or f'<box size="{" ".join(str(2 * half) for half in TRUNK)}"/>'
+    thigh = f'<capsule radius="{THIGH[0]}" length="{THIGH[1]}"/>'
+    shank = f'<cylinder radius="{SHANK[0]}" length="{SHANK[1]}"/>'
     missing = '<visual><geometry><mesh filename="package://nowhere/trunk.dae"/></geometry></visual>'
-
-    def link(name: str, mass: float, com: float, inertia: tuple[float, float, float], shape: str) -> str:
-        x, y, z = inertia
-        return f"""
-  <link name="{name}">
-    <inertial><origin xyz="0 0 {com}"/><mass value="{mass}"/>
-      <inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>
-    {shape}
-  </link>"""
-
-    def collision(shape: str, z: float = 0.0) -> str:
-        return f'<collision><origin xyz="0 0 {z}"/><geometry>{shape}</geometry></collision>'
-
-    def joint(name: str, kind: str, parent: str, child: str, xyz: str, limit: str) -> str:
-        return f"""
-  <joint name="{name}" type="{kind}">
-    <parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}"/><axis xyz="0 1 0"/>{limit}
-  </joint>"""
-
-    thigh = collision(f'<capsule radius="{THIGH[0]}" length="{THIGH[1]}"/>', -THIGH[1] / 2)
-    shank = collision(f'<cylinder radius="{SHANK[0]}" length="{SHANK[1] - 0.02}"/>', -(SHANK[1] - 0.02) / 2)
-    foot = collision(f'<sphere radius="{FOOT}"/>')
-    parts = [link("trunk", 8.0, 0.0, (0.03, 0.2, 0.2), missing + collision(trunk))]
+    parts = [_link("trunk", 8.0, 0.0, (0.03, 0.2, 0.2), trunk).replace("<collision>", f"{missing}<collision>")]
     for leg, (x, y) in LEGS.items():
+        hip, knee = (
+            f'<limit lower="{span[0]}" upper="{span[1]}" effort="30" velocity="30"/>'
+            for span in ((-1.5, 2.5), (-2.6, -0.1))
+        )
         parts += [
-            link(f"{leg}_thigh", 0.8, -0.07, (0.002, 0.002, 0.0005), thigh),
-            link(f"{leg}_shank", 0.3, -0.07, (0.0006, 0.0006, 0.0001), shank),
-            link(f"{leg}_foot", 0.1, 0.0, (0.00005, 0.00005, 0.00005), foot),
-            joint(
-                f"{leg}_hip", "revolute", "trunk", f"{leg}_thigh", f"{x} {y} 0",
-                '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>',
-            ),
-            joint(
-                f"{leg}_knee", "revolute", f"{leg}_thigh", f"{leg}_shank", "0 0 -0.15",
-                '<limit lower="-2.6" upper="-0.1" effort="30" velocity="30"/>',
-            ),
-            joint(f"{leg}_ankle", "fixed", f"{leg}_shank", f"{leg}_foot", "0 0 -0.15", ""),
-        ]  # fmt: skip
+            _link(f"{leg}_thigh", 0.8, -0.07, (0.002, 0.002, 0.0005), thigh, -THIGH[1] / 2),
+            _link(f"{leg}_shank", 0.3, -0.07, (0.0006, 0.0006, 0.0001), shank, -SHANK[1] / 2),
+            _link(f"{leg}_foot", 0.1, 0.0, (0.00005, 0.00005, 0.00005), f'<sphere radius="{FOOT}"/>'),
+            _joint(f"{leg}_hip", "trunk", f"{leg}_thigh", f"{x} {y} 0", hip),
+            _joint(f"{leg}_knee", f"{leg}_thigh", f"{leg}_shank", "0 0 -0.15", knee),
+            _joint(f"{leg}_ankle", f"{leg}_shank", f"{leg}_foot", "0 0 -0.15"),
+        ]
     return f'<robot name="dog">{"".join(parts)}\n</robot>\n'
 
 
 SETTINGS = '''"""The dog's settings, as docs/own-robot.md describes them."""
 
 from sim.robots.robot import RobotCfg
+from sim.robots.training import TrainingCfg
 
 LEGS = ("FL", "FR", "HL", "HR")
 
@@ -170,14 +160,7 @@ class Trot:
 
 
 def write_dog(folder: Path, *, model: str | None = None, suffix: str = "xml", more: str = "") -> Path:
-    """Writes dog.xml or dog.urdf, dog.py and dog_trot.py into a folder; returns the settings file.
-
-    Args:
-        folder: Where to write.
-        model: Text of the model; the MJCF with position actuators if left out.
-        suffix: Of the model's file.
-        more: Further lines of the settings, such as GAINS.
-    """
+    """Writes dog.xml or dog.urdf, dog.py with ``more`` lines, and dog_trot.py; returns the settings file."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"dog.{suffix}").write_text(mjcf() if model is None else model)
     (folder / "dog_trot.py").write_text(CONTROLLER)

@@ -1,54 +1,26 @@
-"""The same robots in plain MuJoCo, as the truth to compare with."""
-
-import xml.etree.ElementTree as ET
+"""Robots in plain MuJoCo C, as the truth to compare with."""
 
 import mujoco
 import numpy as np
 
-from sim.simulation import GROUND_FRICTION
+from sim.mujoco_c.model import crossing_model
+from sim.terrain import NUM_COLS, NUM_ROWS
 
 
-def _finish(root: ET.Element, ground: dict[str, str]) -> mujoco.MjModel:
-    # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
-    ET.SubElement(
-        root.find("worldbody"),
-        "geom",
-        name="ground",
-        conaffinity="1",
-        solmix="0",
-        friction=str(GROUND_FRICTION),
-        **ground,
-    )
-    return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-
-
-def on_plane(robot, quat_wxyz=(1, 0, 0, 0), position=(8, 4, 0)) -> mujoco.MjModel:
-    """The robot on an infinite plane."""
-    plane = {"type": "plane", "size": "20 20 1", "pos": " ".join(map(str, position))}
-    return _finish(ET.parse(robot.model_file).getroot(), plane | {"quat": " ".join(map(str, quat_wxyz))})
-
-
-def on_heights(robot, grid) -> mujoco.MjModel:
-    """The robot on MuJoCo's own heightfield of a 16 m x 8 m grid [row, col]."""
-    grid = np.float64(grid)
-    lowest, extent = grid.min(), max(np.ptp(grid), 1e-3)
-    root = ET.parse(robot.model_file).getroot()
-    rows, cols = map(str, grid.shape)
-    # size: half x, half y, height of data 1, thickness of the base below data 0.
-    ET.SubElement(ET.SubElement(root, "asset"), "hfield", name="grid", nrow=rows, ncol=cols, size=f"8 4 {extent} 1")
-    model = _finish(root, {"type": "hfield", "hfield": "grid", "pos": f"8 4 {lowest}"})
-    model.hfield_data[:] = ((grid - lowest) / extent).ravel()
+def on_plane(robot, quat_wxyz=(1, 0, 0, 0), *, time_constant_s=None) -> mujoco.MjModel:
+    """The robot on an infinite plane through (8, 4, 0), in place of the heightfield."""
+    model = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS)), time_constant_s=time_constant_s)
+    ground = model.geom("ground").id
+    model.geom_type[ground], model.geom_dataid[ground], model.geom_rbound[ground] = mujoco.mjtGeom.mjGEOM_PLANE, -1, 0.0
+    model.geom_size[ground], model.geom_pos[ground] = (0.0, 0.0, 0.05), (8.0, 4.0, 0.0)
+    model.geom_quat[ground] = quat_wxyz
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its tree knows the heightfield
     return model
 
 
 def to_c(joint_q):
     """Joint coordinates in MuJoCo's order: its quaternion begins with w."""
     return np.concatenate([joint_q[:3], joint_q[[6, 3, 4, 5]], joint_q[7:]])
-
-
-def from_c(qpos):
-    """The inverse of :func:`to_c`."""
-    return np.concatenate([qpos[:3], qpos[[4, 5, 6, 3]], qpos[7:]])
 
 
 def run(model: mujoco.MjModel, joint_q, duration_s: float):
@@ -58,7 +30,7 @@ def run(model: mujoco.MjModel, joint_q, duration_s: float):
     data.ctrl[:] = joint_q[7:]
     for _ in range(round(duration_s / model.opt.timestep)):
         mujoco.mj_step(model, data)
-    return from_c(data.qpos)
+    return np.concatenate([data.qpos[:3], data.qpos[[4, 5, 6, 3]], data.qpos[7:]])
 
 
 def geom_positions(model: mujoco.MjModel, joint_q, names):

@@ -10,7 +10,7 @@ import torch
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
-from sim.mujoco_c.crossing import _Episodes, cross, cross_terrains, draw_starts
+from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
 from sim.mujoco_c.model import (
     crossing_model,
     goal_commands,
@@ -20,14 +20,18 @@ from sim.mujoco_c.model import (
     to_mujoco,
 )
 from sim.policy.loaders import load_policy
+from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.simulation import GROUND_FRICTION, SolverCfg
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
+from tests.sim.dogs import KINDS, with_mesh, write_dog
+from tests.sim.plain_mujoco import on_plane
 from tests.sim.policies import stand
 
 EPISODES = 3
+FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -42,16 +46,14 @@ def test_surface_heights_are_those_of_the_oracle(heights):
 
 
 def test_starts_are_those_of_the_rollout(robot):
-    genes = SUPER_GAUSSIAN.hard_random(1, 5)
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
-    rollout.put(genes, np.array([77], np.uint32))
-    expected = to_mujoco(
-        rollout.sim.joint_q.numpy(), rollout.sim.joint_qd.numpy(), np.array(rollout.sim.sensors.base_com)
-    )
+    rollout.put(SUPER_GAUSSIAN.hard_random(1, 5), np.array([77], np.uint32))
+    sim = rollout.sim
+    expected = to_mujoco(sim.joint_q.numpy(), sim.joint_qd.numpy(), np.array(sim.sensors.base_com))
     # Asking for more episodes does not change the first.
-    found = draw_starts(robot, rollout.sim.bank.heights.numpy()[0], 77, EPISODES + 4, "cpu")
-    np.testing.assert_array_equal(found.qpos[:EPISODES], expected.qpos)
-    np.testing.assert_array_equal(found.qvel[:EPISODES], expected.qvel)
+    starts = draw_starts(robot, sim.bank.heights.numpy()[0], 77, EPISODES + 4, "cpu")
+    np.testing.assert_array_equal(starts.qpos[:EPISODES], expected.qpos)
+    np.testing.assert_array_equal(starts.qvel[:EPISODES], expected.qvel)
 
 
 def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_converge(robot, heights):
@@ -76,28 +78,21 @@ def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_c
         np.testing.assert_allclose(5.0 - distance, oracle.surface_height(heights, SPACING, x, y), atol=1e-5)
 
 
-def test_flat_ground_is_crossed_alike_in_both(anymal):
-    # The same contacts, so the same walk: 4 s of it, penalties within 5 % (neighbouring facets, float32 and float64).
-    flat = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
-    cfg = CrossingCfg(max_duration_s=4.0)
-    rollout = Rollout(anymal, anymal.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg)
-    ours = rollout.evaluate(flat, np.array([5], np.uint32))
-    starts = draw_starts(anymal, flat[0], 5, EPISODES, "cpu")
-    policy = load_policy(anymal.policy_file, anymal, "cpu")
-    plain = cross(anymal, policy, flat[0], starts, cfg)
-    assert (plain.outcome == Outcome.TIME_OUT).all()
-    np.testing.assert_array_equal(ours.outcome[0], plain.outcome)
-    np.testing.assert_array_equal(plain.duration_s, 4.0)
-    velocities = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y")]
-    np.testing.assert_allclose(ours.penalties[0][:, velocities], plain.penalties[:, velocities], rtol=0.1)
+def test_plain_mujoco_takes_a_robot_that_is_its_file(tmp_path):
+    model = crossing_model(get_robot(str(with_mesh(tmp_path / "mesh", "mjcf"))), FLAT)
+    assert (model.nu, model.nq) == (8, 15)
+    assert model.geom("trunk").type[0] == mujoco.mjtGeom.mjGEOM_MESH
+    assert model.geom("trunk").conaffinity[0] == 0 and model.geom("ground").conaffinity[0] == 1
+    for kind, part in (({"more": "\n    friction=0.6,"}, "friction"), (KINDS["urdf"], "URDF")):
+        with pytest.raises(ValueError, match=part):
+            crossing_model(get_robot(str(write_dog(tmp_path / part, **kind))), FLAT)
 
 
 def test_cassie_goes_over_alike_in_both(cassie):
     # Nobody balances it: in a second or two it has fallen onto its pelvis, in both at the same time, at the same price.
-    flat = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
-    ours = Rollout(cassie, stand, num_terrains=1, num_replicas=EPISODES, device="cpu").evaluate(flat, np.uint32([5]))
-    starts = draw_starts(cassie, flat[0], 5, EPISODES, "cpu")
-    plain = cross(cassie, stand, flat[0], starts)
+    ours = Rollout(cassie, stand, num_terrains=1, num_replicas=EPISODES, device="cpu")
+    ours = ours.evaluate(FLAT[None], np.uint32([5]))
+    plain = cross(cassie, stand, FLAT, draw_starts(cassie, FLAT, 5, EPISODES, "cpu"))
     assert (ours.outcome == Outcome.BASE_COLLISION).all() and (plain.outcome == Outcome.BASE_COLLISION).all()
     np.testing.assert_allclose(ours.duration_s[0], plain.duration_s, atol=0.05)
     assert (plain.duration_s > 0.5).all() and (plain.duration_s < 3.0).all()
@@ -110,36 +105,31 @@ SETTINGS = pytest.mark.parametrize(
 )
 
 
-def side_by_side(robot, policy, changes, time_constant_s, cfg=None):
+def side_by_side(robot, policy, changes, time_constant_s):
     """The robot in both simulators at the same start, MuJoCo's heightfield replaced by its plane: the same contacts."""
     robot = dataclasses.replace(robot, **changes)
     solver = SolverCfg(time_constant_s=time_constant_s)
-    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg, solver=solver)
-    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    rollout.put(flat[None], np.array([1000], np.uint32))
-    model = crossing_model(robot, flat, time_constant_s=time_constant_s)
-    ground = model.geom("ground").id
-    model.geom_type[ground], model.geom_dataid[ground], model.geom_rbound[ground] = mujoco.mjtGeom.mjGEOM_PLANE, -1, 0.0
-    model.geom_size[ground], model.geom_pos[ground] = (0.0, 0.0, 0.05), 0.0
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its tree knows the heightfield
-    return robot, rollout, _Episodes(robot, model, draw_starts(robot, flat, 1000, EPISODES, "cpu"))
+    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", solver=solver)
+    rollout.put(FLAT[None], np.array([1000], np.uint32))
+    starts = draw_starts(robot, FLAT, 1000, EPISODES, "cpu")
+    return robot, rollout, Episodes(robot, on_plane(robot, time_constant_s=time_constant_s), starts)
 
 
 def walk(robot, policy, plain, seconds):
-    """Let the plain robots walk on level ground; yields their command after each physics step."""
+    """Let the plain robots walk on level ground; yields after each physics step."""
     policy, everyone = load_policy(policy, robot, "cpu"), np.arange(EPISODES)
-    flat, action = np.zeros((NUM_ROWS, NUM_COLS)), np.zeros((EPISODES, robot.num_joints))
+    action = np.zeros((EPISODES, robot.num_joints))
     default = np.array(robot.default_joint_pos)
     for _ in range(round(seconds / robot.control_dt)):
         command = goal_commands(plain.qpos, CrossingCfg())
         state = (plain.qpos, plain.qvel, command, action)
-        rows = observations(flat, *state, default_joint_pos=default, scan=np.stack(robot.scan_points(), axis=1))
+        rows = observations(FLAT, *state, default_joint_pos=default, scan=np.stack(robot.scan_points(), axis=1))
         with torch.inference_mode():
             action = policy(torch.as_tensor(rows, dtype=torch.float32)).numpy().astype(np.float64)
         plain.hold(everyone, default + robot.action_scale * action)
         for _ in range(robot.decimation):
             plain.step(everyone)
-            yield command
+            yield
 
 
 @SETTINGS
@@ -155,26 +145,39 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     pushed = sum(np.abs(plain.forces[:, :, 2]).sum(1) for _ in walk(robot, policy, plain, seconds))
     for _ in range(round(seconds / robot.control_dt)):
         rollout.control_step()
-    found = rollout.sim.joint_q.numpy()
+    joint_q = rollout.sim.joint_q.numpy()
     assert np.abs(plain.qpos[:, 7:] - robot.default_joint_pos).max() > 0.1  # it moves
     assert (pushed * robot.physics_dt > 10.0).all()  # and the ground has a part in it
-    np.testing.assert_allclose(found[:, :3], plain.qpos[:, :3], atol=metres)
-    np.testing.assert_allclose(found[:, 7:], plain.qpos[:, 7:], atol=radians)
+    np.testing.assert_allclose(joint_q[:, :3], plain.qpos[:, :3], atol=metres)
+    np.testing.assert_allclose(joint_q[:, 7:], plain.qpos[:, 7:], atol=radians)
 
 
-def test_walking_on_a_plane_costs_the_same_in_both(robot):
+VELOCITIES = ("yaw_rate", "vel_x", "vel_y")
+
+
+@pytest.mark.parametrize(
+    # On the heightfield neighbouring facets bear a foot, which the plane bears once.
+    ("robot", "plane", "names", "rtol"),
+    [
+        ("anymal", False, VELOCITIES, 0.1),
+        ("anymal", True, (*VELOCITIES, "contact_force"), 0.08),
+        ("cassie", True, (*VELOCITIES, "contact_force"), 0.08),
+    ],
+    indirect=["robot"],
+)
+def test_walking_costs_the_same_in_both(robot, monkeypatch, plane, names, rtol):
     # 4 s: long enough for steps to fall otherwise, so that only what they cost can be held against each other.
+    if plane:
+        monkeypatch.setattr("sim.mujoco_c.crossing.crossing_model", lambda robot, heights, **_: on_plane(robot))
     cfg = CrossingCfg(max_duration_s=4.0)
-    _, rollout, plain = side_by_side(robot, robot.policy_file, {}, None, cfg)
-    feet, limit = np.array([name in robot.foot_geoms for name in robot.geom_names]), robot.contact_force_limit
-    sums = sum(
-        robot.physics_dt * step_penalties(plain.qpos, plain.qvel, command, plain.forces, feet=feet, force_limit=limit)
-        for command in walk(robot, robot.policy_file, plain, cfg.max_duration_s)
-    )
-    ours = rollout.evaluate(np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([1000], np.uint32))
-    assert (ours.outcome == Outcome.TIME_OUT).all() and (plain.qpos[:, 0] > 4.0).all()
-    columns = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y", "contact_force")]
-    np.testing.assert_allclose(ours.penalties[0][:, columns].mean(0), np.mean(sums, axis=0)[columns], rtol=0.08)
+    rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg)
+    ours = rollout.evaluate(FLAT[None], np.array([1000], np.uint32))
+    policy = load_policy(robot.policy_file, robot, "cpu")
+    plain = cross(robot, policy, FLAT, draw_starts(robot, FLAT, 1000, EPISODES, "cpu"), cfg)
+    assert (ours.outcome == Outcome.TIME_OUT).all() and (plain.outcome == Outcome.TIME_OUT).all()
+    np.testing.assert_array_equal(plain.duration_s, 4.0)
+    columns = [PENALTIES.index(name) for name in names]
+    np.testing.assert_allclose(ours.penalties[0][:, columns].mean(0), plain.penalties[:, columns].mean(0), rtol=rtol)
 
 
 @SETTINGS
@@ -208,38 +211,35 @@ def test_sliding_on_its_back_it_is_braked_alike_in_both(anymal, changes, time_co
 
 
 def test_what_ends_a_crossing(robot):
-    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    starts = draw_starts(robot, flat, 5, 4, "cpu")
+    starts = draw_starts(robot, FLAT, 5, 4, "cpu")
     starts.qpos[0, :2] = 13.7, 4.0  # at the goal
     starts.qpos[1, 1] = 10.5  # outside
     starts.qpos[2, 2] = 0.05  # its belly in the ground
     starts.qvel[3, 8] = 5000.0  # a joint far too fast
     policy = load_policy(robot.policy_file, robot, "cpu")
-    found = cross(robot, policy, flat, starts, CrossingCfg(max_duration_s=0.1))
-    assert found.outcome.tolist() == [Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]
-    assert np.isnan(found.penalties[3]).all() and np.isfinite(found.penalties[:3]).all()
-    np.testing.assert_allclose(found.duration_s, 0.005)
+    result = cross(robot, policy, FLAT, starts, CrossingCfg(max_duration_s=0.1))
+    assert result.outcome.tolist() == [Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]
+    assert np.isnan(result.penalties[3]).all() and np.isfinite(result.penalties[:3]).all()
+    np.testing.assert_allclose(result.duration_s, 0.005)
 
 
 @pytest.mark.slow
-def test_episodes_shared_out_over_processes_come_back_in_order(cassie, monkeypatch):
+def test_episodes_shared_out_over_processes_come_back_in_order(cassie):
     """Those of a terrain in two parts, at the search's settings, are what one process says of each start."""
-    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    heights, seeds, crossed = np.stack([flat, flat + np.float32(0.2)]), np.array([3, 4], np.uint32), []
-    policy = "tests.sim.policies:stand"
-    records = dict(
-        cross_terrains(
-            cassie, policy, heights, seeds, space=SUPER_GAUSSIAN, num_episodes=27, processes=2, resolved=False,
-            progress=crossed.append,
-        )
+    progress: list[int] = []
+    crossed = cross_terrains(
+        cassie, "tests.sim.policies:stand", np.stack([FLAT, FLAT + np.float32(0.2)]), np.uint32([3, 4]),
+        space=SUPER_GAUSSIAN, num_episodes=26, processes=2, resolved=False, progress=progress.append,
     )  # fmt: skip
-    assert sorted(records) == [0, 1] and sorted(crossed) == [2, 2, 25, 25]
-    for number, record in records.items():
-        starts = draw_starts(cassie, heights[number], int(seeds[number]), 27, "cpu")
-        expected = cross(cassie, stand, heights[number], starts[25:])
-        assert record.outcome.shape == (27,) and record.penalties.shape == (27, len(PENALTIES))
-        np.testing.assert_array_equal(record.duration_s[25:], expected.duration_s)
-        np.testing.assert_array_equal(record.penalties[25:], expected.penalties)
+    results = dict(crossed)
+    assert sorted(results) == [0, 1] and sorted(progress) == [1, 1, 25, 25]
+    for number, result in results.items():
+        heights = FLAT + np.float32(0.2 * number)
+        starts = draw_starts(cassie, heights, 3 + number, 26, "cpu")
+        expected = cross(cassie, stand, heights, starts[25:])
+        assert result.outcome.shape == (26,) and result.penalties.shape == (26, len(PENALTIES))
+        np.testing.assert_array_equal(result.duration_s[25:], expected.duration_s)
+        np.testing.assert_array_equal(result.penalties[25:], expected.penalties)
 
 
 class Remembers:
@@ -257,20 +257,19 @@ class Remembers:
 
 
 def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
-    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    starts = draw_starts(anymal, flat, 5, 3, "cpu")
+    starts = draw_starts(anymal, FLAT, 5, 3, "cpu")
     starts.qpos[0, :2] = 13.7, 4.0  # at the goal: it ends at once
     policy, cfg = Remembers(), CrossingCfg(max_duration_s=0.1)
-    found = cross(anymal, policy, flat, starts, cfg)
+    result = cross(anymal, policy, FLAT, starts, cfg)
     assert (policy.resets, policy.asked) == (1, [3] * 5)
-    expected = cross(anymal, stand, flat, starts, cfg)
-    np.testing.assert_array_equal(found.outcome, expected.outcome)
-    np.testing.assert_array_equal(found.penalties, expected.penalties)
+    expected = cross(anymal, stand, FLAT, starts, cfg)
+    np.testing.assert_array_equal(result.outcome, expected.outcome)
+    np.testing.assert_array_equal(result.penalties, expected.penalties)
 
 
 def test_an_added_penalty_without_a_formula_is_nan(monkeypatch):
     monkeypatch.setattr("sim.mujoco_c.model.PENALTIES", ("vel_y", "roll_rate"))
     state = (np.zeros((2, 7)), np.zeros((2, 6)), np.array([[0.0, 0.5, 0.0]] * 2), np.zeros((2, 1, 3)))
     state[0][:, 3] = 1.0
-    found = step_penalties(*state, feet=np.array([True]), force_limit=1.0)
-    np.testing.assert_array_equal(found, [[0.25, np.nan]] * 2)
+    penalties = step_penalties(*state, feet=np.array([True]), force_limit=1.0)
+    np.testing.assert_array_equal(penalties, [[0.25, np.nan]] * 2)

@@ -1,213 +1,52 @@
-"""Settings of robots that the project does not ship: what they hold, what is refused, what tells robots apart."""
+"""Robots that the project does not ship: settings and model are checked; MJCF, URDF and meshes become models."""
 
 import dataclasses
-import os
 import pickle
 import re
 import shutil
 
+import mujoco
+import newton
 import numpy as np
 import pytest
+import warp as wp
 
+from sim.bank import TerrainBank
 from sim.files.records import robot_digest
 from sim.robots.find import get_robot
-from sim.robots.model import build_robot
+from sim.robots.model import build_robot, geom_names, joint_names
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
-from tests.sim.dogs import GAINS, KINDS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
+from sim.robots.probes import make_probes
+from sim.simulation import Simulation
+from tests.kernels import oracle
+from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
+from tests.sim.scenes import put
 
 
-def test_a_file_is_a_robot(tmp_path, monkeypatch):
-    write_dog(tmp_path / "mine")
-    monkeypatch.chdir(tmp_path)
-    dog = get_robot("mine/dog.py")
-    file = tmp_path / "mine" / "dog.py"
-    assert (dog.name, dog.num_joints, dog.observation_size) == ("dog", 8, 12 + 24 + 15)
-    assert (dog.settings_file, dog.spec, dog.model_file) == (file, str(file), tmp_path / "mine" / "dog.xml")
-    assert dog.policy_file == tmp_path / "mine" / "dog.pt"
-    assert dog.scales_file == tmp_path / "mine" / "dog.scales.json"
-    with pytest.raises(ValueError, match=rf"calibrate --robot {re.escape(str(file))}`"):
-        dog.read_penalty_scales()
-    assert get_robot(dog) is dog
-    assert pickle.loads(pickle.dumps(dog)) == dog
+@pytest.fixture(params=KINDS)
+def dog(request, tmp_path):
+    return get_robot(str(write_dog(tmp_path, **KINDS[request.param])))
 
 
-FREE = '<freejoint name="root"/>'
-FLOOR = '<worldbody><geom name="floor" type="plane" size="1 1 1"/>'
-HIP = '<joint name="FL_hip"'
-BALL = 'type="sphere" size="0.025"'
-EGG = 'type="ellipsoid" size="0.02 0.02 0.03"'
-DRIVE = '<position name="FL_hip"'
-MORE = "collision_bit=False,"
-CHANGES = [  # what is changed in the settings, and the field or part that the error names
-    ('name="dog"', 'name="anymal"', "name"),
-    ('name="dog"', 'name="a dog"', "name"),
-    ('name="dog"', 'nam="dog"', "nam"),
-    ("ROBOT =", "DOG =", "ROBOT"),
-    ("ROBOT = RobotCfg(", "ROBOT = dict(", "dict"),
-    ("dog.xml", "cat.xml", "cat.xml"),
-    ('base_geoms=("trunk",)', 'base_geoms=("trunk")', "base_geoms"),
-    ('base_geoms=("trunk",)', "base_geoms=()", "base_geoms"),
-    ('base_geoms=("trunk",)', 'base_geoms=("FL_foot",)', "FL_foot"),
-    ('base_geoms=("trunk",)', 'base_geoms=("body", "head")', "body, head"),
-    ('("hip", "knee")', '("hip", "shin")', "FL_shin"),
-    ("(0.6, -1.2) * 4", "(0.6, -1.2) * 3", "default_joint_pos"),
-    ("(0.6, -1.2) * 4", "(0.6, 1.2) * 4", "FL_knee"),
-    ("(0.6, -1.2) * 4", "(0.6, None) * 4", "default_joint_pos"),
-    ("footprint=(0.3, 0.2)", "footprint=(0.3, -0.2)", "footprint"),
-    ('"vel_y", "collision"', '"vel_z"', "penalties"),
-    ('("FL", "FR", "HL", "HR")', '("FL", "FL", "HL", "HR")', "joint_names"),
-    (MORE, f"{MORE} decimation=4.0,", "decimation"),
-    (MORE, 'collision_bit="no",', "collision_bit"),
-    (MORE, f"{MORE} stiffness=(60.0,) * 8,", "damping"),
-    (MORE, MORE + GAINS, "FL_hip"),  # the file has position actuators
-    (MORE, f"{MORE} effort_limit=(1.0,) * 4,", "effort_limit"),
-    (MORE, f"{MORE} contact_time_constant_s=0.004,", "contact_time_constant_s"),
-]
-
-
-@pytest.mark.parametrize(("old", "new", "field"), CHANGES)
-def test_what_is_wrong_in_the_settings_is_named(tmp_path, old, new, field):
-    file = write_dog(tmp_path)
+def replace_once(file, old, new):
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new, 1))
-    with pytest.raises(ValueError, match=re.escape(field)):
-        get_robot(str(file))
 
 
-def test_settings_and_model_are_judged_together_and_all_that_is_wrong_is_named(tmp_path):
-    model = mjcf().replace('mass="8"', 'mass="0"').replace(BALL, EGG).replace(HIP, f'{HIP} armature="-1"')
-    file = write_dog(tmp_path, model=model)
-    text = file.read_text().replace("150.0", "-1").replace("* 4", "* 3").replace('"shank"', '"shin"')
-    file.write_text(text.replace('base_geoms=("trunk",)', "base_geoms=()"))
-    with pytest.raises(ValueError, match=r"dog\.py: ") as raised:
-        get_robot(str(file))
-    parts = (
-        "contact_force_limit", "base_geoms", "trunk", "armature", "default_joint_pos", "FL_shin", "FL_foot", "HR_foot",
-    )  # fmt: skip
-    assert [part for part in parts if part not in str(raised.value)] == []
-
-
-MODELS = [
-    (mjcf(actuators="motor"), "gains for FL_hip"),
-    (mjcf().replace(FREE, ""), "first body"),
-    (mjcf().replace("<worldbody>", FLOOR), "floor"),
-    (mjcf().replace(HIP, f'<joint name="FL_out" axis="1 0 0"/>{HIP}'), "hinge or slide"),
-    (mjcf().replace(BALL, EGG, 1), "FL_foot"),
-    (mjcf().replace("</mujoco>", ""), "XML"),
-    ("<sdf/>", "sdf"),
-    (mjcf().replace("<worldbody>", '<include file="dog.xml"/><worldbody>'), "includes itself"),
-    (mjcf(asset='<mesh name="m" file="dog.py"/>'), "STL or OBJ"),
-    (mjcf(asset='<mesh name="m" file="gone.stl"/>'), "gone.stl"),
-    (mjcf().replace(HIP, f'{HIP} type="ball"'), "FL_hip"),
-    (mjcf().replace(HIP, f'{HIP} ref="0.3"'), "ref"),
-    (mjcf().replace('axis="0 1 0"', 'axis="0 0 0"', 1), "axis"),
-    (mjcf().replace(DRIVE, f'{DRIVE} gear="2"'), "gear"),
-    (mjcf().replace(DRIVE, f'{DRIVE} timeconst="0.1"'), "timeconst"),
-    (mjcf().replace("</actuator>", '<velocity joint="FL_hip" kv="9"/></actuator>'), "FL_hip"),
-    (mjcf().replace('kv="2"', 'kv="-2"'), "kv"),
-    (mjcf().replace('mass="8"', 'mass="nan"'), "mass"),
-    (mjcf().replace("0.03 0.2 0.2", "0 0 0"), "inertia"),
-    (mjcf().replace('pos="0.2 0.12 0"', 'pos="0.2 nan 0"'), "position and rotation"),
-    (mjcf().replace(BALL, 'type="sphere" size="0"', 1), "FL_foot: its sizes"),
-    (mjcf().replace(BALL, 'type="sphere" size="25"', 1), "FL_foot: it is 50 m long"),
-    (urdf(), "gains for FL_hip"),
-    (urdf(trunk='<mesh filename="package://other/trunk.stl"/>'), "package other"),
-    (urdf(trunk='<mesh filename="https://example.org/trunk.stl"/>'), "downloaded"),
-]
-LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
-FIRST_MASS = '<mass value="0.8"/>'
-URDFS = [
-    # The hip's <joint> is the 22nd line, the thigh's <mass> the eighth.
-    (urdf().replace(LIMIT, "", 1), "line 22: joint FL_hip has no <limit>"),
-    (urdf().replace('lower="-1.5" ', "", 1), "line 22: joint FL_hip has no lower"),
-    (urdf().replace('effort="30"', 'effort="0"', 2), "FL_hip, FL_knee"),
-    (urdf().replace(FIRST_MASS, "", 1), "FL_thigh"),
-    (urdf().replace(FIRST_MASS, '<mass value="0,8"/>', 1), "line 8"),
-    (urdf().replace('xyz="0.2 0.12 0"', 'xyz="0.2 left 0"'), "line 23"),
-    (urdf().replace(FIRST_MASS, '<mass value="${m}"/>'), "line 8: a xacro file"),
-    (urdf().replace('<parent link="trunk"/>', "", 1), "line 22: joint FL_hip has no <parent link"),
-    (urdf().replace('<child link="FL_thigh"/>', '<child link="leg"/>'), "leg"),
-    (urdf().replace('"revolute"', '"hinge"', 1), "revolute"),
-    (urdf().replace('"trunk">', '"">', 1), "line 2"),
-]
-
-
-@pytest.mark.parametrize(("model", "part"), URDFS)
-def test_what_a_urdf_lacks_is_named_by_line(tmp_path, model, part):
-    more = GAINS.replace("\n    effort_limit=(30.0,) * 8,", "")
-    with pytest.raises(ValueError, match=re.escape(part)):
-        get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=more)))
-
-
-def test_effort_may_stand_in_the_settings_and_a_link_without_inertial_weighs_nothing(tmp_path):
-    foot = '<inertial><origin xyz="0 0 0.0"/><mass value="0.1"/>'
-    model = urdf().replace(' effort="30"', "")
-    start = model.index(foot)
-    model = model[:start] + model[model.index("</inertial>", start) + len("</inertial>") :]
-    builder = build_robot(get_robot(str(write_dog(tmp_path, model=model, suffix="urdf", more=GAINS))))
-    assert builder.joint_effort_limit[6:] == [30.0] * 8
-    assert sum(builder.body_mass) == pytest.approx(MASS - 0.1)
-
-
-@pytest.mark.parametrize(("model", "part"), MODELS)
-def test_what_is_wrong_with_the_model_is_named(tmp_path, model, part):
-    with pytest.raises(ValueError, match=re.escape(part)):
-        get_robot(str(write_dog(tmp_path, model=model)))
-
-
-def test_actuators_that_would_pull_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="pulls by itself"):
-        get_robot(str(write_dog(tmp_path, model=mjcf(actuators="general"), more=GAINS)))
-
-
-def test_geoms_without_a_name_are_called_by_their_body(tmp_path):
-    file = write_dog(tmp_path, model=mjcf(unnamed=True))
-    with pytest.raises(ValueError, match="FL_thigh_geom_0"):
-        get_robot(str(file))
-    text = file.read_text().replace(
-        'f"{leg}_{part}" for leg in LEGS for part in ("thigh", "shank")', 'f"{leg}_thigh_geom_0" for leg in LEGS'
-    )
-    file.write_text(text)
-    assert get_robot(str(file)).limb_geoms[0] == "FL_thigh_geom_0"
-
-
-def test_what_is_wrong_in_the_training_settings_is_named(tmp_path):
-    file = write_dog(tmp_path)
-    wrong = (
-        'training=TrainingCfg(rewards=RewardCfg(torques=float("nan")), soft_joint_limit=2.0, push_speed=None, '
-        'added_base_mass=(1.0, 0.0)), learning=LearningCfg(num_envs=0, entropy="some"), collision_bit'
-    )
-    head = "from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg\n"
-    file.write_text(head + file.read_text().replace("collision_bit", wrong))
-    with pytest.raises(
-        ValueError,
-        match=r"rewards.torques must be a fin.*soft_joint_limit.*added_base_mass.*entropy.*num_envs",
-    ):
-        get_robot(str(file))
-
-
-def test_a_mesh_in_millimetres_is_told_so(tmp_path):
-    file = with_mesh(tmp_path, "mjcf")
-    (mesh,) = (path for path in read_model_files(get_robot(str(file)).model_file).files if path.suffix == ".stl")
-    mesh.write_bytes(stl(1000.0 * np.array(TRUNK)))
-    with pytest.raises(ValueError, match="trunk: it is 500 m long, at most 10 m are taken"):
-        get_robot(str(file))
-
-
-@pytest.mark.parametrize("content", [None, "1 / 0", "raise SystemExit(0)"])
-def test_a_file_that_is_not_there_or_fails_is_named(tmp_path, content):
-    if content is not None:
-        (tmp_path / "bad.py").write_text(content)
-    with pytest.raises(ValueError, match=r"bad\.py"):
-        get_robot(str(tmp_path / "bad.py"))
-
-
-def test_a_link_to_the_settings_is_the_robot(tmp_path):
+def test_a_file_is_a_robot(tmp_path, monkeypatch):
     file = write_dog(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    dog = get_robot("mine/dog.py")
+    assert (dog.name, dog.num_joints, dog.observation_size) == ("dog", 8, 12 + 24 + 15)
+    assert (dog.settings_file, dog.spec, dog.model_file) == (file, str(file), tmp_path / "mine" / "dog.xml")
+    assert (dog.policy_file, dog.scales_file) == (file.with_name("dog.pt"), file.with_name("dog.scales.json"))
+    with pytest.raises(ValueError, match=re.escape(str(dog.scales_file))):
+        dog.read_penalty_scales()
     (tmp_path / "link.py").symlink_to(file)
-    assert get_robot(str(tmp_path / "link.py")) == get_robot(str(file))
+    assert get_robot(dog) is dog
+    assert get_robot("link.py") == pickle.loads(pickle.dumps(dog)) == dog
 
 
 def test_a_variant_of_a_shipped_robot_is_a_robot(tmp_path, anymal):
@@ -216,73 +55,272 @@ def test_a_variant_of_a_shipped_robot_is_a_robot(tmp_path, anymal):
         'ROBOT = replace(get_robot("anymal"), name="blind-anymal", scan_x=(), scan_y=())\n'
     )
     robot = get_robot(str(tmp_path / "blind.py"))
-    assert robot.observation_size == 48
-    assert robot.model_file == anymal.model_file
+    assert (robot.observation_size, robot.model_file) == (48, anymal.model_file)
     assert robot.policy_file == tmp_path / "blind-anymal.pt"
 
 
-def test_the_hash_tells_robots_apart(tmp_path, anymal):
+def test_the_height_is_computed_where_the_settings_have_none(tmp_path):
+    file = write_dog(tmp_path)
+    replace_once(file, "    default_base_height=0.29,\n", "")
+    # Legs are longest with hips of 0.8 * 0.6 rad, knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
+    assert get_robot(str(file)).default_base_height == pytest.approx(0.2911, abs=3e-3)
+
+
+FREE = '<freejoint name="root"/>'
+WORLD = "<worldbody>"
+HIP = '<joint name="FL_hip"'
+BALL = 'type="sphere" size="0.025"'
+FIRST_DRIVE = DRIVE.format("FL_hip")
+MESH = "<asset></asset>"
+MORE = "collision_bit=False,"
+LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
+FIRST_MASS = '<mass value="0.8"/>'
+MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what, and the part that the error names
+    ("py", 'name="dog"', 'name="anymal"', "name"),
+    ("py", 'name="dog"', 'name="a dog"', "name"),
+    ("py", 'name="dog"', 'nam="dog"', "nam"),
+    ("py", "ROBOT =", "DOG =", "ROBOT"),
+    ("py", "ROBOT = RobotCfg(", "ROBOT = dict(", "dict"),
+    ("py", "ROBOT =", "1 / 0; ROBOT =", "dog.py"),
+    ("py", "dog.xml", "cat.xml", "cat.xml"),
+    ("py", "footprint=(0.3, 0.2)", "footprint=(0.3, -0.2)", "footprint"),
+    ("py", MORE, f"{MORE} training=TrainingCfg(soft_joint_limit=2.0),", "training.soft_joint_limit"),
+    ("py", MORE, f'{MORE} training=TrainingCfg(steady_joints=("tail",)),', "steady_joints"),
+    ("py", 'base_geoms=("trunk",)', "base_geoms=()", "base_geoms"),
+    ("py", 'base_geoms=("trunk",)', 'base_geoms=("FL_foot",)', "FL_foot"),
+    ("py", 'base_geoms=("trunk",)', 'base_geoms=("body", "head")', "body, head"),
+    ("py", '("FL", "FR", "HL", "HR")', '("FL", "FL", "HL", "HR")', "joint_names"),
+    ("py", '("hip", "knee")', '("hip", "shin")', "FL_shin"),
+    ("py", "(0.6, -1.2) * 4", "(0.6, -1.2) * 3", "default_joint_pos"),
+    ("py", "(0.6, -1.2) * 4", "(0.6, 1.2) * 4", "FL_knee"),
+    ("py", '"vel_y", "collision"', '"vel_z"', "penalties"),
+    ("py", MORE, f"{MORE} stiffness=(60.0,) * 8,", "damping"),
+    ("py", MORE, MORE + GAINS, "stiffness"),  # the file has position actuators
+    ("py", MORE, f"{MORE} contact_time_constant_s=0.004,", "contact_time_constant_s"),
+    ("xml", FIRST_DRIVE, "", "FL_hip"),
+    ("xml", FREE, "", "first body"),
+    ("xml", WORLD, f'{WORLD}<geom name="floor" type="plane" size="1 1 1"/>', "floor"),
+    ("xml", HIP, f'<joint name="FL_out" axis="1 0 0"/>{HIP}', "FL_out"),
+    ("xml", BALL, 'type="ellipsoid" size="0.02 0.02 0.03"', "FL_foot"),
+    ("xml", BALL, 'type="sphere" size="0"', "FL_foot"),
+    ("xml", BALL, 'type="sphere" size="25"', "FL_foot: it is 50 m"),
+    ("xml", "</mujoco>", "", "XML"),
+    ("xml", "<mujoco", "<sdf/><mujoco", "XML"),
+    ("xml", WORLD, f'<include file="dog.xml"/>{WORLD}', "includes itself"),
+    ("xml", MESH, '<asset><mesh name="m" file="dog.py"/></asset>', "dog.py"),
+    ("xml", MESH, '<asset><mesh name="m" file="gone.stl"/></asset>', "gone.stl"),
+    ("xml", HIP, f'{HIP} ref="0.3"', "ref"),
+    ("xml", 'axis="0 1 0"', 'axis="0 0 0"', "axis"),
+    ("xml", FIRST_DRIVE, FIRST_DRIVE.replace("kp", 'gear="2" kp'), "gear"),
+    ("xml", FIRST_DRIVE, FIRST_DRIVE.replace("kp", 'timeconst="0.1" kp'), "timeconst"),
+    ("xml", "</actuator>", '<velocity joint="FL_hip" kv="9"/></actuator>', "FL_hip"),
+    ("xml", FIRST_DRIVE, '<general joint="FL_hip" biastype="affine" gainprm="60" biasprm="0 -60"/>', "pulls by itself"),
+    ("xml", 'kv="2"', 'kv="-2"', "kv"),
+    ("xml", 'mass="8"', 'mass="0"', "mass"),
+    ("xml", "0.03 0.2 0.2", "0 0 0", "inertia"),
+    ("xml", 'pos="0.2 0.12 0"', 'pos="0.2 nan 0"', "position"),
+    ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="package://other/trunk.stl"/>', "package other"),
+    ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="https://example.org/trunk.stl"/>', "https"),
+    ("urdf", LIMIT, "", "joint FL_hip has no <limit>"),
+    ("urdf", 'lower="-1.5" ', "", "joint FL_hip has no lower"),
+    ("urdf", FIRST_MASS, '<mass value="0,8"/>', 'dog.urdf, line 8: <mass value="0,8">'),
+    ("urdf", FIRST_MASS, '<mass value="${m}"/>', "line 8"),
+    ("urdf", '<parent link="trunk"/>', "", "<parent link"),
+    ("urdf", '<child link="FL_thigh"/>', '<child link="leg"/>', "leg"),
+    ("urdf", '"revolute"', '"hinge"', "hinge"),
+    ("urdf", '"trunk">', '"">', "link without a name"),
+    ("urdf", "<robot ", "<robots ", "XML"),
+]
+
+
+@pytest.mark.parametrize(("suffix", "old", "new", "part"), MISTAKES)
+def test_a_mistake_in_settings_or_model_is_named(tmp_path, suffix, old, new, part):
+    file = write_dog(tmp_path, **KINDS["urdf" if suffix == "urdf" else "mjcf"])
+    replace_once(file.with_suffix(f".{suffix}"), old, new)
+    with pytest.raises(ValueError, match=re.escape(part)):
+        get_robot(str(file))
+
+
+def test_every_mistake_of_settings_and_model_is_named_at_once(tmp_path):
+    file = write_dog(tmp_path)
+    for old, new in (
+        ("150.0", "-1"),
+        ("* 4", "* 3"),
+        ('"shank"', '"shin"'),
+        ('base_geoms=("trunk",)', "base_geoms=()"),
+    ):
+        replace_once(file, old, new)
+    replace_once(file.with_suffix(".xml"), 'mass="8"', 'mass="0"')
+    replace_once(file.with_suffix(".xml"), HIP, f'{HIP} armature="-1"')
+    with pytest.raises(ValueError, match=r"dog\.py") as raised:
+        get_robot(str(file))
+    for part in ("contact_force_limit", "default_joint_pos", "FL_shin", "base_geoms", "trunk", "armature"):
+        assert part in str(raised.value)
+
+
+def test_effort_is_the_settings_or_the_urdfs(tmp_path):
+    file = write_dog(tmp_path, **KINDS["urdf"])
+    model = file.with_suffix(".urdf")
+    model.write_text(model.read_text().replace(' effort="30"', ""))
+    assert build_robot(get_robot(str(file))).joint_effort_limit[6:] == [30.0] * 8
+    replace_once(file, "effort_limit=(30.0,) * 8,", "")
+    with pytest.raises(ValueError, match="effort_limit"):
+        get_robot(str(file))
+
+
+def test_geoms_without_a_name_are_called_by_their_body(tmp_path):
+    file = write_dog(tmp_path, model=re.sub(r'name="\w+_thigh" (?=type)', "", mjcf()))
+    replace_once(file, '("thigh", "shank")', '("thigh_geom_0", "shank")')
+    assert "HR_thigh_geom_0" in geom_names(build_robot(get_robot(str(file))))
+
+
+def test_the_digest_tells_models_apart(tmp_path):
     file = with_mesh(tmp_path, "mjcf")
-    text, model, mesh = file.read_text(), file.with_name("dog.xml"), tmp_path / "dog" / "meshes" / "trunk.stl"
-    assert robot_digest(anymal) != robot_digest(dataclasses.replace(anymal, action_scale=0.25))
-
-    def digest(path=file):
-        return robot_digest(get_robot(str(path)))
-
-    first = digest()
-    file.write_text("# a remark\n" + text)
-    assert digest() == first
-    file.write_text(
-        text.replace("collision_bit", "training=TrainingCfg(push_speed=0.5), collision_bit").replace(
-            "import RobotCfg", "import RobotCfg, TrainingCfg"
-        )
-    )
-    assert digest() == first
+    drives, model, mesh = file.with_name("drives.xml"), file.with_name("dog.xml"), tmp_path / "dog/meshes/trunk.stl"
+    body, _, actuators = model.read_text().partition("<actuator>")
+    drives.write_text("<mujoco><actuator>" + actuators)
+    model.write_text(body + '<include file="drives.xml"/></mujoco>')
+    first = robot_digest(get_robot(str(file)))
     shutil.copytree(tmp_path / "dog", tmp_path / "elsewhere" / "dog")
-    file.write_text(text)
-    assert digest(tmp_path / "elsewhere" / "dog" / "model" / "dog.py") == first
-    found = {first}
-    for changed, old, new in ((file, b"150.0", b"151.0"), (model, b'mass="0.8"', b'mass="0.9"')):
+    digests = {first}
+    for changed, new in (
+        (model, model.read_bytes().replace(b'mass="0.8"', b'mass="0.9"')),
+        (drives, drives.read_bytes().replace(b'kp="60"', b'kp="61"')),
+        (mesh, stl(1.01 * np.array(TRUNK))),
+    ):
         before = changed.read_bytes()
-        changed.write_bytes(before.replace(old, new, 1))
-        found.add(digest())
+        changed.write_bytes(new)
+        digests.add(robot_digest(get_robot(str(file))))
         changed.write_bytes(before)
-    mesh.write_bytes(stl(np.array(TRUNK) * 1.01))
-    found.add(digest())
-    mesh.write_bytes(stl(TRUNK))
-    assert len(found) == 4 and digest() == first
+    assert len(digests) == 4
+    file.write_text(f"# a remark\n{file.read_text()}")
+    for same in (file, tmp_path / "elsewhere" / "dog" / "model" / "dog.py"):
+        assert robot_digest(get_robot(str(same))) == first
+    drives.unlink()
+    with pytest.raises(ValueError, match=r"drives\.xml"):
+        get_robot(str(file))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_robot_travels_with_its_files(tmp_path, kind):
     robot = get_robot(str(with_mesh(tmp_path / "here", kind)))
+    assert len(read_model_files(robot.model_file).files) == 2
     packed, digest = pickle.loads(pickle.dumps(pack_robot(robot))), robot_digest(robot)
-    assert isinstance(packed, PackedRobot) and len(packed.files) == 2
+    assert isinstance(packed, PackedRobot)
     shutil.rmtree(tmp_path / "here")
-    there = packed.unpacked(tmp_path / "there")
-    assert there == dataclasses.replace(robot, model_file=there.model_file)
-    assert tmp_path / "there" in there.model_file.parents
-    assert sum(build_robot(there).body_mass) == pytest.approx(MASS)
-    assert robot_digest(there) == digest
-
-
-def test_what_an_mjcf_includes_belongs_to_it(tmp_path):
-    file = with_mesh(tmp_path, "mjcf")
-    model = file.with_name("dog.xml")
-    body, _, actuators = model.read_text().partition("<actuator>")
-    (file.parent / "parts").mkdir()
-    (file.parent / "parts" / "drives.xml").write_text("<mujoco><actuator>" + actuators)
-    model.write_text(body + '<include file="parts/drives.xml"/></mujoco>')
-    robot = get_robot(str(file))
-    names = [file.name for file in read_model_files(robot.model_file).files]
-    assert sorted(names) == ["dog.xml", "drives.xml", "trunk.stl"]
-    first = robot_digest(robot)
-    (file.parent / "parts" / "drives.xml").write_text("<mujoco><actuator>" + actuators.replace('kp="60"', 'kp="61"'))
-    assert robot_digest(get_robot(str(file))) != first
-    os.remove(file.parent / "parts" / "drives.xml")
-    with pytest.raises(ValueError, match=r"not there: .*drives\.xml"):
-        get_robot(str(file))
+    unpacked = packed.unpacked(tmp_path / "there")
+    assert unpacked == dataclasses.replace(robot, model_file=unpacked.model_file)
+    assert tmp_path / "there" in unpacked.model_file.parents
+    assert sum(build_robot(unpacked).body_mass) == pytest.approx(MASS)
+    assert robot_digest(unpacked) == digest
 
 
 def test_a_shipped_robot_travels_by_name(anymal):
     assert pack_robot(anymal) == "anymal"
+
+
+def test_the_model_is_what_the_file_says(dog):
+    builder = build_robot(dog)
+    assert sum(builder.body_mass) == pytest.approx(MASS)
+    assert builder.body_count == 9  # a trunk and four legs of two parts: feet are of their shanks
+    assert joint_names(builder) == list(JOINTS)
+    names = geom_names(builder)
+    assert set(names) == {"trunk", *(f"{leg}_{part}" for leg in LEGS for part in ("thigh", "shank", "foot"))}
+    for name, value in (("target_ke", 60), ("target_kd", 2), ("armature", 0.01)):
+        np.testing.assert_allclose(getattr(builder, f"joint_{name}")[6:], value)
+    np.testing.assert_allclose(builder.joint_limit_lower[6:], [-1.5, -2.6] * 4, atol=1e-6)
+    np.testing.assert_allclose(builder.joint_limit_upper[6:], [2.5, -0.1] * 4, atol=1e-6)
+    # A capsule tag of a URDF has its length without the caps: half of 0.15 m.
+    thigh, foot = names.index("FL_thigh"), names.index("HR_foot")
+    assert builder.shape_type[thigh] == newton.GeoType.CAPSULE
+    np.testing.assert_allclose(builder.shape_scale[thigh][:2], [0.03, 0.075], atol=1e-6)
+    np.testing.assert_allclose(builder.shape_transform[thigh][:3], [0, 0, -0.075], atol=1e-6)
+    assert builder.body_label[builder.shape_body[foot]].endswith("HR_shank")
+    np.testing.assert_allclose(builder.shape_transform[foot][:3], [0, 0, -0.15], atol=1e-6)
+    lowest, highest = np.sort(probes_of(builder, thigh)[0][[0, -1], 2])
+    np.testing.assert_allclose([lowest, highest], [-0.15, 0], atol=1e-6)
+
+
+def probes_of(builder, shape):
+    """Positions and radii of a shape's probes [m]."""
+    probes = make_probes(builder)
+    counts = np.diff(probes.strip_start.numpy())
+    on_shape = np.repeat(probes.strip_shape.numpy(), counts) == shape
+    return probes.position.numpy()[on_shape], np.repeat(probes.strip_radius.numpy(), counts)[on_shape]
+
+
+def test_inertias_are_those_that_mujoco_reads(dog):
+    text = dog.model_file.read_text()  # MuJoCo else merges what is fixed to the world: the base of a URDF
+    extension = '<robot name="dog"><mujoco><compiler fusestatic="false"/></mujoco>'
+    model = mujoco.MjModel.from_xml_string(text.replace('<robot name="dog">', extension))
+    data = mujoco.MjData(model)
+    data.qpos[7 if model.nq == 15 else 0 :] = 0
+    mujoco.mj_forward(model, data)
+    builder = build_robot(dog)
+    for k, label in enumerate(builder.body_label):
+        root = model.body(label.rsplit("/", 1)[-1]).id
+        bodies = [root, *(b for b in range(root + 1, model.nbody) if model.body_parentid[b] == root
+                          and model.body_jntnum[b] == 0)]  # fmt: skip
+        masses, centres = model.body_mass[bodies], data.xipos[bodies]
+        centre = np.average(centres, axis=0, weights=masses)
+        inertia = np.zeros((3, 3))
+        for body, mass, off in zip(bodies, masses, centres - centre, strict=True):
+            axes = data.ximat[body].reshape(3, 3)
+            inertia += axes @ np.diag(model.body_inertia[body]) @ axes.T
+            inertia += mass * (off @ off * np.eye(3) - np.outer(off, off))
+        assert builder.body_mass[k] == pytest.approx(masses.sum())
+        np.testing.assert_allclose(np.reshape(builder.body_inertia[k], (3, 3)), inertia, atol=1e-7)
+        np.testing.assert_allclose(np.array(builder.body_com[k]), centre - data.xpos[root], atol=1e-6)
+
+
+def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):
+    # As many URDFs have it: an empty root, here 5 cm under the trunk and turned by a quarter about the vertical.
+    mount = (
+        '<robot name="dog"><link name="base"/><joint name="mount" type="fixed"><parent link="base"/>'
+        '<child link="trunk"/><origin xyz="0 0 0.05" rpy="0 0 1.5707963"/></joint>'
+    )
+    file = write_dog(tmp_path, model=urdf().replace('<robot name="dog">', mount), suffix="urdf", more=GAINS)
+    replace_once(file, "0.29", "0.24")
+    builder = build_robot(get_robot(str(file)))
+    assert builder.body_count == 9 and builder.body_label[0].endswith("base")
+    assert builder.body_mass[0] == pytest.approx(8.0)
+    np.testing.assert_allclose(builder.body_com[0], [0, 0, 0.05], atol=1e-6)
+    np.testing.assert_allclose(np.reshape(builder.body_inertia[0], (3, 3)).diagonal(), [0.2, 0.03, 0.2], rtol=1e-5)
+    pose = builder.shape_transform[geom_names(builder).index("trunk")]
+    np.testing.assert_allclose(pose[:3], [0, 0, 0.05], atol=1e-6)
+    np.testing.assert_allclose(oracle.rotation_matrix(np.array(pose[3:]))[:, 0], [0, 1, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mesh_of_a_file_is_read(tmp_path, kind):
+    builder = build_robot(get_robot(str(with_mesh(tmp_path, kind))))
+    trunk = geom_names(builder).index("trunk")
+    assert builder.shape_type[trunk] == newton.GeoType.MESH
+    positions, radii = probes_of(builder, trunk)
+    np.testing.assert_allclose((np.abs(positions) + radii[:, None]).max(axis=0), TRUNK, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "friction", "time_constant_s"),
+    [
+        ("urdf", "", 1.0, 0.01),  # a URDF says nothing of contact: friction 1, the time constant of the shipped robots
+        ("mjcf", "", 0.8, 0.01),
+        ("mjcf", "\n    friction=0.6,\n    contact_time_constant_s=0.02,", 0.6, 0.02),
+    ],
+)
+def test_contact_and_effort_reach_the_solver(tmp_path, device, kind, more, friction, time_constant_s):
+    given = KINDS[kind] | {"more": KINDS[kind].get("more", "") + more}
+    dog = get_robot(str(write_dog(tmp_path, **given)))
+    sim = Simulation(dog, TerrainBank(1, device=device), np.zeros(1, int))
+    on_robot = sim.model.shape_body.numpy() >= 0
+    np.testing.assert_allclose(sim.model.shape_material_mu.numpy()[on_robot], friction)
+    solref = np.array(sim.solver.mjw_model.geom_solref.numpy()).reshape(-1, 2)
+    assert (np.abs(solref - [time_constant_s, 1.0]).max(axis=1) < 1e-6).sum() >= 13
+    q = np.zeros((1, 15))
+    q[:, 2], q[:, 6], q[:, 7:] = 3.0, 1.0, dog.default_joint_pos
+    put(sim, q)
+    q[0, 7:9] += [0.01, 1.1]  # 60 N m/rad: .6 N m, and 66 N m, of which 30 are to be had
+    sim.targets.assign(np.float32(q))
+    with wp.ScopedDevice(device):
+        sim.physics_step()
+    np.testing.assert_allclose(sim.joint_torque.numpy()[0, 6:8], [0.6, 30.0], rtol=0.1)

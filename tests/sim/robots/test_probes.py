@@ -1,24 +1,29 @@
-"""Sphere probes: inside their shape, everywhere under its surface, and close enough for a sharp ridge."""
+"""Sphere probes of shapes and meshes: inside, everywhere near the surface, and close enough for a sharp ridge."""
+
+from types import SimpleNamespace
 
 import newton
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull, Delaunay
 
-from sim.robots.model import build_robot
+from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import (
-    MAX_EDGE_RADIUS,
+    MAX_MESH_PROBES,
     MAX_SAG,
     box_strips,
     capsule_strips,
     cylinder_strips,
+    hull_probes,
     make_probes,
     max_spacing,
     shape_strips,
 )
+from sim.terrain import SPACING
+from tests.kernels import oracle
+from tests.sim.scenes import Stepper, free_body, lying, positions, put, simulate, slope, velocities
 
-CAPSULES = [(0.0175, 0.1), (0.06, 0.04), (0.1, 0.375), (0.003, 0.2), (0.05, 0.0)]
-BOXES = [(0.1, 0.1, 0.05), (0.3, 0.02, 0.15), (0.01, 0.01, 0.01)]
-CYLINDERS = [(0.02, 0.0625), (0.1, 0.05), (0.25, 0.01)]
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2.0
 
 
 def spheres(strips):
@@ -30,7 +35,10 @@ def spheres(strips):
 def uncovered(points, strips):
     """How far the points, on the shape's surface, lie outside of the nearest probe."""
     centres, radii = spheres(strips)
-    return (np.linalg.norm(points[:, None] - centres, axis=2) - radii).min(axis=1)
+    gap = np.full(len(points), np.inf)
+    for centre, radius in zip(centres, radii, strict=True):
+        gap = np.minimum(gap, np.linalg.norm(points - centre, axis=1) - radius)
+    return gap
 
 
 def on_capsule(radius, half, rng, count=3000):
@@ -59,58 +67,45 @@ def on_cylinder(radius, half, rng, count=4000):
     return np.column_stack([r * np.cos(angle), r * np.sin(angle), z])
 
 
-@pytest.mark.parametrize("radius", [0.001, 0.005, 0.01, 0.0175, 0.03, 0.1, 0.3])
-def test_spacing_lets_a_ridge_sink_by_the_bound(radius):
-    # Two spheres of radius r, s apart, dent the line between them by r - sqrt(r^2 - s^2 / 4).
-    s = max_spacing(radius)
-    assert radius - np.sqrt(radius**2 - s**2 / 4) == pytest.approx(min(MAX_SAG, radius), abs=1e-9)
+@pytest.mark.parametrize(
+    # Shank: r = 17.5 mm, sag 5 mm: s = 2 sqrt(2 * 17.5 * 5 - 25) = 2 sqrt(150) = 24.4949 mm. Smaller than the sag: 2 r.
+    ("radius", "spacing"),
+    [(0.0175, 0.0244949), (0.003, 0.006)],
+)
+def test_spacing_lets_a_ridge_sink_by_the_bound(radius, spacing):
+    assert max_spacing(radius) == pytest.approx(spacing, abs=1e-7)
 
 
-def test_spacing_by_hand():
-    # Shank: r = 17.5 mm, sag 5 mm: s = 2 sqrt(2 * 17.5 * 5 - 25) = 2 sqrt(150) = 24.4949 mm.
-    assert max_spacing(0.0175) == pytest.approx(0.0244949, abs=1e-7)
-
-
-@pytest.mark.parametrize(("radius", "half"), CAPSULES)
+@pytest.mark.parametrize(("radius", "half"), [(0.0175, 0.1), (0.06, 0.04), (0.003, 0.2), (0.05, 0.0)])
 def test_capsule(radius, half):
     strips = capsule_strips(radius, half)
-    gaps = uncovered(on_capsule(radius, half, np.random.default_rng(0)), strips)
-    assert gaps.max() <= min(MAX_SAG, radius) + 1e-9
+    assert uncovered(on_capsule(radius, half, np.random.default_rng(0)), strips).max() <= min(MAX_SAG, radius) + 1e-9
     centres, radii = spheres(strips)
-    assert (radii == radius).all()
-    assert not centres[:, :2].any()
+    assert (radii == radius).all() and not centres[:, :2].any()
     assert (centres[0, 2], centres[-1, 2]) == (-half, half)  # exact at the caps
     assert (np.diff(centres[:, 2]) <= max_spacing(radius) + 1e-12).all()
 
 
-@pytest.mark.parametrize("half", BOXES)
+@pytest.mark.parametrize("half", [(0.1, 0.1, 0.05), (0.3, 0.02, 0.15), (0.01, 0.01, 0.01)])
 def test_box(half):
-    half = np.array(half)
-    strips = box_strips(tuple(half))
+    strips = box_strips(half)
     centres, radii = spheres(strips)
-    assert (np.abs(centres) + radii[:, None] <= half + 1e-9).all()  # nothing sticks out
+    np.testing.assert_allclose((np.abs(centres) + radii[:, None]).max(axis=0), half)  # nothing sticks out
     # A needle between four probes, or a corner (rounded by (sqrt 3 - 1) r = 14.6 mm), is the worst case.
-    assert uncovered(on_box(half, np.random.default_rng(0)), strips).max() < 0.0147
-    for axis in range(3):
-        assert (centres + radii[:, None])[:, axis].max() == pytest.approx(half[axis])
-    # Halfway along a straight line over a face, from probe to probe, a ridge sinks by the bound at most.
-    s = np.diff(np.unique(centres[:, 0]))
-    assert s.max(initial=0) <= max_spacing(radii[0]) + 1e-12
+    assert uncovered(on_box(np.array(half), np.random.default_rng(0)), strips).max() < 0.0147
 
 
 @pytest.mark.parametrize("longest", [0, 1, 2])
 def test_strips_of_a_box_run_along_its_longest_side(longest):
     # 0.5 x 0.16 x 0.1 m, probes of 2 cm at most 26.5 mm apart: 19 along, 6 and 4 across. Of those 24 rows 16 are at the
     # rim; each of the 8 within has a probe on both end faces.
-    half = np.roll([0.25, 0.08, 0.05], longest)
-    strips = box_strips(tuple(half))
-    lengths = [len(strip.centres) for strip in strips]
-    assert sorted(lengths) == [1] * 16 + [19] * 16
+    strips = box_strips(tuple(np.roll([0.25, 0.08, 0.05], longest)))
+    assert sorted(len(strip.centres) for strip in strips) == [1] * 16 + [19] * 16
     for strip in strips:
         assert np.ptp(strip.centres, axis=0)[np.arange(3) != longest].max() < 1e-12
 
 
-@pytest.mark.parametrize(("radius", "half"), CYLINDERS)
+@pytest.mark.parametrize(("radius", "half"), [(0.02, 0.0625), (0.1, 0.05), (0.25, 0.01)])
 def test_cylinder(radius, half):
     strips = cylinder_strips(radius, half)
     centres, radii = spheres(strips)
@@ -123,59 +118,154 @@ def test_cylinder(radius, half):
 def test_probes_of_a_strip_lie_in_a_row(strips):
     # kernels.contact bounds a strip by its ends and takes first and last as its outermost.
     for strip in strips:
-        along = np.diff(strip.centres @ [0, 0, 1])
-        assert (along > 0).all()
-        np.testing.assert_allclose(strip.centres[:, :2], np.broadcast_to(strip.centres[0, :2], (len(strip.centres), 2)))
+        assert (np.diff(strip.centres[:, 2]) > 0).all()
+        assert not np.ptp(strip.centres[:, :2], axis=0).any()
 
 
-def test_shapes_by_their_newton_scale():
-    assert len(shape_strips(newton.GeoType.SPHERE, np.array([0.03, 0, 0]))[0].centres) == 1
-    for kind, scale, strips in (
+@pytest.mark.parametrize(
+    ("kind", "scale", "strips"),
+    [
         (newton.GeoType.CAPSULE, (0.06, 0.04, 0), capsule_strips(0.06, 0.04)),
         (newton.GeoType.BOX, (0.1, 0.2, 0.05), box_strips((0.1, 0.2, 0.05))),
         (newton.GeoType.CYLINDER, (0.1, 0.05, 0), cylinder_strips(0.1, 0.05)),
+    ],
+)
+def test_shapes_by_their_newton_scale(kind, scale, strips):
+    np.testing.assert_allclose(spheres(shape_strips(kind, np.array(scale)))[0], spheres(strips)[0])
+
+
+def ball(count, size):
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True) * np.array(size) / 2
+
+
+# 1 cm, of a small mesh a twelfth of its longest side; more only where 400 probes do not do.
+MESHES = {
+    "base": (CORNERS * [0.6, 0.3, 0.2], 0.025),
+    "shank": (CORNERS * [0.03, 0.03, 0.3], 0.01),
+    "plate": (CORNERS * [0.3, 0.1, 0.02], 0.01),
+    "tetrahedron": (np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), 0.1 / 12),
+    "thigh, not at its origin": (np.add(ball(3000, [0.1, 0.06, 0.3]), [0.4, -0.2, 0.7]), 0.01),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_mesh(name):
+    vertices, most = MESHES[name]
+    probes = hull_probes(vertices)
+    centres, radii = spheres(probes.strips)
+    assert probes.tolerance <= most * (1 + 1e-6) and len(radii) <= MAX_MESH_PROBES
+    assert probes.tolerance == pytest.approx(most) or name == "base"
+    # Points all over the hull's faces, half of them on its edges, and corners.
+    hull, rng = ConvexHull(vertices), np.random.default_rng(1)
+    triangles = hull.points[hull.simplices]
+    weights = rng.dirichlet(np.ones(3), 6000)
+    weights[:3000, 0] = 0.0
+    weights /= weights.sum(axis=1, keepdims=True)
+    chosen = triangles[rng.integers(len(triangles), size=6000)]
+    gap = uncovered(np.vstack([np.einsum("nk,nkj->nj", weights, chosen), hull.points[hull.vertices]]), probes.strips)
+    assert gap.max() <= probes.tolerance
+    assert gap.max() > 0.3 * probes.tolerance, "far more probes than it takes"
+    sticking_out = centres @ hull.equations[:, :3].T + hull.equations[:, 3] + radii[:, None]
+    assert sticking_out.max() < 1e-6
+    # The contact kernel bounds a row by its ends, the radius and the spread, and makes three contacts of it at most.
+    assert len(probes.strips) <= 10
+    for strip in probes.strips:
+        line = strip.centres[-1] - strip.centres[0]
+        share = np.clip((strip.centres - strip.centres[0]) @ line / max(float(line @ line), 1e-12), 0, 1)
+        off = np.linalg.norm(strip.centres - strip.centres[0] - share[:, None] * line, axis=1)
+        assert off.max() == pytest.approx(strip.spread, abs=1e-9)
+
+
+def test_a_mesh_is_scaled_and_collides_as_its_hull():
+    hollow = SimpleNamespace(vertices=np.vstack([CORNERS, CORNERS / 2]))
+    strips = shape_strips(newton.GeoType.MESH, np.array([0.2, 0.1, 0.05]), hollow)
+    expected = hull_probes(CORNERS * [0.2, 0.1, 0.05]).strips
+    np.testing.assert_array_equal(spheres(strips)[0], spheres(expected)[0])
+
+
+def test_a_mesh_without_volume_is_refused():
+    with pytest.raises(ValueError, match="volume"):
+        hull_probes(CORNERS * [1, 1, 0])
+
+
+def mesh_body(folder, vertices, mass=2.0):
+    """A free body whose only geom is a mesh, as a robot of one body."""
+    robot = free_body(folder, 'type="mesh" mesh="shape"', mass=mass)
+    points = " ".join(f"{value:.9f}" for value in np.ravel(vertices))
+    asset = f'<asset><mesh name="shape" vertex="{points}"/></asset><worldbody>'
+    robot.model_file.write_text(robot.model_file.read_text().replace("<worldbody>", asset))
+    return robot
+
+
+def test_a_dropped_mesh_comes_to_rest_as_the_same_box(device, tmp_path):
+    # A box of 0.2 x 0.12 x 0.08 m, as a mesh and as a primitive, dropped on each of its faces on level ground.
+    size, turns = np.array([0.2, 0.12, 0.08]), [((0, 0, 1), 0.0), ((1, 0, 0), np.pi / 2), ((0, 1, 0), np.pi / 2)]
+    half = " ".join(map(str, size / 2))
+    rest = []
+    for robot in (
+        mesh_body(tmp_path / "mesh", CORNERS * size),
+        free_body(tmp_path / "box", f'type="box" size="{half}"', mass=2.0),
     ):
-        np.testing.assert_allclose(spheres(shape_strips(kind, np.array(scale)))[0], spheres(strips)[0])
+        sim = simulate(robot, [slope()] * 3, device)
+        put(sim, np.vstack([lying(1, 8, 4, 0.3, axis, angle) for axis, angle in turns]))
+        Stepper(sim).run(2.0)
+        assert np.abs(velocities(sim)).max() < 0.02
+        rest.append(positions(sim))
+    for mesh, box, thickness in zip(*rest, size[[2, 1, 0]], strict=True):
+        assert mesh[2] == pytest.approx(box[2], abs=1e-3)
+        assert mesh[2] == pytest.approx(thickness / 2, abs=2e-3)
+        assert abs(np.dot(mesh[3:7], box[3:7])) > 0.9999  # lying flat, as the box does
 
 
-def test_a_shape_without_probes_is_named():
-    with pytest.raises(ValueError, match=r"ELLIPSOID.*SPHERE, CAPSULE, BOX, CYLINDER or MESH"):
-        shape_strips(newton.GeoType.ELLIPSOID, np.ones(3))
+def test_no_edge_slips_between_the_probes(device, tmp_path):
+    # Ridges of one node, as sharp as the grid makes them, under a lying plate at twelve places: a ridge enters its hull
+    # by no more than the tolerance and what the contacts give.
+    plate, _ = MESHES["plate"]
+    height, num = 0.3, 12
+    grid = np.zeros((161, 321), np.float32)
+    grid[:, [158, 162]] = height
+    sim = simulate(mesh_body(tmp_path, plate, mass=1.0), [grid] * num, device)
+    q = lying(num, 8, 4, height + 0.012)
+    q[:, 0] += np.linspace(-0.02, 0.02, num)
+    put(sim, q)
+    Stepper(sim).run(1.0)
+    tolerance = hull_probes(plate).tolerance
+    # Points of both ridges, lowered by the tolerance and 2 mm: outside of the plate, seen from the plate.
+    low = height - tolerance - 0.002
+    ridges = np.array([[x * SPACING, 4 + y, low] for x in (158, 162) for y in np.linspace(-0.05, 0.05, 21)])
+    for row in positions(sim):
+        assert row[2] > height - tolerance
+        local = (ridges - row[:3]) @ oracle.rotation_matrix(row[3:7])
+        assert (Delaunay(plate).find_simplex(local) < 0).all()
 
 
-def test_probes_of_the_robot_stand_where_its_geoms_are(anymal):
-    builder = build_robot(anymal)
-    probes = make_probes(builder)
-    starts, shapes = probes.strip_start.numpy(), probes.strip_shape.numpy()
-    assert sorted(shapes) == list(range(13))  # every collision shape, once: no cylinders, no boxes
-    labels = [label.rsplit("/", 1)[-1] for label in builder.shape_label]
-    strip = list(shapes).index(labels.index("LF_FOOT"))
-    # The file puts the foot at (0.08795, 0.01305, -0.31547) in the shank's frame, r = 0.03.
-    np.testing.assert_allclose(probes.position.numpy()[starts[strip]], [0.08795, 0.01305, -0.31547], atol=1e-6)
-    assert probes.strip_radius.numpy()[strip] == pytest.approx(0.03)
-    assert builder.body_label[probes.strip_body.numpy()[strip]].endswith("LF_SHANK")
-    # The base's capsule runs along x from -0.375 to 0.375.
-    strip = list(shapes).index(labels.index("base"))
-    ends = probes.position.numpy()[[starts[strip], starts[strip + 1] - 1]]
-    np.testing.assert_allclose(np.sort(ends[:, 0]), [-0.375, 0.375], atol=1e-6)
-    assert MAX_EDGE_RADIUS < 0.03
+def test_probes_of_the_robots_stand_where_their_geoms_are(robot):
+    builder = build_robot(robot)
+    probes, names = make_probes(builder), geom_names(builder)
+    starts, shapes, bodies = (getattr(probes, f"strip_{name}").numpy() for name in ("start", "shape", "body"))
+    strips = {names[shape]: strip for strip, shape in enumerate(shapes)}
+    assert list(strips) == names and len(strips) == len(shapes)  # every shape once: no cylinders, no boxes
 
+    def ends(name):
+        rows = probes.position.numpy()[starts[strips[name]] : starts[strips[name] + 1]]
+        return rows[[0, -1]][np.argsort(rows[[0, -1], 0])]
 
-def test_probes_of_a_biped_are_a_sphere_and_two_strips(cassie):
-    builder = build_robot(cassie)
-    probes = make_probes(builder)
-    starts, shapes = probes.strip_start.numpy(), probes.strip_shape.numpy()
-    labels = [label.rsplit("/", 1)[-1] for label in builder.shape_label]
-    assert [labels[shape] for shape in shapes] == ["pelvis", "left_toe", "right_toe"]
-    np.testing.assert_allclose(probes.strip_radius.numpy(), [0.25, 0.02, 0.02], atol=1e-6)
-    # At r = .02 neighbours may be 2 sqrt(2 * .02 * .005 - .005^2) = .0265 m apart: six on a toe of .125 m.
-    assert np.diff(starts).tolist() == [1, 6, 6]
-    position = probes.position.numpy()
-    np.testing.assert_allclose(position[starts[0]], 0.0, atol=1e-6)
-    for strip in (1, 2):
-        toe = position[starts[strip] : starts[strip + 1]]
-        # From the heel to the tip, in the plane that the toe turns in: (.03, .03) -+ .0625 (sin .85, -cos .85).
-        np.testing.assert_allclose(np.sort(toe[[0, -1], 0]), [-0.01695, 0.07695], atol=1e-5)
-        np.testing.assert_allclose(np.sort(toe[[0, -1], 1]), [-0.01125, 0.07125], atol=1e-5)
-        np.testing.assert_allclose(toe[:, 2], 0.0, atol=1e-6)
-        assert builder.body_label[probes.strip_body.numpy()[strip]].endswith(labels[shapes[strip]])
+    radii = dict(zip(strips, probes.strip_radius.numpy(), strict=True))
+    if robot.name == "anymal":
+        # The file puts the foot at (0.08795, 0.01305, -0.31547) in the shank's frame, r = 0.03; the base's capsule runs
+        # along x from -0.375 to 0.375.
+        np.testing.assert_allclose(ends("LF_FOOT"), [[0.08795, 0.01305, -0.31547]] * 2, atol=1e-6)
+        assert builder.body_label[bodies[strips["LF_FOOT"]]].endswith("LF_SHANK")
+        np.testing.assert_allclose(ends("base")[:, 0], [-0.375, 0.375], atol=1e-6)
+        assert radii["LF_FOOT"] == pytest.approx(0.03)
+    else:
+        # At r = .02 neighbours may be 2 sqrt(2 * .02 * .005 - .005^2) = .0265 m apart: six on a toe of .125 m. From the
+        # heel to the tip, in the plane that the toe turns in: (.03, .03) -+ .0625 (sin .85, -cos .85).
+        assert radii == pytest.approx({"pelvis": 0.25, "left_toe": 0.02, "right_toe": 0.02}, abs=1e-6)
+        assert np.diff(starts).tolist() == [1, 6, 6]
+        np.testing.assert_allclose(ends("pelvis"), 0.0, atol=1e-6)
+        for toe in ("left_toe", "right_toe"):
+            np.testing.assert_allclose(ends(toe)[:, 0], [-0.01695, 0.07695], atol=1e-5)
+            np.testing.assert_allclose(np.sort(ends(toe)[:, 1]), [-0.01125, 0.07125], atol=1e-5)
+            assert builder.body_label[bodies[strips[toe]]].endswith(toe)
