@@ -68,11 +68,7 @@ class TrainCfg:
         return _with_sizes(self, on_cuda if device.startswith("cuda") else _BASE_ON_CPU)
 
     def check(self, robot: RobotCfg) -> None:
-        """Refuses settings that nothing can be learned with; sizes are given.
-
-        Raises:
-            ValueError: If there are some, naming all that are wrong.
-        """
+        """Refuses settings that nothing can be learned with; sizes are given."""
         check(self)
         lines = [*task_problems(self.task, robot.control_dt), *ppo_problems(self.ppo, self.num_envs)]
         if lines:
@@ -143,24 +139,14 @@ class FinetuneCfg(TrainCfg):
         return replace(cfg, seed=_SPECIALIST_SEED, recipe=replace(cfg.recipe, only="failing", held_out=False))
 
     def sized(self, robot: RobotCfg, device: str, **on_cuda: int) -> Self:
-        """The same with sizes that suit the robot and the Warp device in place of those that are 0.
-
-        Args:
-            robot: The robot.
-            device: Warp device name.
-            on_cuda: Sizes on CUDA that are not the paper's.
-        """
+        """The same with sizes that suit the robot and the Warp device, or are given, in place of those that are 0."""
         paper = _PAPER_CASSIE if robot.name == "cassie" else _PAPER
         sizes = paper | on_cuda if device.startswith("cuda") else _TUNING_ON_CPU
         recipe = replace(self.recipe, swap_every=self.recipe.swap_every or sizes["swap_every"])
         return replace(_with_sizes(self, sizes), recipe=recipe)
 
     def check(self, robot: RobotCfg) -> None:
-        """Refuses settings that nothing can be learned with; sizes are given.
-
-        Raises:
-            ValueError: If there are some, naming what is wrong.
-        """
+        """Refuses settings that nothing can be learned with; sizes are given."""
         super().check(robot)
         if self.terrains < 2 and self.mix != "hand-crafted":
             raise ValueError(f"terrains must be at least 2 for mix {self.mix}, half of each kind, got {self.terrains}")
@@ -192,10 +178,10 @@ class RoundSearchCfg:
 class RoundEvaluationCfg:
     """The evaluation and the validation of every controller of a hardening."""
 
-    terrains: PositiveInt | None = None
-    """A set; on CUDA 300 (Cassie: 180), on the CPU 24."""
-    episodes: PositiveInt | None = None
-    """On each terrain; on CUDA 20, on the CPU 4."""
+    terrains: NonNegativeInt = 0
+    """A set; 0: on CUDA 300 (Cassie: 180), on the CPU 24."""
+    episodes: NonNegativeInt = 0
+    """On each terrain; 0: on CUDA 20, on the CPU 4."""
 
 
 @dataclass(frozen=True, kw_only=True)

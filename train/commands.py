@@ -131,7 +131,8 @@ def _resumed(kind: type[_Cfg], run_dir: Path, robot: RobotCfg) -> _Cfg:
     from train.ppo.training import read_saved
 
     settings = read_saved(run_dir, "train" if kind is TrainCfg else "finetune", robot.name)["settings"]
-    values = {one.name: settings.get(one.name) for one in fields(kind)}  # pyright: ignore[reportArgumentType]
+    known = {setting.name for setting in fields(kind)}  # pyright: ignore[reportArgumentType]
+    values = {name: value for name, value in settings.items() if name in known}
     if ":" in str(values.get("space")):
         del values["space"]
     return from_builtins(kind, values, str(run_dir))
@@ -142,15 +143,15 @@ def _run_dir(flags: _OfTraining, name: str) -> Path:
     if flags.resume is not None and flags.run_dir is not None:
         raise ValueError("--resume goes on where it is, got --run-dir too: leave it out")
     stamp = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    names = (stamp if number == 1 else f"{stamp}-{number}" for number in count(1))  # two may begin in one second
-    new = (place for place in map(Path("runs").joinpath, names) if not place.exists())
-    return flags.run_dir or flags.resume or next(new)
+    names = (f"{stamp}-{number}" if number else stamp for number in count())  # two may begin in one second
+    new = next(place for place in map(Path("runs").joinpath, names) if not place.exists())
+    return flags.run_dir or flags.resume or new
 
 
 def _values(cfg: Any) -> dict[str, Any]:
-    return {one.name: getattr(cfg, one.name) for one in fields(cfg)}
+    return {setting.name: getattr(cfg, setting.name) for setting in fields(cfg)}
 
 
 def _part(kind: type[_Cfg], flags: Any) -> _Cfg:
     """The settings among flags."""
-    return kind(**{one.name: getattr(flags, one.name) for one in fields(kind)})  # pyright: ignore[reportArgumentType]
+    return kind(**{setting.name: getattr(flags, setting.name) for setting in fields(kind)})  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,5 @@
 """Fine-tune a controller on the terrains that broke it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -64,14 +63,18 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         raise ValueError("a fine-tuning must be one process, got several by torchrun: begin it without")
     cfg = cfg.sized(robot, device)
     saved = read_saved(run_dir, "finetune", robot.name) if (run_dir / CHECKPOINT).exists() else None
-    start = _read_start(robot, cfg) if saved is None else None  # of a checkpoint it may be gone
+    start = None
+    if saved is None:  # else the first controller may be gone
+        start = read_start(Path(cfg.policy or robot.policy_file), robot)
+        if cfg.recipe.noise_of is not None:
+            start = start.with_noise_of(read_start(Path(cfg.recipe.noise_of), robot))
     hidden_dims = start.hidden_dims if start else saved["settings"]["ppo"]["hidden_dims"] if saved else ()
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=tuple(hidden_dims)))
     elites = elites_of(robot, cfg)
     settings = {
         **settings_of(cfg, robot),
         "elites": elites.about,
-        "spaces": list(dict.fromkeys(map(_identity, elites.spaces))),
+        "spaces": list(dict.fromkeys(identity(space.name, space.sha256) for space in elites.spaces)),
     }
     if saved is not None:
         check_settings(run_dir, saved, settings)
@@ -103,9 +106,6 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
         run: Directory of a search whose elites have fresh episodes.
         cfg: As of :meth:`FinetuneCfg.specialist`; controller and archive are those of the search.
         options: Where and for how long.
-
-    Raises:
-        ValueError: If the run has no failing elites, its controller is not at hand, or as of :func:`finetune`.
     """
     archive = read_elites(run, robot, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]
@@ -134,11 +134,7 @@ class Elites:
 
 
 def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
-    """The elites to train on.
-
-    Raises:
-        ValueError: If there are none.
-    """
+    """The elites to train on."""
     if cfg.mix != "generated":
         space = load_space(cfg.space, cfg.ground)
         return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
@@ -159,16 +155,16 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
         is_free = [mark not in held_out for mark in marks_of(archive.genes[rows])]
         parts.append(rows[np.array(is_free, bool)])
     if not any(map(len, parts)):
-        raise ValueError(f"{_joined(paths)} must have elites to train on that are {cfg.recipe.only}, got none")
-    rates = [(archive.fresh or archive).goal_rate[rows] for archive, rows in zip(archives, parts, strict=True)]
-    counts = zip(archives, parts, splits, strict=True)
+        places = ", ".join(map(str, paths))
+        raise ValueError(f"{places} must have elites to train on that are {cfg.recipe.only}, got none")
+    chosen = list(zip(archives, parts, splits, strict=True))
     return Elites(
-        genes=tuple(archive.genes[rows] for archive, rows in zip(archives, parts, strict=True)),
+        genes=tuple(archive.genes[rows] for archive, rows, _ in chosen),
         spaces=spaces,
-        goal_rate=np.concatenate(rates),
+        goal_rate=np.concatenate([(archive.fresh or archive).goal_rate[rows] for archive, rows, _ in chosen]),
         about=[
             {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation),
-             "sha256": elites_sha256(archive)} for archive, rows, split in counts
+             "sha256": elites_sha256(archive)} for archive, rows, split in chosen
         ],
     )  # fmt: skip
 
@@ -179,15 +175,6 @@ def _split(cfg: FinetuneCfg, archive: Archive) -> EliteSplit:
         return split_elites(archive)
     nobody = np.zeros(0, np.int64)  # beside all, in an order that does not depend on that of the file
     return EliteSplit(train=np.lexsort(archive.genes.T[::-1]), validation=nobody, test=nobody)
-
-
-def _joined(paths: Sequence[Path]) -> str:
-    return ", ".join(map(str, paths))
-
-
-def _identity(space: TerrainSpace) -> str:
-    """What the terrains of a space depend on, wherever its code lies."""
-    return identity(space.name, space.sha256)
 
 
 class FineTuning(Training):
@@ -207,7 +194,7 @@ class FineTuning(Training):
         elites: Elites,
         start: Start | None,
     ) -> None:
-        """Begin with networks and elites, or go on from a checkpoint; as of :class:`Training`."""
+        """Begin with networks, or go on from a checkpoint; as of :class:`Training`."""
         self.mix = Mix(
             kind=cfg.mix, num_terrains=cfg.terrains, draw=cfg.recipe.draw, genes=elites.genes, spaces=elites.spaces,
             crosses=cfg.task.crosses, seed=cfg.seed, device=device,
@@ -215,7 +202,9 @@ class FineTuning(Training):
         )  # fmt: skip
         if start is not None:
             before = recorded_marks(str(cfg.policy or robot.policy_file))
-            self._alone = 0 if start.critic is not None else _critic_iterations(cfg)
+            asked = cfg.recipe.critic_iterations
+            alone = min(_CRITIC_ITERATIONS, cfg.iterations // 2) if asked is None else asked
+            self._alone = alone if start.critic is None else 0
             self._trained_on = sorted({*chain(*map(marks_of, elites.genes)), *before})
             tiles = self.mix.next()
         else:
@@ -228,7 +217,7 @@ class FineTuning(Training):
             robot, cfg, run_dir, device=device, settings=settings, saved=saved, tiles=tiles, random_ages=False
         )
         if start is not None:
-            self.learner.start_from(start.actor, start.critic)
+            self.learner.start_from(start)
 
     def before_iteration(self) -> None:
         """Exchanges the terrains where that is due, and lets the actor learn once its critic has had its time."""
@@ -242,7 +231,7 @@ class FineTuning(Training):
 
     @property
     def averaged_from(self) -> int:
-        """Likewise; while the critic learns alone, the actor is what it was."""
+        """The iteration after which actors count into the controller; while the critic learns alone, none does."""
         return max(super().averaged_from, self._alone)
 
     def facts(self) -> dict[str, Any]:
@@ -252,15 +241,3 @@ class FineTuning(Training):
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps, the terrains among it."""
         return {**super().state(), "mix": self.mix.state(self.task.counts())}
-
-
-def _read_start(robot: RobotCfg, cfg: FinetuneCfg) -> Start:
-    start = read_start(Path(cfg.policy or robot.policy_file), robot)
-    noise_of = cfg.recipe.noise_of
-    return start if noise_of is None else start.with_noise_of(read_start(Path(noise_of), robot))
-
-
-def _critic_iterations(cfg: FinetuneCfg) -> int:
-    """Iterations at first in which the critic learns alone."""
-    asked_for = cfg.recipe.critic_iterations
-    return min(_CRITIC_ITERATIONS, cfg.iterations // 2) if asked_for is None else asked_for

@@ -29,11 +29,10 @@ from sim.files.command import Interrupted
 from sim.files.intervals import value_words
 from sim.files.records import identity
 from sim.files.settings import check
-from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import is_own, load_space
-from train.cfg import LARGE, FinetuneCfg, HardenCfg, RunCfg
+from sim.spaces.registry import load_space
+from train.cfg import LARGE, FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
 from train.finetune import finetune, train_specialist
 from train.ppo.checkpoint import CHECKPOINT, read_start
 from train.ppo.training import POLICY
@@ -76,17 +75,17 @@ def harden(
     Returns:
         The content of ``rounds.json``, which is written after each round: the counts of all searches, which trainings
         were kept and why, and the tables of all controllers.
-
-    Raises:
-        ValueError: If a setting cannot be used, or the directory holds something else; raised before any long work.
-        Interrupted: On Ctrl-C.
-        FloatingPointError: If a training leaves the finite numbers; its last checkpoint is kept.
-        EvaluatorError: If a worker is lost.
     """
-    hardening = _begin(robot, cfg, run_dir, compute, certifiers, open_evaluator)
+    cfg, content = _begin(robot, cfg, run_dir, compute)
+    hardening = _Hardening(
+        robot=robot, cfg=cfg, path=run_dir, compute=compute, space=load_space(cfg.space, cfg.ground),
+        certifiers=certifiers, open_evaluator=open_evaluator, content=content,
+        policies={"base": cfg.policy or str(robot.policy_file)}, start=cfg.policy,
+    )  # fmt: skip
+    hardening.search_cfg(0, cfg.policy)  # refuses what no search can be
     try:
         with claimed(run_dir):
-            write_atomically(run_dir / ROUNDS_FILE, to_json(hardening.stored))  # by which the directory is known
+            write_atomically(run_dir / ROUNDS_FILE, to_json(content))  # by which the directory is known
             for number in range(cfg.rounds + 1):
                 if number:
                     hardening.train(number)
@@ -94,39 +93,25 @@ def harden(
                 hardening.evaluate()
     except KeyboardInterrupt:
         raise Interrupted(f"Stopped; what is done is kept, and the same command goes on in {run_dir}.") from None
-    _show(hardening.content)
+    _show(content)
     print(f"The hardened controller: {hardening.policies[f'round-{cfg.rounds}']}")
-    return hardening.content
+    return content
 
 
-def _begin(
-    robot: RobotCfg,
-    cfg: HardenCfg,
-    run_dir: Path,
-    compute: Compute,
-    certifiers: Mapping[str, str] | None,
-    open_evaluator: OpenEvaluator,
-) -> "_Hardening":
-    """A hardening whose settings and directory are checked."""
+def _begin(robot: RobotCfg, cfg: HardenCfg, run_dir: Path, compute: Compute) -> tuple[HardenCfg, dict[str, Any]]:
+    """Checked settings with their sizes, and what ``rounds.json`` has, or is to begin with."""
     check(cfg)
     base = cfg.policy or str(robot.policy_file)
     read_start(Path(base), robot)
     check_policy(base, robot, compute.device)
-    large = {} if robot.name == "cassie" else LARGE
-    tune = cfg.tune.sized(robot, compute.device, **large)
+    tune = cfg.tune.sized(robot, compute.device, **({} if robot.name == "cassie" else LARGE))
     tune.check(robot)
     full = (paper_terrains(robot.name), EPISODES)
-    terrains, episodes = sizes_for(compute, cfg.evaluation.terrains, cfg.evaluation.episodes, full=full, small=(24, 4))
-    settings = {
-        **asdict(replace(cfg, tune=tune)), "evaluation": {"terrains": terrains, "episodes": episodes},
-        **identity(robot, base),
-    }  # fmt: skip
+    asked = cfg.evaluation
+    terrains, episodes = sizes_for(compute, asked.terrains or None, asked.episodes or None, full=full, small=(24, 4))
+    cfg = replace(cfg, tune=tune, evaluation=RoundEvaluationCfg(terrains=terrains, episodes=episodes))
+    settings = json.loads(to_json({**asdict(cfg), **identity(robot, base)}))  # as they are read again
     del settings["rounds"]
-    settings = json.loads(to_json(settings))  # as they are read again
-    content = {
-        **origin_of(compute.device, cfg.seed, compute.workers), "robot": robot.name, "settings": settings, "rounds": [],
-        "choices": {},
-    }  # fmt: skip
     if (run_dir / ROUNDS_FILE).exists():
         content = read_json(run_dir / ROUNDS_FILE)
         if different := differences(content.get("settings", {}), settings):
@@ -134,15 +119,11 @@ def _begin(
         done = len(content["rounds"]) - 1
         if cfg.rounds < done:
             raise ValueError(f"rounds must be at least {done}, which {run_dir} has done, got {cfg.rounds}")
-    elif run_dir.is_dir() and not all(map(is_leftover, run_dir.iterdir())):
+        return cfg, content
+    if run_dir.is_dir() and not all(map(is_leftover, run_dir.iterdir())):
         raise ValueError(f"{run_dir} must be empty or hold a hardening, got neither: give another directory")
-    hardening = _Hardening(
-        robot=robot, cfg=cfg, tune=tune, path=run_dir, compute=compute, terrains=terrains, episodes=episodes,
-        space=load_space(cfg.space, cfg.ground), certifiers=certifiers, open_evaluator=open_evaluator,
-        stored=content, policies={"base": base}, start=cfg.policy,
-    )  # fmt: skip
-    hardening.search_cfg(0, cfg.policy)  # refuses what no search can be
-    return hardening
+    origin = origin_of(compute.device, cfg.seed, compute.workers)
+    return cfg, {**origin, "robot": robot.name, "settings": settings, "rounds": [], "choices": {}}
 
 
 @dataclass(kw_only=True)
@@ -151,31 +132,19 @@ class _Hardening:
 
     robot: RobotCfg
     cfg: HardenCfg
-    tune: FinetuneCfg
-    """Settings that all trainings share, with their sizes."""
     path: Path
     compute: Compute
     space: TerrainSpace
-    terrains: int
-    """A set of evaluation and validation."""
-    episodes: int
-    """On each of them."""
     certifiers: Mapping[str, str] | None
     open_evaluator: OpenEvaluator
-    stored: dict[str, Any]
-    """What an earlier session wrote, or settings without a round."""
+    content: dict[str, Any]
+    """What ``rounds.json`` has."""
     policies: dict[str, str]
     """Controller after each round so far, by its name."""
     start: str | None
     """What the next training begins with: the base, or the checkpoint of the last training kept, with its critic."""
     rows: list[dict[str, Any]] = field(default_factory=list)
     choices: dict[str, dict[str, Any]] = field(default_factory=dict)
-    content: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def _named_space(self) -> str | None:
-        """What calls have to name for a space that is code."""
-        return self.space.name if is_own(self.space.name) else None
 
     def _seed(self, number: int) -> int:
         """Seed of a round.
@@ -202,31 +171,26 @@ class _Hardening:
         print(f"\n=== round-{number}: training, in {run}", flush=True)
         base = self.policies["base"]
         # Noise of the actions grows in a training: each begins with that of the base.
-        recipe = replace(self.tune.recipe, noise_of=base if self.start != self.cfg.policy else None)
+        recipe = replace(self.cfg.tune.recipe, noise_of=base if self.start != self.cfg.policy else None)
         cfg = replace(
-            self.tune, seed=self._seed(number), policy=self.start, archive=tuple(map(str, searches)),
-            space=self._named_space, recipe=recipe,
+            self.cfg.tune, seed=self._seed(number), policy=self.start, archive=tuple(map(str, searches)),
+            space=self.space.name, recipe=recipe,
         )  # fmt: skip
         finetune(self.robot, cfg, run, RunCfg(device=self.compute.device))
         before, after = list(self.policies.values())[-1], str(run / POLICY)
-        choice = self._choose({"base": base, "before": before, "after": after}, searches, run.name)
+        choice = self._choose({"base": base, "before": before, "after": after}, searches)
         self.choices[run.name] = choice
         print(f"{run.name} is {'kept' if choice['kept'] else 'not kept'}: {choice['why']}", flush=True)
         if choice["kept"]:
             self.start = str(run / CHECKPOINT)
         self.policies[f"round-{number}"] = after if choice["kept"] else before
 
-    def _choose(self, controllers: Mapping[str, str], searches: Sequence[Path], name: str) -> dict[str, Any]:
-        """Whether to keep a training, by goal rates on validation terrains; of the same controllers as stored."""
-        sha256 = [controller_hash(policy) for policy in controllers.values()]
-        stored = self.stored["choices"].get(name)
-        if stored is not None and stored["sha256"] == sha256:
-            return stored
-        sets = dict(make_sets(FIXED_SETS, self.terrains, 0, space=self.space, part="validation"))
-        sets |= {run.name: self._held_out(run, "validation") for run in searches}
+    def _choose(self, controllers: Mapping[str, str], searches: Sequence[Path]) -> dict[str, Any]:
+        """Whether to keep a training, by goal rates on validation terrains."""
+        sets = self._sets(searches, "validation")
         results = cross_sets(
-            controllers, sets, robot=self.robot, compute=self.compute, episodes=self.episodes, reward=True,
-            cache=self.path / "crossings", open_evaluator=self.open_evaluator,
+            controllers, sets, robot=self.robot, compute=self.compute, episodes=self.cfg.evaluation.episodes,
+            reward=True, cache=self.path / "crossings", open_evaluator=self.open_evaluator,
         )  # fmt: skip
         goal: dict[str, dict[str, float]] = {}
         for when in controllers:
@@ -234,12 +198,16 @@ class _Hardening:
             # Elites of all archives are one set, since a small archive has few for validation.
             elites = np.concatenate([rates.pop(run.name) for run in searches])
             goal[when] = {name: float(np.nanmean(values)) for name, values in (rates | {"elites": elites}).items()}
-        return {**verdict(goal["base"], goal["before"], goal["after"]), "goal": goal, "sha256": sha256}
+        return {**verdict(goal["base"], goal["before"], goal["after"]), "goal": goal}
 
-    def _held_out(self, run: Path, part: Part = "test") -> TerrainSet:
-        """Elites of a search that no training draws."""
-        archive = read_elites(run, self.robot, self._named_space)
-        return replace(generated_set(archive, self.terrains, 0, part), name=run.name)
+    def _sets(self, searches: Sequence[Path], part: Part) -> dict[str, TerrainSet]:
+        """The fixed sets, and of each search the elites of a part that no training draws, by its name."""
+        terrains = self.cfg.evaluation.terrains
+        sets = dict(make_sets(FIXED_SETS, terrains, 0, space=self.space, part=part))
+        for run in searches:
+            archive = read_elites(run, self.robot, self.space.name)
+            sets[run.name] = replace(generated_set(archive, terrains, 0, part), name=run.name)
+        return sets
 
     def search(self, number: int) -> None:
         """Searches for what breaks the controller of a round, and counts its faults."""
@@ -249,11 +217,11 @@ class _Hardening:
         cfg = self.search_cfg(number, self.cfg.policy if policy == self.policies["base"] else policy)
         search(cfg, run, self.compute, robot=self.robot, open_evaluator=self.open_evaluator)
         settings: dict[str, Any] = {
-            "compute": self.compute, "robot": self.robot.spec, "space": self._named_space,
+            "compute": self.compute, "robot": self.robot.spec, "space": self.space.name,
             "open_evaluator": self.open_evaluator,
         }  # fmt: skip
         if self.cfg.specialists and judge(run, stages=("fresh",), **settings).failing.any():
-            specialist = replace(FinetuneCfg.specialist(self.robot), space=self._named_space)
+            specialist = replace(FinetuneCfg.specialist(self.robot), space=self.space.name)
             train_specialist(self.robot, run, specialist, RunCfg(device=self.compute.device))
         judge(run, certifiers=self.certifiers, **settings)
         counts = RunDirectory(run).read_summary()
@@ -276,35 +244,24 @@ class _Hardening:
         return replace(cfg, iterations=-(-(size.episodes or usual) // cfg.episodes_per_iteration))
 
     def evaluate(self) -> None:
-        """Evaluates all controllers so far, and writes ``rounds.json``."""
-        sets = dict(make_sets(FIXED_SETS, self.terrains, 0, space=self.space))
-        sets |= {run.name: self._held_out(run) for run in self._searches()}
+        """Evaluates all controllers so far, and writes ``rounds.json`` where these rounds are not all in it."""
+        if len(self.rows) < len(self.content["rounds"]):
+            return
         tables = evaluate(
-            self.policies, sets, robot=self.robot, compute=self.compute, episodes=self.episodes,
-            cache=self.path / "crossings", open_evaluator=self.open_evaluator,
+            self.policies, self._sets(self._searches(), "test"), robot=self.robot, compute=self.compute,
+            episodes=self.cfg.evaluation.episodes, cache=self.path / "crossings", open_evaluator=self.open_evaluator,
         )  # fmt: skip
-        rows = [
-            *self.rows,
-            *self.stored["rounds"][len(self.rows) :],
-        ]
-        self.content = {**self.stored, "rounds": rows, "choices": {**self.stored["choices"], **self.choices}}
-        if len(rows) == len(self.rows):
-            self.content["tables"] = dict(tables)
+        self.content |= {"rounds": self.rows, "choices": self.choices, "tables": dict(tables)}
         write_atomically(self.path / ROUNDS_FILE, to_json(self.content))
 
 
 def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, float]) -> dict[str, Any]:
-    """Whether to go on with a controller, by goal rates on validation terrains.
+    """Whether to keep the controller ``after`` a training, by goal rates of each validation set.
 
-    Two trainings of one recipe differ by several points, and one may end worse than it began.
-
-    Args:
-        base: Rate by set of the controller that a hardening begins with.
-        before: Of the one before the training.
-        after: Of the one after it.
+    Two trainings of one recipe differ by several points, and a training may end worse than it began.
 
     Returns:
-        ``kept``, ``score`` of both, which is the mean over the sets, and ``why``, in words.
+        ``kept``, ``why``, and ``score`` before and after, the mean over the sets.
     """
     scores = {"before": fmean(before.values()), "after": fmean(after.values())}
     why = f"its goal rate on validation is {scores['after']:.3f}, before {scores['before']:.3f}"

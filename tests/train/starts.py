@@ -11,6 +11,7 @@ from qd.archive import write_archive
 from qd.evaluate.marks import TRAINED_ON, marks_of
 from tests.train.archives import make_archive
 from train.ppo.cfg import PpoCfg
+from train.ppo.checkpoint import STD
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 
@@ -18,15 +19,16 @@ PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 def write_actor(path, *, hidden=(16, 8), critic=False, **extra):
     """A controller of random layers, as rsl_rl writes it."""
     torch.manual_seed(0)
-    state = {"distribution.std_param": torch.full((12,), 0.3)}
-    sizes = (235, *hidden, 12)
-    for k, (width, out) in enumerate(itertools.pairwise(sizes)):
-        state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
-    content = {"actor_state_dict": {**state, **extra}}
+
+    def layers(*sizes):
+        state = {}
+        for k, (width, out) in enumerate(itertools.pairwise(sizes)):
+            state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
+        return state
+
+    content = {"actor_state_dict": {STD: torch.full((12,), 0.3), **layers(235, *hidden, 12), **extra}}
     if critic:
-        shapes = {f"mlp.{2 * k}": (out, width) for k, (width, out) in enumerate(itertools.pairwise((235, *hidden, 1)))}
-        content["critic_state_dict"] = {f"{key}.weight": torch.randn(shape) for key, shape in shapes.items()}
-        content["critic_state_dict"] |= {f"{key}.bias": torch.zeros(shape[0]) for key, shape in shapes.items()}
+        content["critic_state_dict"] = layers(235, *hidden, 1)
     torch.save(content, path)
     return path
 
@@ -46,14 +48,12 @@ def make_places(folder: Path) -> Path:
     return folder
 
 
-def write_bad_starts(folder):
+def write_bad_starts(folder: Path) -> None:
     """Controllers that walk, and cannot be trained on."""
-    write_actor(folder / "std_nan.pt", **{"distribution.std_param": torch.full((12,), float("nan"))})
-    write_actor(folder / "std_negative.pt", **{"distribution.std_param": torch.full((12,), -1.0)})
-    write_actor(folder / "std_short.pt", **{"distribution.std_param": torch.full((2,), 0.3)})
-    whole = torch.load(write_actor(folder / "whole.pt", critic=True), weights_only=True)
-    critic = whole["critic_state_dict"]
-    others = {"other": {**critic, "mlp.0.weight": torch.ones(3, 3)}, "none": 5}
-    others["nan"] = {**critic, "mlp.0.bias": torch.full((16,), float("nan"))}
-    for name, other in others.items():
-        torch.save({**whole, "critic_state_dict": other}, folder / f"critic_{name}.pt")
+    write_actor(folder / "std_negative.pt", **{STD: torch.full((12,), -1.0)})
+    write_actor(folder / "std_short.pt", **{STD: torch.full((2,), 0.3)})
+    content = torch.load(write_actor(folder / "whole.pt", critic=True), weights_only=True)
+    critic = content["critic_state_dict"]
+    others = {"other": {"mlp.0.weight": torch.ones(3, 3)}, "nan": {"mlp.0.bias": torch.full((16,), float("nan"))}}
+    for name, weights in others.items():
+        torch.save({**content, "critic_state_dict": {**critic, **weights}}, folder / f"critic_{name}.pt")

@@ -1,5 +1,6 @@
 """Training a base controller: what a run leaves, how it goes on and stops, and what is refused."""
 
+import errno
 import json
 import os
 import signal
@@ -50,8 +51,7 @@ def test_a_run_leaves_a_controller_and_its_record(finished):
     assert torch.load(exported, weights_only=True)["actor_state_dict"]["mlp.0.weight"].shape == (16, 235)
     assert load_policy(exported, ROBOT, "cpu")(torch.randn(3, 235)).shape == (3, 12)
     record = json.loads(exported.with_suffix(".train.json").read_text())
-    for key in ("command", "commit", "sources_sha256", "device", "versions", "seed", "date", "wall_s", "pieces"):
-        assert key in record, key
+    assert {"command", "commit", "sources_sha256", "device", "versions", "seed", "date", "wall_s"} <= record.keys()
     assert (record["robot"], record["iterations"], record["num_envs"], record["env_steps"]) == ("anymal", 2, 6, 48)
     assert [row["iteration"] for row in record["curve"]] == [1, 2]
     assert record["settings"]["ppo"]["hidden_dims"] == [16, 8]
@@ -72,7 +72,7 @@ def test_it_goes_on_by_its_own_settings(copied):
 
 
 def test_other_settings_robots_and_commands_are_refused(finished, copied):
-    kept = (finished / "checkpoint.pt").read_bytes()
+    before = (finished / "checkpoint.pt").read_bytes()
     for cfg, field in (
         (replace(CFG, ppo=replace(PPO, entropy=0.5)), "ppo.entropy"),
         (replace(CFG, seed=1), "seed"),
@@ -86,26 +86,13 @@ def test_other_settings_robots_and_commands_are_refused(finished, copied):
     torch.save({**content, "kind": "finetune"}, copied / "checkpoint.pt")
     with pytest.raises(ValueError, match="finetune"):
         train(ROBOT, CFG, copied, ON_CPU)
+    content["settings"]["ppo"]["gamma"] = "a lot"
+    torch.save(content, copied / "checkpoint.pt")
+    with pytest.raises(ValueError, match="gamma"):
+        Train.defaults(["--resume", str(copied)])
     with locked(finished, "busy"), pytest.raises(ValueError, match="another training"):
         train(ROBOT, replace(CFG, iterations=3), finished, ON_CPU)
-    assert (finished / "checkpoint.pt").read_bytes() == kept
-
-
-@pytest.mark.parametrize(
-    ("damage", "field"),
-    [
-        (lambda settings: settings["task"].update(gravity=3.0), "gravity"),
-        (lambda settings: settings["ppo"].update(gamma="a lot"), "gamma"),
-        (lambda settings: settings["task"].update(friction=[0.5]), "friction"),
-        (lambda settings: settings.update(num_envs="x"), "num_envs"),
-    ],
-)
-def test_damaged_settings_are_refused(copied, damage, field):
-    content = torch.load(copied / "checkpoint.pt", weights_only=True)
-    damage(content["settings"])
-    torch.save(content, copied / "checkpoint.pt")
-    with pytest.raises(ValueError, match=field):
-        Train.defaults(["--resume", str(copied)])
+    assert (finished / "checkpoint.pt").read_bytes() == before
 
 
 def test_out_of_time_it_saves_and_stops(copied, capsys):
@@ -126,6 +113,16 @@ def test_an_interrupt_saves_and_stops(copied, monkeypatch):
         train(ROBOT, replace(CFG, iterations=50), copied, ON_CPU)
     assert read_checkpoint(copied / "checkpoint.pt")["iter"] == 3 and (copied / "policy.pt").exists()
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(copied, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("tensorboard.summary.writer.record_writer.RecordWriter.write", fail)
+    with pytest.raises(OSError, match=rf"{copied}/events\.out\.tfevents.* No space left"):
+        train(ROBOT, replace(CFG, iterations=3), copied, ON_CPU)
+    assert read_checkpoint(copied / "checkpoint.pt")["iter"] == 2
 
 
 def test_it_saves_every_so_often(tmp_path, monkeypatch):
@@ -151,13 +148,10 @@ def test_places_of_others_are_not_written_to(finished, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "field"),
     [
-        (["--robot", "spot"], "spot"),
         (["--device", "cuda"], "CUDA"),
         (["--run-dir", "/proc/nowhere"], "/proc/nowhere"),
         (["--resume", "{empty}"], "checkpoint.pt"),
-        (["--resume", "{empty}", "--run-dir", "{empty}/new"], "checkpoint.pt"),
         (["--iterations", "-3"], "iterations"),
-        (["--seed", "-1"], "seed"),
         (["--task.episode-s", "0.001"], "task.episode_s"),
     ],
 )

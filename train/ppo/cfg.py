@@ -39,12 +39,7 @@ class PpoCfg(PaceCfg):
 
 
 def ppo_problems(cfg: PpoCfg, num_envs: int) -> list[str]:
-    """What is wrong with the settings of the learner, one line each.
-
-    Args:
-        cfg: The settings.
-        num_envs: Environments of one process.
-    """
+    """What is wrong with the settings of a learner on so many environments of one process, one line each."""
     lines = problems(cfg, "ppo.")
     if lines:
         return lines

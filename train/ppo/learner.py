@@ -16,7 +16,7 @@ from torch import distributed
 
 from sim.policy.loaders import reason_of
 from train.ppo.cfg import PpoCfg
-from train.ppo.checkpoint import STD, State
+from train.ppo.checkpoint import STD, Start, State
 from train.ppo.ppo import CapturedPPO, runner_settings
 from train.task.vec_env import CommandVecEnv
 
@@ -42,11 +42,7 @@ class Ranks:
         return self.rank == 0
 
     def device(self, name: str) -> str:
-        """The Warp device of this process, where ``name`` was asked for.
-
-        Raises:
-            ValueError: If one GPU was named for several processes.
-        """
+        """The Warp device of this process, where ``name`` was asked for."""
         if self.size == 1 or not name.startswith("cuda"):
             return name
         if name not in ("cuda", "cuda:0"):
@@ -62,17 +58,13 @@ class Ranks:
         return bool(flag.item())
 
     def check_same(self, parameters: list[torch.Tensor]) -> None:
-        """That the processes hold the same numbers, as averaged gradients must leave them.
-
-        Raises:
-            FloatingPointError: If they do not.
-        """
+        """A FloatingPointError if the processes do not hold the same numbers, as averaged gradients leave them."""
         if self.size == 1:
             return
-        own = torch.cat([parameter.detach().flatten() for parameter in parameters])
-        first = own.clone()
+        numbers = torch.cat([parameter.detach().flatten() for parameter in parameters])
+        first = numbers.clone()
         distributed.broadcast(first, src=0)
-        if not self.all_want(bool(torch.equal(own, first)), own.device):
+        if not self.all_want(bool(torch.equal(numbers, first)), numbers.device):
             raise FloatingPointError("the networks of the processes have drifted apart: this training is not one")
 
 
@@ -80,10 +72,10 @@ class Runner(OnPolicyRunner):
     """rsl_rl's runner, which several processes may share on CPUs too."""
 
     def _configure_multi_gpu(self) -> None:
-        if Ranks.of_environment().size == 1 or self.device.startswith("cuda"):
+        ranks = Ranks.of_environment()
+        if ranks.size == 1 or self.device.startswith("cuda"):
             super()._configure_multi_gpu()
             return
-        ranks = Ranks.of_environment()
         self.is_distributed, self.gpu_world_size = True, ranks.size
         self.gpu_local_rank, self.gpu_global_rank = ranks.local_rank, ranks.rank
         self.cfg["multi_gpu"] = {"global_rank": ranks.rank, "local_rank": ranks.local_rank, "world_size": ranks.size}
@@ -111,12 +103,12 @@ class Learner:
     """
 
     def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int, random_ages: bool = True) -> None:
-        """Draw the networks from ``seed``.
+        """Draw the networks from ``seed``, as the actions are.
 
         Args:
             env: What is learned.
             cfg: Settings.
-            seed: Of networks and actions.
+            seed: A number from 0.
             random_ages: Begin episodes with clocks set forward, so that they do not end together; such an episode is
                 shorter than its length says, and ends by the clock without having had its time.
         """
@@ -213,28 +205,19 @@ class Learner:
             "rng_cuda": torch.cuda.get_rng_state(task.observation.device) if task.observation.is_cuda else None,
         }
 
-    def start_from(self, actor: State, critic: State | None) -> None:
-        """Begin with a trained actor, and its critic where it is known (:class:`train.ppo.checkpoint.Start`).
-
-        Args:
-            actor: State under rsl_rl's keys; without a standard deviation of the actions, the configured one is kept.
-            critic: Likewise.
-        """
+    def start_from(self, start: Start) -> None:
+        """Begin with trained networks; without a standard deviation of the actions, the configured one is kept."""
         policy = self.alg.get_policy()
-        policy.load_state_dict({STD: policy.state_dict()[STD], **actor})
-        if critic is not None:
-            self.alg.critic.load_state_dict(critic)
+        policy.load_state_dict({STD: policy.state_dict()[STD], **start.actor})
+        if start.critic is not None:
+            self.alg.critic.load_state_dict(start.critic)
 
     def begin_again(self) -> None:
         """Go on from the environment as it is now: to be called between iterations when its episodes began anew."""
         self._observations = self.env.get_observations()
 
     def resume(self, content: dict[str, Any]) -> None:
-        """Go on from :meth:`state`; episodes begin anew.
-
-        Raises:
-            ValueError: If something in it is damaged.
-        """
+        """Go on from :meth:`state`; episodes begin anew."""
         try:
             self.alg.load(content, None, True)
             self._restore(content)
@@ -244,20 +227,11 @@ class Learner:
 
     def _restore(self, content: dict[str, Any]) -> None:
         """Iteration, mean, terrain levels and random numbers of a checkpoint."""
-        task, levels = self.env.task, content["levels"]
+        task = self.env.task
         self.iteration, self.averaged = content["iter"], content["averaged"]
-        mean = content["mean_actor_state_dict"]
-        weights = [value for value in self.actor_state().values() if value.is_floating_point()]
-        shapes = [value.shape for value in weights] if self.averaged else []
-        if [value.shape for value in mean.values()] != shapes or not 0 <= self.averaged <= self.iteration:
-            raise ValueError("mean_actor_state_dict must have the actor's weights, or none if averaged is 0")
-        if not all(bool(value.isfinite().all()) for value in mean.values()):
-            raise ValueError("mean_actor_state_dict has weights that are not finite")
-        self._mean = {key: value.to(self.alg.device) for key, value in mean.items()}
-        if levels.shape != (task.num_envs,) or int(levels.max()) >= task.tiles.num_levels:
-            raise ValueError(f"levels must be {task.num_envs}, each below {task.tiles.num_levels}")
+        self._mean = {key: value.to(self.alg.device) for key, value in content["mean_actor_state_dict"].items()}
         task.counter.fill_(content["counter"])
-        task.restart_all(levels.to(task.levels.device, task.levels.dtype))
+        task.restart_all(content["levels"].to(task.levels.device, task.levels.dtype))
         torch.set_rng_state(content["rng_cpu"])
         if content["rng_cuda"] is not None and task.observation.is_cuda:
             torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)

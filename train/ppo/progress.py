@@ -1,10 +1,13 @@
 """How a training goes: printed rows, TensorBoard's scalars, and the training record."""
 
+import os
 import time
 from pathlib import Path
 from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
+from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - made at run time
+from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 from kernels.rewards import REWARDS
 from qd.run.progress import clock
@@ -20,20 +23,16 @@ _HEADER = (
 
 
 class Progress:
-    """Collects iterations into rows; a row is printed, written to TensorBoard and kept for the record.
-
-    Attributes:
-        slowest_s: Time of the slowest iteration but the first, which compiles and captures [s].
-    """
+    """Collects iterations into rows; a row is printed, written to TensorBoard and kept for the record."""
 
     def __init__(
         self, run_dir: Path, learner: Learner, iterations: int, *, about: dict[str, Any], saved: dict[str, Any] | None
     ) -> None:
-        """Begin a piece of training.
+        """Begin a piece of training of ``iterations`` in all; of several processes the first prints and writes.
 
         Args:
             run_dir: Where TensorBoard's file goes.
-            learner: What is trained; of several processes the first prints and writes.
+            learner: What is trained.
             iterations: In all.
             about: Provenance of this piece.
             saved: :meth:`state` of the pieces before.
@@ -50,8 +49,10 @@ class Progress:
         self._window: list[Iteration] = []
         self._is_warm = False
         self.slowest_s = 0.0
-        self._writer = SummaryWriter(str(run_dir)) if learner.ranks.is_first else None
-        if self._writer is not None:
+        """Time of the slowest iteration but the first, which compiles and captures [s]."""
+        self._events = run_dir / f"events.out.tfevents.{time.time():.0f}.{os.getpid()}"
+        if learner.ranks.is_first:
+            _write_event(self._events, Event(file_version="brain.Event:2"))
             print(_HEADER, flush=True)
 
     def add(self, step: Iteration) -> None:
@@ -65,11 +66,9 @@ class Progress:
             self._finish_row()
 
     def close(self) -> None:
-        """Finish the last row and TensorBoard's file."""
+        """Finish the last row."""
         if self._window:
             self._finish_row()
-        if self._writer is not None:
-            self._writer.close()
 
     def state(self) -> dict[str, Any]:
         """What the next piece needs, plain data."""
@@ -125,9 +124,10 @@ class Progress:
         }
         self._curve.append(_rounded(row))
         self._window = []
-        if self._writer is not None:
+        if learner.ranks.is_first:
             self._print(row)
-            _write_scalars(self._writer, row)
+            scalars = [Summary.Value(tag=tag, simple_value=value) for tag, value in _scalars_of(row).items()]
+            _write_event(self._events, Event(step=learner.iteration, summary=Summary(value=scalars)))
 
     def _print(self, row: dict[str, Any]) -> None:
         left_s = (self._iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
@@ -145,13 +145,23 @@ class Progress:
             print(f"  {row['ends']['invalid']} invalid states reset, {row['overflows']} steps with a solver overflow")
 
 
-def _write_scalars(writer: SummaryWriter, row: dict[str, Any]) -> None:
-    """Adds the numbers of a row to TensorBoard's file, whole before the next row: a killed run keeps them."""
-    for group, value in row.items():
-        for name, number in (value if isinstance(value, dict) else {"": value}).items():
-            if number is not None:
-                writer.add_scalar(f"{group}/{name}" if name else f"train/{group}", number, row["iteration"])
-    writer.flush()
+def _scalars_of(row: dict[str, Any]) -> dict[str, float]:
+    """The numbers of a row by their names in TensorBoard."""
+    scalars = {f"train/{name}": value for name, value in row.items() if not isinstance(value, dict)}
+    for group, values in row.items():
+        if isinstance(values, dict):
+            scalars |= {f"{group}/{name}": value for name, value in values.items()}
+    return {tag: value for tag, value in scalars.items() if value is not None}
+
+
+def _write_event(file: Path, event: Event) -> None:
+    """Adds to TensorBoard's file. Its own writer works in a thread, which dies with a traceback on a full disk."""
+    event.wall_time = time.time()
+    try:
+        with file.open("ab") as opened:
+            RecordWriter(opened).write(event.SerializeToString())
+    except OSError as error:
+        raise OSError(f"{file} cannot be written: {error.strerror}: make room there or name another place") from error
 
 
 def _rounded(value: Any) -> Any:

@@ -61,11 +61,7 @@ def stop_request() -> Iterator[Event]:
 
 
 def device_of(name: str | None) -> str:
-    """Warp device name of this process of a training, where ``name`` was asked for.
-
-    Raises:
-        ValueError: If there is no such device, or torch has no CUDA for it.
-    """
+    """Warp device name of this process of a training, where ``name`` was asked for."""
     device = Ranks.of_environment().device(resolve_device(name))
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(
@@ -81,22 +77,14 @@ def deadline_of(max_seconds: float | None) -> float:
 
 
 def settings_of(cfg: TrainCfg, robot: RobotCfg) -> dict[str, Any]:
-    """What makes a training what it is, checked, as plain values.
-
-    Raises:
-        ValueError: If nothing can be learned with the settings.
-    """
+    """What makes a training what it is, checked, as plain values."""
     cfg.check(robot)
     return {**asdict(cfg), "robot_sha256": robot_digest(robot)}
 
 
 @contextmanager
 def run_directory(run_dir: Path, export: Path | None, *, overwrite: bool) -> Iterator[None]:
-    """Makes the directory of a training, checks that it can be written to, and keeps other trainings out of it.
-
-    Raises:
-        ValueError: If it holds something else, another training works in it, or the export cannot be written.
-    """
+    """Makes the directory of a training, checks that it can be written to, and keeps other trainings out of it."""
     if not Ranks.of_environment().is_first:
         yield
         return
@@ -114,16 +102,7 @@ def run_directory(run_dir: Path, export: Path | None, *, overwrite: bool) -> Ite
 
 
 def read_saved(run_dir: Path, kind: Kind, robot: str) -> dict[str, Any]:
-    """The checkpoint of a training's directory.
-
-    Args:
-        run_dir: The directory.
-        kind: What goes on with it.
-        robot: Name of the robot.
-
-    Raises:
-        ValueError: As of :func:`read_checkpoint`, or if it is of another kind or robot.
-    """
+    """The checkpoint in the directory of a training of a kind, of a robot by its name."""
     saved = read_checkpoint(run_dir / CHECKPOINT)
     if (saved["kind"], saved["robot"]) != (kind, robot):
         raise ValueError(
@@ -134,11 +113,7 @@ def read_saved(run_dir: Path, kind: Kind, robot: str) -> dict[str, Any]:
 
 
 def check_settings(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
-    """Refuses to go on with other settings than a training was begun with, but for :data:`_FREE`.
-
-    Raises:
-        ValueError: If one differs, or more iterations are done than are asked for.
-    """
+    """Refuses to go on with other settings than a training was begun with, or with fewer iterations than are done."""
     before, now = ({name: part[name] for name in part if name not in _FREE} for part in (saved["settings"], settings))
     if different := differences(before, now):
         raise ValueError(f"{run_dir} was begun with other settings: {', '.join(different)}: give those")
@@ -155,13 +130,7 @@ def is_finished(run_dir: Path, iterations: int) -> bool:
 
 
 class Training:
-    """A training at work: the task, what learns on it, and how far it is.
-
-    Attributes:
-        task: The robots.
-        learner: PPO on them.
-        progress: Rows and record.
-    """
+    """A training at work: the task, what learns on it, and how far it is."""
 
     kind: Kind = "train"
 
@@ -182,10 +151,10 @@ class Training:
         Args:
             robot: Who learns.
             cfg: What, with its sizes.
-            run_dir: Where to write.
+            run_dir: Where to write; the directory exists.
             device: Warp device name.
-            settings: What a checkpoint and the record say of it.
-            saved: The checkpoint.
+            settings: What checkpoint and record say of it (:func:`settings_of`).
+            saved: The checkpoint (:func:`read_saved`).
             tiles: Terrains; those of the curriculum if left out.
             random_ages: As of :class:`Learner`.
         """
@@ -233,10 +202,6 @@ class Training:
         Args:
             deadline_s: When it is to be done, on the clock of :func:`time.monotonic` [s].
             export: Another place for the controller and its record.
-
-        Raises:
-            Interrupted: On Ctrl-C, when all is saved.
-            FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
         """
         if self.learner.ranks.is_first:
             write_atomically(self._run_dir / CONFIG, to_json(self._settings))
@@ -279,7 +244,6 @@ class Training:
             write_checkpoint(self._run_dir / CHECKPOINT, self.state())
 
     def _finish(self, export: Path | None) -> None:
-        """Writes the last checkpoint, and the controller with its record at every place asked for."""
         learner = self.learner
         learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
         self.progress.close()

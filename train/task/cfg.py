@@ -81,23 +81,13 @@ class TaskCfg(TrainingCfg):
 
     @classmethod
     def of(cls, robot: RobotCfg, **changes: Any) -> Self:
-        """The task with a robot's own settings.
-
-        Args:
-            robot: Robot settings.
-            changes: Fields to set otherwise.
-        """
+        """The task with a robot's own settings, but for ``changes``."""
         training = {setting.name: getattr(robot.training, setting.name) for setting in fields(TrainingCfg)}
         return cls(**{**training, **changes})
 
 
 def task_problems(cfg: TaskCfg, control_dt: float) -> list[str]:
-    """What is wrong with the settings of a task, one line each.
-
-    Args:
-        cfg: The settings.
-        control_dt: Control step of the robot [s].
-    """
+    """What is wrong with the settings of a task, one line each; ``control_dt`` is the robot's control step [s]."""
     lines = problems(cfg, "task.")
     for name in ("episode_s", "command_interval_s"):
         if 0 < getattr(cfg, name) < control_dt:

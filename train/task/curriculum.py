@@ -36,11 +36,7 @@ class Tiles:
 
 
 def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
-    """Generate the tiles of a training run.
-
-    Raises:
-        ValueError: If there is no column.
-    """
+    """Generate the tiles of a training run."""
     if cfg.num_columns + cfg.noise_columns < 1:
         raise ValueError("the curriculum needs at least one column, got num_columns 0 and noise_columns 0")
     tile_rng, noise_rng = np.random.default_rng(seed).spawn(2)

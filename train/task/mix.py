@@ -87,7 +87,7 @@ class Mix:
         if counts is not None:
             self._remember(counts)
         self.swap += 1
-        self.rows = self._draw_rows()
+        self.rows = self.draw_rows()
         return self.terrains()
 
     def terrains(self) -> Tiles:
@@ -120,25 +120,14 @@ class Mix:
         }
 
     def restore(self, state: dict[str, Any]) -> Tiles:
-        """Go on where a checkpoint was; returns its terrains.
-
-        Raises:
-            ValueError: If the state is none of this mix.
-        """
-        num_rows = self.num_terrains - self.num_hand_crafted if self.kind == "generated" else 0
-        per_elite = ("episodes", "crossed", "present_episodes", "present_crossed")
-        shapes = {"rows": (num_rows,), **dict.fromkeys(per_elite, (self.num_elites,))}
-        arrays = {name: np.asarray(state.get(name, ()), np.int64) for name in shapes}
-        rows, rate = arrays["rows"], state.get("goal_rate")
-        swap = state.get("swap")
-        fits = all(arrays[name].shape == shape for name, shape in shapes.items())
-        if not fits or not isinstance(swap, int) or swap < 0 or np.any((rows < 0) | (rows >= self.num_elites)):
-            raise ValueError(f"the terrains of the checkpoint must be of {self.num_elites} elites, got others")
-        if rate is not None:
-            self.goal_rate = np.asarray(rate, np.float64).reshape(self.num_elites)
-        self.swap, self.rows = swap, rows
-        self.episodes, self.crossed = arrays["episodes"], arrays["crossed"]
-        self._before_resume = np.stack([arrays["present_episodes"], arrays["present_crossed"]])
+        """Go on where a checkpoint was; returns its terrains."""
+        if state["goal_rate"] is not None:
+            self.goal_rate = np.asarray(state["goal_rate"], np.float64)
+        self.swap = state["swap"]
+        self.rows, self.episodes, self.crossed = (
+            np.asarray(state[name], np.int64) for name in ("rows", "episodes", "crossed")
+        )
+        self._before_resume = np.asarray([state["present_episodes"], state["present_crossed"]], np.int64)
         return self.terrains()
 
     def success(self) -> NDArray[np.float64]:
@@ -179,7 +168,7 @@ class Mix:
         ]
         return np.stack(tiles), tuple(TILE_TYPES[kind] for kind in kinds)
 
-    def _draw_rows(self) -> NDArray[np.int64]:
+    def draw_rows(self) -> NDArray[np.int64]:
         """Elites of the next exchange: none twice, unless there are too few."""
         if self.kind != "generated":
             return np.zeros(0, np.int64)

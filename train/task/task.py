@@ -66,12 +66,7 @@ class CommandTask:
             device: Warp device name.
             seed: Of everything drawn.
             tiles: The terrains; those of the curriculum if left out.
-
-        Raises:
-            ValueError: If a count or range is not usable.
         """
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         problems = task_problems(cfg, robot.control_dt)
         if problems:
             raise ValueError("; ".join(problems))
@@ -138,9 +133,6 @@ class CommandTask:
 
         Args:
             action: Policy output, shape (num_envs, num_joints).
-
-        Raises:
-            ValueError: If ``action`` has another shape.
         """
         if action.shape != self._action.shape:
             raise ValueError(f"action must have shape {tuple(self._action.shape)}, got {tuple(action.shape)}")
@@ -154,11 +146,7 @@ class CommandTask:
         self._counted.zero_()
 
     def exchange(self, tiles: Tiles) -> None:
-        """Put other terrains, as many, in place of the present ones, and begin every episode anew on its first level.
-
-        Raises:
-            ValueError: If they are of another number, or a height is not finite.
-        """
+        """Put as many other terrains in place of the present ones, and begin every episode anew on the first level."""
         self.sim.bank.set_heights(tiles.heights, ground=tiles.ground)
         self.tiles = tiles
         self._restart_on(torch.zeros_like(self.levels))

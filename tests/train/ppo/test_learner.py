@@ -1,7 +1,6 @@
 """Checkpoints: training goes on where it stopped, and nothing else is taken for one."""
 
 import json
-import math
 import os
 import subprocess
 import sys
@@ -25,7 +24,7 @@ def learner(shared_task):
 
 def saved(learner, path):
     """The learner's part of a checkpoint, written and read again."""
-    write_checkpoint(path, {**learner.state(), "kind": "train", "settings": {}, "progress": {"note": [1, None, "x"]}})
+    write_checkpoint(path, {**learner.state(), "kind": "train", "settings": {}, "progress": {}})
     return read_checkpoint(path)
 
 
@@ -34,19 +33,13 @@ def state_of(learner):
 
 
 def test_an_iteration_learns(learner):
+    assert len(learner.env.episode_length_buf.unique()) > 1  # episodes begin at random ages
     before = {key: value.clone() for key, value in state_of(learner).items()}
     step = learner.iterate()
     assert learner.iteration == 1 and learner.steps_per_iteration == 24
     assert step.collection_s > 0 and step.learning_s > 0
-    assert all(math.isfinite(loss) for loss in step.losses.values()) and step.losses.keys() == {
-        "value", "surrogate", "entropy",
-    }  # fmt: skip
     assert all((value != before[key]).any() for key, value in state_of(learner).items())
     assert learner.noise_std == pytest.approx(1.0, abs=0.05)
-
-
-def test_episodes_begin_at_random_ages(learner):
-    assert len(learner.env.episode_length_buf.unique()) > 1
 
 
 def test_resumed_training_is_repeatable(learner, tmp_path):
@@ -60,9 +53,7 @@ def test_resumed_training_is_repeatable(learner, tmp_path):
     for seed in (98, 99):  # what is drawn follows from the checkpoint
         again = Learner(learner.env, CFG, seed=seed)
         again.env.task.restart_all(torch.zeros(6))
-        content = read_checkpoint(tmp_path / "c.pt")
-        assert content["progress"] == {"note": [1, None, "x"]}
-        again.resume(content)
+        again.resume(read_checkpoint(tmp_path / "c.pt"))
         assert again.iteration == 1 and again.alg.learning_rate == pytest.approx(rate)
         assert again.env.task.levels.tolist() == levels.tolist()
         # One step of the counter is the restart's own.
@@ -99,106 +90,55 @@ def test_the_mean_is_of_the_actors_that_count(learner, tmp_path):
         assert not value.equal(seen[-1][key])
 
 
-@pytest.mark.parametrize(
-    ("damage", "field"),
-    [
-        (lambda content: content.update(averaged=2), "mean_actor_state_dict"),
-        (lambda content: content["mean_actor_state_dict"].clear(), "mean_actor_state_dict"),
-        (lambda content: content["mean_actor_state_dict"].update({"mlp.0.bias": torch.zeros(1)}), "mean_actor"),
-        (lambda content: content["mean_actor_state_dict"]["mlp.0.bias"].fill_(torch.nan), "not finite"),
-        (lambda content: content.update(levels=torch.arange(3)), "levels"),
-        (lambda content: content["levels"].fill_(99), "levels"),
-        (lambda content: content["critic_state_dict"].popitem(), "damaged"),
-        (lambda content: content["actor_state_dict"].update({"mlp.0.bias": torch.zeros(1)}), "damaged"),
-    ],
-)
-def test_a_damaged_state_is_refused(learner, tmp_path, damage, field):
-    learner.iterate()
-    learner.count_into_mean(True)
+@pytest.mark.parametrize("entry", ["critic_state_dict", "optimizer_state_dict", "levels"])
+def test_a_damaged_state_is_refused(learner, tmp_path, entry):
     content = saved(learner, tmp_path / "c.pt")
-    damage(content)
-    with pytest.raises(ValueError, match=field) as error:
-        Learner(learner.env, CFG, seed=0).resume(content)
-    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="damaged"):
+        Learner(learner.env, CFG, seed=0).resume({**content, entry: {}})
 
 
-def test_a_full_size_checkpoint_is_small(shared_task, tmp_path):
-    learner = Learner(CommandVecEnv(shared_task), PpoCfg(steps_per_env=4, epochs=1, mini_batches=1), seed=0)
-    learner.iterate()
-    saved(learner, tmp_path / "c.pt")
-    assert (tmp_path / "c.pt").stat().st_size < 8e6
-
-
-def test_losses_that_are_not_finite_stop_training(learner, monkeypatch):
-    monkeypatch.setattr(learner.alg, "update", lambda: {"value": float("nan"), "surrogate": 0.0, "entropy": 0.0})
-    with pytest.raises(FloatingPointError, match="losses are not finite"):
-        learner.iterate()
-    assert learner.iteration == 0
-
-
-def test_weights_that_the_last_step_spoiled_stop_training(learner, monkeypatch):
+@pytest.mark.parametrize("spoiled", ["losses", "weights"])
+def test_numbers_that_are_not_finite_stop_training(learner, monkeypatch, spoiled):
     update = learner.alg.update
 
     def spoil():
         losses = update()
+        if spoiled == "losses":
+            return {**losses, "value": float("nan")}
         with torch.no_grad():
             learner.alg.critic.state_dict()["mlp.0.weight"][3, 5] = float("nan")
         return losses
 
     monkeypatch.setattr(learner.alg, "update", spoil)
-    with pytest.raises(FloatingPointError, match="iteration 0: the networks' weights are not finite"):
+    with pytest.raises(FloatingPointError, match=spoiled):
         learner.iterate()
     assert learner.iteration == 0
 
 
 def test_other_files_are_no_checkpoints(learner, tmp_path):
     whole = tmp_path / "whole.pt"
-    content = saved(learner, whole)
+    saved(learner, whole)
     (tmp_path / "truncated.pt").write_bytes(whole.read_bytes()[:5000])
-    (tmp_path / "text.pt").write_text("hello")
     torch.save({"actor_state_dict": {}}, tmp_path / "foreign.pt")
-    torch.save({**content, "counter": "many"}, tmp_path / "counter.pt")
-    torch.save({**content, "format": "another"}, tmp_path / "another.pt")
     torch.save(learner.alg.optimizer, tmp_path / "code.pt")  # a pickled object, not data
-    for name in ("absent", "truncated", "text", "code", "foreign", "counter", "another"):
+    for name in ("absent", "truncated", "code", "foreign"):
         with pytest.raises(ValueError, match=f"{name}.pt") as error:
             read_checkpoint(tmp_path / f"{name}.pt")
         assert "\n" not in str(error.value)
 
 
-ROOT = Path(__file__).parents[3]
-
-
-def torchrun(*arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *arguments]
-    return subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-
-
 @pytest.mark.slow
 def test_two_processes_train_one_controller_and_go_on(tmp_path):
-    run = tmp_path / "run"
-    size = ["--device", "cpu", "--num-envs", "4", "--ppo.hidden-dims", "16", "--ppo.steps-per-env", "8"]
-    first = torchrun("-m", "faultline", "train", *size, "--iterations", "2", "--run-dir", str(run))
-    assert first.returncode == 0, first.stderr
-    assert first.stdout.count("training record written to") == 1  # one of them speaks
-    record = json.loads((run / "policy.train.json").read_text())
-    assert record["env_steps"] == 2 * 2 * 4 * 8
-    assert record["processes"] == 2
-    before = torch.load(run / "policy.pt", weights_only=True)["actor_state_dict"]
-    again = torchrun("-m", "faultline", "train", *size, "--iterations", "3", "--run-dir", str(run))
-    assert again.returncode == 0, again.stderr
-    after = torch.load(run / "policy.pt", weights_only=True)
-    assert after["iter"] == 3
-    assert any(not torch.equal(before[key], value) for key, value in after["actor_state_dict"].items())
-
-
-@pytest.mark.slow
-def test_processes_agree_and_notice_drift():
-    done = torchrun("-m", "tests.train.drift")
+    done = subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
+         "-m", "tests.train.two_processes", str(tmp_path / "run")],
+        cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=300, check=False,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert done.stdout.count("training record written to") == 2  # of two trainings: one of the processes speaks
+    record = json.loads((tmp_path / "run" / "policy.train.json").read_text())
+    assert (record["iterations"], record["processes"], record["env_steps"]) == (2, 2, 2 * 2 * 4 * 4)
 
 
 def test_each_process_takes_its_own_gpu(monkeypatch):
@@ -208,6 +148,6 @@ def test_each_process_takes_its_own_gpu(monkeypatch):
     ranks = Ranks.of_environment()
     assert not ranks.is_first
     assert (ranks.device("cuda:0"), ranks.device("cuda"), ranks.device("cpu")) == ("cuda:1", "cuda:1", "cpu")
-    with pytest.raises(ValueError, match="each process takes its own GPU, got device cuda:3"):
+    with pytest.raises(ValueError, match="cuda:3"):
         ranks.device("cuda:3")
     assert Ranks().device("cuda:3") == "cuda:3"

@@ -1,5 +1,6 @@
 """The captured PPO against rsl_rl's own, and its settings."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -61,26 +62,19 @@ def close(device: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("desired_kl", [1e-5, 0.01, 10.0])  # the learning rate falls, moves both ways, rises
-def test_update_equals_rsl_rl(desired_kl: float, device: str) -> None:
-    cfg = PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=3, mini_batches=2, desired_kl=desired_kl)
+def test_update_equals_rsl_rl(desired_kl: float, monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    cfg = replace(CFG, desired_kl=desired_kl)
     ours, theirs = make_runner(CapturedPPO, cfg, device), make_runner(PPO, cfg, device)
+    losses = []
     for runner in (ours, theirs):
+        monkeypatch.setattr(runner.logger, "log", lambda loss_dict, **_: losses.append(loss_dict))
         torch.manual_seed(5)
         runner.learn(1)
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4 if device == "cpu" else 1e-3)
     assert ours.alg.learning_rate == pytest.approx(theirs.alg.learning_rate, rel=1e-4)
     assert ours.alg.learning_rate != cfg.learning_rate
     for mine, other in zip(parameters(ours), parameters(theirs), strict=True):
         torch.testing.assert_close(mine, other, **close(device))
-
-
-def test_losses_are_the_means_of_rsl_rl(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
-    ours, theirs = make_runner(CapturedPPO, CFG, device), make_runner(PPO, CFG, device)
-    losses = []
-    for runner in (ours, theirs):
-        torch.manual_seed(5)
-        monkeypatch.setattr(runner.logger, "log", lambda loss_dict, **_: losses.append(loss_dict))
-        runner.learn(1)
-    assert losses[0] == pytest.approx(losses[1], rel=1e-4 if device == "cpu" else 1e-3)
 
 
 def test_checkpoint_continues_with_the_same_numbers(tmp_path: Any, device: str) -> None:
@@ -100,25 +94,16 @@ def test_checkpoint_continues_with_the_same_numbers(tmp_path: Any, device: str) 
         torch.testing.assert_close(mine, other, **(EXACT if device == "cpu" else close(device)))
 
 
-def test_settings_are_fresh() -> None:
-    first = runner_settings(PpoCfg())
-    first["algorithm"]["gamma"] = 0.0
-    first["actor"]["hidden_dims"].append(1)
-    assert runner_settings(PpoCfg())["algorithm"]["gamma"] == 0.99
-    assert runner_settings(PpoCfg())["actor"]["hidden_dims"] == [512, 256, 128]
-
-
 def test_unsupported_features_are_refused(device: str) -> None:
     settings = runner_settings(CFG)
     settings["algorithm"]["normalize_advantage_per_mini_batch"] = True
-    with pytest.raises(ValueError, match="leave these three settings"):
+    with pytest.raises(ValueError, match="CapturedPPO"):
         OnPolicyRunner(DummyEnv(device), settings, log_dir=None, device=device)
 
 
-@pytest.mark.parametrize("algorithm", [CapturedPPO, PPO])
-def test_the_value_moves_no_further_than_the_clip_in_an_update(algorithm: type[PPO], device: str) -> None:
+def test_the_value_moves_no_further_than_the_clip_in_an_update(device: str) -> None:
     # The critic says .5, which is what came; it said 0 before. Clipped to 0 + .2, its error is .3 and its square .09.
-    runner = make_runner(algorithm, PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=1, mini_batches=1), device)
+    runner = make_runner(CapturedPPO, replace(CFG, epochs=1, mini_batches=1), device)
     alg = runner.alg
     with torch.no_grad():
         for parameter in alg.critic.parameters():
@@ -136,17 +121,10 @@ def test_the_value_moves_no_further_than_the_clip_in_an_update(algorithm: type[P
     assert alg.update()["value"] == pytest.approx(0.09, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("steps_per_env", 0), ("epochs", 0), ("mini_batches", 0), ("mini_batches", 49), ("learning_rate", 0.0),
-        ("learning_rate", float("nan")), ("gamma", 2.0), ("lam", -0.1), ("clip", 0.0), ("desired_kl", 0.0),
-        ("entropy", -1.0), ("hidden_dims", (8, 0)), ("hidden_dims", ()), ("init_noise_std", -1.0),
-    ],
-)  # fmt: skip
-def test_settings_that_nothing_is_learned_with_are_named(field: str, value: Any) -> None:
-    (line,) = ppo_problems(PpoCfg(**{field: value}), NUM_ENVS)
-    assert f"ppo.{field}" in line
+@pytest.mark.parametrize("changes", [{"gamma": 2.0}, {"mini_batches": 49}, {"hidden_dims": ()}])
+def test_settings_that_nothing_is_learned_with_are_named(changes: dict[str, Any]) -> None:
+    (line,) = ppo_problems(PpoCfg(**changes), NUM_ENVS)
+    assert f"ppo.{next(iter(changes))}" in line
 
 
 def test_an_iteration_has_at_least_two_transitions() -> None:
