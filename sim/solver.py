@@ -1,7 +1,7 @@
 """What is ours within a physics step of mujoco_warp: dynamics and contacts in a kernel each, for every model that fits.
 
 mujoco_warp has no hooks for its solver of contacts, so ours takes the place of a function of the pinned version.
-tests/sim/test_solver.py and test_dynamics.py hold ours against theirs.
+tests/sim/test_solver.py holds ours against theirs.
 """
 
 from typing import Any

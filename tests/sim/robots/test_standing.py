@@ -111,8 +111,8 @@ def test_slopes_equal_mujocos_tilted_plane(eight, eight_stepper, robot, duration
         np.testing.assert_allclose(row[7:], expected[7:], atol=radians)
 
 
-def hillsides(grid, rng):
-    """A place where the ground under the robot leans by 3 to 8 degrees and is uneven by 12 mm at most (rms)."""
+def stand_on_hill(robot, model, grid, rng):
+    """The default pose, level with a hillside of 3 to 8 degrees that is uneven by 12 mm at most (rms), just off it."""
     y, x = np.mgrid[-8:9, -10:11] * SPACING
     basis = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
     places = []
@@ -122,12 +122,7 @@ def hillsides(grid, rng):
         plane, residual, *_ = np.linalg.lstsq(basis, patch)
         if 3 < np.degrees(np.arctan(np.hypot(*plane[:2]))) < 8 and np.sqrt(residual[0] / patch.size) < 0.012:
             places.append((col * SPACING, row * SPACING, *plane))
-    return places[rng.integers(len(places))]
-
-
-def stand_on_hill(robot, model, grid, rng):
-    """The default pose, level with the hillside, its nearest foot just off the ground."""
-    x, y, slope_x, slope_y, height = hillsides(grid, rng)
+    x, y, slope_x, slope_y, height = places[rng.integers(len(places))]
     normal = np.array([-slope_x, -slope_y, 1]) / np.sqrt(1 + slope_x**2 + slope_y**2)
     axis = np.cross([0, 0, 1], normal)
     pose = lying(1, x, y, height, axis / np.linalg.norm(axis), np.arcsin(np.linalg.norm(axis)))[0]
@@ -144,9 +139,7 @@ def nearly_hard(eight):
     """Contacts of impedance 0.99 to 0.999 for a while."""
     solimp = eight.solver.mjw_model.geom_solimp
     before = np.array(solimp.numpy())
-    hard = before.copy()
-    hard[..., :3] = NEARLY_HARD
-    solimp.assign(hard)
+    solimp.assign(np.concatenate([np.broadcast_to(NEARLY_HARD, (*before.shape[:-1], 3)), before[..., 3:]], axis=-1))
     yield
     solimp.assign(before)
 
