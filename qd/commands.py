@@ -286,7 +286,7 @@ class Evaluate(Who, Where):
     out: Path | None = None
     """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
     runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
-    validation validation.json. A figure of a pack or of tables is written beside it as .png."""
+    validation validation.json. A figure of tables is written beside it as .png."""
 
     def execute(self) -> None:
         """Evaluates."""

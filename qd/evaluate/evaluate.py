@@ -102,10 +102,6 @@ def cross_sets(
 
     Returns:
         Set -> controller -> crossings.
-
-    Raises:
-        AllInvalidError: If no episode of a controller on a set is valid.
-        EvaluatorError: If a worker is lost.
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     at_most = max(map(len, sets.values()))
@@ -145,10 +141,6 @@ def evaluate(
         seed: Of bootstraps.
         cache: Folder where crossings are stored and found again.
         open_evaluator: Opens simulations.
-
-    Raises:
-        AllInvalidError: If no episode of a controller on a set is valid.
-        EvaluatorError: If a worker is lost.
     """
     robot, compute = get_robot(robot), compute or Compute()
     sets = sets or make_sets((), _SMALL[0], seed)
@@ -182,11 +174,6 @@ def evaluate_tables(
     """The tables of controllers with where their terrains come from; prints, writes and draws them.
 
     Without ``out`` the file lies under runs/; the figure is beside it.
-
-    Raises:
-        ValueError: If a controller was trained on what it is to be tested on, or a setting cannot be used; raised
-            before any long work.
-        EvaluatorError: If a worker is lost; what was crossed is kept.
     """
     terrains, episodes = sizes_for(
         compute, cfg.terrains, cfg.episodes, full=(paper_terrains(robot.name), EPISODES), small=_SMALL

@@ -1,18 +1,16 @@
-"""Figures of evaluations: tables, packs, doses."""
+"""Figures of evaluations: tables and doses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from qd.evaluate.labels import COLOURS, FATES, MARKERS, SETS
+from qd.evaluate.labels import SETS
 from qd.evaluate.show import published_value
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.figures import bar_lengths, new_figure
-from sim.maps.picture import draw_heights
 from sim.policy.spec import firsts, kind_of
 
 _PANELS = {
@@ -20,23 +18,19 @@ _PANELS = {
     "success": ("no base collision\n[% of episodes]", 100.0),
     "reward": ("training reward\n[sum over 20 s]", 1.0),
 }
-_CHANGED = {"mended": "#0072b2", "still_failing": "#bbbbbb", "newly_broken": "#d55e00"}
 _PAPER = "of that name in the paper"
-_GALLERY_COLUMNS, _DOSE_COLUMNS = 3, 4
+_DOSE_COLUMNS = 4
+# Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
+_COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+_MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
 
 
 def draw_tables(report: Mapping[str, Any]) -> Figure:
-    """Goal rate, no base collision and reward of controllers by set, with intervals, and what became of terrains.
-
-    Where there are certified terrains, the goal rate on those too.
-    """
-    first = next(iter(report["controllers"]))
-    pairs = [pair for pair in next(iter(report["differences"].values())) if pair.startswith(f"{first} -> ")]
+    """Goal rate, no base collision and reward by set with intervals, and goals on certified terrains."""
     certified = {name: about["terrains"] for name, about in report["certified"].items() if about["terrains"]}
-    count = len(_PANELS) + bool(pairs) + bool(certified)
-    rows, columns, size = {3: (1, 3, (13.0, 4.2)), 4: (2, 2, (11.5, 8.0))}.get(count, (2, 3, (17.0, 8.4)))
+    rows, columns, size = (2, 2, (11.5, 8.0)) if certified else (1, 3, (13.0, 4.2))
     figure = new_figure(*size)
-    panels = [figure.add_subplot(rows, columns, place + 1) for place in range(count)]
+    panels = [figure.add_subplot(rows, columns, place + 1) for place in range(len(_PANELS) + bool(certified))]
     for axes, (measure, (label, factor)) in zip(panels, _PANELS.items(), strict=False):
         _draw_measure(axes, report, measure, factor, {name: _label(name) for name in report[measure]})
         axes.set_ylabel(label)
@@ -44,14 +38,10 @@ def draw_tables(report: Mapping[str, Any]) -> Figure:
         labels = {name: f"{_label(name)}\n({terrains} certified)" for name, terrains in certified.items()}
         _draw_measure(panels[-1], report, "certified_goal", 100.0, labels)
         panels[-1].set_ylabel("goal reached on certified terrains\n[% of episodes]")
-    if pairs:
-        _draw_changes(panels[len(_PANELS)], report, pairs)
-    sizes = "; ".join(f"{_label(name)}: {count}" for name, count in report["terrains"].items())
     part = ", validation" if report.get("part") == "validation" else ""
-    title = f"{report['robot']}{part}: {report['episodes']} episodes on each terrain, 95 % intervals over terrains"
-    figure.suptitle(f"{title}\nterrains: {sizes}", fontsize=11)
+    figure.suptitle(f"{report['robot']}{part}: {report['episodes']} episodes on each terrain, 95 % intervals")
     handles = {}
-    for axes in panels[: len(_PANELS)]:
+    for axes in panels:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if _PAPER in handles:  # last
         handles[_PAPER] = handles.pop(_PAPER)
@@ -80,7 +70,7 @@ def _draw_measure(
         x = np.arange(len(labels)) + step * (number - (len(controllers) - 1) / 2)
         axes.errorbar(
             x, factor * means, factor * bar_lengths(means, limits), linestyle="", capsize=3,
-            marker=MARKERS[place % len(MARKERS)], color=COLOURS[place % len(COLOURS)],
+            marker=_MARKERS[place % len(_MARKERS)], color=_COLOURS[place % len(_COLOURS)],
             label=label if controller in firsts(controllers) else "",
         )  # fmt: skip
         paper = np.array([published_value(report, measure, name, controller) for name in labels], np.float64)
@@ -90,46 +80,6 @@ def _draw_measure(
     axes.set_xticks(range(len(labels)), lines, fontsize=10.0 if len(labels) < 5 else 8.5)
     axes.set_xlim(-0.5, len(labels) - 0.5)
     axes.grid(axis="y", alpha=0.3)
-
-
-def _draw_changes(axes: Axes, report: Mapping[str, Any], pairs: Sequence[str]) -> None:
-    """Share of the terrains that are mended, still failing or newly broken: one bar a controller, set by set."""
-    names = list(report["differences"])
-    rows = [(name, pair) for name in names for pair in pairs]
-    places = [place + 1 + place // len(pairs) for place in range(len(rows))]  # a line for each set's name
-    left = np.zeros(len(rows))
-    for fate, colour in _CHANGED.items():
-        shares = np.array([100.0 * (report["differences"][name][pair][fate]["share"] or 0.0) for name, pair in rows])
-        axes.barh(places, shares, left=left, color=colour, label=FATES[fate])
-        left += shares
-    for number, name in enumerate(names):
-        axes.text(0.0, number * (len(pairs) + 1), f" {_label(name)}", va="center", fontsize=9)
-    first, _, _ = pairs[0].partition(" -> ")
-    axes.set_yticks(places, [pair.partition(" -> ")[2] for _, pair in rows], fontsize=8)
-    axes.set_ylim(max(places) + 0.7, -0.7)
-    axes.set_xlabel(
-        f"failed terrains, compared with {first} [% of terrains]\n(under half of the episodes reach the goal)"
-    )
-    axes.set_xlim(left=0)
-    axes.legend(frameon=False, fontsize=8, loc="best")
-    axes.grid(axis="x", alpha=0.3)
-    axes.set_axisbelow(True)
-
-
-def draw_gallery(heights: NDArray[np.float32], captions: Sequence[str], title: str) -> Figure:
-    """Maps of terrains, heights [m] of shape (N, nrow, ncol), with one scale of heights."""
-    rows = max(1, -(-len(heights) // _GALLERY_COLUMNS))
-    figure = new_figure(13.0, 0.9 + 2.3 * rows)
-    figure.suptitle(title)
-    panels, image = [], None
-    for place, (terrain, caption) in enumerate(zip(heights, captions, strict=True)):
-        axes = figure.add_subplot(rows, _GALLERY_COLUMNS, place + 1)
-        image = draw_heights(axes, terrain, (float(heights.min()), float(heights.max())))
-        axes.set_title(caption, fontsize=9)
-        panels.append(axes)
-    if image is not None:
-        figure.colorbar(image, ax=panels, label="height [m]", shrink=0.8, pad=0.01)
-    return figure
 
 
 def draw_dose(report: Mapping[str, Any]) -> Figure:
@@ -146,7 +96,7 @@ def draw_dose(report: Mapping[str, Any]) -> Figure:
         for number, controller in enumerate(report["controllers"]):
             known = [row for row in of_element if row["controller"] == controller and row["goal_rate"] is not None]
             values = [row["value"] for row in known]
-            colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+            colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
             rates = [100.0 * row["goal_rate"] for row in known]
             axes.plot(values, rates, label=controller, color=colour, marker=marker, markersize=4)
             low, high = ([100.0 * row["interval"][end] for row in known] for end in (0, 1))

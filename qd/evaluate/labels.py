@@ -33,7 +33,3 @@ FATES = {
     "fine": "fine",
 }
 """What may have become of a terrain from one controller to another: failed by the first, both, the second, neither."""
-COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-"""Of controllers, in order: Okabe and Ito's, which are apart for every kind of colour blindness."""
-MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
-"""Of controllers, in order."""

@@ -51,11 +51,7 @@ def _parts_of_weights(file: Path) -> list[dict[str, Any]]:
 
 
 def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], elites: str) -> None:
-    """Refuses to test controllers on elites, shape (T, num_genes), that they were trained on.
-
-    Raises:
-        ValueError: If one of the controllers was trained on some of them, as far as its record says; naming it.
-    """
+    """Refuses to test controllers on elites, shape (T, num_genes), that they were trained on."""
     marks = marks_of(genes)
     for name, policy in controllers.items():
         count = len(recorded_marks(policy).intersection(marks))

@@ -1,6 +1,6 @@
 """What crossings say of a controller: rates, reward and scaled penalties by terrain, by terrain type and by level."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,24 +62,6 @@ def of_terrains(families: Families, chosen: NDArray[np.bool_]) -> Families:
     return None if families is None else families[chosen]
 
 
-def invalid_line(outcomes: Mapping[str, int]) -> str:
-    """What to say of the invalid episodes of a set; empty where it has none.
-
-    A falling robot may leave the valid states before it touches the ground: what is left out may be failures.
-
-    Args:
-        outcomes: Episodes by how they ended (:class:`kernels.episode.Outcome`, lower case).
-    """
-    count, total = outcomes["invalid"], sum(outcomes.values())
-    if not count:
-        return ""
-    goal, success = outcomes["goal"] / total, 1.0 - (outcomes["base_collision"] + count) / total
-    return (
-        f"{count} of {total} episodes are invalid ({count / total:.1%}) and left out; counted as failures, goal would "
-        f"be {goal:.3f}, no base collision {success:.3f}"
-    )
-
-
 def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
     """``success`` (no base collision), ``goal`` and ``fallen`` rate of each terrain, shape (T,); NaN if invalid."""
     counted = counted_episodes(result.invalid)
@@ -100,9 +82,6 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
     Args:
         result: Crossings of T terrains, with their reward.
         scales: Scale of each penalty, in the result's order.
-
-    Raises:
-        ValueError: If the reward was not summed, or there is not one scale a penalty.
     """
     if result.reward is None:
         raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")

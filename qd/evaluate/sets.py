@@ -182,19 +182,17 @@ def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, spa
     independent = read_elites(path, robot, space)
     if not len(independent):
         raise ValueError(f"independent must be a search that found something, got {path} without elites")
-    if archive_path is None:
-        return independent
-    archive = read_elites(archive_path, robot, space)
-    remedy = "give a search with another seed"
-    if (independent.space, independent.space_sha256) != (archive.space, archive.space_sha256):
-        raise ValueError(f"independent must be of space {archive.space}, got {path} of {independent.space}: {remedy}")
-    shared = len(set(marks_of(independent.genes)) & set(marks_of(archive.genes)))
-    seed = search_seed(path)
-    if shared or (seed is not None and seed == search_seed(archive_path)):
-        raise ValueError(
-            f"independent must share neither elites nor the search's seed with {archive_path}, got {path} of seed "
-            f"{seed} with {shared} elites in both: {remedy}"
-        )
+    if archive_path is not None:
+        archive = read_elites(archive_path, robot, space)
+        shared = len(set(marks_of(independent.genes)) & set(marks_of(archive.genes)))
+        seed = search_seed(path)
+        other_space = (independent.space, independent.space_sha256) != (archive.space, archive.space_sha256)
+        if other_space or shared or (seed is not None and seed == search_seed(archive_path)):
+            raise ValueError(
+                f"independent must be of space {archive.space} and share neither elites nor the search's seed with "
+                f"{archive_path}, got {path} of {independent.space} and seed {seed} with {shared} elites in both: give "
+                f"a search with another seed"
+            )
     return independent
 
 
@@ -264,18 +262,18 @@ def space_of(archive: Archive) -> TerrainSpace:
     return get_space(archive.space, archive.space_sha256)
 
 
-def far_part(distance: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Places of the third of terrains with the largest distance to its nearest training terrain, ascending."""
-    count = -(-len(distance) // 3)
-    return np.sort(np.argsort(-distance, kind="stable")[:count])
+def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
+    """The third of a set that is farthest from training terrains, in the set's order and with the same episodes.
 
-
-def part_of(whole: TerrainSet, places: NDArray[np.int64], name: str) -> TerrainSet:
-    """Some of a set's terrains under another name; their episodes are the same."""
+    Args:
+        whole: The set.
+        distance: Of each terrain to its nearest training terrain, shape (T,).
+    """
+    places = np.sort(np.argsort(-distance, kind="stable")[: -(-len(distance) // 3)])
     families, certificates = whole.families, whole.certificates
     return replace(
         whole,
-        name=name,
+        name="generated_far",
         terrains=whole.terrains[places],
         seeds=whole.seeds[places],
         numbers=whole.numbers[places],
@@ -297,17 +295,13 @@ def nearest_distance(
     Returns:
         Distance to the nearest over all nodes [m], shape (T,). Computed on the CPU, so that it is the same everywhere.
     """
-    maps = _heights(genes, space)
+    maps, others = (
+        heights_of(some, space).reshape(len(some), -1).astype(np.float64) for some in (genes, training_genes)
+    )
     nearest = np.full(len(maps), np.inf)
-    for first in range(0, len(training_genes), _BANK):
-        others = _heights(training_genes[first : first + _BANK], space)
-        nearest = np.minimum(nearest, rms_distances(maps, others).min(axis=1))
+    for first in range(0, len(others), _BANK):
+        nearest = np.minimum(nearest, rms_distances(maps, others[first : first + _BANK]).min(axis=1))
     return nearest
-
-
-def _heights(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:
-    """Height maps [m] as rows, as :func:`qd.groups.rms_distances` takes them."""
-    return heights_of(genes, space).reshape(len(genes), -1).astype(np.float64)
 
 
 def make_sets(
@@ -345,7 +339,7 @@ def make_sets(
         if "generated_far" in names:
             training_genes = archive.genes[split_elites(archive).train]
             distance = nearest_distance(whole.terrains, training_genes, space_of(archive))
-            sets["generated_far"] = part_of(whole, far_part(distance), "generated_far")
+            sets["generated_far"] = far_third(whole, distance)
     if independent is not None and INDEPENDENT in names:
         sets[INDEPENDENT] = independent_set(independent, count, seed)
     return {name: sets[name] for name in SETS if name in names}

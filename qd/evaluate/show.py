@@ -8,13 +8,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from qd.evaluate.labels import MEASURES, SETS
-from qd.evaluate.measures import invalid_line
+from qd.evaluate.labels import CERTIFIED, MEASURES, SETS
 from sim.files.intervals import value_words
 
 _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
 _BIASED = {
+    None: "",
     "searched": "too low, since the terrains were chosen by its failures",
     "certifier": "too high, since some terrains were chosen by its successes",
 }
@@ -49,34 +49,51 @@ def show_rates(report: dict[str, Any]) -> None:
 
 
 def _show_invalid(outcomes: Mapping[str, Mapping[str, int]]) -> None:
-    for what, counts in outcomes.items():
-        if line := invalid_line(counts):
-            print(f"{what}: {line}")
+    for label, counts in outcomes.items():
+        if counts["invalid"]:
+            share = counts["invalid"] / sum(counts.values())
+            print(f"{label}: {counts['invalid']} episodes are invalid ({share:.1%}) and left out; they may be failures")
 
 
 def show_tables(report: dict[str, Any]) -> None:
-    """Prints ``tables.json``: every set with every controller, what became of terrains, and what nobody crossed."""
+    """Prints ``tables.json``: every set with every controller, and what became of terrains."""
     if report.get("part") == "validation":
         print("\nValidation terrains, to choose settings by. Rates to report are of part test.")
     for name in report["goal"]:
         rows = [
-            (controller, *_cells(report, name, controller), _paper_cell(report, name, controller))
+            (controller, *_cells(report, name, controller, _FORMS), _paper_cell(report, name, controller))
             for controller in report["goal"][name]
         ]
         title = f"{SETS.get(name, name)}: {report['terrains'][name]} terrains x {report['episodes']} episodes"
         show_table(title, ("", *(MEASURES[key] for key in _FORMS), "paper: success, reward"), rows)
     for name, about in report["certified"].items():
-        _show_certified(report, name, about)
-    _show_over_seeds(report["over_seeds"])
-    _show_penalties(report["penalties"])
-    _show_differences(report["differences"])
+        certifiers = ", ".join(f"{certifier} {count}" for certifier, count in about["certifiers"].items())
+        title = f"{SETS.get(name, name)}, certified: {about['terrains']} of {report['terrains'][name]} ({certifiers})"
+        rows = [
+            (controller, *_cells(report, name, controller, CERTIFIED), _BIASED[about["chosen_by"].get(controller)])
+            for controller in report["goal"][name]
+        ]
+        head = ("", *(MEASURES[measure] for measure in CERTIFIED.values()), "biased")
+        show_table(title, head, rows if about["terrains"] else [])
     rows = [
-        (f"{SETS[name]}, {group.replace('_', ' ')}", about["count"], value_words(about["share"], about["interval"]))
-        for name, groups in report["traversable"].items()
-        for group, about in groups.items()
+        (f"{name}, {kind}, {measure.replace('_', ' ')}", value_words(summary["mean"], summary["interval"]))
+        for measure, sets in report["over_seeds"].items()
+        for name, kinds in sets.items()
+        for kind, summary in kinds.items()
     ]
     if rows:
-        show_table("terrains that some controller crossed once, or that none did", ("", "terrains", "share"), rows)
+        show_table("several controllers of a kind: mean, 95 % t interval over them", ("", "mean"), rows)
+    by_controller = {
+        f"{name}, {controller}": values
+        for name, row in report["penalties"].items()
+        for controller, values in row.items()
+    }
+    rows = [
+        (label, *(value_words(value, None, ".2f") for value in values.values()))
+        for label, values in by_controller.items()
+    ]
+    show_table("scaled penalties", ("", *next(iter(by_controller.values()))), rows)
+    _show_differences(report["differences"])
     _show_invalid(
         {
             f"{controller} on {name}": counts
@@ -86,11 +103,11 @@ def show_tables(report: dict[str, Any]) -> None:
     )
 
 
-def _cells(report: dict[str, Any], name: str, controller: str) -> list[str]:
+def _cells(report: dict[str, Any], name: str, controller: str, measures: Iterable[str]) -> list[str]:
     intervals = report["intervals"]
     return [
-        value_words(report[key][name][controller], intervals[key][name][controller], form)
-        for key, form in _FORMS.items()
+        value_words(report[key][name][controller], intervals[key][name][controller], _FORMS.get(key, ".3f"))
+        for key in measures
     ]
 
 
@@ -102,42 +119,6 @@ def published_value(report: Mapping[str, Any], measure: str, name: str, controll
 def _paper_cell(report: dict[str, Any], name: str, controller: str) -> str:
     success, reward = (published_value(report, key, name, controller) for key in ("success", "reward"))
     return "" if success is None else f"{success:.3f}, {reward:.1f}"
-
-
-def _show_certified(report: dict[str, Any], name: str, about: dict[str, Any]) -> None:
-    certifiers = ", ".join(f"{certifier} {count}" for certifier, count in about["certifiers"].items())
-    title = f"{SETS.get(name, name)}, certified: {about['terrains']} of {report['terrains'][name]} ({certifiers})"
-    keys = ("certified_goal", "certified_success")
-    rows = [
-        (
-            controller,
-            *(value_words(report[key][name][controller], report["intervals"][key][name][controller]) for key in keys),
-            _BIASED.get(about["chosen_by"].get(controller, ""), ""),
-        )
-        for controller in report["goal"][name]
-    ]
-    show_table(title, ("", MEASURES["goal"], MEASURES["success"], "biased"), rows if about["terrains"] else [])
-
-
-def _show_over_seeds(summaries: dict[str, Any]) -> None:
-    rows = [
-        (f"{name}, {kind}, {measure.replace('_', ' ')}", value_words(summary["mean"], summary["interval"]))
-        for measure, sets in summaries.items()
-        for name, kinds in sets.items()
-        for kind, summary in kinds.items()
-    ]
-    if rows:
-        show_table("several controllers of a kind: mean, 95 % t interval over them", ("", "mean"), rows)
-
-
-def _show_penalties(penalties: dict[str, Any]) -> None:
-    names = list(next(iter(next(iter(penalties.values())).values())))
-    rows = [
-        (f"{name}, {controller}", *(value_words(values[key], None, ".2f") for key in names))
-        for name, row in penalties.items()
-        for controller, values in row.items()
-    ]
-    show_table("scaled penalties", ("", *names), rows)
 
 
 def _show_differences(differences: dict[str, Any]) -> None:

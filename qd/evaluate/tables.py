@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.labels import CERTIFIED, FROM_ARCHIVE, MEASURES, RATES
+from qd.evaluate.labels import CERTIFIED, MEASURES, RATES
 from qd.evaluate.measures import Families, Measured, interval_of, mean_of, of_terrains
 from qd.evaluate.paper import Published, published
 from qd.evaluate.sets import TerrainSet
@@ -126,8 +126,6 @@ class Tables(TypedDict):
     invalid_terrains: dict[str, dict[str, int]]
     differences: dict[str, dict[str, Difference]]
     """Set -> ``first -> second``, of every two kinds' first controllers."""
-    traversable: dict[str, dict[str, Counted]]
-    """Generated set -> ``crossed`` and ``never_crossed`` (:func:`split_by_goal`)."""
     paper: Published | None
     """The paper's numbers, None of a robot it has none of."""
     reward_weights: dict[str, Any]
@@ -164,11 +162,7 @@ def read_tables(file: Path, robot: RobotCfg) -> Tables:
 
 
 def as_tables(content: Any) -> Tables:
-    """JSON values as tables.
-
-    Raises:
-        ValueError: If something is missing or of another type, naming it.
-    """
+    """JSON values as tables."""
     tables = msgspec.convert(content, Tables)
     for measure in (*MEASURES, *CERTIFIED):
         rows = [*tables[measure].values(), *tables["intervals"].get(measure, {}).values()]
@@ -213,11 +207,6 @@ def make_tables(
                 {first: row[first] for first in firsts(row)}, sets[name].numbers, seed, sets[name].families
             )
             for name, row in crossed.items()
-        },
-        traversable={
-            name: split_by_goal(row, sets[name].numbers, seed, sets[name].families)
-            for name, row in crossed.items()
-            if name in FROM_ARCHIVE
         },
         paper=published(robot.name),
         reward_weights={
@@ -274,27 +263,6 @@ def _about_certified(sets: Mapping[str, TerrainSet], controllers: Mapping[str, C
     return certified
 
 
-def split_by_goal(
-    row: Mapping[str, Measured], numbers: NDArray[np.int64], seed: int, families: Families = None
-) -> dict[str, Counted]:
-    """Terrains that any of the controllers crossed, and those that none did: the search may ask for what nobody can.
-
-    A terrain counts as crossed if at least one episode of one controller reached the goal. With more or better
-    controllers, or more episodes, more terrains would be: a lower bound of what is traversable. Terrains that are
-    invalid with every controller are in neither group.
-
-    Args:
-        row: What each controller made of T terrains.
-        numbers: Number of each terrain, shape (T,).
-        seed: Of the bootstrap over terrains.
-        families: Of terrains that are not independent, shape (T,).
-    """
-    judged = np.any([measured.valid for measured in row.values()], axis=0)
-    crossed = np.any([measured.goals > 0 for measured in row.values()], axis=0)
-    groups = {"crossed": crossed & judged, "never_crossed": ~crossed & judged}
-    return {name: _counted(member, judged, numbers, seed, families) for name, member in groups.items()}
-
-
 def difference(
     before: Measured, after: Measured, numbers: NDArray[np.int64], seed: int, families: Families = None
 ) -> Difference:
@@ -308,29 +276,29 @@ def difference(
         families: Of terrains that are not independent, shape (T,).
     """
     both = before.valid & after.valid
-    fails, then_fails = (np.where(both, rates.values["goal"] < FAILING_GOAL_RATE, False) for rates in (before, after))
+    kin = of_terrains(families, both)
+    fails, then_fails = (both & (rates.values["goal"] < FAILING_GOAL_RATE) for rates in (before, after))
     limits, then_limits = _wilson_limits(before), _wilson_limits(after)
     apart = (limits[:, 1] < then_limits[:, 0]) | (then_limits[:, 1] < limits[:, 0])
-
-    def counted(member: NDArray[np.bool_]) -> Counted:
-        return _counted(member, both, numbers, seed, families)
-
-    def changed(member: NDArray[np.bool_]) -> Counted:
-        return {**counted(member), "clear": int((member & apart).sum())}
-
-    fine = counted(~fails & ~then_fails & both)
-    del fine["terrains"]  # type: ignore[misc] - the most, and nothing is to be seen on them
+    members = {
+        "mended": fails & ~then_fails,
+        "still_failing": fails & then_fails,
+        "newly_broken": ~fails & then_fails,
+        "fine": both & ~fails & ~then_fails,
+    }
+    counts: dict[str, Counted] = {}
+    for fate, member in members.items():
+        shares = member[both].astype(float)
+        counts[fate] = Counted(count=int(member.sum()), share=mean_of(shares), interval=interval_of(shares, seed, kin))
+        if fate != "fine":
+            counts[fate]["terrains"] = np.sort(numbers[member]).tolist()
+        if fate in ("mended", "newly_broken"):
+            counts[fate]["clear"] = int((member & apart).sum())
     gains = {name: (after.values[name] - before.values[name])[both] for name in MEASURES}
     return Difference(
         compared=int(both.sum()),
-        mended=changed(fails & ~then_fails),
-        still_failing=counted(fails & then_fails),
-        newly_broken=changed(~fails & then_fails),
-        fine=fine,
-        gain={
-            name: Gain(mean=mean_of(gain), interval=interval_of(gain, seed, of_terrains(families, both)))
-            for name, gain in gains.items()
-        },
+        **counts,  # type: ignore[typeddict-item]
+        gain={name: Gain(mean=mean_of(gain), interval=interval_of(gain, seed, kin)) for name, gain in gains.items()},
     )
 
 
@@ -341,18 +309,6 @@ def differences(
     return {
         f"{first} -> {second}": difference(crossed[first], crossed[second], numbers, seed, families)
         for first, second in combinations(crossed, 2)
-    }
-
-
-def _counted(
-    member: NDArray[np.bool_], among: NDArray[np.bool_], numbers: NDArray[np.int64], seed: int, families: Families
-) -> Counted:
-    shares = member[among].astype(float)
-    return {
-        "count": int(member.sum()),
-        "share": mean_of(shares),
-        "interval": interval_of(shares, seed, of_terrains(families, among)),
-        "terrains": np.sort(numbers[member]).tolist(),
     }
 
 
@@ -394,12 +350,12 @@ def over_seeds(tables: Mapping[str, Values], measures: Iterable[str]) -> dict[st
             for kind in dict.fromkeys(map(kind_of, row)):
                 values = [value for controller, value in row.items() if kind_of(controller) == kind]
                 if len(values) > 1:
-                    summary = _summary(values, is_rate=measure in RATES)
+                    summary = _mean_over_seeds(values, is_rate=measure in RATES)
                     summaries.setdefault(measure, {}).setdefault(name, {})[kind] = summary
     return summaries
 
 
-def _summary(values: list[Number], *, is_rate: bool) -> OverSeeds:
+def _mean_over_seeds(values: list[Number], *, is_rate: bool) -> OverSeeds:
     numbers = [value for value in values if value is not None]
     if len(numbers) < len(values):
         return OverSeeds(mean=None, interval=None, values=values)

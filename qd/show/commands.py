@@ -161,7 +161,7 @@ class Export(Who, Which):
     With --pack it makes a pack from a judged run: faults and near-faults, to test any controller on with `faultline
     evaluate --pack`. The terrains are spread over the ways in which the searched controller fails and over families of
     kin. Every controller crosses each terrain. pack.npz has the terrains, pack.json the rates and what is known of each
-    terrain, pack.png shows some of them.
+    terrain.
     """
 
     from_pack: str | None = None
@@ -206,7 +206,7 @@ class Export(Who, Which):
         export_terrains(source, formats=split_words(self.formats), out=self.out, overwrite=self.overwrite)
 
     def _make_pack(self) -> None:
-        from qd.evaluate.make_pack import make_pack
+        from qd.evaluate.pack import make_pack
         from qd.run.directory import find_run
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from qd.evaluate.make_pack import make_pack
+from qd.evaluate.pack import make_pack
 from results.make.common import parse, published_controllers
 
 

@@ -13,16 +13,12 @@ from tests.train.starts import write_actor, write_trained
 GENES = make_archive(20).genes
 
 
-def test_marks_are_of_the_genes_alone():
-    marks = marks_of(GENES)
-    assert len(set(marks)) == 20 and all(len(mark) == 12 for mark in marks)
-    assert marks_of(GENES[::-1].astype(np.float64)) == marks[::-1]
-
-
 def test_the_records_of_all_files_of_a_controller_are_read(tmp_path):
     path = write_trained(tmp_path, GENES[:3])
+    marks = marks_of(GENES[:3])
+    assert len(set(marks)) == 3 and marks_of(GENES[2::-1].astype(np.float64)) == marks[::-1]
     for policy in (str(path), str(tmp_path / "tuned.onnx"), f"some.module:adapter@{path}"):
-        assert recorded_marks(policy) == set(marks_of(GENES[:3]))
+        assert recorded_marks(policy) == set(marks)
     assert recorded_marks("some.module:walk") == set() == recorded_marks(str(tmp_path / "other.pt"))
     path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: 5}))
     with pytest.raises(ValueError, match=TRAINED_ON):
@@ -31,18 +27,10 @@ def test_the_records_of_all_files_of_a_controller_are_read(tmp_path):
 
 @pytest.mark.parametrize("inside", ["checkpoint", "controller"])
 def test_marks_in_the_file_itself_count_where_no_record_lies_beside_it(inside, tmp_path):
-    path = write_actor(tmp_path / "policy.pt")
+    path, part = write_actor(tmp_path / "policy.pt"), {TRAINED_ON: marks_of(GENES)}
     content = torch.load(path, weights_only=True)
-
-    def write(marks):
-        part = {TRAINED_ON: marks}
-        torch.save(content | ({"extra": part} if inside == "checkpoint" else part), path)
-
-    write(marks_of(GENES))
-    assert recorded_marks(str(path)) == recorded_marks(f"some.module:adapter@{path}") == set(marks_of(GENES))
-    write([5])
-    with pytest.raises(ValueError, match=TRAINED_ON):
-        recorded_marks(str(path))
+    torch.save(content | ({"extra": part} if inside == "checkpoint" else part), path)
+    assert recorded_marks(str(path)) == recorded_marks(f"some.module:adapter@{path}") == set(part[TRAINED_ON])
 
 
 def test_a_file_of_another_kind_has_no_marks(tmp_path):
@@ -57,5 +45,5 @@ def test_a_file_of_another_kind_has_no_marks(tmp_path):
 def test_a_controller_is_not_tested_on_what_it_was_trained_on(tmp_path):
     controllers = {"base": "some.module:walk", "C-G": str(write_trained(tmp_path, GENES[:8]))}
     check_untrained(controllers, GENES[8:], "run")
-    with pytest.raises(ValueError, match=r"C-G .* got 2 of the 14"):
+    with pytest.raises(ValueError, match=r"C-G .* 2 of the 14"):
         check_untrained(controllers, GENES[6:], "run")

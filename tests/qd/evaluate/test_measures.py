@@ -8,7 +8,6 @@ import pytest
 from qd.evaluate.measures import (
     count_outcomes,
     interval_of,
-    invalid_line,
     mean_of,
     measure,
     summarise,
@@ -20,13 +19,10 @@ from tests.train.results import BAD, GOAL, HIT, LATE, OUT, result_of
 
 def test_rates_of_a_terrain():
     result = result_of([[GOAL, GOAL, HIT, LATE], [OUT, LATE, LATE, GOAL]], fallen=[[0, 0, 1, 0], [0, 0, 0, 0]])
-    rates = terrain_rates(result)
-    assert rates["success"].tolist() == [0.75, 1.0]
-    assert rates["goal"].tolist() == [0.5, 0.25]
-    assert rates["fallen"].tolist() == [0.25, 0.0]
-    assert count_outcomes(result) == {
-        "running": 0, "goal": 3, "base_collision": 1, "time_out": 3, "out": 1, "invalid": 0,
-    }  # fmt: skip
+    rates = {name: values.tolist() for name, values in terrain_rates(result).items()}
+    assert rates == {"success": [0.75, 1.0], "goal": [0.5, 0.25], "fallen": [0.25, 0.0]}
+    counts = {"running": 0, "goal": 3, "base_collision": 1, "time_out": 3, "out": 1, "invalid": 0}
+    assert count_outcomes(result) == counts
 
 
 def test_everything_is_a_mean_over_valid_episodes():
@@ -38,17 +34,16 @@ def test_everything_is_a_mean_over_valid_episodes():
     )
     measured = measure(result, (1.0, 2.0))
     for name, expected in {"success": 2 / 3, "goal": 2 / 3, "fallen": 0.0, "reward": 15.0}.items():
-        assert measured.values[name][0] == pytest.approx(expected), name
-        assert np.isnan(measured.values[name][1])
-    assert measured.penalties["vel_x"][0] == pytest.approx(1.5)  # (1 + 2 + 6) / 3 by the scale of 2
-    assert measured.penalties["yaw_rate"][0] == 0.0 and np.isnan(measured.penalties["vel_x"][1])
+        assert measured.values[name] == pytest.approx([expected, np.nan], nan_ok=True), name
+    assert measured.penalties["vel_x"] == pytest.approx([1.5, np.nan], nan_ok=True)  # (1 + 2 + 6) / 3 by the scale of 2
     assert measured.episodes.tolist() == [3, 0] and measured.goals.tolist() == [2, 0]
-    assert measured.valid.tolist() == [True, False]
-    assert measured.outcomes["invalid"] == 3
-    with pytest.raises(ValueError, match="reward"):
-        measure(result_of([[GOAL]]), (1.0, 1.0))
-    with pytest.raises(ValueError, match="scales"):
-        measure(result_of([[GOAL]], reward=[[1.0]]), (1.0,))
+    assert measured.valid.tolist() == [True, False] and measured.outcomes["invalid"] == 3
+    summary = summarise(result, 0)
+    assert summary["success_rate"] == pytest.approx(2 / 3)
+    assert (summary["terrains"], summary["invalid_terrains"], summary["outcomes"]["invalid"]) == (2, 1, 3)
+    for given, scales, field in (({}, (1.0, 1.0), "reward"), ({"reward": [[1.0]]}, (1.0,), "scales")):
+        with pytest.raises(ValueError, match=field):
+            measure(result_of([[GOAL]], **given), scales)
 
 
 def test_means_and_intervals_leave_invalid_terrains_out():
@@ -59,21 +54,6 @@ def test_means_and_intervals_leave_invalid_terrains_out():
     # Two families: all ones, and the single zero. A quarter of the resamples has the second alone.
     assert interval_of(values, 0, np.array([0, 1, 2, 0, 0])) == [0.0, 1.0]
     assert interval_of(values, 0, np.zeros(5, np.int64)) is None  # one family says nothing of its spread
-
-
-def test_invalid_episodes_may_be_failures():
-    line = invalid_line({"goal": 880, "base_collision": 77, "time_out": 0, "invalid": 43})
-    # 880 of 1,000 arrive; 77 + 43 of 1,000 fail.
-    assert "43 of 1000" in line and "be 0.880, no base collision 0.880" in line
-    assert invalid_line({"goal": 5, "base_collision": 1, "invalid": 0}) == ""
-
-
-def test_invalid_episodes_are_left_out_and_counted():
-    result = result_of([[GOAL, GOAL, HIT, BAD], [GOAL, GOAL, BAD, BAD]])
-    summary = summarise(result, 0)
-    assert summary["success_rate"] == pytest.approx(2 / 3)
-    assert (summary["terrains"], summary["invalid_terrains"], summary["outcomes"]["invalid"]) == (2, 1, 3)
-    assert summary["by_type"] is None and summary["by_level"] is None
 
 
 def test_groups():
@@ -88,9 +68,6 @@ def test_groups():
 def test_velocity_error_is_a_mean_over_time():
     # .9 (m/s)^2 s over 10 s counted is (.3 m/s)^2; .24 over 6 s is .2^2; a fall before 2 s and an invalid one do not
     # count.
-    result = result_of(
-        [[GOAL, GOAL], [HIT, BAD]], duration_s=[[12.0, 8.0], [1.5, 12.0]], vel_x=[[0.9, 0.24], [0.0, 9.0]]
-    )
-    error = velocity_error(result, 0)
-    assert error["vx_error_mean"] == pytest.approx((0.3 + 0.2) / 2)
-    assert error["episodes"] == 2
+    outcomes, duration_s = [[GOAL, GOAL], [HIT, BAD]], [[12.0, 8.0], [1.5, 12.0]]
+    error = velocity_error(result_of(outcomes, duration_s=duration_s, vel_x=[[0.9, 0.24], [0.0, 9.0]]), 0)
+    assert error["vx_error_mean"] == pytest.approx((0.3 + 0.2) / 2) and error["episodes"] == 2
