@@ -25,7 +25,7 @@ from qd.evaluate.sets import TerrainSet
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.intervals import t_interval, wilson_interval
 from sim.files.records import check_robot
-from sim.policy.spec import MARK, controller_hash, firsts, kind_of
+from sim.policy.spec import controller_hash, firsts, kind_of
 from sim.robots.robot import RobotCfg
 
 Number = float | None
@@ -326,8 +326,8 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
     """
     known: dict[tuple[str, str], str] = {}
     for name, policy in controllers.items():
-        if not re.fullmatch(f"[^{MARK}]+({MARK}[^{MARK}]+)?", name):
-            raise ValueError(f"a controller must be named KIND or KIND{MARK}SEED, as C-G{MARK}1, got '{name}'")
+        if not re.fullmatch("[^@]+(@[^@]+)?", name):
+            raise ValueError(f"a controller must be named KIND or KIND@SEED, as C-G@1, got '{name}'")
         key = (kind_of(name), controller_hash(policy) or policy)
         if key in known:
             raise ValueError(f"{known[key]} and {name} must be different trainings, got the same controller twice")

@@ -14,19 +14,19 @@ _PROBE = ".write-test"
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Replaces a file in one step that survives a kill and a power cut.
-
-    The temporary file has a fixed name beside the target, so that what a kill leaves behind is overwritten by the next
-    write instead of piling up. The folder exists. After an OSError, as on a full disk, the old file is whole.
-    """
-    temporary = path.with_name(f".{path.name}{_TEMPORARY}")
+    """Replaces a file in one step that survives a kill and a power cut; after an OSError the old file is whole."""
+    temporary = path.with_name(f".{path.name}{_TEMPORARY}")  # the next write overwrites what a kill leaves behind
     try:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-        _sync_folder(path.parent)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # or the renaming may be lost
+        finally:
+            os.close(folder)
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -34,15 +34,6 @@ def write_atomically(path: Path, data: bytes) -> None:
             f"{path} cannot be written: {error.strerror or error}: make room there or give another place; what was "
             "saved before is whole"
         ) from error
-
-
-def _sync_folder(folder: Path) -> None:
-    """Puts a rename on the disk, which may be lost otherwise."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def is_leftover(path: Path) -> bool:
@@ -94,10 +85,12 @@ def _refuse_constant(name: str) -> None:
 
 
 def check_zip(path: Path) -> None:
-    """Compares the parts of a zip file, such as torch and NumPy write, with their checksums.
+    """Compares the parts of a file that torch or NumPy wrote as a zip with their checksums, or raises a ValueError.
 
-    Torch never looks at them when it loads: a flipped bit would be another weight. A ValueError says what is damaged.
+    Torch never looks at them when it loads: a flipped bit would be another weight. Other files pass.
     """
+    if not zipfile.is_zipfile(path):
+        return
     try:
         with zipfile.ZipFile(path) as file:
             damaged = file.testzip()
@@ -109,10 +102,7 @@ def check_zip(path: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, busy: str) -> Iterator[None]:
-    """Keeps other processes that ask for the same out of a folder, or raises a ValueError that says ``busy``.
-
-    It ends with the process, however that ends.
-    """
+    """Keeps other processes out of a folder while this one lives, or raises a ValueError that says ``busy``."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

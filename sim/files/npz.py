@@ -19,16 +19,12 @@ def array_names(path: Path) -> list[str]:
 
 
 def read_arrays(path: Path, names: Sequence[str], *, max_bytes: float = float("inf")) -> dict[str, NDArray[Any]]:
-    """Some arrays of an npz file by name.
+    """Some arrays of an npz file by name; any Exception if it is damaged, another file, or lacks one.
 
     Args:
         path: The file.
         names: Which.
         max_bytes: Largest size of one of them; a packed file of zeros is small at any size.
-
-    Raises:
-        Exception: Anything, if it is damaged, another file, or lacks one: zip, zlib and npy headers fail with a dozen
-            types.
     """
     with zipfile.ZipFile(path) as members:
         missing = set(names) - {name.removesuffix(_ENDING) for name in members.namelist()}
@@ -41,35 +37,25 @@ def read_arrays(path: Path, names: Sequence[str], *, max_bytes: float = float("i
     return {name: np.lib.format.read_array(io.BytesIO(part), allow_pickle=False) for name, part in data.items()}
 
 
-def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Sequence[int | str]]) -> dict[str, int]:
-    """Raises ValueError for an array whose shape does not fit; arrays that are not there fit.
-
-    Args:
-        arrays: By name.
-        shapes: Of each array; a text stands for the same size wherever it is.
-
-    Returns:
-        The size that each text stands for.
-    """
-    sizes: dict[str, int] = {}
+def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Sequence[int | str]]) -> None:
+    """Raises ValueError for an array, if present, whose shape does not fit; a text stands for one size everywhere."""
+    sizes: dict[int | str, int] = {}
     for name, shape in shapes.items():
-        got = arrays[name].shape if name in arrays else ()
-        if name in arrays and (
-            len(got) != len(shape)
-            or any(length != (sizes.setdefault(size, length) if isinstance(size, str) else size)
-                   for size, length in zip(shape, got, strict=True))
-        ):  # fmt: skip
-            expected = tuple(sizes.get(size, size) if isinstance(size, str) else size for size in shape)
+        if name not in arrays:
+            continue
+        got = arrays[name].shape
+        for size, length in zip(shape, got, strict=False):
+            if isinstance(size, str):
+                sizes.setdefault(size, length)
+        expected = tuple(sizes.get(size, size) for size in shape)
+        if got != expected:
             raise ValueError(f"{name} must have shape {expected}, got {got}")
-    return sizes
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]], *, compression: int = zipfile.ZIP_DEFLATED) -> bytes:
     """A packed npz file, which ``numpy.load`` reads; equal arrays give equal bytes.
 
-    Args:
-        arrays: By name.
-        compression: Of :mod:`zipfile`; ``ZIP_BZIP2`` packs whole numbers into half of the bytes, and takes longer.
+    ``zipfile.ZIP_BZIP2`` packs whole numbers into half of the bytes, and takes longer.
     """
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w") as members:

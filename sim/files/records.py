@@ -13,9 +13,9 @@ from dataclasses import MISSING, Field, fields
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
-from sim.policy.spec import ControllerSpec, controller_hash
+from sim.policy.spec import ControllerSpec, RobotSettings, controller_hash
 from sim.robots.model_files import read_model_files
 
 PENALTY_DEFINITION = "squared"
@@ -23,37 +23,17 @@ PENALTY_DEFINITION = "squared"
 ROOMS = ("kernels", "sim", "qd", "train")
 """Folders of the source code."""
 
-_ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[2]
+"""Folder of the rooms."""
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
 _SOURCES = (".py", ".cu", ".xml")
 _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning")
 _SHOWN = 12  # digits of a hash in a message
 
 
-class RecordedRobot(Protocol):
-    """What a record needs of a robot's settings, a dataclass (:class:`sim.robots.robot.RobotCfg`)."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    @property
-    def name(self) -> str:
-        """What files are called after it."""
-        ...
-
-    @property
-    def model_file(self) -> Path:
-        """MJCF or URDF."""
-        ...
-
-    @property
-    def spec(self) -> str:
-        """Name or settings file."""
-        ...
-
-
 def provenance(device: str, seed: int) -> dict[str, Any]:
     """Command, commit, hash of the sources, device, versions, seed and date of the running program."""
-    changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "--", *(_ROOT / name for name in ROOMS)])
+    changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "--", *(ROOT / name for name in ROOMS)])
     commit = _output(["git", "rev-parse", "HEAD"])
     return {
         "command": _command(),
@@ -76,9 +56,9 @@ def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:
     """SHA-256 of the source files of rooms: Python, CUDA and robot models."""
     digest = hashlib.sha256()
     for room in rooms:
-        for path in sorted((_ROOT / room).rglob("*")):
+        for path in sorted((ROOT / room).rglob("*")):
             if path.suffix in _SOURCES:
-                digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
+                digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -119,13 +99,13 @@ def device_name(device: str) -> str:
 def _output(command: Sequence[str | Path]) -> str | None:
     """What a program prints, run in the checkout; None where it is missing or fails."""
     try:
-        done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, timeout=20, check=True)
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
 
 
-def robot_digest(robot: RecordedRobot) -> str:
+def robot_digest(robot: RobotSettings) -> str:
     """SHA-256 of a robot: its settings without those of training, its model and its meshes.
 
     A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
@@ -144,31 +124,22 @@ def _default(setting: Field[Any]) -> Any:
     return setting.default if setting.default_factory is MISSING else setting.default_factory()
 
 
-def robot_identity(robot: RecordedRobot) -> dict[str, str]:
+def robot_identity(robot: RobotSettings) -> dict[str, str]:
     """The keys ``robot_sha256`` and ``penalty_definition``, which every record of a robot has."""
     return {"robot_sha256": robot_digest(robot), "penalty_definition": PENALTY_DEFINITION}
 
 
-def identity(robot: RecordedRobot, policy: str | Path) -> dict[str, str | None]:
-    """What a record of a robot under a controller names, as JSON values.
+def identity(robot: RobotSettings, policy: str | Path) -> dict[str, str | None]:
+    """What a record of a robot under a controller names: ``robot``, ``policy`` (a name without folders), their hashes.
 
-    Returns:
-        ``robot`` (its name), ``robot_sha256``, ``penalty_definition``, ``policy`` (a name without folders) and
-        ``policy_sha256``, None for a controller without a file.
+    ``policy_sha256`` is None for a controller without a file.
     """
     controller = {"policy": ControllerSpec.parse(policy).label, "policy_sha256": controller_hash(str(policy))}
     return {"robot": robot.name, **robot_identity(robot), **controller}
 
 
-def check_robot(record: Mapping[str, Any], robot: RecordedRobot, file: Path, remedy: str) -> None:
-    """Refuses a record of a robot that has changed since.
-
-    Args:
-        record: What the file names.
-        robot: The robot of that name, as it is now.
-        file: The record, for the message.
-        remedy: What to do about it, other than putting back the robot.
-    """
+def check_robot(record: Mapping[str, Any], robot: RobotSettings, file: Path, remedy: str) -> None:
+    """Refuses the record in a file that is of the robot before it changed; ``remedy`` is what else helps."""
     expected, now = record.get("robot_sha256"), robot_digest(robot)
     if expected != now:
         raise ValueError(
@@ -177,7 +148,7 @@ def check_robot(record: Mapping[str, Any], robot: RecordedRobot, file: Path, rem
         )
 
 
-def check_identity(record: Mapping[str, Any], robot: RecordedRobot, file: Path, remedy: str) -> None:
+def check_identity(record: Mapping[str, Any], robot: RobotSettings, file: Path, remedy: str) -> None:
     """Refuses a record of a robot that has changed since (:func:`check_robot`) or of penalties defined otherwise."""
     definition = record.get("penalty_definition")
     if definition != PENALTY_DEFINITION:

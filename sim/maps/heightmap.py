@@ -12,7 +12,7 @@ that has the terrain's own nodes is taken as it is.
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,12 +27,8 @@ from sim.files.settings import from_builtins
 from sim.ground import GroundMaps
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
-MIN_SIDE_M = 1.0
-MAX_SIDE_M = 100.0
-MAX_HEIGHT_M = 10.0
-"""Largest height, above or below 0."""
+_MAX_HEIGHT_M = 10.0  # above or below 0
 _MAX_NODES = 10_000  # along one side
-_MAX_BYTES = 8 * _MAX_NODES**2 + 1024  # of as many float64, and a header
 _GROUND = ("friction", "time_constant_s")
 _WHOLE = (SPACING * (NUM_COLS - 1), SPACING * (NUM_ROWS - 1))
 _GRAY_MODES = ("L", "I", "I;16", "I;16B", "I;16L", "I;16N")
@@ -50,7 +46,7 @@ class Heightmap:
     """Friction and softness, of a map that has the size of a terrain."""
 
 
-_Side = Annotated[float, Meta(ge=MIN_SIDE_M, le=MAX_SIDE_M)]
+_Side = Annotated[float, Meta(ge=1, le=100)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +90,7 @@ def read_heightmap(
     values, arrays = dict[str, Any](), dict[str, NDArray[Any]]()
     if path.suffix.lower() == ".npz":
         arrays = _read_npz(path)
-        heights = arrays["heights"].astype(np.float64)
+        heights = arrays["heights"]
         values = {"size_m": arrays["size_m"].ravel().tolist()} if "size_m" in arrays else {}
     elif path.suffix.lower() == ".png":
         heights = _read_png(path)
@@ -107,35 +103,25 @@ def read_heightmap(
         raise ValueError(f"a heightmap must be an .npz or a .png file, got {path}: save it as one of these")
     given = {"size_m": size_m, "scale_m": scale_m, "offset_m": offset_m}
     values = {name: given[name] if given[name] is not None else values.get(name) for name in given}
-    meaning = _meaning_of(path, {name: value for name, value in values.items() if value is not None})
+    if values["size_m"] is None:
+        raise ValueError(
+            f"{path}: expected its size: give --size X Y in metres, or size_m in the .npz or in {beside.name}"
+        )
+    meaning = from_builtins(_Meaning, {name: value for name, value in values.items() if value is not None}, str(path))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is named below
         heights = heights * meaning.scale_m + meaning.offset_m
     _check_heights(path, heights)
     return Heightmap(heights=heights, size_m=meaning.size_m, ground=_ground_in(path, arrays, meaning.size_m))
 
 
-def _meaning_of(path: Path, values: dict[str, Any]) -> _Meaning:
-    if "size_m" not in values:
-        raise ValueError(
-            f"{path}: expected its size: give --size X Y in metres, or size_m in the .npz or in a .json beside a .png"
-        )
-    try:
-        return from_builtins(_Meaning, values, str(path))
-    except ValueError as error:
-        raise ValueError(f"{error}: sizes are {MIN_SIDE_M:g} to {MAX_SIDE_M:g} m, a crossing is 16 m x 8 m") from None
-
-
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a map, by name."""
     try:
         names = [name for name in array_names(path) if name in ("size_m", *_GROUND)]
-        arrays = read_arrays(path, ["heights", *names], max_bytes=_MAX_BYTES)
+        arrays = read_arrays(path, ["heights", *names], max_bytes=8 * _MAX_NODES**2 + 1024)
         check_shapes(arrays, {"heights": ("nrow", "ncol")})
+        return {**arrays, "heights": arrays["heights"].astype(np.float64, casting="same_kind")}
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
         raise ValueError(f"{path} must be an .npz file with an array 'heights', got: {error}") from None
-    if arrays["heights"].dtype.kind != "f":
-        raise ValueError(f"{path}: heights must be floats [m], got {arrays['heights'].dtype}")
-    return arrays
 
 
 def _read_png(path: Path) -> NDArray[np.float64]:
@@ -147,53 +133,47 @@ def _read_png(path: Path) -> NDArray[np.float64]:
         raise ValueError(f"{path} must be a PNG image, got: {error}") from None
     if gray is None:
         raise ValueError(
-            f"{path} must be a grayscale image of 8 or 16 bits of at most {_MAX_NODES} a side, got mode '{mode}' "
-            f"and {size[0]} x {size[1]}: convert it first"
+            f"{path} must be a grayscale image of 8 or 16 bits, got mode '{mode}', {size}: convert it first"
         )
     return gray[::-1].astype(np.float64)
 
 
 def _ground_in(path: Path, arrays: dict[str, NDArray[Any]], size_m: tuple[float, float]) -> GroundMaps | None:
-    """Friction and softness of a map of the size of a terrain."""
     maps = {name: arrays[name] for name in _GROUND if name in arrays}
     if not maps:
         return None
-    if not np.allclose(size_m, _WHOLE, rtol=0.0, atol=1e-6):
+    if not _is_whole(size_m):
         raise ValueError(
             f"{path}: with friction or softness it must be {_WHOLE[0]:g} m x {_WHOLE[1]:g} m, got {size_m}"
         )
+    plain = GroundMaps.plain(1)
     try:
-        plain = GroundMaps.plain(1)
-        friction, time_constant_s = (
-            np.asarray(maps[name], dtype=np.float32)[None] if name in maps else getattr(plain, name) for name in _GROUND
-        )
-        return GroundMaps(friction=friction, time_constant_s=time_constant_s)
+        return replace(plain, **{name: np.asarray(values, np.float32)[None] for name, values in maps.items()})
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _is_whole(size_m: tuple[float, float]) -> bool:
+    return np.allclose(size_m, _WHOLE, rtol=0.0, atol=1e-6)
 
 
 def _check_heights(path: Path, heights: NDArray[np.float64]) -> None:
     if min(heights.shape) < 2 or max(heights.shape) > _MAX_NODES:
         raise ValueError(f"{path}: a heightmap needs 2 to {_MAX_NODES} nodes a side, got {heights.shape}")
-    if not np.isfinite(heights).all():
-        count = np.count_nonzero(~np.isfinite(heights))
+    if count := np.count_nonzero(~np.isfinite(heights)):
         raise ValueError(f"{path}: {count} of {heights.size} heights are NaN or infinite: fill them first")
     low, high = float(heights.min()), float(heights.max())
-    if max(-low, high) > MAX_HEIGHT_M:
+    if max(-low, high) > _MAX_HEIGHT_M:
         raise ValueError(
-            f"{path}: heights must lie in +-{MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: are they metres (--scale), "
+            f"{path}: heights must lie in +-{_MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: are they metres (--scale), "
             "and is the ground about 0 (--offset)?"
         )
 
 
 def as_terrain(heightmap: Heightmap) -> NDArray[np.float32]:
-    """A heightmap as a terrain to cross, by the rules at the top of this file.
-
-    Returns:
-        Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
-    """
+    """A heightmap as a terrain to cross, by the rules at the top of this file; heights [m], (NUM_ROWS, NUM_COLS)."""
     heights, (size_x, size_y) = heightmap.heights, heightmap.size_m
-    if heights.shape == (NUM_ROWS, NUM_COLS) and np.allclose(heightmap.size_m, _WHOLE, rtol=0.0, atol=1e-6):
+    if heights.shape == (NUM_ROWS, NUM_COLS) and _is_whole(heightmap.size_m):
         return heights.astype(np.float32)
     along_y = _weights(heights.shape[0], size_y, NUM_ROWS)
     along_x = _weights(heights.shape[1], size_x, NUM_COLS)

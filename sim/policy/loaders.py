@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import sys
 import warnings
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -54,24 +53,20 @@ def prepare_torch(device: str) -> None:
 
 
 def reason_of(error: BaseException) -> str:
-    """What went wrong, in one line; of a refused file torch's finding, without its advice to load it as code."""
-    _, _, finding = str(error).partition("WeightsUnpickler error: ")
-    lines = [line.strip() for line in (finding or str(error)).splitlines() if line.strip()]
-    lines = [line for line in lines if not line.startswith("Weights only load failed")]
-    if not lines:
-        return type(error).__name__
-    line = lines[-1] if lines[0].startswith("The following operation failed") else lines[0].partition(". Please")[0]
-    return line if isinstance(error, RuntimeError | ValueError | OSError) else f"{type(error).__name__}: {line}"
+    """What went wrong, in one line; of a refused file without torch's advice to load it as code."""
+    text = str(error).partition("WeightsUnpickler error: ")[2] or str(error)
+    lines = [line.strip() for line in text.splitlines() if line.strip()] or [""]
+    if lines[0].startswith("The following operation failed"):  # in TorchScript, whose own trace comes first
+        return lines[-1]
+    return f"{type(error).__name__}: {lines[0].partition('. Please')[0]}"
 
 
 def read_weights(path: Path) -> Any:
     """What ``torch.save`` wrote: plain tensors and values, as data only, and compared with its checksums.
 
-    Raises:
-        Exception: Anything, if the file is damaged, foreign, or holds code.
+    It raises anything if the file is damaged, foreign, or holds code.
     """
-    if zipfile.is_zipfile(path):
-        check_zip(path)
+    check_zip(path)
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
@@ -80,8 +75,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
 
     Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
     checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
-    file made to harm can crash. If the training record beside a
-    file names another robot, a warning says so.
+    file made to harm can crash. A warning says if the training record beside a file names another robot.
 
     Args:
         spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or ``module:adapter@file``;
@@ -103,16 +97,15 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     policy = _load_file(Path(spec), robot, where) if named.place is None else _load_code(named, robot, where)
     _try_policy(policy, robot, where, str(spec))
     if named.file is not None:
-        warn_if_trained_otherwise(Path(named.file), robot)
+        _warn_if_trained_otherwise(Path(named.file), robot)
     return policy
 
 
-def warn_if_trained_otherwise(policy: Path, robot: RobotCfg) -> None:
-    """Warns where the training record beside a controller names another robot than the one it is to walk."""
+def _warn_if_trained_otherwise(policy: Path, robot: RobotCfg) -> None:
     record = policy.with_suffix(".train.json")
     try:
         settings = read_json(record).get("settings")
-    except (OSError, ValueError):  # no record, or a damaged one, of which nothing is known
+    except (OSError, ValueError):  # no record, or a damaged one
         return
     trained = settings.get("robot_sha256") if isinstance(settings, dict) else None
     if trained is None or trained == robot_digest(robot):
@@ -138,12 +131,16 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
         raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; expected {_FORMATS}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
-    if spec.file is None and not getattr(target, "faultline_factory", False):
-        _check_takes_observation(target, spec)
+    if spec.file is not None:
+        arguments = _load_file(Path(spec.file), robot, device, fits=False), robot
+    elif getattr(target, "faultline_factory", False):
+        arguments = robot, device
+    elif inspect.isclass(target):
+        raise ValueError(
+            f"policy '{spec}' is a class: mark it by `faultline_factory = True` to be called with (robot, device)"
+        )
+    else:
         return target
-    arguments = (
-        (robot, device) if spec.file is None else (_load_file(Path(spec.file), robot, device, fits=False), robot)
-    )
     try:
         policy = target(*arguments)
     except Exception as error:
@@ -152,22 +149,6 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
     if not callable(policy):
         raise ValueError(f"policy '{spec}' must return a callable, got {type(policy).__name__}")
     return policy
-
-
-def _check_takes_observation(target: Any, spec: ControllerSpec) -> None:
-    """Refuses what is no function of the observation: a class without the mark, or a function of something else."""
-    try:
-        if not inspect.isclass(target):
-            inspect.signature(target).bind(None)
-            return
-    except ValueError:  # not all that is written in C has a signature
-        return
-    except TypeError:
-        pass
-    raise ValueError(
-        f"policy '{spec}' must be a function of the observation: a class or function that makes a controller of "
-        "(robot, device) is marked by `faultline_factory = True`"
-    )
 
 
 def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -> Policy:
@@ -187,13 +168,12 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
 
         return load_onnx(path, expected if fits else None, device)
     try:
-        if zipfile.is_zipfile(path):
-            check_zip(path)
+        check_zip(path)
     except ValueError as error:
         raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back") from error
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of TorchScript files, which are none of the matter here
+            warnings.simplefilter("ignore")  # torch warns of TorchScript files
             content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         return _load_script(path, device, error)

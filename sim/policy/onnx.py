@@ -14,21 +14,15 @@ from onnx import TensorProto, helper, numpy_helper
 from sim.files.atomic import prepare_output, write_atomically
 from sim.policy.mlp import MlpPolicy
 
-INPUT, OUTPUT = "observation", "action"
 _OPSET, _IR_VERSION = 17, 8  # of 2022: what runs on robots is rarely new
 _CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 
 
 class OnnxPolicy:
-    """A controller that onnxruntime runs: where the observations are if it can, else on the CPU, with copies.
-
-    Args:
-        session: An ``onnxruntime.InferenceSession`` with one float32 input and one float32 output.
-        sizes: Observation and action size.
-        device: Where the session computes.
-    """
+    """A controller that onnxruntime runs: where the observations are if it can, else on the CPU, with copies."""
 
     def __init__(self, session: Any, sizes: tuple[int, int], device: torch.device) -> None:
+        """Of a session with one float32 input and one output, of these observation and action sizes, on its device."""
         self.sizes = sizes
         self.device = device
         self._session = session
@@ -81,7 +75,6 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> OnnxPol
 
 
 def _check_all_inside(data: bytes) -> None:
-    """Raises ValueError for a model without a graph, or with weights in another file."""
     model = onnx.ModelProto.FromString(data)
     if not model.graph.node:
         raise ValueError("it has no graph")
@@ -135,12 +128,15 @@ def _checked_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[int, in
     return expected
 
 
-def to_onnx(policy: MlpPolicy) -> bytes:
-    """The bytes of an ONNX file that computes what a policy does.
+def export_onnx(policy: MlpPolicy, path: Path) -> None:
+    """Writes a policy as one self-contained file that ends in .onnx; its folder is made if need be.
 
     Its input is ``observation``, shape (batch, observation_size), its output ``action``, shape (batch, num_joints),
     both float32, the batch free. The same policy gives the same bytes.
     """
+    if path.suffix.lower() != ".onnx":
+        raise ValueError(f"'{path}' must end in .onnx, by which controllers of that kind are known")
+    prepare_output(path)
     nodes: list[Any] = []
     weights: list[Any] = []
 
@@ -152,13 +148,13 @@ def to_onnx(policy: MlpPolicy) -> bytes:
         nodes.append(helper.make_node(kind, inputs, [name], name=f"make_{name}", **attributes))
         return name
 
-    value = INPUT
+    value = "observation"
     if policy.normalised:  # the 1e-2 is rsl_rl's
         value = node("Sub", [value, weight("mean", policy.mean)], "centred")
         value = node("Div", [value, weight("scale", policy.std + 1e-2)], "normalised")
     last = len(policy.layers) - 1
     for k, layer in enumerate(policy.layers):
-        name = OUTPUT if k == last else f"layer_{k}"
+        name = "action" if k == last else f"layer_{k}"
         if isinstance(layer, torch.nn.Linear):
             inputs = [value, weight(f"weight_{k}", layer.weight), weight(f"bias_{k}", layer.bias)]
             value = node("Gemm", inputs, name, transB=1)
@@ -166,16 +162,8 @@ def to_onnx(policy: MlpPolicy) -> bytes:
             value = node("Elu", [value], name, alpha=1.0)
     ports = [
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])]
-        for name, size in zip((INPUT, OUTPUT), policy.sizes, strict=True)
+        for name, size in zip(("observation", "action"), policy.sizes, strict=True)
     ]
     graph = helper.make_graph(nodes, "policy", *ports, initializer=weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
-    return model.SerializeToString(deterministic=True)
-
-
-def export_onnx(policy: MlpPolicy, path: Path) -> None:
-    """Writes a policy as one self-contained file that ends in .onnx; its folder is made if need be."""
-    if path.suffix.lower() != ".onnx":
-        raise ValueError(f"'{path}' must end in .onnx, by which controllers of that kind are known")
-    prepare_output(path)
-    write_atomically(path, to_onnx(policy))
+    write_atomically(path, model.SerializeToString(deterministic=True))

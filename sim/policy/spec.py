@@ -8,18 +8,20 @@ import sys
 import sysconfig
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import Field, dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
 _NAMED = re.compile(r"(?P<place>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
 
 
-class RobotWithController(Protocol):
-    """What the names of controllers take of a robot's settings."""
+class RobotSettings(Protocol):
+    """What names and records take of a robot's settings, a dataclass (:class:`sim.robots.robot.RobotCfg`)."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     @property
     def name(self) -> str:
@@ -29,6 +31,16 @@ class RobotWithController(Protocol):
     @property
     def policy_file(self) -> Path:
         """The controller that comes with it."""
+        ...
+
+    @property
+    def model_file(self) -> Path:
+        """MJCF or URDF."""
+        ...
+
+    @property
+    def spec(self) -> str:
+        """Name or settings file."""
         ...
 
 
@@ -80,31 +92,25 @@ class ControllerSpec:
         return ControllerSpec(place=place, name=self.name, file=file and str(folder / Path(file).name))
 
 
-def spec_of(policy: str, robot: RobotWithController) -> str:
+def spec_of(policy: str, robot: RobotSettings) -> str:
     """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
     return str(robot.policy_file) if policy == SHIPPED else policy
 
 
-def name_of(policy: str | Path, robot: RobotWithController) -> str:
-    """How files of results and settings name a controller, the inverse of :func:`spec_of`.
-
-    The robot's own is :data:`SHIPPED` there, since its file lies elsewhere on each machine.
-    """
+def name_of(policy: str | Path, robot: RobotSettings) -> str:
+    """How files of results name a controller, the inverse of :func:`spec_of`: :data:`SHIPPED` lies at no fixed path."""
     return SHIPPED if is_same(str(policy), str(robot.policy_file)) else str(policy)
 
 
 def controller_hash(policy: str | Path) -> str | None:
     """SHA-256 of a controller: of its file, or of the code's file, the controller's and the callable's name.
 
-    What code reads beside its own file is not in it.
-
-    Returns:
-        None if a file is missing, or the code of a module has none.
+    None if a file is missing, or a module has none. What code reads beside its own file is not in it.
     """
     spec = ControllerSpec.parse(policy)
     files = list(spec.files)
     if spec.place is not None and not spec.place.endswith(".py"):
-        files.insert(0, Path(_origin_of(spec.place)))
+        files.insert(0, _file_of_module(spec.place))
     if not all(file.is_file() for file in files):
         return None
     hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
@@ -113,13 +119,13 @@ def controller_hash(policy: str | Path) -> str | None:
     return hashlib.sha256(" ".join([str(spec.name), *hashes]).encode()).hexdigest()
 
 
-def _origin_of(module: str) -> str:
-    """File of a module; empty if there is no such module."""
+def _file_of_module(module: str) -> Path:
+    """File of a module; a path that is no file if there is no such module."""
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):  # no package of that name
-        return ""
-    return "" if spec is None or spec.origin is None else spec.origin
+        spec = None
+    return Path("" if spec is None or spec.origin is None else spec.origin)
 
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -148,7 +154,7 @@ def run_file(path: Path) -> ModuleType:
     path = path.resolve()
     name = f"faultline_file_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
     spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    if spec is None:
         raise ValueError(f"{path} is no Python file: expected a name that ends in .py")
     module = importlib.util.module_from_spec(spec)
     if str(path.parent) not in sys.path:
@@ -164,15 +170,7 @@ def run_file(path: Path) -> ModuleType:
 
 
 def find_named(place: str, name: str) -> Any:
-    """What a module or a Python file calls ``name``.
-
-    Args:
-        place: An importable module, or a file whose name ends in .py.
-        name: Dots reach into classes.
-
-    Raises:
-        Exception: Anything, if it cannot be run or has no such name.
-    """
+    """What a module, or a file whose name ends in .py, calls ``name``; dots reach into classes. It can fail anyhow."""
     target: Any = run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
     for part in name.split("."):
         if not hasattr(target, part):
@@ -181,13 +179,9 @@ def find_named(place: str, name: str) -> Any:
     return target
 
 
-MARK = "@"
-"""Between the kind of a controller and its seed: C-G, C-G@1 and C-G@2 are of kind C-G."""
-
-
 def kind_of(name: str) -> str:
-    """The kind of a controller by its name."""
-    return name.split(MARK)[0]
+    """The kind of a controller by its name: C-G of C-G, and of C-G@1 and C-G@2, which have other seeds."""
+    return name.partition("@")[0]
 
 
 def firsts(names: Iterable[str]) -> list[str]:
@@ -198,7 +192,7 @@ def firsts(names: Iterable[str]) -> list[str]:
     return list(first.values())
 
 
-def about_controllers(controllers: Mapping[str, str], robot: RobotWithController) -> dict[str, dict[str, str | None]]:
+def about_controllers(controllers: Mapping[str, str], robot: RobotSettings) -> dict[str, dict[str, str | None]]:
     """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own."""
     return {
         name: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
@@ -206,12 +200,11 @@ def about_controllers(controllers: Mapping[str, str], robot: RobotWithController
     }
 
 
-def controllers_of(policies: Sequence[str], robot: RobotWithController, *, flag: str = "policies") -> dict[str, str]:
+def controllers_of(policies: Sequence[str], robot: RobotSettings, *, flag: str = "policies") -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
 
     Args:
-        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; one text may hold several, separated
-            by spaces.
+        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; a text may hold several, with spaces.
         robot: The robot, whose controller is the shipped one.
         flag: The flag that names them, for errors.
     """
@@ -244,7 +237,7 @@ def label_suffix(policy: str) -> str:
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
-def who_crossed(robot: RobotWithController, policy: str) -> str:
+def who_crossed(robot: RobotSettings, policy: str) -> str:
     """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
     return robot.name + ("" if is_same(policy, str(robot.policy_file)) else label_suffix(policy))
 

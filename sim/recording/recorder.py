@@ -113,15 +113,11 @@ class Recording:
 
     def of_terrain(self, terrain: int) -> "Recording":
         """The recording of the terrain of one index alone."""
-        num_frames = self.num_frames[terrain : terrain + 1]
-        cut = {name: getattr(self, name)[terrain : terrain + 1, :, : num_frames.max()] for name in FRAME_ARRAYS}
-        each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s")
-        cut |= {name: getattr(self, name)[terrain : terrain + 1] for name in each}
-        for name in ("genes", "friction", "time_constant_s"):
-            whole = getattr(self, name)
-            cut[name] = None if whole is None else whole[terrain : terrain + 1]
-        cut["touching"] = self.touching[terrain : terrain + 1, :, : num_frames.max()]
-        return replace(self, num_frames=num_frames, **cut)
+        row, frames = slice(terrain, terrain + 1), int(self.num_frames[terrain].max())
+        cut = {name: getattr(self, name)[row, :, :frames] for name in (*FRAME_ARRAYS, "touching")}
+        each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s", "num_frames")
+        given = [name for name in ("genes", "friction", "time_constant_s") if getattr(self, name) is not None]
+        return replace(self, **cut, **{name: getattr(self, name)[row] for name in (*each, *given)})
 
     def result(self) -> RolloutResult:
         """What came of the recorded episodes; positions are those of the last frame, what they took is not known."""
@@ -162,24 +158,24 @@ class _Frames:
         self._num_base = len(robot.base_geoms)  # the first ones
         self._columns = [PENALTIES.index(name) for name in robot.penalties]
         self._num_frames = np.zeros(num_terrains * rollout.num_replicas, dtype=np.int32)
-        self._over = np.zeros(len(self._num_frames), dtype=bool)
-        self._taken: list[tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[Any]]]] = []
+        self._ended = np.zeros(len(self._num_frames), dtype=bool)
+        self._frames: list[tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[Any]]]] = []
 
     def before_step(self) -> None:
         """Add the present state of every robot on its way as a frame."""
         outcome = self._rollout.state.outcome.numpy()
-        self._take(np.flatnonzero(outcome == Outcome.RUNNING), ended=False)
+        self._add(np.flatnonzero(outcome == Outcome.RUNNING), ended=False)
 
     def after_step(self) -> None:
         """Add the last frame of every episode that ended; where a step broke the state, there is none."""
         state = self._rollout.state
         outcome, episode = state.outcome.numpy(), state.episode.numpy()
         ended = np.flatnonzero((outcome != Outcome.RUNNING) & (episode >= 0))
-        ended = ended[~self._over[episode[ended]]]
-        self._over[episode[ended]] = True
-        self._take(ended[outcome[ended] != Outcome.INVALID], ended=True)
+        ended = ended[~self._ended[episode[ended]]]
+        self._ended[episode[ended]] = True
+        self._add(ended[outcome[ended] != Outcome.INVALID], ended=True)
 
-    def _take(self, envs: NDArray[Any], *, ended: bool) -> None:
+    def _add(self, envs: NDArray[Any], *, ended: bool) -> None:
         if len(envs) == 0:
             return
         state = self._rollout.state
@@ -204,17 +200,17 @@ class _Frames:
             hit = state.outcome.numpy()[envs] == Outcome.BASE_COLLISION
             missed = hit & ~rounded["touching"][:, : self._num_base].any(axis=1)
             rounded["touching"][missed, : self._num_base] = True
-        self._taken.append((row, frame, rounded))
+        self._frames.append((row, frame, rounded))
         self._num_frames[row] += 1
 
     def stacked(self) -> dict[str, Any]:
         """All frames by name once the episodes are over, and how many each episode has."""
         most = int(self._num_frames.max())
         stacks: dict[str, Any] = {"num_frames": self._num_frames.reshape(self._shape)}
-        for name, first in self._taken[0][2].items():
+        for name, first in self._frames[0][2].items():
             fill, dtype = (np.nan, np.float32) if name in FRAME_ARRAYS else (False, np.bool_)
             stack = np.full((len(self._num_frames), most, *first.shape[1:]), fill, dtype)
-            for row, frame, values in self._taken:
+            for row, frame, values in self._frames:
                 stack[row, frame] = values[name]
             stacks[name] = stack.reshape(*self._shape, *stack.shape[1:])
         return stacks

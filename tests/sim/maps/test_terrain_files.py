@@ -89,12 +89,13 @@ def test_contacts_with_the_exported_scene_are_with_the_same_surface(rough, tmp_p
 
 
 def test_a_margin_continues_the_edge(rough):
-    plain, wide = as_hfield(rough), as_hfield(rough, margin=10)
-    assert wide.data.shape == (NUM_COLS + 20, NUM_ROWS + 20)
-    np.testing.assert_array_equal(wide.data[10:-10, 10:-10], plain.data)
-    assert (wide.data[:10, 10:-10] == plain.data[0]).all()
-    assert wide.position == plain.position
-    assert wide.size[:2] == pytest.approx((4.5, 8.5))
+    plain, wide = as_hfield(rough), as_hfield(rough, margin=((10, 20), (30, 40)))
+    assert wide.data.shape == (NUM_COLS + 70, NUM_ROWS + 30)
+    np.testing.assert_array_equal(wide.data[40:-30, 10:-20], plain.data)  # its first row has the highest x
+    assert (wide.data[:40, 10:-20] == plain.data[0]).all()
+    # 8 m and 1.5 m of margin along y, 16 m and 3.5 m along x; more beyond the high ends moves the middle.
+    assert wide.size[:2] == pytest.approx((4.75, 9.75))
+    assert wide.position[:2] == pytest.approx((8.25, 4.25))
 
 
 @pytest.mark.parametrize("flat", [False, True])

@@ -91,7 +91,7 @@ ADAPTER = "def adapt(actor, robot): "
         ("x = 3", "act", "no 'act'"),
         ("act = 3", "act", "int"),
         ("class act: pass", "act", "faultline_factory"),
-        ("def act(robot, device): pass", "act", "faultline_factory"),
+        ("def act(robot, device): pass", "act", "'device'"),
         ("def act(o): raise SystemExit", "act", r"mine\.py, line 1\)"),
         ("def act(o): return [0.0] * 12", "act", "got list"),
         ("def act(o): return o[:, :11]", "act", r"\(4, 11\)"),

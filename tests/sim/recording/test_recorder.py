@@ -120,6 +120,7 @@ def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
     assert recording.num_frames[1, 2] == 26  # broken after 0.5 s, in the 26th control step; frames 0 to 25
     np.testing.assert_allclose(recording.duration_s[1, 2], 0.505, atol=1e-6)
     assert np.isfinite(recording.qpos(1, 2)[:25]).all()
+    assert (recording.foot_force[:, :, 0] == 0).all()  # whatever robots did before
 
 
 def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
