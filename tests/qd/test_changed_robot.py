@@ -55,13 +55,6 @@ def test_numbers_of_another_definition_are_refused(dog, monkeypatch):
             read()
 
 
-def test_a_robot_that_is_not_shipped_must_be_named(dog):
-    with pytest.raises(ValueError, match="dog"):
-        robot_of({"robot": "dog"} | json.loads((dog.parent / "dog.scales.json").read_text()), None, dog.parent)
-    with pytest.raises(ValueError, match="anymal"):
-        find_archive("anymal", dog.parent / "archive.npz")
-
-
 def test_a_controller_trained_with_the_robot_before_is_told_so(dog, capsys):
     robot = get_robot(str(dog))
     policy = save_checkpoint(dog.parent / "a1.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())
