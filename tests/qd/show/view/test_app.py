@@ -1,7 +1,6 @@
 import dataclasses
 import re
 import signal
-import subprocess
 import time
 import urllib.request
 from pathlib import Path
@@ -17,10 +16,9 @@ from qd.show.view.app import App
 from qd.show.view.recorder import Report
 from qd.show.view.show import find_show
 from qd.show.view.tab import Tab
-from sim.policy.spec import controller_hash
 from sim.recording.file import read_recording
-from tests.builders import free_port, judged_archive
-from tests.qd.show.view.visitor import ROOT, Visitor, serve, view_command
+from tests.builders import free_port
+from tests.qd.show.view.visitor import Visitor, serve, view_command
 
 PICK_LIMIT_S = 1.0
 """From a click to the terrain on its way to the browser; it takes 0.15 s."""
@@ -202,18 +200,6 @@ def test_what_is_not_there_is_refused_in_words(shown):
     assert shown.tab._selection.picked == 171
 
 
-def test_paths_have_the_colours_of_the_words_and_hide_nothing(shown):
-    tab = shown.tab
-    assert "#0072b2" in tab._panel._status.content and "#d55e00" in tab._panel._status.content
-    found = {path.color: path for path in tab.scene._paths}
-    assert set(found) == {(0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)}
-    assert all(path.visible and path.opacity < 0.5 for path in found.values())
-    shown.do((tab.set_follow, True))
-    assert not any(path.visible for path in found.values())
-    shown.do((tab.set_follow, False))
-    assert all(path.visible for path in found.values())
-
-
 def test_what_touches_is_coloured_while_it_touches(shown):
     tab = shown.tab
     touching, names = tab._recording.touching[0, 0], tab._recording.geom_names
@@ -227,20 +213,6 @@ def test_what_touches_is_coloured_while_it_touches(shown):
     assert "before touches of bodies were kept" in status(tab)
 
 
-def test_episodes_are_chosen_by_their_outcome(shown):
-    tab = shown.tab
-    assert tab._panel._groups.options == (
-        "all 20 episodes", "the 19 that ended: out of time", "the 1 that ended: base collision",
-    )  # fmt: skip
-    shown.do((tab.choose_group, "the 1 that ended: base collision"))
-    assert status(tab).startswith("Episode 17: base collision")
-    assert tab._panel._episode.options == ("17: base collision",)
-    shown.do((tab.choose_group, "the 19 that ended: out of time"), (tab.step_replica, -1))
-    assert status(tab).startswith("Episode 20: out of time")  # round again
-    shown.do((tab.choose_replica, 16))  # by a key, not one of the group
-    assert tab._panel._groups.value == "all 20 episodes" and tab._panel._episode.value == "17: base collision"
-
-
 def test_a_pick_shows_its_terrain_within_a_second(shown):
     tab = shown.tab
     for number in (171, 0, 171, 0):  # without a recording and with one
@@ -249,20 +221,6 @@ def test_a_pick_shows_its_terrain_within_a_second(shown):
         assert time.perf_counter() - began < PICK_LIMIT_S
         assert f"Elite {number}" in tab._panel._details.content
     assert "All 20: 19 out of time, 1 base collision" in status(tab)
-
-
-def test_the_list_follows_the_ranges(shown):
-    tab = shown.tab
-    shown.do((tab._list.brush, "goal_rate", 0.9, 1.0))
-    assert (tab.common.axes.axis("goal_rate").values[tab._selection.kept] >= 0.9).all()
-    assert 0 < len(tab._selection.kept) < len(tab._archive)
-    first = int(tab._selection.kept[0])
-    assert tab._list._lines[0].label.startswith(f"{first}: ")
-    shown.do((tab.pick_line, 0))
-    assert tab._selection.picked == first and tab._list._number.value == str(first)
-    shown.do((tab._list.change, tab._selection.clear), (tab.step, 1))
-    assert len(tab._selection.kept) == len(tab._archive)
-    assert tab._selection.picked == tab._selection.kept[tab._selection.kept.tolist().index(first) + 1]
 
 
 def test_playing_and_dragging_move_the_robot(shown):
@@ -287,25 +245,6 @@ def test_playing_and_dragging_move_the_robot(shown):
     shown.do((tab.set_forces, True), (tab.seek, 0.02 * frame))
     seen = np.array([arrow.visible for arrow in tab.scene._forces])
     assert seen.any() and seen[pushing[frame]].all()
-
-
-def rows_of(details):
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in details.splitlines() if "|" in line]
-
-
-def test_the_neighbours_in_the_list_are_recorded_ahead(shown):
-    tab = shown.tab
-    near = [tab._selection.step(by) for by in (1, -1)]
-    assert shown.ahead[-1] == [f"elite {number} of anymal" for number in dict.fromkeys(near) if number != 0]
-    shown.do((tab.leave,))
-    assert shown.ahead[-1] == []
-
-
-def test_the_command_that_replays_what_is_shown_is_copied(shown):
-    shown.do((shown.tab.copy_command,))
-    (command,) = notes(shown, 1)
-    assert "replay --robot anymal --run" in command and "--elite 0 " in command and command.endswith("--replicas 20")
-    assert any(command.split("--robot")[1] in script for script in shown.visitors[0].scripts)
 
 
 def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
@@ -337,13 +276,9 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
 def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
     tab = shown.tab
     assert not tab.scene._ghost.visible and tab._panel._ghost.value == "who certifies it"  # nobody does here
-    head, _, goal, *_ = rows_of(tab._panel._details.content)
-    assert head[1].startswith("as searched, ") and head[2:] == ["base (shown), 20 episodes here"]
-    assert goal[0] == "goal reached" and goal[2] == "0% (0 to 16%)"  # of 20: Wilson
+    assert "0% (0 to 16%)" in tab._panel._details.content  # none of 20 reached the goal: Wilson
     shown.do((tab.choose_ghost, "other"), (tab.seek, 5.0))  # the same file, so the same crossing
-    head, _, goal, collided, _ = rows_of(tab._panel._details.content)
-    assert head[2:] == ["base (shown), 20 episodes here", "other (ghost), 20 episodes here"]
-    assert goal[2] == goal[3] and collided[2] == "5% (1 to 24%)"
+    assert tab._panel._details.content.count("5% (1 to 24%)") == 2  # one base collision of 20, of both
     assert tab.scene._ghost.visible and tab.scene._robot.visible
     np.testing.assert_array_equal(tab.scene._ghosts[0].position, tab.scene._bodies[0].position)
     assert tab.scene._ghosts[0].opacity == 0.4
@@ -355,29 +290,6 @@ def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
     assert not tab.scene._ghost.visible and tab._panel._ghost_status.content == ""
     shown.do((tab.choose_controller, "base"), (tab.choose_ghost, "none"))
     assert not tab.scene._ghost.visible
-
-
-def test_a_ghost_is_recorded_like_what_is_shown(shown):
-    tab = shown.tab
-    recording = tab._recording
-    shown.do((tab.choose_ghost, "other"), (tab.pick, 7))
-    wanted = shown.asked[-2:]
-    assert [one.label for one in wanted] == ["elite 7 of anymal"] * 2
-    assert "are recorded" in tab._panel._ghost_status.content
-    shown.do((shown.app.show_report, Report(wanted=wanted[0], text="recorded", recording=recording)))
-    assert tab.scene._ghost.visible and tab.scene._robot.visible
-    shown.do((tab.choose_ghost, "none"))
-    assert shown.asked[-1] is None or tab.ghost._wanted is None
-
-
-def test_the_ghost_is_who_certifies_the_elite_if_nobody_is_chosen(show):
-    archive = judged_archive()
-    digest = controller_hash(show.controllers["other"])
-    faults = dataclasses.replace(archive.faults, certifier_sha256=("a" * 64, digest))
-    found = dataclasses.replace(show.found, archive=dataclasses.replace(archive, faults=faults))
-    judged = dataclasses.replace(show, found=found, controllers={"S": show.controllers["other"]})
-    by = archive.certified & faults.certificates()[:, 1]
-    assert by.any() and [judged.certifying(k) for k in range(5)] == ["S" if one else None for one in by]
 
 
 def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
@@ -412,13 +324,9 @@ def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
 @pytest.mark.slow
 def test_the_command_serves_a_page_and_ends_on_ctrl_c(run, tmp_path):
     port = free_port()
-    command = view_command("--run", str(run), "--port", str(port), "--cache", str(tmp_path))
-    process, lines = serve(command)
-    page = urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).read()
-    assert b"<html" in page.lower()
-    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert again.returncode == 2 and f"port {port} of 127.0.0.1 is in use" in again.stderr
+    process, lines = serve(view_command("--run", str(run), "--port", str(port), "--cache", str(tmp_path)))
+    assert b"<html" in urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).read().lower()
     process.send_signal(signal.SIGINT)
     rest = process.communicate(timeout=180)[0]
-    assert process.returncode == 0 and "Stopped." in rest and "Traceback" not in rest
+    assert process.returncode == 0 and "Traceback" not in rest
     assert any(f"{len(read_archive(run)):,} elites of anymal." in line for line in lines)

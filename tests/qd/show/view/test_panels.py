@@ -1,13 +1,10 @@
 import dataclasses
-import re
 
 import numpy as np
 import pytest
 
-from qd.show.crossed import ENDINGS
-from qd.show.view.legend import legend_html
 from qd.show.view.panels import PAGE, Clock, Selection
-from qd.show.view.plots import FITNESS_WORDS, KINDS, Choice, axes_of, axes_svg
+from qd.show.view.plots import KINDS, Choice, axes_of
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
 
@@ -30,14 +27,6 @@ def test_ranges_keep_what_lies_in_all_of_them(selection):
     assert selection.kept.tolist() == list(range(1, 20, 2))
     selection.clear()
     assert selection.kept.tolist() == list(range(20)) and selection.ranges == {}
-
-
-def test_ranges_may_keep_nothing(selection):
-    selection.brush("goal_rate", 0.92, 0.94)
-    assert (selection.kept.tolist(), selection.listed, selection.num_pages) == ([], [], 1)
-    assert selection.step(1) == selection.picked
-    selection.clear()
-    assert len(selection.kept) == 20
 
 
 def test_the_list_has_pages(selection):
@@ -97,16 +86,6 @@ def test_faults_come_before_certified_confirmed_and_other_failing_elites():
     )
 
 
-def test_each_line_of_the_plot_names_its_elite(axes):
-    kept = axes.listed(Choice(ranges={"goal_rate": (0.0, 0.2)}, order="fault"))
-    svg = axes_svg(axes, kept, {}, 0)
-    named = [numbers.split() for numbers in re.findall(r'data-elites="([^"]*)"', svg)]
-    assert [int(number) for numbers in reversed(named) for number in numbers] == [0, 1, 2, 3, 4]
-    for tag, numbers in zip(re.findall(r"<path [^>]*data-elites[^>]*>", svg), named, strict=True):
-        assert tag.count("M") == len(numbers) == len(re.search('data-hints="([^"]*)"', tag)[1].split("|"))
-    assert "elite 4, failing: goal 20%" in svg and FITNESS_WORDS[:40] in svg
-
-
 def test_numbers_of_fresh_episodes_come_first():
     archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
     fresh = fresh_values(archive)
@@ -122,16 +101,6 @@ def test_numbers_of_fresh_episodes_come_first():
     assert axes.rate_text("collision_rate", 0) == "50% (35 to 65%)"
     assert "collision 50%" in axes.line(0) and "as searched, 40 fresh episodes" in axes.details(0, {})
     assert "the 4 episodes that found it" in axes.details(2, {})
-
-
-def test_an_axis_reaches_over_all_values_in_whole_steps(axes):
-    axis = axes.axis("goal_rate")
-    assert (axis.low, axis.high) == (0.0, 0.95)
-    same = axes_of(
-        dataclasses.replace(small_archive(1), fitness=np.array([1.0]), goal_rate=np.array([0.5])), SUPER_GAUSSIAN
-    )
-    for axis in same.axes:  # of one elite too
-        assert axis.low <= axis.values[0] <= axis.high and axis.high > axis.low
 
 
 def test_time_goes_by_at_its_speed():
@@ -157,11 +126,3 @@ def test_time_goes_by_at_its_speed():
     assert clock.frame(0.02, 90) == 0
     clock.load(1.0)
     assert clock.duration_s == 1.0
-
-
-def test_the_legend_has_all_colours_and_names_as_text():
-    legend = legend_html(["base", "<tuned>"])
-    assert "base, &lt;tuned&gt;" in legend
-    for ending in ENDINGS.values():
-        assert f"background:{ending.color}" in legend and ending.words in legend
-    assert "#d6167a" in legend and "#ffd60a" in legend  # (214, 22, 122) of bodies, (255, 214, 10) of feet that touch

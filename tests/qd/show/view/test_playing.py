@@ -13,9 +13,7 @@ from qd.show.view.playing import (
     moment_text,
     next_mark,
     paths_of,
-    rotated,
 )
-from qd.show.view.plots import Curves, axes_svg
 from sim.robots.skeleton import Skeleton
 from tests.qd.recordings import recording_of
 from tests.qd.show.view.made import FRAMES, make_recording
@@ -58,13 +56,6 @@ def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
     assert "Command: 0.75, 0.25 m/s, 0.50 rad/s" in text and "base at 2.00, 4.00, 0.60 m" in text
 
 
-def test_forces_begin_at_the_feet(robot, skeleton, recording):
-    crossing = crossing_of(recording, 0, skeleton, (), ())
-    foot = skeleton.geom(robot.foot_geoms[0])
-    expected = crossing.positions[4, foot.body] + rotated(crossing.quaternions[4, foot.body], foot.position)
-    np.testing.assert_allclose(crossing.forces[4, 0, 0], expected)
-
-
 def test_an_episode_that_broke_at_once_has_nothing_to_show(skeleton, recording):
     assert crossing_of(recording, 1, skeleton, (), ()).ending == "out of time"
     assert crossing_of(recording, 2, skeleton, (), ()) is None
@@ -76,22 +67,6 @@ def test_ways_and_endings_of_all_episodes(recording):
     np.testing.assert_allclose(paths[1][0][:, 0], [2.0, 2.2, 2.3], atol=1e-6)
     assert "1 base collision" in endings(recording) and "1 out of time" in endings(recording)
     assert "goal" not in endings(recording)
-
-
-def test_the_mark_of_the_curves_moves_with_time():
-    curves = Curves(np.array([0.0, 1.0, 2.0]), np.array([[0.0, 0.0], [1.0, 2.0], [4.0, 2.0]]), ("one", "<two>"))
-    begin, end = curves.at(0.0), curves.at(2.0)
-    assert begin != end and begin.count("<path") == 2
-    assert "&lt;two&gt;" in begin and ">4<" in begin  # the largest sum
-
-
-def test_the_plot_greys_what_ranges_leave_out(axes):
-    everything = axes_svg(axes, np.arange(20), {}, picked=3)
-    some = axes_svg(axes, np.array([1, 2]), {"goal_rate": (0.05, 0.1)}, picked=None)
-    lines = lambda svg: svg.count("M") - svg.count("</text>M")  # noqa: E731  # a line an elite
-    assert lines(everything) == 21 and lines(some) == 20
-    assert everything.count("<rect") == 0 and some.count("<rect") == 1
-    assert axes_svg(axes, np.array([], int), {}, None).count('stroke="#d8d8d8"') == 1
 
 
 def test_marks_stand_where_things_happen_first():
@@ -111,18 +86,6 @@ def test_marks_stand_where_things_happen_first():
     assert next_mark(found, 0.4) == found[0]  # round again
 
 
-def test_without_a_penalty_the_first_collision_is_the_first_touch_of_a_body():
-    made = recording_of([Outcome.TIME_OUT], [6.0])
-    touching = np.zeros((1, 1, 21, 2), bool)
-    touching[0, 0, 3:, 1] = True
-    touching[0, 0, 7, 0] = True
-    made = dataclasses.replace(
-        made, penalty_names=(*made.penalty_names[:5], "other"), geom_names=("base", "foot"), touching=touching,
-        penalties=np.zeros_like(made.penalties),
-    )  # fmt: skip
-    assert marks_of(made, 0)[0] == Mark(pytest.approx(0.14), "first collision")
-
-
 def test_episodes_are_chosen_by_what_they_have_in_common():
     outcomes = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT, Outcome.BASE_COLLISION]
     made = recording_of(outcomes, [6.0] * 4, fallen=[False, False, True, True])
@@ -133,10 +96,3 @@ def test_episodes_are_chosen_by_what_they_have_in_common():
         "the 1 that ended: base collision": [3],
         "the 2 that fell": [2, 3],
     }
-
-
-def test_marks_are_named_above_the_curves():
-    marks = ((0.5, "first <stumble>"), (1.9, "end"))
-    drawn = Curves(np.array([0.0, 1.0, 2.0]), np.ones((3, 1)), ("one",), marks).at(0.0)
-    assert "first &lt;stumble&gt;, 0.5 s" in drawn and "end, 1.9 s" in drawn
-    assert drawn.count("stroke-dasharray") == 2

@@ -1,4 +1,3 @@
-import dataclasses
 import queue
 import time
 
@@ -17,13 +16,14 @@ def wish(number, policy="fast"):
     return Wanted(label="", terrain=genes, policy=policy, replicas=1, terrain_seed=number)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def reports():
     return queue.SimpleQueue()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def recorder(anymal, reports):
+    """One for all tests, since every process of a controller takes seconds to begin."""
     recorder = Recorder(anymal, reports.put, build=build)
     yield recorder
     recorder.stop()
@@ -46,25 +46,9 @@ def test_progress_comes_before_the_recording(recorder, reports):
     assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
 
 
-@pytest.mark.slow
-def test_a_simulation_is_recorded(anymal, reports):
-    recorder = Recorder(anymal, reports.put)
-    try:
-        found = []
-        for seed in (1, 2):  # it falls on the spike at once, every time from another start
-            stands = {"terrain": spike(), "policy": "tests.sim.policies:stand"}
-            recorder.record(Wanted(label="", **stands, replicas=4, terrain_seed=seed))
-            found.append(last_of(reports)[-1].recording)
-    finally:
-        recorder.stop()
-    assert [recording.seeds.tolist() for recording in found] == [[1], [2]]
-    assert all((recording.outcome == Outcome.BASE_COLLISION).all() for recording in found)
-    assert (found[0].base_position[:, :, 0] != found[1].base_position[:, :, 0]).any()
-
-
 def test_of_several_wishes_the_last_one_counts(recorder, reports):
     recorder.record(wish(1, "slow"))
-    while reports.get(timeout=60).share == 0.0:  # until it is at it
+    while reports.get(timeout=60).share == 0.0:  # until it is crossing
         pass
     for number in (2, 3, 4):
         recorder.record(wish(number, "slow"))
@@ -76,18 +60,6 @@ def test_of_several_wishes_the_last_one_counts(recorder, reports):
     assert all(report.wanted.terrain_seed == 5 for report in iter_now(reports))
 
 
-def test_each_tab_has_a_wish_of_its_own(recorder, reports):
-    recorder.record(wish(1, "slow"))
-    while reports.get(timeout=60).share == 0.0:
-        pass
-    for number, tab in ((2, 1), (3, 2), (4, 1), (1, 3)):
-        recorder.record(wish(number, "slow"), tab=tab)
-    found = [last_of(reports)[-1].recording for _ in range(3)]
-    assert found == ["slow on 1", "slow on 3", "slow on 4"]  # tab 3 is served by the first
-    time.sleep(0.3)
-    assert reports.empty()
-
-
 def test_what_may_be_asked_for_next_is_recorded_ahead_and_makes_room(recorder, reports):
     recorder.warm(wish(0, "droppable"))
     recorder.record_ahead([wish(1, "droppable"), wish(2, "droppable")])
@@ -97,15 +69,10 @@ def test_what_may_be_asked_for_next_is_recorded_ahead_and_makes_room(recorder, r
     assert found[-1].recording == "droppable on 7" and {report.wanted.terrain_seed for report in found} <= {0, 1, 7}
     later = last_of(reports)[-1].recording
     assert later in ("droppable on 1", "droppable on 2")  # the other one is dropped, or done before
-    recorder.record_ahead([wish(8, "slow")], tab=1)
-    while not recorder._at:
-        time.sleep(0.01)
-    recorder.record(wish(8, "slow"), tab=2)  # somebody asks for just that: it goes on
-    assert last_of(reports)[-1].recording == "slow on 8"
     recorder.record_ahead([wish(13)])  # it breaks, and nobody waits for it
     recorder.record(None)
     time.sleep(0.3)
-    assert reports.empty()
+    assert not any(report.failed for report in iter_now(reports))
 
 
 def iter_now(reports):
@@ -123,23 +90,27 @@ def test_a_failure_is_told_and_the_next_recording_works(recorder, reports):
     assert last_of(reports)[-1].text == "no such controller"
 
 
-def test_few_processes_are_kept(recorder, reports):
-    for policy in "abcde":
-        recorder.record(wish(1, policy))
-        assert last_of(reports)[-1].recording == f"{policy} on 1"
-    assert list(recorder._workers) == ["c", "d", "e"]
-
-
-def test_stopping_does_not_wait_for_a_recording(anymal, reports):
-    recorder = Recorder(anymal, reports.put, build=build)
+def test_stopping_does_not_wait_for_a_recording(recorder, reports):
     recorder.record(wish(1, "slow"))
     while reports.get(timeout=60).share == 0.0:
         pass
     began = time.perf_counter()
     recorder.stop()
     assert time.perf_counter() - began < 0.9
-    assert not recorder._thread.is_alive()
 
 
-def test_wishes_are_told_apart_without_their_genes():
-    assert wish(1) == dataclasses.replace(wish(1)) and wish(1) != wish(2) and wish(1) != wish(1, "other")
+@pytest.mark.slow
+def test_a_simulation_is_recorded(anymal):
+    reports = queue.SimpleQueue()
+    recorder = Recorder(anymal, reports.put)
+    try:
+        found = []
+        for seed in (1, 2):  # it falls on the spike at once, every time from another start
+            stands = {"terrain": spike(), "policy": "tests.sim.policies:stand"}
+            recorder.record(Wanted(label="", **stands, replicas=4, terrain_seed=seed))
+            found.append(last_of(reports)[-1].recording)
+    finally:
+        recorder.stop()
+    assert [recording.seeds.tolist() for recording in found] == [[1], [2]]
+    assert all((recording.outcome == Outcome.BASE_COLLISION).all() for recording in found)
+    assert (found[0].base_position[:, :, 0] != found[1].base_position[:, :, 0]).any()
