@@ -17,7 +17,7 @@ from qd.run.directory import RunDirectory, find_run
 from sim.policy.loaders import load_policy
 from sim.policy.mlp import MlpPolicy
 from sim.policy.onnx import export_onnx
-from sim.policy.spec import SHIPPED, controller_hash, is_same
+from sim.policy.spec import SHIPPED, controller_hash
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.spaces.registry import identity, load_space
@@ -78,8 +78,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     }
     if saved is not None:
         check_settings(run_dir, saved, settings)
-        is_exported = run.export is None or is_same(str(run.export), str(run_dir / POLICY))
-        if is_exported and is_finished(run_dir, cfg.iterations):
+        if is_finished(run_dir, cfg.iterations, run.export):
             return run_dir / POLICY
     with run_directory(run_dir, run.export, overwrite=run.overwrite):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
@@ -140,12 +139,11 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
         return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
     paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
     archives = [read_elites(path, robot, cfg.space) for path in paths]
-    spaces = tuple(map(space_of, archives))
     splits = [_split(cfg, archive) for archive in archives]
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):
         held_out.update(marks_of(archive.genes[np.concatenate([split.test, split.validation])]))
-    parts = []
+    chosen = []
     for archive, split, path in zip(archives, splits, paths, strict=True):
         rows = split.train
         if cfg.recipe.only == "failing":
@@ -153,14 +151,13 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
                 raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: judge it first")
             rows = rows[archive.failing[rows]]
         is_free = [mark not in held_out for mark in marks_of(archive.genes[rows])]
-        parts.append(rows[np.array(is_free, bool)])
-    if not any(map(len, parts)):
+        chosen.append((archive, rows[np.array(is_free, bool)], split))
+    if not any(len(rows) for _, rows, _ in chosen):
         places = ", ".join(map(str, paths))
         raise ValueError(f"{places} must have elites to train on that are {cfg.recipe.only}, got none")
-    chosen = list(zip(archives, parts, splits, strict=True))
     return Elites(
         genes=tuple(archive.genes[rows] for archive, rows, _ in chosen),
-        spaces=spaces,
+        spaces=tuple(map(space_of, archives)),
         goal_rate=np.concatenate([(archive.fresh or archive).goal_rate[rows] for archive, rows, _ in chosen]),
         about=[
             {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation),

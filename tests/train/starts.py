@@ -16,7 +16,7 @@ from train.ppo.checkpoint import STD
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 
 
-def write_actor(path, *, hidden=(16, 8), critic=False, **extra):
+def write_actor(path, *, hidden=(16, 8), critic=False, critic_hidden=None, **extra):
     """A controller of random layers, as rsl_rl writes it."""
     torch.manual_seed(0)
 
@@ -28,7 +28,7 @@ def write_actor(path, *, hidden=(16, 8), critic=False, **extra):
 
     content = {"actor_state_dict": {STD: torch.full((12,), 0.3), **layers(235, *hidden, 12), **extra}}
     if critic:
-        content["critic_state_dict"] = layers(235, *hidden, 1)
+        content["critic_state_dict"] = layers(235, *(critic_hidden or hidden), 1)
     torch.save(content, path)
     return path
 
@@ -46,14 +46,3 @@ def make_places(folder: Path) -> Path:
     write_archive(folder / "archive" / "archive.npz", make_archive(10))
     write_actor(folder / "start.pt")
     return folder
-
-
-def write_bad_starts(folder: Path) -> None:
-    """Controllers that walk, and cannot be trained on."""
-    write_actor(folder / "std_negative.pt", **{STD: torch.full((12,), -1.0)})
-    write_actor(folder / "std_short.pt", **{STD: torch.full((2,), 0.3)})
-    content = torch.load(write_actor(folder / "whole.pt", critic=True), weights_only=True)
-    critic = content["critic_state_dict"]
-    others = {"other": {"mlp.0.weight": torch.ones(3, 3)}, "nan": {"mlp.0.bias": torch.full((16,), float("nan"))}}
-    for name, weights in others.items():
-        torch.save({**content, "critic_state_dict": {**critic, **weights}}, folder / f"critic_{name}.pt")

@@ -168,8 +168,8 @@ def test_errors_come_before_any_work(flags, field, tmp_path, monkeypatch, capsys
 def test_new_runs_have_places_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     places = []
-    monkeypatch.setattr("train.base.train", lambda robot, cfg, run_dir, run: places.append(run_dir) or run_dir.mkdir())
-    (tmp_path / "runs").mkdir()
+    monkeypatch.setattr("train.base.train", lambda robot, cfg, run_dir, run: places.append(run_dir))
     for _ in range(3):
         assert run_command(Train, ["--device", "cpu"], name="train") == 0
+        places[-1].mkdir(parents=True)
     assert len(set(places)) == 3 and all(place.parent.name == "runs" for place in places)

@@ -31,12 +31,10 @@ def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Content of a checkpoint that :func:`write_checkpoint` wrote, tensors on the CPU."""
-    if not path.is_file():
-        raise ValueError(f"{path} must be the checkpoint of a training, got no file: name its directory")
     try:
         content = read_weights(path)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
-        raise ValueError(f"{path} must be a checkpoint, got {reason_of(error)}: put a copy of it back") from error
+        raise ValueError(f"{path} must be the checkpoint of a training, got {reason_of(error)}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{path} must be a '{FORMAT}', got another kind of file: name the directory of a training")
     return content

@@ -50,22 +50,8 @@ class CapturedPPO(PPO):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Construct rsl_rl's PPO and move its learning rate to the device.
-
-        Raises:
-            ValueError: If a feature of rsl_rl's PPO is asked for that this update does not compute.
-        """
+        """Construct rsl_rl's PPO and move its learning rate to the device."""
         super().__init__(*args, **kwargs)
-        if self.rnd or self.symmetry or self.actor.is_recurrent or self.use_mixed_precision:
-            raise ValueError(
-                "CapturedPPO computes the plain feed-forward update, got RND, symmetry, a recurrent actor or mixed "
-                'precision: use rsl_rl\'s own ("class_name": "PPO") for these'
-            )
-        if self.schedule != "adaptive" or self.normalize_advantage_per_mini_batch or not self.use_clipped_value_loss:
-            raise ValueError(
-                "CapturedPPO computes the adaptive schedule with rollout-wide advantages and a clipped value loss: "
-                "leave these three settings of rsl_rl's PPO at their defaults"
-            )
         on_cuda = torch.device(self.device).type == "cuda"
         self._lr = torch.tensor(float(self.learning_rate), device=self.device)
         self._actor_learns = torch.ones((), device=self.device)

@@ -123,10 +123,11 @@ def check_settings(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any
         )
 
 
-def is_finished(run_dir: Path, iterations: int) -> bool:
-    """Whether a training has done its iterations and written its controller."""
+def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
+    """Whether a training has done its iterations and written its controller wherever it is asked for."""
     record = (run_dir / POLICY).with_suffix(".train.json")
-    return record.exists() and read_json(record).get("iterations") == iterations
+    is_exported = export is None or is_same(str(export), str(run_dir / POLICY))
+    return is_exported and record.exists() and read_json(record).get("iterations") == iterations
 
 
 class Training:

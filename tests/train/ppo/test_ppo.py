@@ -94,11 +94,11 @@ def test_checkpoint_continues_with_the_same_numbers(tmp_path: Any, device: str) 
         torch.testing.assert_close(mine, other, **(EXACT if device == "cpu" else close(device)))
 
 
-def test_unsupported_features_are_refused(device: str) -> None:
-    settings = runner_settings(CFG)
-    settings["algorithm"]["normalize_advantage_per_mini_batch"] = True
-    with pytest.raises(ValueError, match="CapturedPPO"):
-        OnPolicyRunner(DummyEnv(device), settings, log_dir=None, device=device)
+def test_settings_reach_rsl_rl(device: str) -> None:
+    cfg = replace(CFG, learning_rate=0.002, gamma=0.5, lam=0.6, clip=0.3, desired_kl=0.7, entropy=0.8)
+    alg = make_runner(CapturedPPO, cfg, device).alg
+    assert (alg.learning_rate, alg.gamma, alg.lam, alg.clip_param) == (0.002, 0.5, 0.6, 0.3)
+    assert (alg.desired_kl, alg.entropy_coef, alg.num_learning_epochs, alg.num_mini_batches) == (0.7, 0.8, 3, 2)
 
 
 def test_the_value_moves_no_further_than_the_clip_in_an_update(device: str) -> None:
