@@ -34,6 +34,7 @@ def test_a_ramp_by_hand():
     ("field", "kind"),
     [
         (plateau(6.0, 12.0, -0.2), "drop"),
+        (np.where(X < 12, -0.2 * np.clip((X - 4) / 4, 0, 1), 0).astype(np.float32), "rise"),  # down gently, up a wall
         (plateau(7.0, 7.6, 0.2, run=0.2), "ridge"),
         (plateau(7.0, 7.6, -0.2, run=0.2), "ditch"),
         (plateau(7.0, 7.6, 0.2, run=0.05, y_from=3.8), "ridge end"),
